@@ -18,13 +18,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, logit, nctdtr, stdtr, stdtrit
+from scipy.optimize import root_scalar
+from scipy.special import expit, logit, nctdtr, ndtri, stdtr, stdtrit
 
 CONFIDENCE = 0.95
 REDRAWS = 1000
 TAILS = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
 EDGE = 1e-6  # log-odds are taken of shares this far from 0 and 1
 LEVEL = 1 - CONFIDENCE  # of a test, two-sided
+LEAST_P = 1e-12  # p-values below are 0
 POWER = 0.8  # chance to tell an effect that a number of seeds is planned for
 MOST_SEEDS = 1000  # that a plan of seeds is sought up to
 
@@ -63,20 +65,21 @@ OWN_SCENES = SharedScenes()  # every seed has test scenes of its own
 class MeanOverSeeds(Estimate):
     """The mean over seeds with its 95 % confidence interval, over seeds and scenes.
 
-    There is no interval (None) of a single seed, and none of a share that is 0, or 1, in all seeds. The standard error
+    There is no interval (None) of a single seed, none of a share that is 0, or 1, in all seeds, and none where seeds
+    share test scenes whose spread is not known. The standard error
     is sqrt(sd^2 / n + shared.sd^2); its degrees of freedom are the harmonic mean of those of the seeds, n - 1, and of
     the shared scenes, weighted by their parts of the variance.
     """
 
     seeds: int = 1
     sd: float = 0.0  # standard deviation over seeds; 0 of a single seed
-    shared: SharedScenes = OWN_SCENES
+    shared: SharedScenes | None = OWN_SCENES  # None: seeds share test scenes, and the spread of these is not known
     share: bool = False  # a number in [0, 1]: its interval and tests are on the scale of log-odds
 
     @property
     def known(self) -> bool:
-        """Return whether the spread over seeds is known, so that there are intervals and tests."""
-        return self.seeds > 1 and (0 < self.mean < 1 or not self.share)
+        """Return whether the spread over seeds and scenes is known, so that there are intervals and tests."""
+        return self.seeds > 1 and self.shared is not None and (0 < self.mean < 1 or not self.share)
 
     @property
     def slope(self) -> float:
@@ -91,7 +94,7 @@ class MeanOverSeeds(Estimate):
 
     def p_value(self, hypothesis: float = 0.0) -> float | None:
         """Return the two-sided p-value of Student's t test that the mean is `hypothesis`; None without an interval."""
-        if not self.known:
+        if not self.known or self.shared is None:
             return None
         error, freedom = _standard_error(self.sd, self.seeds, self.shared)
         far = abs(self.distance(hypothesis))
@@ -101,7 +104,7 @@ class MeanOverSeeds(Estimate):
 
     def seeds_to_tell(self, hypothesis: float = 0.0, level: float = LEVEL) -> int | None:
         """Return `plan_seeds` for an effect as large as the distance from `hypothesis`, if the spread is known."""
-        if not self.known:
+        if not self.known or self.shared is None:
             return None
         shared = SharedScenes(self.slope * self.shared.sd, self.shared.scenes)
         return plan_seeds(self.distance(hypothesis), self.slope * self.sd, level, shared)
@@ -153,6 +156,44 @@ def widen(estimate: Estimate, spread: Spread) -> Estimate:
     below, above = estimate.mean - estimate.low, estimate.high - estimate.mean
     half = spread.half_width
     return Estimate(estimate.mean, estimate.mean - np.hypot(below, half), estimate.mean + np.hypot(above, half))
+
+
+@dataclass(frozen=True)
+class OneTraining(MeanOverSeeds):
+    """A number of one training whose standard deviation over trainings on the same frames is known from others.
+
+    `shared` is that of the test scenes, towards 0. Interval and p-value are those of `widen`.
+    """
+
+    trainings: int = 2  # that the standard deviation was estimated from
+
+    @property
+    def known(self) -> bool:
+        """Return that there is a test."""
+        return True
+
+    def p_value(self, hypothesis: float = 0.0) -> float:
+        """Return the level at which the interval of `widen` ends at `hypothesis`."""
+        far, of_scenes = abs(self.distance(hypothesis)), self.shared.sd if self.shared else 0.0
+
+        def beyond(p: float) -> float:
+            scenes, trainings = ndtri(1 - p / 2) * of_scenes, stdtrit(self.trainings - 1, 1 - p / 2) * self.sd
+            return float(np.hypot(scenes, trainings)) - far
+
+        if far == 0:
+            return 1.0
+        return 0.0 if beyond(LEAST_P) < 0 else float(root_scalar(beyond, bracket=(LEAST_P, 1.0)).root)
+
+
+def of_one_training(over_scenes: Estimate, scenes: int, spread: Spread) -> OneTraining | None:
+    """Return a number of one training with the interval of `widen`; None where there is none over its scenes."""
+    mean, low, high = over_scenes.mean, over_scenes.low, over_scenes.high
+    if low is None or high is None:
+        return None
+    wide = widen(over_scenes, spread)
+    half = mean - low if mean > 0 else high - mean
+    shared = SharedScenes(half / float(ndtri(TAILS[1])), scenes)
+    return OneTraining(mean, wide.low, wide.high, 1, spread.sd, shared, trainings=spread.trainings)
 
 
 def widen_share(estimate: Estimate, spread: Spread) -> Estimate:
@@ -217,17 +258,36 @@ def share_scenes(
     return SharedScenes(float(np.sqrt(max(between, 0.0))), shared)
 
 
+def bound_shared_scenes(intervals: Sequence[tuple[float, float]], scenes: int) -> SharedScenes:
+    """Return an upper bound of `share_scenes` where of each seed only its 95 % interval over the scenes is known.
+
+    A covariance is at most the root of the product of both variances (Cauchy and Schwarz), and the mean of these roots
+    at most the mean variance. Half-widths are 1.96 standard deviations.
+    """
+    half = np.array([high - low for low, high in intervals]) / 2
+    return SharedScenes(float(np.sqrt(np.mean(half**2)) / ndtri(TAILS[1])), scenes)
+
+
+def score_interval(share: float, trials: int) -> Estimate:
+    """Return a share of independent trials with Wilson's 95 % score interval (JASA 22, 1927), of 0 and 1, too."""
+    z2 = float(ndtri(TAILS[1])) ** 2 / trials
+    middle = (share + z2 / 2) / (1 + z2)
+    half = float(np.sqrt(z2 * share * (1 - share) + z2**2 / 4)) / (1 + z2)
+    return Estimate(share, middle - half, middle + half)
+
+
 def mean_over_seeds(
-    values: Sequence[float], *, shared: SharedScenes = OWN_SCENES, share: bool = False
+    values: Sequence[float], *, shared: SharedScenes | None = OWN_SCENES, share: bool = False
 ) -> MeanOverSeeds:
     """Return the mean of `values`, one per seed, and its 95 % interval: mean ± t · sqrt(sd^2 / n + shared.sd^2).
 
+    `shared` None: seeds share test scenes whose spread is not known, so that there is no interval.
     `share`: a number in [0, 1], whose interval is on the scale of log-odds by the delta method and stays inside [0, 1].
     """
     array = np.asarray(values, dtype=np.float64)
     sd = float(array.std(ddof=1)) if len(array) > 1 else 0.0
     found = MeanOverSeeds(float(array.mean()), None, None, len(array), sd, shared, share)
-    if not found.known:
+    if not found.known or shared is None:
         return found
     error, freedom = _standard_error(sd, len(array), shared)
     half = float(stdtrit(freedom, TAILS[1])) * error

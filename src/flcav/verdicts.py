@@ -27,11 +27,11 @@ def verdict(low: float | None, high: float | None) -> str:
 
 
 def explain_verdict(decided: str) -> str:
-    """Return a clause that explains the verdict `decided` of `verdict`, for one run."""
+    """Return a clause that says the verdict `decided` on a claim of one run."""
     return {
-        HELD: "the interval lies above 0, so the claim held in this run",
-        NOT_HELD: "the interval lies below 0, so the claim did not hold in this run",
-        UNDECIDED: "the interval contains 0, so this run does not decide",
+        HELD: "the claim held in this run",
+        NOT_HELD: "the claim did not hold in this run",
+        UNDECIDED: "this run does not decide",
     }[decided]
 
 
@@ -49,12 +49,15 @@ class Judged:
     """The verdict on one of several claims that are judged together."""
 
     verdict: str  # HELD, NOT_HELD or UNDECIDED
-    p: float | None  # corrected for the claims of the family; None where the spread over seeds is not known
+    p: float | None  # corrected for the claims of the family; None where the spread over seeds or scenes is not known
     family: int  # number of claims that are judged together
     seeds: int | None  # that it takes to decide, if the effect is as large as was found; None: unknown, or too many
 
-    def describe(self) -> str:
-        """Return p and the number of claims as text, and of an undecided claim how many seeds it would take."""
+    def describe(self, takes: str = "seeds") -> str:
+        """Return p and the number of claims as text, and of an undecided claim how many seeds it would take.
+
+        `takes`: the word for seeds.
+        """
         if self.p is None:
             return "the spread over seeds is not known"
         corrected = f", corrected for {self.family} claims" if self.family > 1 else ""
@@ -62,7 +65,7 @@ class Judged:
         if self.verdict != UNDECIDED:
             return said
         seeds = f"more than {MOST_SEEDS}" if self.seeds is None else f"about {self.seeds}"
-        return f"{said}; to tell an effect of this size takes {seeds} seeds"
+        return f"{said}; to tell an effect of this size takes {seeds} {takes}"
 
 
 def correct_p_values(p_values: Sequence[float]) -> list[float]:
@@ -78,8 +81,8 @@ def correct_p_values(p_values: Sequence[float]) -> list[float]:
 def judge(claims: Sequence[Claim]) -> list[Judged]:
     """Return the verdicts on all claims of a page, by p-values that are corrected for their number.
 
-    Claims whose spread over seeds is not known are undecided and do not count. The number of seeds is for the level
-    that a single claim has at worst, `LEVEL` divided by the number of claims, and a power of 0.8.
+    Claims whose spread over seeds or scenes is not known are undecided and do not count. The number of seeds is for the
+    level that a single claim has at worst, `LEVEL` divided by the number of claims, and a power of 0.8.
     """
     found = [claim.mean.p_value(claim.than) for claim in claims]
     known = [p for p in found if p is not None]
@@ -109,7 +112,10 @@ def _describe_aim(aim: str, mean: MeanOverSeeds, judged: Judged) -> str:
     over = f"{mean.describe()} over {mean.seeds} seeds of standard deviation {mean.sd:.3f}"
     if mean.seeds == 1:
         over = f"{mean.mean:.3f} of one seed"
-    return f"*{aim}*: **{REACHED[judged.verdict]}**, {over}; {judged.describe()}."
+    elif mean.shared is None:
+        return f"*{aim}*: **{UNDECIDED}**, {over}; how it varies over their common test scenes is not known."
+    takes = "seeds on these test scenes" if mean.shared and mean.shared.scenes else "seeds"
+    return f"*{aim}*: **{REACHED[judged.verdict]}**, {over}; {judged.describe(takes)}."
 
 
 def format_p(p: float) -> str:

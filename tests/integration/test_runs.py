@@ -30,6 +30,7 @@ from flcav.experiments.arms.run import ARMS, ArmsResult, compare_arms
 from flcav.experiments.fig6a.results import AllocationResult
 from flcav.experiments.fig6a.run import compare_plans
 from flcav.experiments.placement.run import NEAR, TOWN, prove_placement
+from flcav.experiments.run_tables import judge_anew
 from flcav.federation.privacy import account_epsilon
 from flcav.federation.rules import Rules
 from flcav.network.clock.records import load_rounds
@@ -332,9 +333,11 @@ def test_findings_say_what_their_intervals_say(result: Run) -> None:
         low, high = difference.estimate.low, difference.estimate.high
         assert low is not None
         assert high is not None
-        assert finding.verdict == verdict(low, high)
+        assert finding.verdict in (UNDECIDED, verdict(low, high))
         if "nothing to compare" not in finding.sentence:
             assert f"{difference.estimate.mean:+.3f}".replace("-", "−") in finding.sentence
+
+    assert judge_anew(result) == result.findings
 
 
 def test_the_report_needs_no_other_file(finished: Path, result: Run) -> None:

@@ -8,9 +8,14 @@ from flcav.intervals import (
     Estimate,
     Spread,
     bootstrap_over_scenes,
+    bound_shared_scenes,
     combine_spreads,
+    mean_over_seeds,
     measure_spread,
+    of_one_training,
     pool_spreads,
+    score_interval,
+    share_scenes,
     widen,
     widen_share,
 )
@@ -105,3 +110,63 @@ def test_a_widened_share_stays_a_share_and_agrees_with_the_plain_one_in_the_midd
         assert (found.low, found.high) == pytest.approx((plain.low, plain.high), abs=0.001)
     assert widen_share(Estimate(1.0, 1.0, 1.0), spread) == Estimate(1.0, 1.0, 1.0)
     assert widen(Estimate(0.3, None, None), spread) == Estimate(0.3, None, None)
+
+
+def test_the_p_value_of_one_training_is_that_of_its_sources_alone_and_of_its_interval():
+    """Scenes alone give the normal test, trainings alone Student's t with the freedom of their spread."""
+    scenes, still = Estimate(0.05, 0.01, 0.08), Spread(0.0, 8)
+    alone = of_one_training(scenes, 30, still)
+    assert alone is not None
+    assert alone.p_value() == pytest.approx(2 * stats.norm.sf(0.05 / (0.04 / stats.norm.ppf(0.975))), rel=1e-6)
+    trained = of_one_training(Estimate(0.05, 0.05, 0.05), 30, Spread(0.02, 8))
+    assert trained is not None
+    assert trained.p_value() == pytest.approx(2 * stats.t.sf(0.05 / 0.02, 7), rel=1e-6)
+    ends = float(np.hypot(0.04, stats.t.ppf(0.975, 7) * 0.02))
+    both = of_one_training(Estimate(ends, ends - 0.04, ends + 0.01), 30, Spread(0.02, 8))
+    assert both is not None
+    assert (both.low, both.p_value()) == (pytest.approx(0.0, abs=1e-9), pytest.approx(0.05, rel=1e-6))
+    below = of_one_training(Estimate(-ends, -ends - 0.01, -ends + 0.04), 30, Spread(0.02, 8))
+    assert below is not None
+    assert (below.high, below.p_value()) == (pytest.approx(0.0, abs=1e-9), pytest.approx(0.05, rel=1e-6))
+    assert of_one_training(Estimate(0.1, None, None), 1, still) is None
+    same = of_one_training(Estimate(0.0, 0.0, 0.0), 30, still)
+    assert same is not None
+    assert (same.p_value(), same.p_value(0.1)) == (1.0, 0.0)
+
+
+def test_more_trainings_of_one_run_tell_what_its_scenes_allow():
+    found = of_one_training(Estimate(0.05, 0.03, 0.07), 100, Spread(0.04, 8))
+    assert found is not None
+    few, many = found.seeds_to_tell(), found.seeds_to_tell(level=0.01)
+    assert few is not None
+    assert many is not None
+    assert 5 < few < many, "of trainings alone it takes 8 by the tables of the paired t test"
+    blurred = of_one_training(Estimate(0.05, 0.0, 0.1), 100, Spread(0.04, 8))
+    assert blurred is not None
+    assert blurred.seeds_to_tell() is None
+
+
+@pytest.mark.parametrize(("right", "trials"), [(7, 7), (0, 12), (30, 33)])
+def test_the_score_interval_is_that_of_scipy(right: int, trials: int):
+    theirs = stats.binomtest(right, trials).proportion_ci(method="wilson")
+    found = score_interval(right / trials, trials)
+    assert (found.low, found.high) == pytest.approx((theirs.low, theirs.high))
+
+
+def test_shared_scenes_are_bounded_by_what_one_seed_varies_over_them():
+    """Equal to it where seeds differ in nothing, above it where each also has scenes that are hard for it alone."""
+    rng = np.random.default_rng(0)
+    hard, own = rng.normal(0.8, 0.1, 40), rng.normal(0.0, 0.1, (3, 40))
+    for values, same in ((np.tile(hard, (3, 1)), True), (hard + own, False)):
+        measures = [lambda times, row=row: times @ row / np.maximum(times.sum(axis=1), 1) for row in values]
+        ends = [bootstrap_over_scenes(of, np.arange(40), 2000, rng=rng) for of in measures]
+        bound = bound_shared_scenes(ends, 40)
+        found = share_scenes(measures, [np.arange(40)] * 3, 2000, rng=rng)
+        assert bound.scenes == found.scenes == 40
+        assert bound.sd == pytest.approx(found.sd, rel=0.08) if same else bound.sd > 1.2 * found.sd
+
+
+def test_where_the_spread_of_shared_scenes_is_unknown_there_is_neither_interval_nor_test():
+    found = mean_over_seeds([0.7, 0.71, 0.72], shared=None)
+    assert (found.low, found.high, found.p_value(0.5), found.seeds_to_tell(0.5)) == (None, None, None, None)
+    assert found.sd == pytest.approx(0.01)

@@ -21,7 +21,7 @@ def test_without_an_interval_nothing_is_decided() -> None:
     assert verdict(None, None) == UNDECIDED
 
 
-def test_the_words_say_what_the_interval_says():
-    assert explain_verdict(UNDECIDED) == "the interval contains 0, so this run does not decide"
-    assert explain_verdict(NOT_HELD) == "the interval lies below 0, so the claim did not hold in this run"
+def test_the_words_say_what_was_decided():
+    assert explain_verdict(UNDECIDED) == "this run does not decide"
+    assert explain_verdict(NOT_HELD) == "the claim did not hold in this run"
     assert (signed(-0.0125), signed(2, 1)) == ("−0.013", "+2.0")

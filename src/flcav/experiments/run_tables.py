@@ -4,17 +4,24 @@ import numpy as np
 
 from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
-from flcav.pipeline.collecting.findings import name_stage
+from flcav.pipeline.arms import resolve_settings
+from flcav.pipeline.collecting.findings import findings, name_stage
+from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.plans import RoundPlan
 from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.tests import Finding
 from flcav.pipeline.results.training import StageResult
 
 
 def tables(run: Run) -> dict[str, str]:
-    """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, spread of retraining."""
+    """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, spread of retraining.
+
+    Findings are judged anew, so that results of before a change of the judging are judged as others are.
+    """
+    judged = judge_anew(run)
     own = {
-        "findings": format_bullets(f"*{each.question}* **{each.verdict}**. {each.sentence}" for each in run.findings),
+        "findings": format_bullets(f"*{each.question}* **{each.verdict}**. {each.sentence}" for each in judged),
         "tests": _tests(run),
         "differences": _differences(run),
         "plan": _plan(run),
@@ -22,6 +29,15 @@ def tables(run: Run) -> dict[str, str]:
         "sensors": _sensors(run),
     }
     return own | {"spread": _spread(run)} if run.recipe.retrainings else own
+
+
+def judge_anew(run: Run) -> tuple[Finding, ...]:
+    """Return the findings of a run's results by the present rules; those that it was saved with may be older."""
+    labels = {task: choose_labels(task, own.labels) for task, own in run.recipe.tasks.items()}
+    settings = resolve_settings(run.recipe, labels)
+    roles = {name: region.role for name, region in run.recipe.regions.items()}
+    caveats = {task: LABEL_SOURCES[kind].caveat for task, kind in labels.items()}
+    return findings(run.differences, run.tested, run.arms, settings, roles, caveats)
 
 
 def _tests(run: Run) -> str:

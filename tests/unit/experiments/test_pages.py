@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,15 @@ def test_pages_have_the_fixed_form(folder: Path) -> None:
     places = [page.index(part) for part in parts]
     assert places == sorted(places)
     assert "<!-- end -->" in page
+
+
+@pytest.mark.parametrize("folder", PAGES, ids=lambda folder: folder.name)
+def test_pages_count_looks_and_say_what_they_can_tell(folder: Path) -> None:
+    page = (folder / "README.md").read_text()
+    looks = re.search(r"^## (Changes after|What was changed after)[^\n]*\n(?P<rows>.*?)(?=^## |\Z)", page, re.M | re.S)
+    assert looks, "a section of what was changed after which look"
+    assert looks["rows"].count("\n|") >= 3, "a table of it"
+    assert re.search(r"[Pp]ower|[Nn]o comparison|compares no|to tell|that tell", page), "power, or no comparison"
 
 
 def test_every_table_is_on_its_page() -> None:

@@ -8,7 +8,7 @@ from scipy.optimize import curve_fit
 
 from flcav.config import InputError
 from flcav.optimization.curves.bands import bootstrap_bands, fit_upper_curve
-from flcav.optimization.curves.fitting import fit_additive, fit_effective
+from flcav.optimization.curves.fitting import explain_exponent, fit_additive, fit_effective
 from flcav.optimization.curves.history import accumulate_resources, article_histories, parse_histories
 
 PRINTED = {"weather": (11.84, 1.23), "signs": (8.15, 0.62), "objects": (0.51, 0.10)}  # a and b of the article
@@ -188,3 +188,17 @@ def test_bands_are_infinite_where_the_error_is():
     low, high = band.between(np.array([[0.0, 0, 0], [100.0, 0, 0]]))
     assert (low[0], high[0]) == (np.inf, np.inf)
     assert 0 < low[1] <= high[1] < 1
+
+
+@pytest.mark.parametrize(
+    ("b", "said"),
+    [
+        (1e-6, "cloud: exponent 1e-06 is the least that is tried: it is not identified by this history"),
+        (10 - 1e-9, "cloud: exponent 10 is the largest that is tried: it is not identified by this history"),
+        (6.0, "hardly a power law"),
+        (0.5, None),
+    ],
+)
+def test_an_exponent_at_a_bound_of_the_search_is_not_identified(b: float, said: str | None) -> None:
+    found = explain_exponent("cloud", b)
+    assert found is None if said is None else found is not None and said in found

@@ -65,14 +65,26 @@ def test_each_finding_tells_its_own_numbers_frames_and_verdict() -> None:
     )
     assert [edge.verdict, cloud.verdict, pole.verdict] == [HELD, UNDECIDED, NOT_HELD]
     assert "0.412 (pretrained) and 0.503 (edge FL): +0.091, 95 % interval +0.055 to +0.127" in edge.sentence
-    assert "held in this run" in edge.sentence
+    assert "p 0.002, corrected for 3 claims: the claim held in this run" in edge.sentence
     assert "0.503 (edge FL) and 0.495 (edge + cloud FL): −0.008" in cloud.sentence
-    assert "contains 0, so this run does not decide" in cloud.sentence
+    assert "trainings on these scenes: this run does not decide" in cloud.sentence
     assert "0.544 (edge FL (densest)) and 0.503 (edge FL)" in pole.sentence
     assert pole.question == "Does the placed pole beat the pole with the densest traffic?"
     for finding in (edge, cloud, pole):
         assert "96 test frames of 8 scenes and over retraining (standard deviation 0.012 of 9" in finding.sentence
         assert CAVEAT in finding.sentence
+
+
+def test_claims_of_a_run_are_judged_together() -> None:
+    """Alone p is below 0.05 and the interval excludes 0; Holm's correction for five claims multiplies it by five."""
+    one = difference(EDGE, (MAIN, PRETRAIN), 0.06, 0.022, 0.11)
+    others = [difference(CLOUD, (MAIN, EDGE), 0.0, -0.02, 0.02)] * 4
+    assert [each.verdict for each in told(one)] == [HELD]
+    edge, *_ = told(one, *others)
+    assert edge.verdict == UNDECIDED
+    assert "corrected for 5 claims; to tell an effect of this size takes" in edge.sentence
+    unknown = replace(others[0], spread=None)
+    assert told(one, unknown)[0].verdict == HELD, "what cannot be judged does not count"
 
 
 def test_without_a_spread_of_retraining_no_claim_has_held() -> None:

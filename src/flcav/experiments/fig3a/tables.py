@@ -2,11 +2,18 @@
 
 from flcav.experiments.fig3a.run import Fig3a
 from flcav.markdown import format_bullets, format_table
+from flcav.optimization.curves.curves import STAGES
+from flcav.optimization.curves.fitting import explain_exponent
 
 
 def tables(results: Fig3a) -> dict[str, str]:
-    """Return Markdown by name: findings, article, own."""
-    return {"findings": format_bullets(results.findings), "article": _article(results), "own": _own(results)}
+    """Return Markdown by name: findings, article, own, curve."""
+    return {
+        "findings": format_bullets(results.findings),
+        "article": _article(results),
+        "own": _own(results),
+        "curve": _curve(results),
+    }
 
 
 def _article(results: Fig3a) -> str:
@@ -17,6 +24,15 @@ def _article(results: Fig3a) -> str:
         cells = [f"{fitted:.4g} ({wanted:g}, {by:+.1%})" for fitted, wanted, by in constants]
         rows.append([task, len(each.points), *cells, f"{each.rmse:.3f}"])
     return format_table(("task", "points", "a (printed, off)", "b (printed, off)", "rmse of accuracy"), rows)
+
+
+def _curve(results: Fig3a) -> str:
+    """Return the decays that the error of the own curve is the sum of, and what there is to say of their exponents."""
+    rows = []
+    for stage, decay, name in zip(STAGES, results.own.curve.decays(), "xyz"):
+        said = explain_exponent(stage, decay.b) or ""
+        rows.append([stage, str(decay).replace("x", name), said.removeprefix(f"{stage}: ")])
+    return format_table(("stage", "error", "note"), rows)
 
 
 def _own(results: Fig3a) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from flcav.dataset.store import Dataset
 from flcav.experiments.studies.run import Study, StudyResult, describe_limits, list_counts
-from flcav.intervals import Estimate
+from flcav.intervals import Estimate, score_interval
 from flcav.markdown import format_bullets, format_table
 from flcav.perception.weather.evaluate import Classification, evaluate_whole_space
 from flcav.perception.weather.model import Classifier
@@ -45,12 +45,24 @@ def _accuracy(results: StudyResult[Classification]) -> str:
         tested = results.tested(test)
         for name, mean in numbers.items():
             each = [found if name == "accuracy" else found.nearest or found for found in tested]
-            over_scenes = ", ".join(Estimate(one.accuracy, one.low, one.high).describe() for one in each)
+            over_scenes = ", ".join(_with_interval(one).describe() for one in each)
             what = "within the regions" if name == "accuracy" else "everywhere, nearest class"
             counts = (list_counts([one.pictures for one in each]), list_counts([one.scenes for one in each]))
             rows.append([test, what, *counts, mean.describe(), over_scenes])
     header = ("test", "pictures", "number", "scenes", "accuracy, over seeds", "each seed, over its scenes")
     return format_table(header, rows)
+
+
+def _with_interval(found: Classification) -> Estimate:
+    """Return the accuracy with its interval over scenes; of 0 and 1, where no drawn scenes differ, Wilson's."""
+    if found.low == found.high and found.low is not None:
+        return score_interval(found.accuracy, found.scenes)
+    return Estimate(found.accuracy, found.low, found.high)
+
+
+def _over_scenes(found: Classification, name: str) -> Estimate:
+    one = found if name == "accuracy" else found.nearest or found
+    return Estimate(one.accuracy, one.low, one.high)
 
 
 def _recall(results: StudyResult[Classification]) -> str:
@@ -92,4 +104,11 @@ def _is_share(name: str) -> bool:
     return True  # accuracies
 
 
-STUDY = Study(WEATHER, WEATHER.study(), draw=_draw, extra={WHOLE_SPACE: add_nearest}, is_share=_is_share)
+STUDY = Study(
+    WEATHER,
+    WEATHER.study(),
+    draw=_draw,
+    extra={WHOLE_SPACE: add_nearest},
+    is_share=_is_share,
+    over_scenes=_over_scenes,
+)

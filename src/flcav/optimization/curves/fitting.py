@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from flcav.config import InputError
 from flcav.optimization.curves.curves import STAGES, Additive, Effective, Federated
 from flcav.optimization.curves.forms import (
+    FLATTEST,
     STEEPEST,
     CurveT,
     Form,
@@ -70,11 +71,7 @@ class Fit(Generic[CurveT]):
                 f"{self.points} points for {len(self.fitted.parameters)} parameters: nothing is left to check them"
             )
         decays = zip(STAGES, self.curve.decays()) if isinstance(self.curve, Additive) else [("samples", self.curve)]
-        said += [
-            f"{stage}: exponent {decay.b:.3g} is hardly a power law: the history drops at once or varies too little"
-            for stage, decay in decays
-            if decay.b > 0.5 * STEEPEST
-        ]
+        said += [told for stage, decay in decays if (told := explain_exponent(stage, decay.b)) is not None]
         if self.r_squared is None:
             said.append("the accuracy is the same at all points: nothing is known of what more would bring")
         elif self.r_squared < 0.5:
@@ -93,6 +90,16 @@ class Fit(Generic[CurveT]):
             if asked > most
         ]
         return f"extrapolated beyond the history: {', '.join(over)}" if over else None
+
+
+def explain_exponent(stage: str, b: float) -> str | None:
+    """Return a sentence on an exponent at a bound of the search, or hardly that of a power law; else None."""
+    for bound, which in ((FLATTEST, "least"), (STEEPEST, "largest")):
+        if np.isclose(b, bound, rtol=1e-3, atol=0):
+            return f"{stage}: exponent {b:.3g} is the {which} that is tried: it is not identified by this history"
+    if b > 0.5 * STEEPEST:
+        return f"{stage}: exponent {b:.3g} is hardly a power law: the history drops at once or varies too little"
+    return None
 
 
 CurveFit = Fit[Additive] | Fit[Effective] | Fit[Federated]

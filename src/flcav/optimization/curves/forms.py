@@ -28,7 +28,7 @@ from flcav.optimization.curves.curves import (
 Array = NDArray[np.float64]
 CurveT = TypeVar("CurveT", Additive, Effective, Federated, covariant=True)
 
-STEEPEST = 10.0  # largest exponent tried
+FLATTEST, STEEPEST = 1e-6, 10.0  # least and largest exponent tried
 STARTS = (0.1, 0.5, 1.5)  # exponents at the starts of the search
 LARGEST_BETA = 1e3  # relative to alpha
 DEFAULT_BETA = 0.5  # of the article
@@ -83,7 +83,7 @@ class AdditiveForm:
     def bounds(self) -> tuple[list[float], list[float]]:
         """Return the least and most of each parameter."""
         n, shifts = len(self.stages), self._middle_shifts()
-        least = [1e-9] * n + [1e-6] * n + [0.0] * self.floor + [1e-3 * shift for shift in shifts]
+        least = [1e-9] * n + [FLATTEST] * n + [0.0] * self.floor + [1e-3 * shift for shift in shifts]
         most = [np.inf] * n + [STEEPEST] * n + [1.0] * self.floor + [1e3 * shift for shift in shifts]
         return least, most
 
@@ -161,7 +161,7 @@ class EffectiveForm:
     def bounds(self) -> tuple[list[float], list[float]]:
         """Return the least and most of each parameter."""
         beta = [LARGEST_BETA * self.alpha] * (self.beta is None)
-        return [1e-9, 1e-6, *[0.0] * self.floor, *[0.0] * len(beta)], [np.inf, STEEPEST, *[1.0] * self.floor, *beta]
+        return [1e-9, FLATTEST, *[0.0] * self.floor, *[0.0] * len(beta)], [np.inf, STEEPEST, *[1.0] * self.floor, *beta]
 
     def starts(self, level: float) -> list[list[float]]:
         """Return one start per exponent of `STARTS`."""
@@ -243,7 +243,7 @@ class FederatedForm:
     def bounds(self) -> tuple[list[float], list[float]]:
         """Return the least and most of each parameter."""
         most = self._fitted(1.0, LARGEST_GAMMA, 1.0, LARGEST_BETA * self.alpha)
-        return [1e-9, 1e-6, *self._fitted(0.0, 0.0, -1.0, 0.0)], [np.inf, STEEPEST, *most]
+        return [1e-9, FLATTEST, *self._fitted(0.0, 0.0, -1.0, 0.0)], [np.inf, STEEPEST, *most]
 
     def starts(self, level: float) -> list[list[float]]:
         """Return one start per exponent of `STARTS`, and sign of the drift if that is fitted."""

@@ -1,17 +1,19 @@
 """Findings of a run: verdicts on the claims of the method, as sentences with the numbers behind them.
 
 A claim says that a difference of a measure is positive. Its 95 % interval is a paired bootstrap over scenes, widened by
-the spread of retraining. The claim held if the interval lies above 0, did not hold if it lies below, and is undecided
-if the interval contains 0 or the spread is not known: another training on the same frames might say otherwise.
+the spread of retraining, and its p-value is that of this interval. P-values of a run are corrected together (Holm).
+A claim held, or did not hold, if its corrected p-value is at most 0.05. It is undecided else, and where the spread is
+not known: another training on the same frames might say otherwise.
 """
 
 from collections.abc import Mapping, Sequence
 
+from flcav.intervals import OneTraining, of_one_training
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference, Finding, Test
-from flcav.verdicts import UNDECIDED, explain_verdict, signed, verdict
+from flcav.verdicts import UNDECIDED, Claim, Judged, explain_verdict, judge, signed
 
 WORDS = {
     PRETRAIN: "pretrained",
@@ -43,15 +45,33 @@ def findings(
     """
     rules = {name: setting.placement.rule for name, setting in settings.items()}
     values = {(test.arm, test.stage, test.region, test.task): test for test in tests}
+    own = [each for each in differences if each.arm == MAIN]
+    same = [_tell_same_poles(each, arms, settings) for each in own]
     return tuple(
-        _finding(each, _question(each, rules, roles), values, _tell_same_poles(each, arms, settings), caveats)
-        for each in differences
-        if each.arm == MAIN
+        _finding(each, judged, _question(each, rules, roles), values, none_differs, caveats)
+        for each, judged, none_differs in zip(own, _judge(own, values, same), same, strict=True)
     )
+
+
+def _judge(
+    differences: Sequence[Difference], values: Mapping[tuple[str, str, str, str], Test], same: Sequence[str | None]
+) -> list[Judged | None]:
+    """Return the verdicts on all differences, judged together; None where the spread of retraining is not known.
+
+    `same`: what is said of each difference where nothing differs, which is not judged.
+    """
+    means: list[OneTraining | None] = []
+    for each, none_differs in zip(differences, same, strict=True):
+        scenes = values[each.arm, each.stage, each.region, each.task].result.scenes
+        spread = each.spread if none_differs is None else None
+        means.append(None if spread is None else of_one_training(each.over_scenes, scenes, spread))
+    found = iter(judge([Claim(mean) for mean in means if mean is not None]))
+    return [None if mean is None else next(found) for mean in means]
 
 
 def _finding(
     each: Difference,
+    judged: Judged | None,
     question: str,
     values: Mapping[tuple[str, str, str, str], Test],
     same: str | None,
@@ -73,14 +93,14 @@ def _finding(
     if low is None or high is None:
         return Finding(place, question, UNDECIDED, f"{told}, over {over}: too few scenes for an interval.")
     rests = f" ({caveats[each.task]})" if caveats.get(each.task) else ""
-    if each.spread is None:
+    if each.spread is None or judged is None:
         unknown = "how much another training on the same frames would differ is not known, so this run does not decide"
         sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over} alone; {unknown}{rests}."
         return Finding(place, question, UNDECIDED, sentence)
-    decided = verdict(low, high)
     of = f"{over} and over retraining (standard deviation {each.spread.sd:.3f} of {each.spread.trainings} trainings)"
-    sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {of}; {explain_verdict(decided)}{rests}."
-    return Finding(place, question, decided, sentence)
+    said = f"{judged.describe('trainings on these scenes')}: {explain_verdict(judged.verdict)}"
+    sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {of}; {said}{rests}."
+    return Finding(place, question, judged.verdict, sentence)
 
 
 def _before(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) -> Test:
