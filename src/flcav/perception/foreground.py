@@ -6,25 +6,21 @@ A pole's background is learned from its own sweeps of the same dataset.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 from flcav.dataset.store import Dataset
 from flcav.perception.agents import POLE, kind_of
 from flcav.sensors.frame import Frame
 from flcav.sensors.lidar.background import Background, learn_background
 
-if TYPE_CHECKING:
-    from flcav.perception.objects.config import SecondConfig
-
 MOST_SWEEPS = 100  # of each pole, evenly spread over the dataset, that its background is learned from
 
 
-def frame_reader(data: Dataset, config: "SecondConfig") -> Callable[[int], Frame]:
-    """Return the function that reads a frame by its number as a network of `config` sees it.
+def frame_reader(data: Dataset, foreground: bool) -> Callable[[int], Frame]:
+    """Return the function that reads a frame by its number as a network sees it.
 
-    For a network of foregrounds, the sweeps of poles lack their background; other agents' are whole.
+    For a network of foregrounds (`foreground`), the sweeps of poles lack their background; other agents' are whole.
     """
-    if not config.foreground:
+    if not foreground:
         return data.frame
 
     def read(number: int) -> Frame:

@@ -7,8 +7,8 @@ import shapely
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.roadside.detector import detect_frames, score_town
-from flcav.fusion.detector import OFF_ROAD_M, ROAD, keep_on_surface, load_road_network, road_detector
-from flcav.geometry import Boxes
+from flcav.fusion.detector import OFF_ROAD_M, ROAD, flatten_ground, keep_on_surface, load_road_network, road_detector
+from flcav.geometry import Boxes, inverse, pose, transform_points
 from flcav.perception.card import LICENCE
 from flcav.perception.foreground import frame_reader
 from flcav.perception.objects.samples import select_fitting_frames
@@ -16,6 +16,7 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import find_shipped, read_card
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.world.map.relief import Relief
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ def test_the_detector_finds_most_cars_around_a_pole_it_has_not_seen(roadside: Da
 
 def test_a_network_of_foregrounds_sees_a_pole_without_its_background_and_vehicles_whole(roadside: Dataset) -> None:
     network = load_road_network()
-    read = frame_reader(roadside, network.config)
+    read = frame_reader(roadside, network.config.foreground)
     for number, key in enumerate(roadside.keys[:4]):
         whole, seen = roadside.frame(number).lidar["lidar"], read(number).lidar["lidar"]
         if key.agent.startswith("cav"):
@@ -58,6 +59,34 @@ def test_boxes_are_in_the_world_with_scores_and_variances(roadside: Dataset) -> 
     assert found.score.min() >= 0.7
     assert found.variance is not None
     assert set(found.label) == {"car"}
+
+
+def test_on_a_slope_points_are_as_high_as_above_level_ground() -> None:
+    corners = np.array([(x, y) for x in (-100.0, 100.0) for y in (-100.0, 100.0)])
+    relief = Relief(np.column_stack((corners, 0.1 * corners[:, 0] - 0.05 * corners[:, 1] + 7)))
+    world_from_lidar = pose(10.0, 20.0, 13.0, yaw=0.4)  # 6 m above the ground there
+    places = np.array([[30.0, 20.0, 1.5], [-15.0, -5.0, 0.0], [10.0, 20.0, 6.0]])  # x, y, height above the ground
+    ground = 0.1 * places[:, 0] - 0.05 * places[:, 1] + 7
+    world = np.column_stack((places[:, :2], ground + places[:, 2]))
+    points = np.column_stack((transform_points(inverse(world_from_lidar), world), [0.1, 0.2, 0.3])).astype(np.float32)
+    flat = flatten_ground(points, world_from_lidar, relief)
+    np.testing.assert_allclose(flat[:, 2], places[:, 2] - 6.0, atol=1e-5)
+    np.testing.assert_array_equal(flat[:, [0, 1, 3]], points[:, [0, 1, 3]])
+
+
+def test_cars_on_slopes_are_found_and_stand_on_the_road(tmp_path: Path) -> None:
+    shared = {"seed": 5, "scenes": 3, "spins_per_scene": 2, "every_s": 6.0, "warmup_s": 30.0, "cavs": 0}
+    record(EmbeddedSource(Recipe.model_validate({"town": "hilly_grid", "poles": (6,), **shared})), tmp_path / "data")
+    data = Dataset.open(tmp_path / "data")
+    score = score_town("hilly_grid", False, detect_frames(data))
+    assert score.recall.mean > 0.6
+    assert score.precision.mean > 0.8
+    town, found = data.town(), [road_detector(data)(number) for number in range(len(data))]
+    assert town is not None
+    assert town.relief is not None
+    for boxes in found:
+        stand = boxes.center[:, 2] - boxes.size[:, 2] / 2
+        np.testing.assert_allclose(stand, town.relief.heights(*boxes.center[:, :2].T), atol=0.3)
 
 
 def test_what_lies_off_the_drivable_surface_is_left_out() -> None:

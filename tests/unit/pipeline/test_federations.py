@@ -5,9 +5,8 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-import torch
+from line_task import LineTask, Slope
 from pydantic import ValidationError
-from pydantic.dataclasses import dataclass
 
 from flcav.config import InputError
 from flcav.federation.privacy import account_epsilon
@@ -17,7 +16,7 @@ from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavgm import FedAvgM
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.task import Practice, Task
+from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies, resolve_settings
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
@@ -106,31 +105,6 @@ def test_the_largest_update_of_the_arms_is_planned_with() -> None:
     assert half == pytest.approx(whole / 2, rel=0.05)
     assert more == pytest.approx(1.5 * whole, rel=0.05)
     assert model_mb(OBJECTS, "tiny", forms) == more
-
-
-@dataclass(frozen=True)
-class Slope:
-    bias: bool = True
-
-
-class Line(torch.nn.Linear):
-    def __init__(self, config: Slope) -> None:
-        super().__init__(1, 1)
-        self.config = config
-
-
-class LineTask:
-    """Fits y = 2 x to samples x."""
-
-    name, family, configurations, practice = "line", "line", {"tiny": Slope()}, Practice(2, learning_rate=0.1)
-    build = Line
-
-    def draw(self, samples, index, config, rng):
-        return samples[index]
-
-    def loss(self, network, samples):
-        x = torch.tensor(np.array(samples))[:, None]
-        return ((network(x) - 2 * x) ** 2).mean()
 
 
 def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:

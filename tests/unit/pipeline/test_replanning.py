@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from pydantic.dataclasses import dataclass
+from line_task import Line, LineTask, Slope
 from safetensors.numpy import load_file
 
 from flcav.federation.rules import Rules
@@ -19,7 +19,7 @@ from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.plan import Price
 from flcav.optimization.problem import Problem
-from flcav.perception.task import Practice, Task
+from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.network import DrivenRounds
 from flcav.pipeline.planning.course import Course, Replanning
@@ -141,22 +141,6 @@ def test_the_rate_is_that_of_the_place_among_the_rounds_of_the_plan_and_never_ri
     assert found == pytest.approx([0, 1 / 4, 1 / 4, 3 / 8, 1, 1, 1, 1])
     same = replace(plain, rounds=3, planned=(6, 6, 6))
     assert [same.work(number) for number in (1, 2, 3)] == [plain.work(number) for number in (1, 2, 3)]
-
-
-@dataclass(frozen=True)
-class Slope:
-    bias: bool = True
-
-
-class Line(torch.nn.Linear):
-    def __init__(self, config: Slope) -> None:
-        super().__init__(1, 1)
-        self.config = config
-
-
-class LineTask:
-    name, family, configurations, practice = "t", "line", {"tiny": Slope()}, Practice(2, learning_rate=0.1)
-    build = Line
 
 
 class Walk:

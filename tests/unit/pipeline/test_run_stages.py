@@ -8,8 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-import torch
-from pydantic.dataclasses import dataclass
+from line_task import LineTask, Slope
 from safetensors.numpy import load_file, save
 
 from flcav import files
@@ -24,7 +23,7 @@ from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.files import write_bytes
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.task import Practice, Task
+from flcav.perception.task import Task
 from flcav.perception.training import train
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.checkpoint import find_checkpoint
@@ -190,31 +189,6 @@ def test_a_checkpoint_of_another_strategy_is_refused(tmp_path: Path) -> None:
     edge(tmp_path)
     with pytest.raises(InputError, match=r"a checkpoint of FedAvg\(\), which FedAdam\(.*\) cannot go on with"):
         edge(tmp_path, FedAdam())
-
-
-@dataclass(frozen=True)
-class Slope:
-    bias: bool = True
-
-
-class Line(torch.nn.Linear):
-    def __init__(self, config: Slope) -> None:
-        super().__init__(1, 1)
-        self.config = config
-
-
-class LineTask:
-    """Fits y = 2 x to samples x."""
-
-    name, family, configurations, practice = "line", "line", {"tiny": Slope()}, Practice(2, learning_rate=0.1)
-    build = Line
-
-    def draw(self, samples, index, config, rng):
-        return samples[index]
-
-    def loss(self, network, samples):
-        x = torch.tensor(np.array(samples))[:, None]
-        return ((network(x) - 2 * x) ** 2).mean()
 
 
 LINEAR = cast(Task, LineTask())

@@ -1,13 +1,14 @@
-"""Annotations of frames read from other formats: from boxes, with what can be computed of them; names of agents.
+"""Readers of other formats, what they share: scenes, names of agents, annotations from boxes with all that follows.
 
 What a format does not say is NaN, or UNKNOWN_PIXELS. Computed are returns (the points in an object's box), velocities
 from tracks, and the rectangles that boxes fill in images.
 """
 
-from collections.abc import Hashable, Iterable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,11 @@ from PIL import Image
 from flcav.config import InputError
 from flcav.dataset.payloads import read_image
 from flcav.dataset.store import LazyMapping
+from flcav.files import Json
 from flcav.geometry import Boxes, count_points_in_boxes, inverse, transform_points
 from flcav.sensors.camera.lens import Lens, project
-from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, SignViews, Views
+from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, LinkedFrame, SignViews, Views
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front, compute_truncation
-from flcav.sources.source import Source
 
 Array = NDArray[np.float64]
 
@@ -28,10 +29,46 @@ LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track whose differ
 EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 
 
-class LogSource(Source, Protocol):
-    """A source that reads recorded logs."""
+class LogSource(ABC):
+    """A source that reads recorded logs from a folder: of its scenes, all that every format says alike.
 
-    notes: tuple[str, ...]  # sentences on what is not in the files, for whoever imports them
+    The traffic is known at its frames alone, so that there is no trace. A reader names its format, and sets the fields.
+    """
+
+    FORMAT: ClassVar[str]
+    notes: tuple[str, ...] = ()  # sentences on what is not in the files, for whoever imports them
+    _folder: Path
+    _split: str | None  # that was asked for
+    _split_of: Mapping[str, str | None]  # scene -> its split
+    _labelled: bool = True  # whether all frames have boxes
+    _beams: int | None = None  # of the LiDAR, where the format settles them
+
+    def describe(self) -> Mapping[str, Json]:
+        """Return folder, splits and what is labelled."""
+        return {
+            "imported": self.FORMAT,
+            "from": str(self._folder.resolve()),
+            "split": self._split or "",
+            "labels": ["objects"] if self._labelled else [],
+            "splits": name_splits(self._split_of),
+            **({} if self._beams is None else {"beams": self._beams}),
+        }
+
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes."""
+        return list(self._split_of)
+
+    def trace(self, scene: str) -> None:
+        """Return None: the traffic between frames is not known."""
+        return
+
+    @abstractmethod
+    def frame_count(self, scene: str) -> int:
+        """Return the number of frames of a scene."""
+
+    @abstractmethod
+    def frames(self, scene: str) -> Iterator[LinkedFrame]:
+        """Yield the frames of a scene; raises `InputError` where a file is missing, truncated or malformed."""
 
 
 @dataclass(frozen=True)

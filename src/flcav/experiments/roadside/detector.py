@@ -43,6 +43,7 @@ VALIDATION: Mapping[str, Mapping[str, Any]] = {
 TESTS: Mapping[str, Mapping[str, Any]] = {
     "grid": {"seed": 7311, "scenes": 10},
     "ring": {"seed": 7312, "scenes": 10},
+    "hilly_grid": {"seed": 7313, "scenes": 5},
 }
 
 

@@ -150,7 +150,7 @@ def _find_cars(
     A car counts where one of the suites has `MIN_RETURNS` from it. Boxes are compared in the first suite's frame.
     """
     network = load_road_network()
-    read = frame_reader(data, network.config)
+    read = frame_reader(data, network.config.foreground)
     cars = np.zeros(len(EDGES_M) - 1, dtype=np.int64)
     hits = {arm: np.zeros_like(cars) for arm in placed}
     frames = {(data.keys[n].scene, data.keys[n].index, data.keys[n].agent): n for n in range(len(data))}

@@ -106,7 +106,7 @@ def measure_ranges(out: Path, progress: Report = ignore_progress) -> tuple[Senso
     for town, seed in TOWNS.items():
         record(EmbeddedSource(parse_config(Recipe, {**SHARED, "town": town, "seed": seed}, town)), out / town)
         data = Dataset.open(out / town)
-        read = frame_reader(data, network.config)
+        read = frame_reader(data, network.config.foreground)
         for number in range(len(data)):
             frame, place = read(number), data.world_from_agent(number)[:2, 3]
             targets = list_cars(data, [(number, name) for name in MODELS])

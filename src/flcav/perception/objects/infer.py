@@ -71,7 +71,7 @@ def _of_file(path: Path) -> Cloud:
 
 def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[Cloud]:
     dataset = Dataset.open(folder)
-    read = frame_reader(dataset, config)
+    read = frame_reader(dataset, config.foreground)
     for i in dataset.numbers(frames):
         frame = read(i)
         lidar, origin = choose_lidar(frame), folder / frame.key

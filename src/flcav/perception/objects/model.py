@@ -5,6 +5,7 @@ Yan, Mao, Li, "SECOND: Sparsely Embedded Convolutional Detection", Sensors 18(10
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -225,23 +226,14 @@ def small_config(
 def road_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -6.0) -> SecondConfig:
     """Return the configuration of the roadside detector: 38.4 m to every side of a LiDAR 6 m above the road.
 
-    A pole stands anywhere beside the road, so that samples are turned by up to a quarter to either side. Raises
-    `InputError` for unknown classes.
+    Its layers are those of `small_config`. A pole stands anywhere beside the road, so that samples are turned by up to
+    a quarter to either side. Raises `InputError` for unknown classes.
     """
-    return SecondConfig(
+    return replace(
+        small_config(classes, ground_z_m),
         anchors=_anchors(classes),
         range_m=(-38.4, -38.4, ground_z_m - 0.7, 38.4, 38.4, ground_z_m + 3.3),
-        voxel_m=(0.1, 0.1, 0.1),
-        sparse_channels=(16, 16, 32, 32),
-        sparse_out=32,
-        bev_layers=(3, 3),
-        bev_channels=(48, 96),
-        bev_up_channels=(64, 64),
-        ground_z_m=ground_z_m,
-        intensity=False,
         foreground=True,
-        uncertainty=True,
-        bfloat16=True,
         augmentation=Augmentation(turn_rad=1.57, scale=0.03, lift_m=0.1, drop=0.2),
     )
 

@@ -37,7 +37,7 @@ class ObjectsOutcomes:
         Raises `InputError` where there are no frames, or one has no LiDAR.
         """
         found, truths = detect_frames(
-            network, map(frame_reader(data, network.config), frames), total=len(frames), progress=progress
+            network, map(frame_reader(data, network.config.foreground), frames), total=len(frames), progress=progress
         )
         classes = network.config.classes
         if not truths:

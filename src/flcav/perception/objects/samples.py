@@ -101,7 +101,7 @@ class RecordedSweeps(Sequence[Sample]):
         data.check_labelled("objects")
         if blind := [data.name(number) for number in frames if not data.lidars(number)]:
             raise InputError(f"{data.folder}: no LiDAR in {len(blind)} of {len(frames)} frames, as in {blind[0]}")
-        self._read, self._config, self._frames = frame_reader(data, config), config, frames
+        self._read, self._config, self._frames = frame_reader(data, config.foreground), config, frames
 
     def __len__(self) -> int:
         return len(self._frames)

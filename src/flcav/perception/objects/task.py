@@ -111,7 +111,11 @@ class ObjectsTask(ObjectsOutcomes):
         data.check_labelled("objects")
         numbers, classes = data.numbers(frames), network.config.classes
         found, truths = detect_frames(
-            network, map(frame_reader(data, network.config), numbers), asked, total=len(numbers), progress=progress
+            network,
+            map(frame_reader(data, network.config.foreground), numbers),
+            asked,
+            total=len(numbers),
+            progress=progress,
         )
         return ObjectsEvaluation(
             frames=len(truths),
@@ -125,12 +129,12 @@ class ObjectsTask(ObjectsOutcomes):
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Set the Platt scaling of the network's scores, fitted on frames (None: all) it was not trained on."""
         data.check_labelled("objects")
-        calibrate(network, map(frame_reader(data, network.config), data.numbers(frames)))
+        calibrate(network, map(frame_reader(data, network.config.foreground), data.numbers(frames)))
 
     def pack_samples(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> Iterator[bytes]:
         """Yield the message of each frame: its whole sweep and its boxes."""
         RecordedSweeps(data, config, frames)  # raises for frames without a LiDAR
-        read = frame_reader(data, config)
+        read = frame_reader(data, config.foreground)
         return (pack_sweep(read(i), config) for i in frames)
 
     def unpack_samples(self, messages: Sequence[bytes], config: SecondConfig) -> list[Sample]:
@@ -156,7 +160,7 @@ class ObjectsTask(ObjectsOutcomes):
         threshold: lowest score of a detection. See `flcav.perception.objects.errors`.
         """
         data.check_labelled("objects")
-        numbers, read = data.numbers(frames), frame_reader(data, network.config)
+        numbers, read = data.numbers(frames), frame_reader(data, network.config.foreground)
 
         def found() -> Iterator[Boxes]:
             for done, number in enumerate(numbers, start=1):

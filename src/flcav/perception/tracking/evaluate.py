@@ -82,7 +82,7 @@ def evaluate_tracks(
     total = sum(map(len, numbers.values()))
     per_class: dict[str, list[list[TrackingFrame]]] = {name: [] for name in network.config.classes}
     speed_errors: dict[str, list[float]] = {name: [] for name in network.config.classes}
-    read, done = frame_reader(data, network.config), 0
+    read, done = frame_reader(data, network.config.foreground), 0
     for sequence in numbers.values():
         tracker = Tracker()
         story: list[tuple[Frame, Tracked]] = []

@@ -5,7 +5,7 @@ A sweep's points are of both stacked LiDARs, in the ego frame at the sweep's tim
 no distortion: av2-api's camera model has none, the coefficients in `intrinsics.feather` are of the raw images.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,17 +18,16 @@ from scipy.spatial.transform import Rotation
 from flcav.config import InputError
 from flcav.dataset.formats.reading import (
     AgentNames,
+    LogSource,
     Picture,
     annotate,
     check_finite,
     choose_split,
     difference_tracks,
-    name_splits,
     pinhole,
     read_pictures,
     view_boxes,
 )
-from flcav.files import Json
 from flcav.geometry import Boxes, pose, transform_points, wrap_angle, yaw_of
 from flcav.sensors.camera.lens import Lens
 from flcav.sensors.frame import Calibration, LinkedFrame
@@ -79,8 +78,11 @@ class Labels(NamedTuple):
     velocity: Array  # (A, 3) city frame [m/s]
 
 
-class Argoverse2Source:
+class Argoverse2Source(LogSource):
     """The logs of a folder of Argoverse 2's sensor dataset: one log, a folder of logs, or folders of SPLITS of them."""
+
+    FORMAT = "argoverse2"
+    _beams = BEAMS
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where there is no log in `folder`, none of `split`, or a file of a log is missing."""
@@ -94,29 +96,11 @@ class Argoverse2Source:
         bare = [log.folder.name for log in self._logs.values() if not log.labelled]
         self.notes = (f"no annotations.feather in {len(bare)} of {len(self._logs)} logs, so no boxes",) if bare else ()
         self._labelled = not bare
-
-    def describe(self) -> Mapping[str, Json]:
-        """Return folder, splits and what is labelled."""
-        return {
-            "imported": "argoverse2",
-            "from": str(self._folder.resolve()),
-            "split": self._split or "",
-            "beams": BEAMS,
-            "labels": ["objects"] if self._labelled else [],
-            "splits": name_splits({scene: log.split for scene, log in self._logs.items()}),
-        }
-
-    def scenes(self) -> list[str]:
-        """Return the logs' ids."""
-        return list(self._logs)
+        self._split_of = {scene: log.split for scene, log in self._logs.items()}
 
     def frame_count(self, scene: str) -> int:
         """Return the number of sweeps of a log."""
         return len(self._logs[scene].sweeps)
-
-    def trace(self, scene: str) -> None:
-        """Return None: the traffic between the sweeps is not known."""
-        return
 
     def frames(self, scene: str) -> Iterator[LinkedFrame]:
         """Yield a frame for each sweep of a log; raises `InputError` where a file is missing or truncated."""

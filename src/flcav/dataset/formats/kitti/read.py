@@ -7,7 +7,7 @@ flcav's says more, in `frames.csv`. The LiDAR stands where KITTI's does, HEIGHT_
 
 import csv
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,14 +26,13 @@ from flcav.dataset.formats.kitti.files import (
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import (
     AgentNames,
+    LogSource,
     annotate,
     choose_split,
     measure_picture,
-    name_splits,
     read_pictures,
     unseen_views,
 )
-from flcav.files import Json
 from flcav.geometry import Boxes, inverse, pose
 from flcav.sensors.frame import Calibration, LinkedFrame
 
@@ -64,8 +63,10 @@ class Shot(NamedTuple):
     exported: bool  # by flcav, whose camera may have moved on since the spin: an agent keeps its first calibration
 
 
-class KittiSource:
+class KittiSource(LogSource):
     """The frames of a KITTI folder, `training` and `testing`."""
+
+    FORMAT = "kitti"
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where `folder` has no frames, none of `split`, or a frame no calibration."""
@@ -91,27 +92,9 @@ class KittiSource:
         self._labelled = not bare
         self.notes = (f"no label_2 of {bare} of {len(every)} frames, so no boxes there",) if bare else ()
 
-    def describe(self) -> Mapping[str, Json]:
-        """Return folder, splits and what is labelled."""
-        return {
-            "imported": "kitti",
-            "from": str(self._folder.resolve()),
-            "split": self._split or "",
-            "labels": ["objects"] if self._labelled else [],
-            "splits": name_splits(self._split_of),
-        }
-
-    def scenes(self) -> list[str]:
-        """Return a name for each frame, or of an export the scenes that it was made of."""
-        return list(self._shots)
-
     def frame_count(self, scene: str) -> int:
         """Return the number of frames of a scene."""
         return len(self._shots[scene])
-
-    def trace(self, scene: str) -> None:
-        """Return None: nothing is known between frames."""
-        return
 
     def frames(self, scene: str) -> Iterator[LinkedFrame]:
         """Yield the frames of a scene; raises `InputError` where a file is missing, truncated or malformed."""

@@ -19,17 +19,16 @@ from flcav.dataset.formats.nuscenes.tables import VERSION
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
     AgentNames,
+    LogSource,
     Picture,
     annotate,
     check_finite,
     choose_split,
     difference_tracks,
-    name_splits,
     pinhole,
     read_pictures,
     view_boxes,
 )
-from flcav.files import Json
 from flcav.geometry import Boxes, inverse, yaw_of
 from flcav.sensors.frame import Calibration, LinkedFrame
 
@@ -95,8 +94,10 @@ class Spin(NamedTuple):
     time_s: float
 
 
-class NuscenesSource:
+class NuscenesSource(LogSource):
     """The key frames of a nuScenes folder, or of a folder of tables in it, such as `v1.0-mini`."""
+
+    FORMAT = "nuscenes"
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where tables are missing or malformed, or there is nothing of `split`."""
@@ -116,8 +117,9 @@ class NuscenesSource:
         self._spins, split_of = self._order(table["scene"], table["log"], table["sample"])
         self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._read_notes(table)
+        self._beams = BEAMS if self._tables.name in VERSIONS else None
         self._labelled = bool(table["sample_annotation"])
-        self.notes: tuple[str, ...] = () if self._labelled else ("no annotations in its tables, so no boxes",)
+        self.notes = () if self._labelled else ("no annotations in its tables, so no boxes",)
 
     def _at(self, table: Mapping[str, Row], token: str) -> Row:
         if token not in table:
@@ -211,28 +213,9 @@ class NuscenesSource:
         for number, row in enumerate(rows):
             self._notes[row["sample_token"]].append(number)
 
-    def describe(self) -> Mapping[str, Json]:
-        """Return folder, splits and what is labelled."""
-        return {
-            "imported": "nuscenes",
-            "from": str(self._tables.resolve()),
-            "split": self._split or "",
-            "labels": ["objects"] if self._labelled else [],
-            "splits": name_splits(self._split_of),
-            **({"beams": BEAMS} if self._tables.name in VERSIONS else {}),
-        }
-
-    def scenes(self) -> list[str]:
-        """Return the scenes' names."""
-        return list(self._split_of)
-
     def frame_count(self, scene: str) -> int:
         """Return the number of key frames of a scene."""
         return len(self._spins[scene])
-
-    def trace(self, scene: str) -> None:
-        """Return None: the traffic between key frames is not known."""
-        return
 
     def frames(self, scene: str) -> Iterator[LinkedFrame]:
         """Yield the key frames of a scene; raises `InputError` where a file is missing, truncated or malformed."""

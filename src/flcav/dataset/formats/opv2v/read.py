@@ -17,17 +17,16 @@ from flcav.dataset.formats.opv2v.write import CAMERAS, FOLDERS, KMH, from_carla
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
     AgentNames,
+    LogSource,
     Picture,
     annotate,
     check_finite,
     choose_split,
     measure_picture,
-    name_splits,
     pinhole,
     read_pictures,
     view_boxes,
 )
-from flcav.files import Json
 from flcav.geometry import Boxes, heading_vectors, inverse, yaw_of
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Calibration, LinkedFrame
@@ -51,8 +50,10 @@ class Shot(NamedTuple):
     time_s: float
 
 
-class Opv2vSource:
+class Opv2vSource(LogSource):
     """The scenarios of a folder: one of a split, a split of scenarios, or the folder of splits."""
+
+    FORMAT = "opv2v"
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where there is no scenario, none of `split`, or an agent's first frame is malformed."""
@@ -64,7 +65,6 @@ class Opv2vSource:
         self._track: dict[str, dict[str, str]] = {}
         names = AgentNames()
         self._shots = {scene: self._open(scene, found[scene], names) for scene in self._split_of}
-        self.notes: tuple[str, ...] = ()
 
     def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Shot]:
         known = self._track[scene] = _read_names(folder / PROTOCOL)
@@ -86,27 +86,9 @@ class Opv2vSource:
                 shots += [Shot(path / stamp, agent, int(stamp), rank[stamp] * PERIOD_S) for stamp in own]
         return sorted(shots, key=lambda shot: (shot.spin, shot.agent))
 
-    def describe(self) -> Mapping[str, Json]:
-        """Return folder, splits and what is labelled."""
-        return {
-            "imported": "opv2v",
-            "from": str(self._folder.resolve()),
-            "split": self._split or "",
-            "labels": ["objects"],
-            "splits": name_splits(self._split_of),
-        }
-
-    def scenes(self) -> list[str]:
-        """Return the scenarios' names."""
-        return list(self._shots)
-
     def frame_count(self, scene: str) -> int:
         """Return the number of frames of a scenario, of all agents."""
         return len(self._shots[scene])
-
-    def trace(self, scene: str) -> None:
-        """Return None: only what agents see is known of the traffic."""
-        return
 
     def frames(self, scene: str) -> Iterator[LinkedFrame]:
         """Yield the frames of a scenario; raises `InputError` where a file is missing, truncated or malformed."""
