@@ -12,6 +12,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import LineString
 
+from flcav.config import shorten
 from flcav.geometry import heading_vectors, left_vectors
 from flcav.world.map.parameters import SignalParameters
 from flcav.world.map.roads import Connection, RoadNet
@@ -22,7 +23,7 @@ from flcav.world.opendrive.road_surface import Road
 Array = NDArray[np.float64]
 Placed = tuple[ElementTree.Element, ElementTree.Element]  # a road, and a signal or a reference to one on it
 
-LIGHT = "1000001"  # type of a traffic light for vehicles
+LIGHT, WALKERS = "1000001", "1000002"  # types of traffic lights: for vehicles, for pedestrians
 HEAD_M = 1.0  # height of a head; a higher signal includes its post
 HEIGHT_M = (1.8, 9.0)  # heights of a head's centre that are believed
 PLACE_M = 15.0  # from the end of a road of the map to that of its lane in the net
@@ -57,7 +58,7 @@ def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: Ro
                 continue
             name = signal.get("id", "")
             place = locate(Road(row), signal, offset_m)
-            reason = "not a light for vehicles" if signal.get("type") != LIGHT else "" if place else "no place"
+            reason = _refuse_kind(signal.get("type", "")) or ("" if place else "no place")
             way = (
                 None if reason else ways.find([(roads[road], ref) for road, ref in named.get(name, ())], (row, signal))
             )
@@ -70,6 +71,11 @@ def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: Ro
             else:
                 found.append(head)
     return SignalHeads(tuple(found), left)
+
+
+def _refuse_kind(kind: str) -> str:
+    """Return why a dynamic signal of this type has no head; empty where it has."""
+    return "" if kind == LIGHT else "for pedestrians" if kind == WALKERS else f"of the type {shorten(kind)}"
 
 
 def _list_references(root: ElementTree.Element) -> dict[str, list[tuple[str, ElementTree.Element]]]:
