@@ -205,12 +205,14 @@ def judge_differences(results: ExchangeResult) -> dict[str, Judged]:
 
 
 def draw_results(results: ExchangeResult) -> bytes:
-    """Return the figure of accuracy against the bytes of the wireless uplink as a PNG."""
+    """Return the figure of accuracy beside the bytes of the wireless uplink as a PNG."""
 
     def sent(name: str) -> float:
         return float(np.mean([seed[name].wireless_up_mb for seed in results.seeds.values()]))
 
     marks = [
-        Mark(group, name, sent(name), results.accuracy[name][OWN]) for group, arms in ARMS.items() for name in arms
+        Mark(group, name, sent(name), results.accuracy[name][OWN], results.accuracy[name][UNSEEN])
+        for group, arms in ARMS.items()
+        for name in arms
     ]
     return style.png(draw_exchanges(marks))

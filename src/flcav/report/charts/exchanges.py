@@ -1,77 +1,73 @@
-"""Chart of accuracy against the bytes of the uplink: an arm of a comparison of exchanges is a point."""
+"""Chart of accuracy beside the bytes of the uplink: a row for each arm of a comparison of exchanges."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from flcav.intervals import MeanOverSeeds
 from flcav.report import style
 
 COLOURS = (style.INK, style.BLUE, style.ORANGE, style.GREEN, style.VERMILLION)  # in the order of the groups
-LINE = 0.046  # height of a line of text, of the axes
-NEAR = 1.35  # factor of the uplink within which names stand in one column
-DODGE = 1.035  # factor between points of a column, so that their intervals can be told apart
+ROW, GAP = 0.235, 0.6  # height of a row [inch], and between two groups [rows]
 
 
 @dataclass(frozen=True)
 class Mark:
-    """An arm: its group, megabytes sent upwards by wireless, and its accuracy."""
+    """An arm: its group, megabytes sent upwards by wireless, and accuracy in the own and in the unseen region."""
 
     group: str
     name: str
-    up_mb: float  # 0: nothing is sent; a line across
-    accuracy: MeanOverSeeds
+    up_mb: float  # 0: nothing is sent
+    own: MeanOverSeeds
+    unseen: MeanOverSeeds
 
 
 @style.styled
 def draw_exchanges(marks: Sequence[Mark]) -> Figure:
-    """Return the figure of accuracy, with 95 % intervals over seeds, against the uplink on a logarithmic axis."""
-    figure = style.canvas(8.6, 5.4)
-    axes = figure.add_subplot()
-    axes.set_xscale("log")
-    colours = dict(zip(dict.fromkeys(mark.group for mark in marks), COLOURS, strict=False))
-    sent = sorted((mark for mark in marks if mark.up_mb > 0), key=lambda mark: (mark.up_mb, -mark.accuracy.mean))
-    ends = [end for mark in marks for end in (mark.accuracy.low, mark.accuracy.high, mark.accuracy.mean) if end]
-    low, high = min(ends) - 0.02, max(ends) + 0.02
-    axes.set(ylim=(low, high), xlim=(sent[0].up_mb / 3, sent[-1].up_mb * 12))
-    for mark in marks:
-        if mark.up_mb == 0:
-            axes.axhline(mark.accuracy.mean, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
-            axes.annotate(mark.name, (0.01, mark.accuracy.mean), (0, 3), "axes fraction", color=style.MUTED)
-    for column in _columns(sent):
-        _draw_column(axes, column, colours, rightmost=column[-1] is sent[-1])
-    for group, colour in colours.items():
-        axes.plot([], [], "o", color=colour, markersize=5, label=group)
-    axes.set(xlabel="wireless uplink of stages II and III, MB", ylabel="accuracy in the own region (95 % interval)")
-    axes.grid(axis="y")
-    style.key(figure, axes.get_legend_handles_labels()[0])
+    """Return the figure of a row per arm: accuracy, with 95 % intervals over seeds, and the uplink on a log axis.
+
+    A line across the accuracies marks the first arm that sends something, which the others are compared with.
+    """
+    groups = list(dict.fromkeys(mark.group for mark in marks))
+    rows = [place + GAP * groups.index(mark.group) for place, mark in enumerate(marks)]
+    figure = style.canvas(8.6, ROW * (rows[-1] + 1) + 0.9)
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(5, 3))
+    first = next(mark for mark in marks if mark.up_mb > 0)
+    left.axvline(first.own.mean, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
+    for row, mark in zip(rows, marks, strict=True):
+        colour = COLOURS[groups.index(mark.group) % len(COLOURS)]
+        _draw_interval(left, row - 0.13, mark.own, colour, filled=True)
+        _draw_interval(left, row + 0.17, mark.unseen, colour, filled=False)
+        if mark.up_mb > 0:
+            right.plot(mark.up_mb, row, "o", color=colour, markersize=5)
+            right.annotate(
+                f"{mark.up_mb:.2g}" if mark.up_mb < 10 else f"{mark.up_mb:.0f}",
+                (mark.up_mb, row),
+                (6, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=style.SMALL,
+                color=style.MUTED,
+            )
+    left.set_yticks(rows, [mark.name for mark in marks])
+    for label, mark in zip(left.get_yticklabels(), marks, strict=True):
+        label.set_color(COLOURS[groups.index(mark.group) % len(COLOURS)])
+    left.set_ylim(rows[-1] + 0.7, -0.7)
+    left.set_xlabel("accuracy (95 % interval): own region ●, unseen region ○")
+    sent = [mark.up_mb for mark in marks if mark.up_mb > 0]
+    right.set(xscale="log", xlabel="wireless uplink, stages II and III [MB]", xlim=(min(sent) / 1.6, max(sent) * 3))
+    right.xaxis.set_major_formatter(FuncFormatter(lambda mb, _: f"{mb:g}"))
+    right.xaxis.set_minor_formatter(NullFormatter())
+    for axes in (left, right):
+        axes.grid(axis="x")
+        axes.spines["left"].set_visible(False)
     return figure
 
 
-def _columns(sent: Sequence[Mark]) -> Iterator[list[Mark]]:
-    """Yield the marks, in ascending order of bytes, in columns of about the same bytes."""
-    column: list[Mark] = []
-    for mark in sent:
-        if column and mark.up_mb > NEAR * column[0].up_mb:
-            yield column
-            column = []
-        column.append(mark)
-    yield column
-
-
-def _draw_column(axes: Axes, column: Sequence[Mark], colours: Mapping[str, str], rightmost: bool) -> None:
-    """Draw the points of a column, and their names beside it: on the right of the last one, else on the left."""
-    low, high = axes.get_ylim()
-    order = sorted(column, key=lambda mark: -mark.accuracy.mean)
-    heights = style.keep_apart([mark.accuracy.mean for mark in order], LINE * (high - low), high)
-    names_at = column[-1].up_mb * 1.9 if rightmost else column[0].up_mb / 1.25
-    for place, (mark, height) in enumerate(zip(order, heights, strict=True)):
-        x, mean, colour = mark.up_mb * DODGE ** (place - len(order) / 2), mark.accuracy.mean, colours[mark.group]
-        if mark.accuracy.low is not None and mark.accuracy.high is not None:
-            axes.plot([x, x], [mark.accuracy.low, mark.accuracy.high], color=colour, linewidth=1, alpha=0.6)
-        axes.plot([x, names_at], [mean, height], color=colour, linewidth=0.5, alpha=0.5)
-        axes.plot(x, mean, "o", color=colour, markersize=5)
-        side = "left" if rightmost else "right"
-        axes.annotate(mark.name, (names_at, height), color=colour, fontsize=style.SMALL, ha=side, va="center")
+def _draw_interval(axes: Axes, row: float, mean: MeanOverSeeds, colour: str, filled: bool) -> None:
+    if mean.low is not None and mean.high is not None:
+        axes.plot([mean.low, mean.high], [row, row], color=colour, linewidth=1.2 if filled else 0.7)
+    axes.plot(mean.mean, row, "o", color=colour, markersize=4.5, markerfacecolor=colour if filled else "white")
