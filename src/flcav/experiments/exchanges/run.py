@@ -20,6 +20,7 @@ from flcav.network.ledger import Direction, Ledger, Link
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results import Run
+from flcav.pipeline.running import WORK
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.exchanges import Mark, draw_exchanges
@@ -112,7 +113,7 @@ def shrink_recipe(recipe: RunRecipe) -> RunRecipe:
 def compare_exchanges(recipe: RunRecipe, runs: Sequence[Run], folders: Sequence[Path]) -> ExchangeResult:
     """Return the results of the arms of `recipe`, from a run of each seed in its folder.
 
-    `folders` hold the runs' steps in `work` and the arms' ledgers in `ledgers`.
+    `folders` hold the runs' steps and the arms' ledgers.
     """
     return summarise(
         recipe, {str(run.recipe.seed): measure_seed(run, folder) for run, folder in zip(runs, folders, strict=True)}
@@ -147,7 +148,7 @@ def measure_seed(run: Run, folder: Path) -> dict[str, ExchangeArm]:
     """Return the numbers of every arm of one seed's run."""
     plan = run.arms[MAIN].plan.tasks[TASK]
     rounds = plan.edge_rounds + plan.cloud_rounds * run.recipe.federation.edge_rounds_per_cloud_round
-    links = link_regions(run.recipe, TASK, folder / "work", rounds)
+    links = link_regions(run.recipe, TASK, folder / WORK, rounds)
     found = {NONE: ExchangeArm(measure_places(run, MAIN, PRETRAIN), 0.0, 0.0, 0.0, 0.0, 0.0, None, None)}
     for name, arm in NAMES.items():
         if name == NONE:
