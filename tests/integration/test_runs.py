@@ -89,6 +89,13 @@ def result(finished: Path) -> Run:
     return Run.load(finished, RESULTS)
 
 
+def test_plans_before_the_run_predict_what_is_compared_with_training(studied: Studied, result: Run) -> None:
+    (seed,) = studied[2].budgets[0].seeds
+    first, *made_anew = result.arms[MAIN].plans
+    assert made_anew
+    assert seed.predicted["joint"] == first.tasks["objects"].predicted
+
+
 def without(finished: Path, out: Path, unwanted: Callable[[str], bool]) -> Path:
     """Return a copy of the run's steps in which those of some names have not begun."""
     shutil.copytree(finished / "work", out / "work", ignore=lambda _, names: [name for name in names if unwanted(name)])

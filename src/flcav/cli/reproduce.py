@@ -226,15 +226,21 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
 @when_interrupted()
 def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
-    from flcav.experiments.fig6a.run import BUDGETS, budget_recipes, compare_plans, draw_allocation
+    from flcav.experiments.fig6a.run import BUDGETS, budget_recipes, compare_plans, draw_allocation, plans_differ
     from flcav.files import write_bytes, write_json
     from flcav.pipeline.running import run_several
 
-    recipe, numbers = _load_sized("allocation", scale), range(1, seeds + 1)
+    recipe = _load_sized("allocation", scale)
     with live_steps(Target.fig6a_allocation.value) as notify:
-        recipes = budget_recipes(recipe, numbers)
-        runs = iter(run_several(recipes, out, jobs=jobs, notify=notify, stale=stale, engine=engine))
-    results = compare_plans(recipe, {factor: [next(runs) for _ in numbers] for factor in BUDGETS})
+
+        def finish(numbers: Sequence[int], factors: Sequence[float]) -> "dict[float, list[Run]]":
+            recipes = budget_recipes(recipe, numbers, factors)
+            runs = iter(run_several(recipes, out, jobs=jobs, notify=notify, stale=stale, engine=engine))
+            return {factor: [next(runs) for _ in numbers] for factor in factors}
+
+        first = finish([1], BUDGETS)
+        others = finish(range(2, seeds + 1), [factor for factor, (run,) in first.items() if plans_differ(run)])
+    results = compare_plans(recipe, {factor: [*own, *others.get(factor, [])] for factor, own in first.items()})
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "plans.png", draw_allocation(results))
     for each in results.budgets:

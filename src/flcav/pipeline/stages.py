@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from flcav.federation.privacy import affordable_rounds
 from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.choice import open_runtime
@@ -272,29 +273,35 @@ def federate_edge(
         if shared is None
         else (partial(federate_outputs, shared), give_outputs(clients, shared, to_arrays(network)))
     )
+
+    def afford(rounds: int) -> int:
+        privacy = rules.privacy
+        return rounds if privacy is None else affordable_rounds(privacy, rules.selection, [*clients], rounds, earlier)
+
     with open_runtime(runtime, asked, processes) as where:
         how["runtime"] = where
         if replanning is None:
-            save = federating.make_saver(schedule.rounds)
+            save, last = federating.make_saver(schedule.rounds), afford(schedule.rounds)
 
             def keep(round_: int, weights: Weights, loss: float) -> None:
                 save(round_, weights, loss)
-                if round_ < schedule.rounds:
+                if round_ < last:
                     before_round(round_ + 1, weights)
 
-            if done < schedule.rounds:
+            if done < last:
                 before_round(done + 1, start)
             run(asked, start, schedule, account, **how, rules=rules, done=done, on_round=keep)
         else:
             course = replanning.course
 
             def run_round(weights: Weights, number: int, driven: Driven) -> LocalUpdate | None:
+                if afford(number) < number:
+                    return None
                 before_round(number, weights)
                 own, lossy = course.schedule(schedule, number), replace(account, outages=driven.outages)
                 keep = federating.make_saver(course.rounds)
                 given: Any = {**how, "rules": driven.rules, "done": number - 1, "on_round": keep}
-                found = run(asked, weights, own, lossy, **given)
-                return found if len(federating.losses) == number else None
+                return run(asked, weights, own, lossy, **given)
 
             replanning.run(start, done, federating.scores, run_round)
     federating.finish(network, len(federating.losses), averaged, share)

@@ -137,6 +137,18 @@ def test_claims_under_several_budgets_are_corrected_together() -> None:
     assert all("corrected for 10 claims" in own[2].sentence for own in both)
 
 
+def test_plans_that_coincide_are_told_and_not_judged() -> None:
+    same = [replace(seed, plans=dict.fromkeys(PLANS, seed.plans[JOINT])) for seed in RIGHT.seeds]
+    both = allocation_findings([WRONG, replace(RIGHT, factor=4.0, seeds=(same[0],))], HISTORY)
+    assert "corrected for 5 claims" in both[0][2].sentence
+    told, budgets = both[1]
+    assert told.verdict == "undecided"
+    assert "the same, 118 samples, 12 edge rounds, 1 cloud rounds" in told.sentence
+    assert "0.667 after cloud FL (predicted: 0.660)" in told.sentence
+    assert budgets.verdict == "held"
+    assert not replace(RIGHT, seeds=(same[0], RIGHT.seeds[1])).coincide
+
+
 def test_budgets_are_multiples_of_the_recipe_s() -> None:
     recipe = load_run_recipe(recipe_path("runs/allocation"))
     found = budget_recipes(recipe, (1, 2))

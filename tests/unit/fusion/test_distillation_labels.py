@@ -84,11 +84,19 @@ def test_the_average_has_what_the_road_sees_and_what_it_cannot_see_but_a_vehicle
     assert near(blind.boxes, GHOST)  # nobody saw that the ground is free
 
 
-def test_two_vehicles_that_agree_are_surer_than_each() -> None:
-    one, other = (Sighting(f"cav{n}", 1.0, np.eye(4), boxes(UNSURE, score=0.5), navigation=ACCURATE) for n in (0, 1))
-    assert not len(average_spin([one], [], CONFIG, 0.7)[0].boxes)
-    both = average_spin([one, other], [], CONFIG, 0.7)
-    assert [each.confirmed.tolist() for each in both] == [[True], [True]]  # 1 - .5 * .5 is above the threshold
+def test_two_vehicles_confirm_an_object_that_each_is_sure_of() -> None:
+    def told(*scores: float, threshold: float) -> list[list[bool]]:
+        seen = [
+            Sighting(f"cav{n}", 1.0, np.eye(4), boxes(UNSURE, score=score), navigation=ACCURATE)
+            for n, score in enumerate(scores)
+        ]
+        return [each.confirmed.tolist() for each in average_spin(seen, [], CONFIG, threshold)]
+
+    assert told(0.5, threshold=0.6) == [[]]
+    assert told(0.5, 0.5, threshold=0.4) == [[True], [True]]
+    assert told(0.5, 0.5, threshold=0.6) == [[False], [False]]  # 1 - .5 * .5 is no probability: both run one network
+    assert told(0.9, 0.5, threshold=0.6) == [[False], [False]]
+    assert told(0.9, 0.5, 0.8, threshold=0.6) == [[True]] * 3
 
 
 def test_nobody_tells_of_anything_and_that_is_an_average_too() -> None:
@@ -252,13 +260,13 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     monkeypatch.setattr(rounds, "asked_of", lambda frame, config: truth)
     how = Distillation(position_m=0.05, heading_deg=0.1)
     split = Frames(cast(Any, data), (0, 1), {})
-    labels = RoadAverageLabels(how, CONFIG, 0.6, split, (0, 1), (3,), "grid", tmp_path)
-    book, weights = Ledger(Budget(1.0, 0.0)), to_arrays(second_tiny())
-    labels.send_views(book)
+    book, weights, about = Ledger(Budget(1.0, 0.0)), to_arrays(second_tiny()), (how, CONFIG, 0.6, split, (0, 1), (3,))
+    labels = RoadAverageLabels(*about, "grid", book, folder=tmp_path)
+    labels.send_views()
     assert {entry.bytes for entry in book.entries} == {len(seen.message())}
     assert [(entry.direction, entry.round) for entry in book.entries] == [("down", 0)] * 2
     own = labels["grid/cav0"]
-    labels.renew(1, weights, book)
+    labels.renew(1, weights)
     assert sorted(labels) == ["grid/cav0", "grid/cav1"]
     assert labels["grid/cav0"] is own  # a client holds it
     assert near(own[0].boxes, BOTH)
@@ -267,15 +275,18 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     assert [(e.direction, e.client) for e in sent] == [(d, f"grid/cav{n}") for d in ("up", "down") for n in (1, 0)]
     assert {(e.stage, e.task, e.link, e.round) for e in sent} == {("edge", "objects", "wireless", 1)}
     assert abs(sent[1].bytes - sent[0].bytes - 15 * 4 - len("Car\n")) <= 8  # one box more, and padding of the header
-    labels.renew(2, weights, book)
-    labels.renew(2, weights, book)  # as after a stop
+    labels.renew(2, weights)
+    labels.renew(2, weights)  # as after a stop
     history = read_history(tmp_path).rounds
     assert [(each.round, each.precision, each.recall) for each in history] == [(1, 1.0, 1.0), (2, 1.0, 1.0)]
-    before = len(book.entries)
-    labels.renew(1, weights)
-    assert (len(book.entries), read_history(tmp_path).rounds) == (before, history)
+    last = RoadAverageLabels(*about, "grid", later := Ledger(Budget(1.0, 0.0)), "cloud")
+    last.renew(1, weights)
+    assert [replace(entry, stage="edge") for entry in later.entries] == list(sent)  # the same messages
+    assert {entry.stage for entry in later.entries} == {"cloud"}
+    np.testing.assert_array_equal(last["grid/cav0"][0].boxes.array(), own[0].boxes.array())
+    assert read_history(tmp_path).rounds == history
     with pytest.raises(BudgetExceeded, match="wireless uplink budget exceeded: grid/cav1"):
-        labels.renew(3, weights, Ledger(Budget(1e-4, 0.0)))
+        RoadAverageLabels(*about, "grid", Ledger(Budget(1e-4, 0.0))).renew(3, weights)
 
 
 def test_labels_that_are_renewed_need_one_process() -> None:

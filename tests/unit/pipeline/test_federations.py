@@ -191,9 +191,13 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
         folder = tmp_path / f"{rounds}-{earlier}"
         schedule = learning.schedule(rounds, 2, "edge", "a")
         book = Ledger(Budget(1.0, 1.0))
-        how = (FEDAVG, rules, earlier, book, folder, report)
-        losses = federate_edge(learning, network, clients["a"], schedule, *how)
+        how, begun = (FEDAVG, rules, earlier, book, folder, report), []
+        about: Any = {"before_round": lambda round_, weights: begun.append(round_)}
+        losses = federate_edge(learning, network, clients["a"], schedule, *how, **about)
         assert (folder / "weights.safetensors").exists()
+        assert begun == list(range(1, len(losses) + 1))
+        assert federate_edge(learning, network, clients["a"], schedule, *how, **about) == losses  # from its checkpoint
+        assert len(begun) == len(losses)
         return len(losses)
 
     assert (edge(3, 0), edge(9, 0), edge(9, 4)) == (3, 6, 2)

@@ -11,6 +11,7 @@ STAGE_NAMES = {"pretrain": "pretraining", "edge": "edge FL", "cloud": "cloud FL"
 Gain = tuple[str, str]  # plan, stage
 Ranges = Mapping[str, tuple[float, float]]
 GAINS: tuple[Gain, ...] = tuple((name, stage) for name in (EQUAL, JOINT) for stage in (EDGE, CLOUD))
+BETTER = "Does the joint plan beat equal shares for every stage?"
 COUNT_NAMES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
 
 
@@ -18,11 +19,30 @@ def allocation_findings(budgets: Sequence[AtBudgets], history: Ranges) -> tuple[
     """Return the findings under each pair of budgets: gain, ranking by prediction, gain of every stage, accuracy, use.
 
     The claims that are tests over seeds, the joint plan's gain and those of the stages under all budgets, are judged
-    together. `history`: least and most of each count in the history that the plans are predicted from.
+    together. Where both plans are one, there is nothing to judge. `history`: least and most of each count in the
+    history that the plans are predicted from.
     """
-    claims = [[each.summary.realised_difference[TOWN][CLOUD], *_stage_gains(each).values()] for each in budgets]
+    claims = [
+        [] if each.coincide else [each.summary.realised_difference[TOWN][CLOUD], *_stage_gains(each).values()]
+        for each in budgets
+    ]
     judged = iter(judge([Claim(mean) for own in claims for mean in own]))
-    return tuple(_told(each, history, [next(judged) for _ in own]) for each, own in zip(budgets, claims, strict=True))
+    return tuple(
+        _told(each, history, [next(judged) for _ in own]) if own else (_one_plan(each), _budgets(each))
+        for each, own in zip(budgets, claims, strict=True)
+    )
+
+
+def _one_plan(results: AtBudgets) -> PlanFinding:
+    """Return the finding where both plans are the same: no difference to judge."""
+    counts = ", ".join(f"{count} {COUNT_NAMES[name]}" for name, count in results.seeds[0].plans[JOINT].counts.items())
+    realised, predicted = results.summary.realised[TOWN][JOINT], results.summary.predicted[JOINT]
+    sentence = (
+        f"Both plans are the same, {counts}: the limits of rounds and of the pool, and not the budgets, decide. "
+        f"On {TOWN}, AP50 was {realised[PRETRAIN].mean:.3f} pretrained, {realised[EDGE].mean:.3f} after edge FL and "
+        f"{realised[CLOUD].mean:.3f} after cloud FL (predicted: {predicted[CLOUD]:.3f})."
+    )
+    return _finding(BETTER, UNDECIDED, sentence)
 
 
 def _told(results: AtBudgets, history: Ranges, judged: Sequence[Judged]) -> tuple[PlanFinding, ...]:
@@ -56,7 +76,7 @@ def _better(results: AtBudgets, difference: MeanOverSeeds, judged: Judged) -> Pl
     else:
         over = f"over {difference.seeds} seeds, paired, of standard deviation {difference.sd:.3f}"
         sentence += f" {over}; {judged.describe()}. {_needed(results, difference, judged)}"
-    return _finding("Does the joint plan beat equal shares for every stage?", judged.verdict, sentence)
+    return _finding(BETTER, judged.verdict, sentence)
 
 
 def _needed(results: AtBudgets, difference: MeanOverSeeds, judged: Judged) -> str:

@@ -51,6 +51,11 @@ class AllocationSeed:
     poles: Mapping[str, Mapping[str, int]]  # by plan and town
     ledger: Mapping[str, Mapping[str, LinkUse]]  # by plan and link
 
+    @property
+    def coincide(self) -> bool:
+        """Return whether both plans are the same: as many samples and rounds."""
+        return self.plans[EQUAL].counts == self.plans[JOINT].counts
+
 
 @dataclass(frozen=True)
 class AllocationSummary:
@@ -84,6 +89,11 @@ class AtBudgets:
     def name(self) -> str:
         """Return the budgets in words: x 0.25, x 1."""
         return f"x {self.factor:g}"
+
+    @property
+    def coincide(self) -> bool:
+        """Return whether both plans are the same in every seed."""
+        return all(seed.coincide for seed in self.seeds)
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,8 @@ ARM_OF = {EQUAL: "equal", JOINT: MAIN}
 STAGES = (PRETRAIN, EDGE, CLOUD)
 
 
-def budget_recipes(recipe: RunRecipe, seeds: Sequence[int]) -> dict[str, RunRecipe]:
-    """Return the recipe of each run, every factor of `BUDGETS` with every seed, by the name of its folder."""
+def budget_recipes(recipe: RunRecipe, seeds: Sequence[int], factors: Sequence[float] = BUDGETS) -> dict[str, RunRecipe]:
+    """Return the recipe of each run, every factor of the budgets with every seed, by the name of its folder."""
     return {
         _name_run(factor, seed): recipe.model_copy(
             update={
@@ -51,8 +51,16 @@ def budget_recipes(recipe: RunRecipe, seeds: Sequence[int]) -> dict[str, RunReci
                 ),
             }
         )
-        for factor, seed in product(BUDGETS, seeds)
+        for factor, seed in product(factors, seeds)
     }
+
+
+def plans_differ(run: Run) -> bool:
+    """Return whether the joint plan of a run has other samples or rounds than equal stages.
+
+    Where it has not, both arms are one training, and more seeds tell nothing about their difference.
+    """
+    return not one_seed(run).coincide
 
 
 def _name_run(factor: float, seed: int) -> str:
@@ -73,7 +81,10 @@ def compare_plans(recipe: RunRecipe, runs: Mapping[float, Sequence[Run]]) -> All
 
 
 def one_seed(run: Run) -> AllocationSeed:
-    """Return the numbers of one seed's run."""
+    """Return the numbers of one seed's run.
+
+    What is predicted is told by the plans before the run: those made anew by the joint plan's run rest on its scores.
+    """
     towns = run.recipe.with_role("federate")
     arms = {name: run.arms[arm] for name, arm in ARM_OF.items()}
     plan_of = {name: arm.plan.tasks[TASK] for name, arm in arms.items()}
@@ -82,7 +93,7 @@ def one_seed(run: Run) -> AllocationSeed:
         for each in run.differences
         if (each.arm, each.before_arm) == (MAIN, ARM_OF[EQUAL])
     }
-    predicted = {name: dict(plan.predicted or {}) for name, plan in plan_of.items()}
+    predicted = {name: dict(arm.plans[0].tasks[TASK].predicted or {}) for name, arm in arms.items()}
     return AllocationSeed(
         seed=run.recipe.seed,
         plans={

@@ -2,6 +2,7 @@
 
 Before each round every vehicle detects with the weights that the round begins with, sends boxes and its own pose up,
 and receives the road average of its spin; its samples are then labelled anew. All messages are entered in the ledger.
+After stage II they are labelled once, before the first round.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +25,7 @@ from flcav.fusion.pose_graph import Sighting
 from flcav.fusion.posts import find_posts, posts_of
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes, inverse, transform_points
-from flcav.network.ledger import Ledger
+from flcav.network.ledger import Direction, Ledger
 from flcav.network.messages import send
 from flcav.perception.metrics import match
 from flcav.perception.objects.config import SecondConfig
@@ -57,15 +58,18 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
         frames: Sequence[int],
         poles: Sequence[int],
         region: str,
-        folder: Path,
+        book: Ledger,
+        stage: str = EDGE,
+        folder: Path | None = None,
         report: Report = ignore_progress,
     ) -> None:
         """Hold the vehicles' `frames` of a split, to be labelled with the sensors on `poles`.
 
-        threshold: lowest score of a label that vehicles alone tell of. folder: of the stage.
+        threshold: lowest score of a label that vehicles alone tell of. book: ledger of the messages, under `stage`.
+        folder: where the quality of the labels is kept, `read_history`; None: nowhere.
         """
         self._how, self._config, self._threshold, self._split, self._region = how, config, threshold, split, region
-        self._frames, self._folder, self._report = frames, folder, report
+        self._frames, self._book, self._stage, self._folder, self._report = frames, book, stage, folder, report
         self._views = road_views(split, poles, trained=True)
         self._seen_by = {i: self._views.get(self._spin(i), []) for i in frames}  # as each frame's vehicle has them
         town = split.data.town() if how.pose_graph else None
@@ -94,25 +98,21 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
     def _spin(self, frame: int) -> tuple[str, int]:
         return self._split.data.keys[frame].scene, self._split.data.keys[frame].index
 
-    def send_views(self, book: Ledger) -> None:
+    def send_views(self) -> None:
         """Send what the road sensors see to the vehicles, for the free ground; before the first round."""
         for i in self._frames:
-            about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down"}
-            sent = [send(book, view.message(), **about, client=self._name(i)) for view in self._seen_by[i]]
+            sent = [self._send("down", i, 0, view.message()) for view in self._seen_by[i]]
             self._seen_by[i] = [RoadView.from_message(message) for message in sent]
 
-    def renew(self, round_: int, weights: Weights, book: Ledger | None = None) -> None:
-        """Label all samples by the road average of what `weights` detect.
-
-        Messages enter `book`, with which the quality of the labels is kept, too; without one nothing is.
-        """
+    def renew(self, round_: int, weights: Weights) -> None:
+        """Label all samples by the road average of what `weights` detect, before a round."""
         network = second(self._config)
         from_arrays(network, weights)
         told: dict[int, Sighting] = {}
         own: dict[int, Boxes] = {}
         for done, i in enumerate(self._frames, start=1):
             sighting, own[i] = self._see(network, i)
-            told[i] = unpack_sighting(sighting.agent, self._send(book, "up", i, round_, pack_sighting(sighting)))
+            told[i] = unpack_sighting(sighting.agent, self._send("up", i, round_, pack_sighting(sighting)))
             self._report(done, len(self._frames), "labels")
         spins: dict[tuple[str, int], list[int]] = {}
         for i in self._frames:
@@ -124,14 +124,14 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
             sightings = [*(told[i] for i in frames), *poles]
             found = average_spin(sightings, views, self._config, self._threshold, self._posts)
             for i, guidance in zip(frames, found, strict=True):
-                given[i] = Guidance.from_message(self._send(book, "down", i, round_, guidance.message()))
+                given[i] = Guidance.from_message(self._send("down", i, round_, guidance.message()))
         place = dict.fromkeys(self._samples, 0)
         for i in self._frames:
             name, frame = self._name(i), self._split.data.frame(i)
             views, lidar = self._seen_by[i], choose_lidar(frame)
             self._samples[name][place[name]] = distil_sample(frame, own[i], given[i], views, self._config, lidar)
             place[name] += 1
-        if book is not None:
+        if self._folder is not None:
             kept = tuple(each for each in read_history(self._folder).rounds if each.round < round_)
             quality = measure_labels(round_, self._split, self._frames, self._region, self, self._config)
             LabelHistory((*kept, quality)).save(self._folder, LABELS)
@@ -151,11 +151,9 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
         known = how.navigate(frame.world_from_agent, rng)
         return Sighting(key.agent, key.time_s, known, found.transform(mount), posts, how.navigation), found
 
-    def _send(self, book: Ledger | None, direction: Any, i: int, round_: int, message: bytes) -> bytes:
-        if book is None:
-            return message
-        about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": direction}
-        return send(book, message, **about, client=self._name(i), round_=round_)
+    def _send(self, direction: Direction, i: int, round_: int, message: bytes) -> bytes:
+        about: Any = {"stage": self._stage, "task": OBJECTS.name, "link": "wireless", "client": self._name(i)}
+        return send(self._book, message, **about, direction=direction, round_=round_)
 
 
 def read_history(folder: Path) -> LabelHistory:

@@ -7,7 +7,6 @@ from typing import Any
 from flcav.fusion.distillation import Distillation
 from flcav.network.ledger import Ledger
 from flcav.perception.objects.distillation.loss import DistillationTerms, DistilledObjects
-from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.distillation import RoadAverageLabels, measure_labels, read_history
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.results import LabelQuality, Pretrained
@@ -31,23 +30,22 @@ def label_by_average(
     frames: Sequence[int],
     poles: Sequence[int],
     distillation: Fields,
-    book: Ledger | None,
+    book: Ledger,
+    stage: str,
 ) -> RoadAverageLabels:
-    """Return the samples of a region's vehicles with the road average for labels.
+    """Return the samples of a region's vehicles with the road average for labels; messages enter `book`, under `stage`.
 
-    In stage II (without a step "edge") they are to be renewed before each round, and what road sensors see is sent by
-    `book`. Afterwards the network of stage II labels them, once.
+    They are to be renewed: in stage II (without a step "edge") before each round, and what road sensors see is sent;
+    afterwards once, and vehicles still have what road sensors saw.
     """
     pretrained = Pretrained.load(work.inputs[steps["pretrain"]])
     assert pretrained.threshold is not None  # fixed wherever labels come from detections
     config = load_stage_network(learning.task, work.inputs[steps["pretrain"]]).config
     how, split = Distillation.model_validate(distillation), Frames.open(work.inputs[steps["frames"]])
-    where: Any = (split, frames, poles, region, work.folder, work.report)
+    where: Any = (split, frames, poles, region, book, stage, None if "edge" in steps else work.folder, work.report)
     labels = RoadAverageLabels(how, config, pretrained.threshold, *where)
-    if "edge" in steps:
-        labels.renew(1, to_arrays(load_stage_network(learning.task, work.inputs[steps["edge"]])))
-    elif book is not None:
-        labels.send_views(book)
+    if "edge" not in steps:
+        labels.send_views()
     return labels
 
 

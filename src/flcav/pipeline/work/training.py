@@ -1,7 +1,6 @@
 """Steps of the three stages of training, and of centralised training in place of stage II."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -138,17 +137,19 @@ def edge_step(
     if "edge" in steps:
         stage, rounds = MORE_EDGE, own.cloud_rounds * k
         book = Ledger(book.budget, read_entries(work, steps["edge"]))
-        samples, poles = _label_samples(work, learning, region, labels, steps, None, distillation)
     else:
         stage, rounds = EDGE, own.edge_rounds
-        samples, poles = _label_samples(work, learning, region, labels, steps, book, distillation)
+    before = len(book.entries)
+    samples, poles = _label_samples(work, learning, region, labels, steps, book, EDGE, distillation)
+    start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
+    if stage == MORE_EDGE and rounds and isinstance(samples, RoadAverageLabels):
+        samples.renew(1, to_arrays(start))
     if distillation is not None:
         learning = learn_by_distillation(learning, distillation)
     rest = None if replan is None else Rest(work, plan, task, k, budget_mb, RoundPlans.model_validate(replan), book)
     course = rest.open_edge(region, steps["pretrain"]) if rest is not None and stage == EDGE else None
     if rest is not None and stage == MORE_EDGE:
         rounds = rest.count_further(region, steps["pretrain"])
-    start = load_stage_network(learning.task, work.inputs[steps.get("edge", steps["pretrain"])])
     clients = make_clients(learning, start.config, samples)
     earlier = StageResult.load(work.inputs[steps["edge"]]).rounds if "edge" in steps else 0
     schedule = learning.schedule(rounds, learning.training.local_steps, stage, region, earlier=earlier)
@@ -162,12 +163,12 @@ def edge_step(
         seeds = [schedule.work(number).seed for number in range(1, rounds + 1)]
         return simulate(follow_plan(how, by, earlier), seeds)
 
-    before, asked = len(book.entries), (learning, start, clients, schedule, strategy)
+    asked = (learning, start, clients, schedule, strategy)
     frames = validation if rest is None or course is None else {**rest.how.frames, **validation}
     watched = {name: Frames.open(work.inputs[step]) for name, step in frames.items()}
     about: Any = {"shared": shared}
     if isinstance(samples, RoadAverageLabels) and stage == EDGE:
-        about["before_round"] = partial(samples.renew, book=book)
+        about["before_round"] = samples.renew
     if course is None:
         driven = drive(own, rounds)
         where: Any = (book, work.folder, work.report, driven.outages, watched, processes, runtime)
@@ -217,15 +218,17 @@ def cloud_step(
     )
     if distillation is not None:
         learning = learn_by_distillation(learning, distillation)
-    servers, held, count, helped = {}, 0, 0, []
+    rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
+    servers, held, count, helped, before = {}, 0, 0, [], len(book.entries)
     for region, steps in regions.items():
-        samples, poles = _label_samples(work, learning, region, labels, steps, None, distillation)
+        samples, poles = _label_samples(work, learning, region, labels, steps, book, CLOUD, distillation)
         clients = make_clients(learning, start.config, samples)
         weights = to_arrays(load_stage_network(learning.task, work.inputs[steps["edge"]]))
+        if rounds and isinstance(samples, RoadAverageLabels):
+            samples.renew(1, weights)
         servers[region] = RegionStart(clients, weights, StageResult.load(work.inputs[steps["edge"]]).rounds)
         held += sum(len(client.samples) for client in clients.values())
         count, helped = count + len(clients), [*helped, *poles]
-    rounds, k = own.tasks[task].cloud_rounds, how.edge_rounds_per_cloud_round
     federating = Strategies(*find_strategies(how))
     shared = None
     if isinstance(federating.edge, FedMD):
@@ -233,7 +236,7 @@ def cloud_step(
         shared = shown.samples
         for at in servers.values():
             send_region_network(book, learning.task, at.weights, at.clients, CLOUD)
-    before, schedule = len(book.entries), learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
+    schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "")
     networks = {
         name: open_network(work, learning, how, name, [*at.clients], regions[name], at.earlier, train_s, speeds)
         for name, at in servers.items()
@@ -325,13 +328,14 @@ def _label_samples(
     region: str,
     labels: str,
     steps: Mapping[str, Any],
-    book: Ledger | None = None,
-    distillation: Fields | None = None,
+    book: Ledger,
+    stage: str,
+    distillation: Fields | None,
 ) -> tuple[Mapping[str, Sequence[Any]], tuple[int, ...]]:
     """Return each vehicle's labelled samples, and the poles that contributed labels.
 
-    `steps`: "pretrain", the recorded "frames", the arm's "place", and "sites", the placements of all arms.
-    `distillation`: settings of the labels "road-average", which are made before each round.
+    `steps`: "pretrain", the recorded "frames", the arm's "place", and "sites", the placements of all arms; after stage
+    II "edge". Messages enter `book`, under `stage`. `distillation`: settings of the labels "road-average".
     """
     split, kind = Frames.open(work.inputs[steps["frames"]]), LABEL_SOURCES[labels]
     frames = _select_group(work, split, steps)
@@ -340,11 +344,12 @@ def _label_samples(
         return annotated_samples(learning.task, config, split, frames, region), ()
     poles = Placed.load(work.inputs[steps["place"]]).chosen if kind.from_poles else ()
     if distillation is not None:
-        return label_by_average(work, learning, region, steps, frames, poles, distillation, book), poles
+        return label_by_average(work, learning, region, steps, frames, poles, distillation, book, stage), poles
     frozen = load_stage_network(learning.task, work.inputs[steps["pretrain"]])
     threshold = Pretrained.load(work.inputs[steps["pretrain"]]).threshold
     assert threshold is not None  # fixed wherever labels come from detections
-    samples = pseudo_label_samples(frozen, threshold, split, frames, poles, region, work.report, book, kind.trained)
+    first = None if "edge" in steps else book  # later labels are those of stage II
+    samples = pseudo_label_samples(frozen, threshold, split, frames, poles, region, work.report, first, kind.trained)
     return samples, poles
 
 
