@@ -109,7 +109,7 @@ def compare(name: str, work: Work, rounds: int) -> None:
         }
         for way in ways.values():
             way()  # starts processes
-        pids = [os.getpid(), *pool._processes, *(pid for each in several._all for pid in each._processes)]
+        pids = [os.getpid(), *pool._processes, *several.pids]
         cpu, wall = ({way: [] for way in ways} for _ in range(2))
         for _ in range(REPEATS):
             for way, do in ways.items():

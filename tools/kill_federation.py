@@ -18,10 +18,10 @@ from pathlib import Path
 
 from flcav.files import sha256
 from flcav.pipeline.federations.alone import WORK, federate_regions, list_federations
-from flcav.pipeline.graph import Graph
+from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import MAIN, load_run_recipe
-from flcav.pipeline.results import LEDGER, RESULT, WEIGHTS
+from flcav.pipeline.results.saved import LEDGER, RESULT, WEIGHTS
 from flcav.pipeline.steps import Step
 from flcav.pipeline.steps.engines import perform
 from flcav.pipeline.steps.step import Record, read_record

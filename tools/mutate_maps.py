@@ -15,7 +15,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "contract"))
-OWN = [ROOT / "tests" / "data" / "cross.xodr", ROOT / "recipes" / "maps" / "quarter.xodr"]
+OWN = [
+    ROOT / "tests" / "data" / "cross.xodr",
+    ROOT / "tests" / "data" / "cross_with_objects.xodr",
+    ROOT / "recipes" / "maps" / "quarter.xodr",
+]
 
 
 def main() -> None:

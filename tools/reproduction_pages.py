@@ -44,7 +44,7 @@ from flcav.experiments.studies import trajectory as trajectory_tables
 from flcav.experiments.studies import weather as weather_tables
 from flcav.experiments.studies.run import EvaluationT, Study, StudyResult, results_of_json
 from flcav.files import Json, write_bytes
-from flcav.pipeline.results import Run
+from flcav.pipeline.results.run import Run
 from flcav.pipeline.running import RESULTS
 from flcav.records import from_json
 

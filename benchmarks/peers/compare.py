@@ -92,10 +92,9 @@ def launch(name: str, python: Path, rounds: int, cores: list[int]) -> "subproces
 
 def compare(python: Path, cores: list[int], repeats: int) -> None:
     """Time the peers on these cores, and print medians and ratios."""
-    names = [name for name in NAMES if name != "bare" or len(cores) == 1]
     peers: dict[str, Peer] = {}
     try:
-        for name in names:
+        for name in NAMES:
             peers[name] = Peer(launch(name, python, repeats + 1, cores))
             peers[name].read()
         for _ in range(repeats + 1):

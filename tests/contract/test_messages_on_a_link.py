@@ -32,7 +32,7 @@ from flcav.perception.task import build_network, find_configuration
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.messages import release_network, report_errors
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.stages import upload_samples
+from flcav.pipeline.stages.uploads import upload_samples
 
 
 class Wire:

@@ -24,7 +24,7 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Stateful
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
-from flcav.pipeline.graph import Graph
+from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import Federation, load_run_recipe
 from flcav.pipeline.steps import Step
 from flcav.sources.recipe import recipe_path

@@ -12,10 +12,9 @@ from flcav.config import InputError
 from flcav.network.ledger import Ledger
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
-from flcav.pipeline import results
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.graph import Graph
-from flcav.pipeline.planning import parse_history
+from flcav.pipeline.graph.graph import Graph
+from flcav.pipeline.planning.histories import parse_history
 from flcav.pipeline.recipe import (
     CLOUD,
     EDGE,
@@ -30,7 +29,11 @@ from flcav.pipeline.recipe import (
     Training,
     load_run_recipe,
 )
-from flcav.pipeline.results import WEIGHTS, Difference, Pretrained, Run
+from flcav.pipeline.results import tests as results
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.saved import WEIGHTS
+from flcav.pipeline.results.tests import Difference
+from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.running import RESULTS, run, run_several
 from flcav.pipeline.seeds.learning_history import ORIGIN, HistoryOrigin
 from flcav.report.pages.run_page import page, write_report
@@ -211,7 +214,7 @@ def test_a_town_from_a_map_federates(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert shown is not None
     import_town(RECIPES.parent / shown[1], tmp_path / shown[2])
     steps = {step.name: step for step in Graph(recipe, path.parent).steps}  # `test_the_loop` runs such ones
-    assert set(steps["mine-edge-objects"].arguments["version"]) == {"town.net.xml", "town.yaml"}
+    assert set(steps["mine-edge-objects"].arguments["settings"].version) == {"town.net.xml", "town.yaml"}
     assert "test-cloud-fl-objects-ring" in steps
 
 

@@ -37,9 +37,11 @@ from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import find_configuration
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.graph import Graph
+from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, load_run_recipe
-from flcav.pipeline.results import ErrorRegistry, FederatedRound, Placed, Pretrained, Run, StageResult, Watched
+from flcav.pipeline.results.placement import ErrorRegistry, Placed
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.training import FederatedRound, Pretrained, StageResult, Watched
 from flcav.pipeline.running import RESULTS, SUMMARY, run, run_seeds
 from flcav.pipeline.seeds.comparing import compare
 from flcav.report.pages.run_page import write_report
@@ -315,7 +317,7 @@ def test_rounds_are_watched_on_validation_frames(finished: Path, result: Run) ->
     graph = Graph(RECIPE, TOY.parent)
     for step in graph.steps:
         if step.name.startswith("rounds-"):
-            assert "-validation-" in step.arguments["frames"]
+            assert "-validation-" in step.arguments["settings"].frames
     assert {(each.stage, each.region) for each in result.watched} == {
         (s, r) for s in (PRETRAIN, EDGE, CLOUD) for r in ("grid", "ring")
     }

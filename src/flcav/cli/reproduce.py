@@ -16,7 +16,7 @@ from flcav.threads import use_threads
 if TYPE_CHECKING:
     from flcav.files import Json
     from flcav.pipeline.recipe import RunRecipe
-    from flcav.pipeline.results import Run
+    from flcav.pipeline.results.run import Run
 
 RUN = ("jobs", "engine", "stale")  # options of targets that run as steps
 STUDY = ("seeds", "scale", *RUN)  # options of targets that run over seeds

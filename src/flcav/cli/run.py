@@ -11,7 +11,7 @@ from flcav.cli.terminal import print_json, when_interrupted
 from flcav.threads import use_threads
 
 if TYPE_CHECKING:
-    from flcav.pipeline.results import Run, Summary
+    from flcav.pipeline.results.run import Run, Summary
 
 
 SEEDS = typer.Option(1, "--seeds", min=1, help="Number of seeds, from the recipe's on; above 1, a folder each.")

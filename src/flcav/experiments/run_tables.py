@@ -4,9 +4,11 @@ import numpy as np
 
 from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
-from flcav.pipeline.findings import name_stage
+from flcav.pipeline.collecting.findings import name_stage
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results import RoundPlan, Run, StageResult
+from flcav.pipeline.results.plans import RoundPlan
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.training import StageResult
 
 
 def tables(run: Run) -> dict[str, str]:

@@ -6,15 +6,15 @@ from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
     from flcav.pipeline.recipe import RunRecipe, load_run_recipe
-    from flcav.pipeline.results import Run, Summary
+    from flcav.pipeline.results.run import Run, Summary
     from flcav.pipeline.running import run, run_seeds
     from flcav.pipeline.seeds.comparing import Compared, compare
 
 PLACES = {
     "Compared": "flcav.pipeline.seeds.comparing",
-    "Run": "flcav.pipeline.results",
+    "Run": "flcav.pipeline.results.run",
     "RunRecipe": "flcav.pipeline.recipe",
-    "Summary": "flcav.pipeline.results",
+    "Summary": "flcav.pipeline.results.run",
     "compare": "flcav.pipeline.seeds.comparing",
     "load_run_recipe": "flcav.pipeline.recipe",
     "run": "flcav.pipeline.running",

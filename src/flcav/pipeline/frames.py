@@ -1,7 +1,7 @@
 """Data splits of a run: recorded in a town, or divided by scenes out of a recorded dataset."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from flcav.perception.agents import POLE, kind_of
 from flcav.perception.client import as_shared
 from flcav.perception.tasks import task_named
 from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName, find_path
-from flcav.pipeline.results import Recorded
+from flcav.pipeline.results.saved import Saved
 from flcav.progress import Report
 from flcav.seeds import derive_seed, stream
 from flcav.sources.embedded import EmbeddedSource
@@ -26,12 +26,21 @@ from flcav.world.map.town import PACKAGED
 
 DATA = "data"
 SHORTEST_S = 10.0  # shortest scene for tracks: it takes a past, a future, and several presents
-Fields = Mapping[str, Any]  # fields of a `Recipe`, as YAML has them
 SHARES: Mapping[Role, Mapping[SplitName, float]] = {  # fractions of a dataset's scenes
     "pretrain": {"pool": 0.7, "validation": 0.15, "test": 0.15},
     "federate": {"validation": 0.15, "registry": 0.2, "edge": 0.4, "test": 0.25},
     "unseen": {"validation": 0.3, "test": 0.7},
 }
+
+
+@dataclass(frozen=True)
+class Recorded(Saved):
+    """A data split: the folder of its dataset, and its frames by who recorded them."""
+
+    folder: str  # relative to the step's own, or absolute
+    vehicles: tuple[int, ...]  # numbers of the vehicles' frames
+    poles: Mapping[int, tuple[int, ...]]  # numbers of each roadside sensor's frames, by pole
+    scenes: int
 
 
 @dataclass(frozen=True)
@@ -49,10 +58,11 @@ class Frames:
         return cls(Dataset.open(folder / recorded.folder), recorded.vehicles, recorded.poles)
 
 
-def recording_fields(recipe: RunRecipe, region: str, split: SplitName, task: str) -> Fields:
+def make_recording_recipe(recipe: RunRecipe, region: str, split: SplitName, task: str, name: str) -> Recipe:
     """Return the recording recipe of a split in a region's town, without poles.
 
-    Settings of the task, the run, the region, and the run's entry of the task override each other in this order.
+    Settings of the task, the run, the region, and the run's entry of the task override each other in this order. Raises
+    `InputError`, naming the recording by its `name`, where they do not go together.
     """
     place, frames = recipe.regions[region], getattr(recipe.sized_splits, split)
     changes = [as_shared(task_named(task)).recording, recipe.recording.fields(), place.recording.fields()]
@@ -63,7 +73,7 @@ def recording_fields(recipe: RunRecipe, region: str, split: SplitName, task: str
     if how["every_s"] < frames.every_s:  # the same duration, sampled more often
         spins = round(max(frames.spins * frames.every_s, SHORTEST_S) / how["every_s"]) + 1
     drawn = (recipe.test_draw,) if split == "test" and recipe.test_draw else ()
-    return {
+    fields = {
         **how,
         "town": place.town or region,
         "split": split,
@@ -72,13 +82,12 @@ def recording_fields(recipe: RunRecipe, region: str, split: SplitName, task: str
         "spins_per_scene": spins,
         "cavs": recipe.vehicles(region) if split == "edge" else frames.cavs,
     }
+    return parse_config(Recipe, fields, name)
 
 
-def record_frames(fields: Fields, poles: Sequence[int], beside: Path, folder: Path, report: Report) -> Recorded:
-    """Record a split below `folder` with the vehicles' and these poles' sensors; resumes an interrupted recording."""
-    asked = parse_config(Recipe, {**fields, "poles": sorted(set(poles))}, folder.name)
-    source = EmbeddedSource(asked, beside)
-    record(source, folder / DATA, progress=report)
+def record_frames(recipe: Recipe, beside: Path, folder: Path, report: Report) -> Recorded:
+    """Record a split below `folder`; resumes an interrupted recording."""
+    record(EmbeddedSource(recipe, beside), folder / DATA, progress=report)
     return group_frames(Dataset.open(folder / DATA), DATA)
 
 

@@ -19,9 +19,10 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, wrap_angle
 from flcav.network.ledger import Ledger
 from flcav.pipeline.frames import group_frames
-from flcav.pipeline.graph import Graph
+from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import EDGE, SPLITS_OF, RunRecipe
-from flcav.pipeline.results import LEDGER, Plan
+from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.steps import Step, Work
 from flcav.progress import ignore_progress
 from flcav.sensors.frame import Frame

@@ -10,7 +10,8 @@ from flcav.experiments.fig6a.run import BUDGETS, PLANS, STAGES, _collect, budget
 from flcav.experiments.fig6a.tables import tables
 from flcav.intervals import Estimate
 from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.results import LinkUse, Placed, Pole
+from flcav.pipeline.results.placement import Placed, Pole
+from flcav.pipeline.results.run import LinkUse
 from flcav.report.charts.plans import predicted_and_realised
 from flcav.sources.recipe import recipe_path
 

@@ -8,7 +8,8 @@ import pytest
 from flcav.experiments.distillation.run import ARMS, BOTH, IDEAL, NO_ROAD, PLAIN, PRETRAINED, compare_labels
 from flcav.experiments.distillation.tables import tables
 from flcav.pipeline.recipe import EDGE, MAIN, load_run_recipe
-from flcav.pipeline.results import LabelQuality, Spent
+from flcav.pipeline.results.run import Spent
+from flcav.pipeline.results.training import LabelQuality
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/distillation"))

@@ -27,10 +27,11 @@ from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.federations import distillation as rounds
-from flcav.pipeline.federations.distillation import RoadAverageLabels, measure_labels, read_history
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.work.training import edge_step
+from flcav.pipeline.labels import quality, road_average
+from flcav.pipeline.labels.quality import measure_labels, read_history
+from flcav.pipeline.labels.road_average import RoadAverageLabels
+from flcav.pipeline.work.edge import edge_step
 from flcav.sensors.frame import Annotations, Calibration, Frame
 
 CONFIG = second_tiny().config
@@ -203,7 +204,7 @@ def test_precision_and_recall_of_labels_count_targets_once_and_neutral_ones_not(
     truth = FrameTruth("s", boxes((10, 0), (20, 0), (30, 0), z=-1.0), boxes((40, 0), z=-1.0), Boxes.empty())
     keys = [SimpleNamespace(agent="cav1"), SimpleNamespace(agent="cav0")]
     data = SimpleNamespace(keys=keys, frame=lambda i: frame([BOTH]))
-    monkeypatch.setattr(rounds, "asked_of", lambda frame, config: truth)
+    monkeypatch.setattr(quality, "asked_of", lambda frame, config: truth)
     points = np.zeros((0, 4), np.float32)
     first = Sample(points, boxes((10, 0), (20.3, 0), (40, 0), z=-1.0))  # two right, one on a neutral object
     second = Sample(points, boxes((10, 0), (10.1, 0), (25, 9), z=-1.0))  # one right, one twice, one wrong
@@ -253,11 +254,15 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     manifest = SimpleNamespace(recipe={"seed": 1})
     data = SimpleNamespace(keys=keys, frame=lambda i: spins[i], manifest=manifest)
     found = [boxes(BOTH, z=-1.0), boxes(BOTH, OUT_OF_SIGHT, z=-1.0)]
-    monkeypatch.setattr(rounds, "road_views", lambda *about, trained: {("s", 0): [seen]})
+    monkeypatch.setattr(road_average, "road_views", lambda *about, trained: {("s", 0): [seen]})
     seen_cars = {len(each.lidar["lidar"]): told for each, told in zip(spins, found, strict=True)}
-    monkeypatch.setattr(rounds, "detect_in", lambda network, frames, **how: [seen_cars[len(frames[0].lidar["lidar"])]])
+
+    def detections(network, frames, **how):
+        return [seen_cars[len(frames[0].lidar["lidar"])]]
+
+    monkeypatch.setattr(road_average, "detect_in", detections)
     truth = FrameTruth("s", boxes(BOTH, z=-1.0), Boxes.empty(), Boxes.empty())
-    monkeypatch.setattr(rounds, "asked_of", lambda frame, config: truth)
+    monkeypatch.setattr(quality, "asked_of", lambda frame, config: truth)
     how = Distillation(position_m=0.05, heading_deg=0.1)
     split = Frames(cast(Any, data), (0, 1), {})
     book, weights, about = Ledger(Budget(1.0, 0.0)), to_arrays(second_tiny()), (how, CONFIG, 0.6, split, (0, 1), (3,))
@@ -291,7 +296,7 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
 
 def test_labels_that_are_renewed_need_one_process() -> None:
     nothing: Any = None
-    about = (nothing, "objects", None, {}, 1, (1.0, 1.0), "grid", {}, "road-average", {}, {})
+    settings = cast(Any, SimpleNamespace(distillation=Distillation()))
     for where in ({"processes": 2}, {"runtime": "ray"}):
         with pytest.raises(InputError, match="renewed between rounds"):
-            edge_step(*about, distillation={}, **where)  # pyright: ignore[reportArgumentType]
+            edge_step(nothing, settings, **where)  # pyright: ignore[reportArgumentType]

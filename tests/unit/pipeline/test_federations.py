@@ -20,17 +20,12 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Practice, Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies, resolve_settings
-from flcav.pipeline.planning import UpdateForm, model_mb, update_forms
+from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
 from flcav.pipeline.recipe import Federation, RunRecipe, Training
-from flcav.pipeline.stages import (
-    Learning,
-    RegionStart,
-    Strategies,
-    federate_cloud,
-    federate_edge,
-    load_stage_network,
-    make_clients,
-)
+from flcav.pipeline.stages.clients import Strategies, make_clients
+from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
+from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
+from flcav.pipeline.stages.learning import Learning, load_stage_network
 from flcav.progress import ignore_progress
 
 PRIVACY = {"clip": 1.0, "noise": 4.0}
@@ -145,15 +140,16 @@ def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:
     for region, x in (("a", 1.0), ("b", 4.0)):
         clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
         starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
-    strategies, where = Strategies(FEDAVG, FEDAVG), (Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
-    federate_cloud(learning, network, starts, 2, 1, strategies, Rules(personal=("bias",)), *where)
+    where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
+    federation = CloudFederation(learning, network, starts, 1, *where)
+    federate_cloud(federation, 2, Rules(personal=("bias",)))
     found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
     assert np.array_equal(found["a"]["weight"], found["b"]["weight"])
     assert np.array_equal(found["a"]["weight"], found[None]["weight"])
     assert found["a"]["bias"] != found["b"]["bias"]
     assert found[None]["bias"] == pytest.approx((found["a"]["bias"] + found["b"]["bias"]) / 2)
     with pytest.raises(InputError, match="personal: 'head' matches none of 2 arrays"):
-        federate_cloud(learning, network, starts, 2, 1, strategies, Rules(personal=("head",)), *where)
+        federate_cloud(federation, 2, Rules(personal=("head",)))
 
 
 def test_regional_models_are_beside_that_of_all(tmp_path: Path) -> None:
@@ -163,9 +159,9 @@ def test_regional_models_are_beside_that_of_all(tmp_path: Path) -> None:
     for region, x in (("a", 1.0), ("b", 4.0)):
         clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
         starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
-    strategies, where = Strategies(FEDAVG, FEDAVG), (Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
+    where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
     rules = Rules.model_validate({"personal": {"pull": 0.5}})
-    federate_cloud(learning, network, starts, 2, 1, strategies, rules, *where)
+    federate_cloud(CloudFederation(learning, network, starts, 1, *where), 2, rules)
     found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
     for name in ("weight", "bias"):
         assert found["a"][name] != found["b"][name]
@@ -191,12 +187,15 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
         folder = tmp_path / f"{rounds}-{earlier}"
         schedule = learning.schedule(rounds, 2, "edge", "a")
         book = Ledger(Budget(1.0, 1.0))
-        how, begun = (FEDAVG, rules, earlier, book, folder, report), []
-        about: Any = {"before_round": lambda round_, weights: begun.append(round_)}
-        losses = federate_edge(learning, network, clients["a"], schedule, *how, **about)
+        how, begun = (FEDAVG, earlier, book, folder, report), []
+        federation = EdgeFederation(
+            *(learning, network, clients["a"], schedule, *how),
+            before_round=lambda round_, weights: begun.append(round_),
+        )
+        losses = federate_edge(federation, rules)
         assert (folder / "weights.safetensors").exists()
         assert begun == list(range(1, len(losses) + 1))
-        assert federate_edge(learning, network, clients["a"], schedule, *how, **about) == losses  # from its checkpoint
+        assert federate_edge(federation, rules) == losses  # from its checkpoint
         assert len(begun) == len(losses)
         return len(losses)
 
@@ -206,8 +205,8 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
 
     def cloud(edge_rounds: int) -> int:
         book, folder = Ledger(Budget(1.0, 1.0)), tmp_path / f"cloud{edge_rounds}"
-        how = (Strategies(FEDAVG, FEDAVG), rules, book, folder, report)
-        return len(federate_cloud(learning, network, starts, 9, edge_rounds, *how))
+        how = (Strategies(FEDAVG, FEDAVG), book, folder, report)
+        return len(federate_cloud(CloudFederation(learning, network, starts, edge_rounds, *how), 9, rules))
 
     assert (cloud(1), cloud(2), cloud(3)) == (4, 2, 1)
     fifth = account_epsilon(rules.privacy, rules.selection, [*clients["a"]], 5)

@@ -5,11 +5,15 @@ from dataclasses import replace
 import pytest
 
 from flcav.intervals import Estimate, Spread
-from flcav.pipeline import results
-from flcav.pipeline.findings import findings
+from flcav.pipeline.arms import resolve_settings
+from flcav.pipeline.collecting.findings import findings
+from flcav.pipeline.collecting.history import gap_closed, gaps_closed
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results import ArmResult, Difference, Placed, Plan
-from flcav.pipeline.running import gap_closed, gaps_closed
+from flcav.pipeline.results import tests as results
+from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.run import ArmResult
+from flcav.pipeline.results.tests import Difference
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
 
 CAVEAT = "ideal road detector, upper bound"
@@ -28,6 +32,7 @@ def result_of(arm: str, stage: str, mean: float) -> results.Test:
 
 
 TESTS = [result_of(*key, mean) for key, mean in MEANS.items()]
+TIED = [result_of(name, EDGE, 0.503) for name in ("random", "slow")]
 
 
 def arm(*poles: int) -> ArmResult:
@@ -40,8 +45,16 @@ def difference(stage: str, before: tuple[str, str], mean: float, low: float, hig
 
 
 def told(*differences: Difference, densest: int = 8):
-    arms, rules = {MAIN: arm(2), "densest": arm(densest)}, {MAIN: "vrcsp", "densest": "densest"}
-    return findings(differences, TESTS, arms, rules, {"grid": "federate"}, {"objects": CAVEAT})
+    from test_run_recipe import parsed
+
+    own = {
+        "densest": {"placement": {"rule": "densest"}},
+        "random": {"placement": {"rule": "random"}},
+        "slow": {"training": {"steps": 9}},
+    }
+    settings = resolve_settings(parsed(arms=own), {"objects": "ideal-road"})
+    arms = {MAIN: arm(2), "densest": arm(densest), "random": arm(2), "slow": arm(2)}
+    return findings(differences, TESTS + TIED, arms, settings, {"grid": "federate"}, {"objects": CAVEAT})
 
 
 def test_each_finding_tells_its_own_numbers_frames_and_verdict() -> None:
@@ -72,7 +85,17 @@ def test_without_a_spread_of_retraining_no_claim_has_held() -> None:
 def test_a_densest_pole_that_was_chosen_leaves_nothing_to_compare() -> None:
     (pole,) = told(difference(EDGE, ("densest", EDGE), 0.0, 0.0, 0.0), densest=2)
     assert pole.verdict == UNDECIDED
-    assert "nothing to compare" in pole.sentence
+    assert pole.sentence.startswith(
+        "Pole 2, placed by VRCSP, is also where traffic is densest: there is nothing to comp"
+    )
+
+
+def test_other_rules_that_choose_the_same_pole_leave_nothing_to_compare_and_another_training_a_tie() -> None:
+    random, slow = told(*(difference(EDGE, (name, EDGE), 0.0, 0.0, 0.0) for name in ("random", "slow")))
+    assert random.verdict == slow.verdict == UNDECIDED
+    assert random.sentence.startswith("Pole 2 has a sensor in both arms: there is nothing to compare")
+    assert "0.503 (edge FL (slow)) and 0.503 (edge FL): +0.000, 95 % interval +0.000 to +0.000" in slow.sentence
+    assert "pole" not in slow.sentence
 
 
 def test_one_scene_decides_nothing() -> None:

@@ -5,8 +5,8 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.perception.errors import PerceptionError
-from flcav.pipeline.placing import Sites, place_sensors
 from flcav.pipeline.recipe import Placement
+from flcav.pipeline.stages.placement import Sites, place_sensors
 
 SITES = Sites(np.array([2, 5, 7, 9]), np.array([[0, 0, 6], [100, 0, 6], [200, 0, 6], [300, 0, 6]], dtype=np.float64))
 

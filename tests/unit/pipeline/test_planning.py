@@ -24,18 +24,11 @@ from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import to_arrays
-from flcav.pipeline import planning
-from flcav.pipeline.planning import (
-    HistoryPoint,
-    PlanRequest,
-    PlanSettings,
-    fit_curve,
-    load_history,
-    make_plan,
-    model_mb,
-    parse_history,
-    remake_plan,
-)
+from flcav.pipeline.planning import allocation
+from flcav.pipeline.planning.allocation import PlanRequest, PlanSettings, fit_curve, make_plan
+from flcav.pipeline.planning.histories import HistoryPoint, load_history, parse_history
+from flcav.pipeline.planning.stages import remake_plan
+from flcav.pipeline.planning.updates import model_mb
 from flcav.pipeline.recipe import FixedPlan, Limits
 from flcav.pipeline.seeds.spread import read_spreads
 from flcav.pipeline.tables import append_records
@@ -54,7 +47,7 @@ def _equal_histories_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
             FITTED[key] = fit_curve(history, group_samples, k)
         return FITTED[key]
 
-    monkeypatch.setattr(planning, "fit_curve", fit_once)
+    monkeypatch.setattr(allocation, "fit_curve", fit_once)
 
 
 SIZES = MessageSizes(sample_mb=0.4, model_mb=1.4)

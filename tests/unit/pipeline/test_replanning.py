@@ -21,13 +21,18 @@ from flcav.network.plan import Price
 from flcav.optimization.problem import Problem
 from flcav.perception.task import Practice, Task
 from flcav.perception.weights import to_arrays
-from flcav.pipeline import stages
 from flcav.pipeline.federations.network import DrivenRounds
-from flcav.pipeline.federations.replanning import Course, Follower, Planner, Replanning, Terms, restrict_problem
-from flcav.pipeline.planning import count_carried_out
+from flcav.pipeline.planning.course import Course, Replanning
+from flcav.pipeline.planning.rounds import Follower, Planner, restrict_problem
+from flcav.pipeline.planning.stages import count_carried_out
+from flcav.pipeline.planning.terms import Terms
 from flcav.pipeline.recipe import Training
-from flcav.pipeline.results import WEIGHTS, Plan, RoundPlan, StageResult, TaskPlan
-from flcav.pipeline.stages import Learning, federate_edge
+from flcav.pipeline.results.plans import Plan, RoundPlan, TaskPlan
+from flcav.pipeline.results.saved import WEIGHTS
+from flcav.pipeline.results.training import StageResult
+from flcav.pipeline.stages import edge as stage_two
+from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
+from flcav.pipeline.stages.learning import Learning
 from flcav.progress import Report, ignore_progress
 
 PREDICTED = {"pretrain": 0.4, "edge": 0.6, "cloud": 0.7}
@@ -182,8 +187,8 @@ def stage(folder: Path, lost: dict[tuple[int, str], Outage], report: Report = ig
     schedule = learning.schedule(4, 2, "edge", "a")
     watched: Any = {"a": cast(Any, Empty())}
     losses = federate_edge(
-        *(learning, network, cast(Any, clients), schedule, FEDAVG, rules, 0, book, folder, report),
-        validation=watched,
+        EdgeFederation(learning, network, cast(Any, clients), schedule, FEDAVG, 0, book, folder, report, watched),
+        rules,
         replanning=replanning,
     )
     assert len(losses) == course.rounds
@@ -198,7 +203,7 @@ class Empty:
 def test_a_lost_vehicle_s_megabytes_are_a_further_round_and_a_kill_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stages, "score_network", lambda task, network, *frames: float(network.bias.detach()) % 1)
+    monkeypatch.setattr(stage_two, "score_network", lambda task, network, *frames: float(network.bias.detach()) % 1)
     (tmp_path / "plain").mkdir()
     assert [made.plan.edge_rounds for made in stage(tmp_path / "plain", {}).made] == [4] * 4
     lost = {(number, "a/cav1"): Outage("away") for number in (1, 3)}  # half of a round's megabytes each

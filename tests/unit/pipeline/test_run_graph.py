@@ -6,8 +6,10 @@ from typing import Any
 import pytest
 
 from flcav.config import InputError
-from flcav.pipeline.graph import Graph
+from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import MAIN, RunRecipe, load_run_recipe
+from flcav.pipeline.steps import Step
+from flcav.pipeline.work.uploads import UploadSettings
 from flcav.sources.recipe import recipe_path
 
 OBJECTS = {"objects": {"history": "objects"}}
@@ -35,6 +37,11 @@ def steps_of(recipe: RunRecipe, beside: Path = Path()) -> dict[str, str]:
         assert step.name not in found
         found[step.name] = step.fingerprint(found)
     return found
+
+
+def settings_of(step: Step) -> Any:
+    """Return the settings of a step."""
+    return step.arguments["settings"]
 
 
 @pytest.mark.parametrize("name", ["demo", "arms", "allocation", "distillation"])
@@ -73,11 +80,11 @@ def test_a_plan_within_a_horizon_reckons_with_the_network() -> None:
         return next(step for step in Graph(recipe_of(**changes), Path()).steps if step.name == "plan")
 
     on_air = plan(horizon_s=60.0, federation={"network": {"radio": {"bandwidth_mhz": 20}}})
-    assert on_air.arguments["air"]["drives"] == {"grid": "grid-registry-objects"}
-    assert on_air.arguments["air"]["network"]["radio"]["bandwidth_mhz"] == 20
+    assert settings_of(on_air).air.drives == {"grid": "grid-registry-objects"}
+    assert settings_of(on_air).air.network.radio.bandwidth_mhz == 20
     assert "grid-registry-objects" in on_air.needs
     for without in (plan(), plan(horizon_s=60.0), plan(federation={"network": {}})):
-        assert "air" not in without.arguments
+        assert settings_of(without).air is None
         assert "grid-registry-objects" not in without.needs
 
 
@@ -87,10 +94,10 @@ def test_further_edge_rounds_go_on_from_the_runs_own_edge_rounds() -> None:
     added = {step.name: step for step in armed.steps if step.name not in plain}
     more = "grid-more-edge-fl-objects"
     assert set(added) == {more, f"test-{more}-grid"}
-    assert added[more].arguments["steps"]["edge"] == "grid-edge-fl-objects"
+    assert settings_of(added[more]).inputs.edge == "grid-edge-fl-objects"
     assert "grid-edge-fl-objects" in added[more].needs
     (edge,) = (step for step in armed.steps if step.name == "grid-edge-fl-objects")
-    assert "edge" not in edge.arguments["steps"]
+    assert settings_of(edge).inputs.edge is None
     with pytest.raises(ValueError, match=r"must be \[edge\], \[edge, cloud\] or \[edge, more_edge\]"):
         recipe_of(arms={"further": {"stages": ["more_edge"]}})
 
@@ -100,10 +107,10 @@ def test_plans_are_made_anew_between_stages_from_what_the_run_itself_reached() -
     recipe = recipe_of(arms=arms, retrainings=1)
     steps = {step.name: step for step in Graph(recipe, Path()).steps}
     followed = {
-        name: step.arguments.get("plan") or step.arguments["steps"]["plan"]
+        name: settings_of(step).plan if name.startswith("pretrain-") else settings_of(step).inputs.plan
         for name, step in steps.items()
         if name.startswith(("pretrain-", "grid-edge-fl"))
-    } | {name: step.arguments["regions"]["grid"]["plan"] for name, step in steps.items() if name.startswith("cloud-")}
+    } | {name: settings_of(step).first.plan for name, step in steps.items() if name.startswith("cloud-")}
     for name, plan in followed.items():
         after = "" if "pretrain" in name else "-after-edge" if "cloud" in name else "-after-pretrain"
         assert plan == ("plan-equal" if "equal" in name else f"plan{after}"), name
@@ -112,7 +119,7 @@ def test_plans_are_made_anew_between_stages_from_what_the_run_itself_reached() -
     assert set(first.needs) == {"plan", "pretrain-objects", "rounds-pretrain-objects-grid"}
     ledgers = {"pretrain-objects", "grid-edge-fl-objects"}
     assert set(second.needs) == {"plan", "plan-after-pretrain", *ledgers, "rounds-grid-edge-fl-objects-grid"}
-    assert all("-validation-" in steps[f"rounds-{name}-grid"].arguments["frames"] for name in ledgers)
+    assert all("-validation-" in settings_of(steps[f"rounds-{name}-grid"]).frames for name in ledgers)
     for fixed in (
         recipe_of(replan=False),
         recipe_of(tasks={"objects": {"plan": {"samples": 9, "edge_rounds": 1, "cloud_rounds": 1}}}),
@@ -132,19 +139,19 @@ def test_rounds_are_planned_anew_by_the_run_itself_and_followed_by_its_arms() ->
     assert recipe_of().replan == "stages"
     plain, steps = ({step.name: step for step in Graph(each, Path()).steps} for each in (between, within))
     assert list(plain) == list(steps)
-    changed = {name for name in steps if dict(plain[name].arguments) != dict(steps[name].arguments)}
+    changed = {name for name in steps if settings_of(plain[name]) != settings_of(steps[name])}
     grid, cloud, more = "grid-edge-fl-objects", "cloud-fl-objects", "grid-more-edge-fl-objects"
     followed = {f"{grid}-densest": grid, f"{cloud}-densest": cloud, more: cloud}
     assert changed == {grid, cloud, *followed, "grid-central-objects-oracle", "plan-after-edge"}
     for name, own in ((grid, steps[grid]), (cloud, steps[cloud])):
-        assert own.arguments["replan"]["frames"] == {"grid": "grid-validation-objects"}, name
+        assert settings_of(own).replan.frames == {"grid": "grid-validation-objects"}, name
         assert {"plan", "grid-validation-objects"} <= set(own.needs)
     for name, other in followed.items():
-        assert steps[name].arguments["replan"]["follows"] == other
+        assert settings_of(steps[name]).replan.follows == other
         assert other in steps[name].needs
-    assert steps["grid-central-objects-oracle"].arguments["follows"] == grid
+    assert settings_of(steps["grid-central-objects-oracle"]).follows == grid
     assert grid in steps["grid-central-objects-oracle"].needs
-    assert steps["plan-after-edge"].arguments["edges"] == {"objects": [grid]}
+    assert settings_of(steps["plan-after-edge"]).edges == {"objects": (grid,)}
     before: set[str] = set()
     for step in steps.values():
         assert set(step.needs) <= before, step.name
@@ -156,7 +163,7 @@ def test_uploads_are_planned_where_the_recipe_asks_for_it_and_drawn_as_ever_othe
     assert drawn == steps_of(recipe_of())
     assert drawn["plan"] != planned["plan"]
     (plan,) = (step for step in Graph(recipe_of(uploads="planned"), Path()).steps if step.name == "plan")
-    assert plan.arguments["uploads"] == {"regions": ("suburb",), "network": None, "range_m": 40.0}
+    assert settings_of(plan).uploads == UploadSettings(regions=("suburb",), network=None, range_m=40.0)
 
 
 def test_a_retraining_repeats_what_learns_and_nothing_else() -> None:
@@ -171,9 +178,10 @@ def test_a_retraining_repeats_what_learns_and_nothing_else() -> None:
         for n in (1, 2)
         for arm in ("densest" if "densest" in name else "main",)
     }
-    seeds = {step.name: step.arguments["seed"] for step in again.steps if step.run.__name__ == "pretrain_step"}
+    pretrained = {step.name: settings_of(step) for step in again.steps if step.run.__name__ == "pretrain_step"}
+    seeds = {name: own.learning.seed for name, own in pretrained.items()}
     assert len(set(seeds.values())) == len(seeds) == 3
-    uploads = {step.arguments["upload_seed"] for step in again.steps if "upload_seed" in step.arguments}
+    uploads = {own.upload_seed for own in pretrained.values()}
     assert uploads == {1}
     ours = {step.name: step.arguments for step in plain.steps}
     assert all(step.arguments == ours[step.name] for step in again.steps if step.name in ours)
@@ -182,9 +190,9 @@ def test_a_retraining_repeats_what_learns_and_nothing_else() -> None:
 def test_an_arm_may_train_otherwise_on_the_same_frames() -> None:
     armed = Graph(recipe_of(arms={"slow": {"training": {"steps": 77}}}), Path())
     steps = {step.name: step for step in armed.steps}
-    assert steps["pretrain-objects-slow"].arguments["training"]["steps"] == 77
+    assert settings_of(steps["pretrain-objects-slow"]).learning.training.steps == 77
     assert "grid-place-slow" not in steps
-    assert steps["grid-edge-fl-objects-slow"].arguments["steps"]["place"] == "grid-place"
+    assert settings_of(steps["grid-edge-fl-objects-slow"]).inputs.place == "grid-place"
     with pytest.raises(ValueError, match=r"arms\.slow\.training: unknown field 'cooldowns'"):
         recipe_of(arms={"slow": {"training": {"cooldowns": [0.1]}}})
 
@@ -231,16 +239,16 @@ def test_no_task_trains_on_what_it_is_tested_on() -> None:
 
 def test_each_task_is_recorded_as_it_needs() -> None:
     fields = {
-        step.name: step.arguments["fields"]
+        step.name: settings_of(step).recipe
         for step in Graph(recipe_of(tasks=SEVERAL), Path()).steps
         if step.name.endswith(("-pool-objects", "-pool-signs", "-pool-trajectory"))
     }
     objects, signs, trajectory = (fields[f"suburb-pool-{task}"] for task in SEVERAL)
-    assert "vehicle_rig" not in objects
-    assert "cameras" in signs["vehicle_rig"]
-    assert trajectory["every_s"] == 0.5
-    assert trajectory["spins_per_scene"] * 0.5 > objects["spins_per_scene"] * 4.0 - 4.0
-    assert objects["seed"] == signs["seed"]  # the same traffic
+    assert not objects.vehicle_rig.cameras
+    assert signs.vehicle_rig.cameras
+    assert trajectory.every_s == 0.5
+    assert trajectory.spins_per_scene * 0.5 > objects.spins_per_scene * 4.0 - 4.0
+    assert objects.seed == signs.seed  # the same traffic
 
 
 def test_recordings_of_an_own_town_name_its_files(tmp_path: Path) -> None:
@@ -284,20 +292,22 @@ def test_arms_of_distillation_share_all_but_stage_two_and_have_their_labels_meas
         "average": {"labels": {"objects": "road-average"}, "stages": ["edge"]},
     }
     plain, armed = steps_of(recipe_of()), Graph(recipe_of(arms=arms), Path()).steps
-    added = {step.name: step.arguments for step in armed if step.name not in plain}
+    added = {step.name: settings_of(step) for step in armed if step.name not in plain}
     edges = {name: added[name] for name in added if name.startswith("grid-edge-fl")}
     assert list(edges) == ["grid-edge-fl-objects-contrastive", "grid-edge-fl-objects-average"]
-    terms = [each["distillation"]["terms"] for each in edges.values()]
-    assert terms == [["contrastive"], ["regression", "contrastive"]]
-    assert added["cloud-fl-objects-contrastive"]["distillation"]["terms"] == ["contrastive"]
+    terms = [each.distillation.terms for each in edges.values()]
+    assert terms == [("contrastive",), ("regression", "contrastive")]
+    assert added["cloud-fl-objects-contrastive"].distillation.terms == ("contrastive",)
     assert {name.split("-")[0] for name in added} <= {"grid", "cloud", "test"}
-    arguments = {step.name: step.arguments for step in armed}
-    scored = [name for name, own in arguments.items() if own.get("scored")]
+    settings = {step.name: settings_of(step) for step in armed}
+    scored = [name for name, own in settings.items() if getattr(own, "scored", False)]
     assert scored == ["grid-edge-fl-objects", *edges]
-    assert "distillation" not in arguments["grid-edge-fl-objects"]
-    before = {step.name: step.arguments for step in Graph(recipe_of(), Path()).steps}
-    assert all("scored" not in own and "distillation" not in own for own in before.values())
+    assert settings["grid-edge-fl-objects"].distillation is None
+    several = {step.name: settings_of(step) for step in Graph(recipe_of(tasks=SEVERAL, arms=arms), Path()).steps}
+    assert [several[f"grid-edge-fl-{task}"].scored for task in SEVERAL] == [True, False, False]
+    before = {step.name: settings_of(step) for step in Graph(recipe_of(), Path()).steps}
+    assert not any(getattr(own, name, False) for own in before.values() for name in ("scored", "distillation"))
     same = {"grid-edge-fl-objects"}  # whose labels are measured now
-    assert all(arguments[name] == own for name, own in before.items() if name not in same)
+    assert all(settings[name] == own for name, own in before.items() if name not in same)
     with pytest.raises(ValueError, match=r"arms\.odd\.distillation: .*terms"):
         recipe_of(arms={"odd": {"distillation": {"terms": ["outputs"]}}})

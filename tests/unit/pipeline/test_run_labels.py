@@ -9,9 +9,10 @@ import pytest
 from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
-from flcav.pipeline import labels
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels import LABEL_SOURCES, choose_labels, fit_label_threshold, select_frames_near
+from flcav.pipeline.labels import pseudo_labels
+from flcav.pipeline.labels.pseudo_labels import fit_label_threshold, select_frames_near
+from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
 
 
 def cars(*places: tuple[float, float]) -> Boxes:
@@ -37,8 +38,8 @@ def test_own_labels_start_where_nine_of_ten_are_right(
     hits = [(10.0 * i, score) for i, score in enumerate(scores_of_hits, start=1)]
     misses = [(-10.0 * i, score) for i, score in enumerate(scores_of_misses, start=1)]
     truth = FrameTruth("s", cars(*hits), Boxes.empty(), Boxes.empty())
-    monkeypatch.setattr(labels, "asked_of", lambda frame, config: truth)
-    monkeypatch.setattr(labels, "detect_in", lambda network, frames: [cars(*hits, *misses)])
+    monkeypatch.setattr(pseudo_labels, "asked_of", lambda frame, config: truth)
+    monkeypatch.setattr(pseudo_labels, "detect_in", lambda network, frames: [cars(*hits, *misses)])
     data = SimpleNamespace(frame=lambda i: SimpleNamespace(lidar={"lidar": None}, key="k"))
     split = Frames(cast(Any, data), (0,), {})
     assert fit_label_threshold(cast(Any, SimpleNamespace(config=None)), [split]) == threshold

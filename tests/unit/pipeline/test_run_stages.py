@@ -27,19 +27,15 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Practice, Task
 from flcav.perception.training import train
 from flcav.perception.weights import to_arrays
-from flcav.pipeline import stages
+from flcav.pipeline.federations.checkpoint import find_checkpoint
 from flcav.pipeline.federations.rounds import FederationCheckpoints, round_path
 from flcav.pipeline.recipe import Training
-from flcav.pipeline.results import WEIGHTS
-from flcav.pipeline.stages import (
-    Learning,
-    choose_planned_uploads,
-    choose_uploads,
-    pretrain,
-    region_budget,
-    share_budget,
-    train_centrally,
-)
+from flcav.pipeline.results.saved import WEIGHTS
+from flcav.pipeline.stages import centralised
+from flcav.pipeline.stages.centralised import pretrain, train_centrally
+from flcav.pipeline.stages.learning import Learning
+from flcav.pipeline.stages.uploads import choose_planned_uploads, choose_uploads
+from flcav.pipeline.work.budgets import region_budget, share_budget
 from flcav.progress import Report, ignore_progress
 from flcav.seeds import derive_seed
 
@@ -156,26 +152,38 @@ def test_a_damaged_checkpoint_is_found_and_the_one_before_it_is_used(tmp_path: P
         assert resumed.entries == book.entries
 
 
-def test_a_full_disk_leaves_nothing_half_written_and_the_federation_goes_on(
+def test_a_full_disk_at_any_write_is_named_keeps_the_checkpoint_before_and_the_federation_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    weights, _ = edge(tmp_path / "whole")
-    whole, written = files.write_in_pieces, 0
+    whole, names = files.write_in_pieces, []
 
     def full(path: Path, data: bytes) -> None:
-        nonlocal written
-        written += 1
-        whole(path, data[: len(data) // 2] if written == 5 else data)
-        if written == 5:
+        names.append(path.name)
+        last = len(names) == fails
+        whole(path, data[: len(data) // 2] if last else data)
+        if last:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    with monkeypatch.context() as patched:
-        patched.setattr(files, "write_in_pieces", full)
-        with pytest.raises(OSError, match=r"No space left on device: '.*round.json'"):
-            edge(tmp_path / "full")
-    assert not [path for path in (tmp_path / "full").iterdir() if path.name.endswith(".part")]
-    found, _ = edge(tmp_path / "full")
-    assert all(np.array_equal(found[name], weights[name]) for name in weights)
+    fails = 0  # counted from 1: the write for which there is no space
+    monkeypatch.setattr(files, "write_in_pieces", full)
+    weights, book = edge(tmp_path / "whole", Scaffold())
+    writes = len(names)
+    assert writes == 3 * 3 + 2, "of each round weights, state and record; from the second on the record before"
+    for fails in range(1, writes + 1):
+        folder = tmp_path / str(fails)
+        names.clear()
+        with pytest.raises(OSError, match=rf"No space left on device: '{folder}/") as told:
+            edge(folder, Scaffold())
+        assert told.value.errno == errno.ENOSPC
+        assert not [path for path in folder.iterdir() if path.name.endswith(".part")]
+        done = sum(name.startswith(".round.json.") for name in names[:-1])
+        found, damage = find_checkpoint(folder)
+        assert (0 if found is None else found.round, damage) == (done, "")
+        names.clear()
+        fails = 0
+        resumed, own = edge(folder, Scaffold())
+        assert all(np.array_equal(resumed[name], weights[name]) for name in weights)
+        assert own.entries == book.entries
 
 
 def test_a_checkpoint_of_another_strategy_is_refused(tmp_path: Path) -> None:
@@ -237,7 +245,7 @@ def test_pretraining_takes_the_tasks_schedule_and_ends_with_its_last_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learning = Learning(LINEAR, None, Training(steps=25), 3)
-    monkeypatch.setattr(stages, "mean_score", lambda task, network, splits: -float(network.weight.detach()))
+    monkeypatch.setattr(centralised, "mean_score", lambda task, network, splits: -float(network.weight.detach()))
     found = pretrain(learning, SAMPLES, (), tmp_path, ignore_progress)
     other = learning.build_network()
     history = train(LINEAR, other, SAMPLES, steps=25, schedule="one_cycle", seed=derive_seed(3, "pretrain"))
@@ -249,7 +257,7 @@ def test_pretraining_takes_the_tasks_schedule_and_ends_with_its_last_step(
 
 
 def test_a_kill_does_not_change_pretraining(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stages, "mean_score", lambda task, network, splits: float(network.bias.detach()))
+    monkeypatch.setattr(centralised, "mean_score", lambda task, network, splits: float(network.bias.detach()))
 
     def killed(done: int, total: int, note: str = "") -> None:
         if done == 70:
@@ -291,7 +299,7 @@ def test_a_central_control_takes_the_steps_of_all_vehicles_at_the_same_rates(mon
         taken.append(how)
         return 0.5
 
-    monkeypatch.setattr(stages, "train_steps", counted)
+    monkeypatch.setattr(centralised, "train_steps", counted)
     learning = Learning(OBJECTS, "tiny", Training(local_steps=16), 3)
     losses = train_centrally(learning, None, [1, 2, 3], rounds=5, clients=4, name="federate")
     edge = learning.schedule(5, 16, "edge", "grid")

@@ -12,8 +12,9 @@ import pytest
 
 from flcav.experiments.splits import record_split
 from flcav.experiments.studies import STUDIES, study_named
+from flcav.pipeline.recipe import Federation
 from flcav.pipeline.steps.source_hash import PACKAGES, Sources, find_definitions
-from flcav.pipeline.work import recording, testing, training
+from flcav.pipeline.work import cloud, edge, pretraining, recording, testing
 
 TOY = {
     "__init__.py": """
@@ -95,6 +96,8 @@ def test_a_step_reaches_definitions_through_packages_that_hand_them_on(toy):
     assert set(hashes(toy, "circle")) == {"toy.work", "toy.shapes.round"}
     assert set(hashes(toy, "by_name")) == {"toy.work", "toy.other"}
     assert list(find_definitions({"strategy": "toy.other:Other", "note": "at 12:30"})) == [("toy.other", "Other")]
+    with_settings = Federation.model_validate({"strategy": {"toy.other:Other": {"share": 0.5}}})
+    assert ("toy.other", "Other") in set(find_definitions(with_settings))
 
 
 @pytest.mark.parametrize(
@@ -149,17 +152,17 @@ def test_one_constant_of_a_module_is_reached_or_all_where_the_module_is_passed_o
 STEPS = {
     "recording": record_split,
     "frames": recording.record_step,
-    "pretraining": training.pretrain_step,
+    "pretraining": pretraining.pretrain_step,
     "evaluation": testing.test_step,
-    "stage II": training.edge_step,
-    "stage III": training.cloud_step,
+    "stage II": edge.edge_step,
+    "stage III": cloud.cloud_step,
 } | {f"{name}, {part}": getattr(study_named(name), part) for name in STUDIES for part in ("learn", "test")}
 
 
 @pytest.mark.parametrize("run", STEPS.values(), ids=STEPS.keys())
 def test_no_step_reaches_the_drawing_of_results_or_the_command_line(run):
     reached = Sources().hashes(find_definitions(run))
-    assert 50 < len(reached) < 250
+    assert 50 < len(reached) < 300
     assert not [name for name in reached if name.startswith(("flcav.report", "flcav.cli"))]
     assert not [name for name in reached if name.startswith("flcav.pipeline.steps.run")]
 

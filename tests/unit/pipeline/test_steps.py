@@ -15,9 +15,10 @@ from typing import Any
 import pytest
 
 import flcav
-from flcav.config import InputError
+from flcav.config import Config, InputError
 from flcav.pipeline.provenance import checkout
 from flcav.pipeline.steps import Step, Work, run_side_by_side, run_steps
+from flcav.pipeline.steps.engines import find_seed
 from flcav.pipeline.steps.step import DONE_NOW
 
 
@@ -60,6 +61,19 @@ class Setting:
 @dataclass(frozen=True)
 class Other:
     share: float = 0.5
+
+
+class Checked(Config):
+    share: float = 0.5
+
+
+class CheckedToo(Config):
+    share: float = 0.5
+
+
+class CheckedAround(Config):
+    inner: Checked
+    seed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -108,6 +122,12 @@ def test_what_most_others_wait_for_comes_first(tmp_path):
     assert done == ["first", "second", "alone", "third"]  # as many wait for "alone" as for "third"
 
 
+def test_the_seed_of_a_step_is_its_own_or_that_of_what_it_is_given():
+    assert find_seed({"settings": CheckedAround(inner=Checked(), seed=7)}) == 7
+    assert find_seed({"settings": CheckedAround(inner=Checked()), "recipe": {"seed": 3}}) == 3
+    assert find_seed({"around": Around(Setting()), "names": ["seed"]}) is None
+
+
 def test_a_folder_of_another_configuration_is_refused(tmp_path):
     run_steps(STEPS[:1], tmp_path, jobs=1, notify=quiet)
     with pytest.raises(InputError, match="another configuration"):
@@ -130,8 +150,9 @@ def test_a_step_that_was_begun_is_not_gone_on_with_as_another(tmp_path):
 
 def test_records_among_the_arguments_are_told_apart_by_class_and_fields():
     settings = (Setting(), Setting(0.25), Other(), Around(Setting()), Around(Other()))
+    settings += (Checked(), Checked(share=0.25), CheckedToo(), CheckedAround(inner=Checked(share=0.25)))
     assert len({Step("a", refuse, {"setting": setting}).fingerprint({}) for setting in settings}) == len(settings)
-    with pytest.raises(TypeError, match="neither a JSON value nor a dataclass"):
+    with pytest.raises(TypeError, match="neither a JSON value nor a record"):
         Step("a", refuse, {"setting": object()}).fingerprint({})
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from flcav.perception.outcomes import Outcomes
-from flcav.pipeline.results import OUTCOMES
+from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.seeds.summary import mean_of_tests
 
 SCENES, PICTURES = 10, 20

@@ -8,22 +8,11 @@ from flcav.geometry import Boxes
 from flcav.intervals import Estimate, Spread
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results import (
-    ArmResult,
-    Difference,
-    Finding,
-    LinkUse,
-    Placed,
-    Plan,
-    Pole,
-    Pretrained,
-    Run,
-    Spent,
-    TaskPlan,
-    Test,
-    Tested,
-    Validated,
-)
+from flcav.pipeline.results.placement import Placed, Pole
+from flcav.pipeline.results.plans import Plan, TaskPlan
+from flcav.pipeline.results.run import ArmResult, LinkUse, Run, Spent
+from flcav.pipeline.results.tests import Difference, Finding, Test, Tested
+from flcav.pipeline.results.training import Pretrained, Validated
 from flcav.report.pictures.clouds import Detections, Sweep
 from flcav.report.pictures.maps import ErrorMap, poles_of
 from flcav.world.map.town import load_town

@@ -8,7 +8,9 @@ from jinja2 import UndefinedError
 
 from flcav.network.plan import Price
 from flcav.pipeline.recipe import EDGE, MAIN
-from flcav.pipeline.results import Finding, Plan, RoundPlan, StageResult
+from flcav.pipeline.results.plans import Plan, RoundPlan
+from flcav.pipeline.results.tests import Finding
+from flcav.pipeline.results.training import StageResult
 from flcav.report.pages.html import render
 from flcav.report.pages.run_page import page
 

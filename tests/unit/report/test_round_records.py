@@ -13,7 +13,9 @@ from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
 from flcav.pipeline.federations.checkpoint import Checkpoint
 from flcav.pipeline.federations.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
-from flcav.pipeline.results import LEDGER, FederatedRound, LabelQuality, Run, StageResult
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.saved import LEDGER
+from flcav.pipeline.results.training import FederatedRound, LabelQuality, StageResult
 from flcav.report.pages import html
 from flcav.report.pages.run_page import page
 

@@ -12,10 +12,11 @@ from typing import Annotated
 
 from flcav.files import Json
 from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds
-from flcav.pipeline.findings import name_stage
+from flcav.pipeline.collecting.findings import name_stage
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
-from flcav.pipeline.results import Pole, Run
+from flcav.pipeline.results.placement import Pole
+from flcav.pipeline.results.run import Run
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts import figures

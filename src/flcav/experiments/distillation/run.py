@@ -11,10 +11,11 @@ from typing import Annotated
 
 from flcav.files import Json
 from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.pipeline.collecting.history import gap_closed
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results import LabelQuality, Run
-from flcav.pipeline.running import gap_closed
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.training import LabelQuality
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts import figures

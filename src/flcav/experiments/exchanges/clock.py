@@ -17,9 +17,9 @@ from flcav.network.radio.links import RadioLinks
 from flcav.pipeline.arms import Names, resolve_settings
 from flcav.pipeline.federations.network import link_scenes
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels import choose_labels
+from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, RunRecipe
-from flcav.pipeline.results import Placed
+from flcav.pipeline.results.placement import Placed
 
 
 def link_regions(recipe: RunRecipe, task: str, work: Path, rounds: int) -> dict[str, list[RadioLinks]]:

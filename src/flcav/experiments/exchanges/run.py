@@ -19,7 +19,7 @@ from flcav.intervals import MeanOverSeeds, mean_over_seeds
 from flcav.network.ledger import Direction, Ledger, Link
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results import Run
+from flcav.pipeline.results.run import Run
 from flcav.pipeline.running import WORK
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style

@@ -18,7 +18,7 @@ from flcav.optimization.curves.curves import Additive
 from flcav.optimization.curves.fitting import Fit, fit_additive
 from flcav.optimization.curves.history import History, article_histories
 from flcav.optimization.graph import Layers, build_graph
-from flcav.pipeline.planning import load_history
+from flcav.pipeline.planning.histories import load_history
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style

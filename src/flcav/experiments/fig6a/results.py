@@ -7,7 +7,7 @@ from typing import Annotated
 from flcav.files import Json
 from flcav.intervals import Estimate, MeanOverSeeds
 from flcav.pipeline.provenance import Provenance
-from flcav.pipeline.results import LinkUse
+from flcav.pipeline.results.run import LinkUse
 from flcav.records import LEFT_OUT, Record
 
 EQUAL, JOINT = "equal-stages", "joint"  # the plans

@@ -26,10 +26,10 @@ from flcav.experiments.fig6a.results import (
     Reached,
 )
 from flcav.intervals import Estimate, mean_over_seeds
-from flcav.pipeline.planning import load_history
+from flcav.pipeline.planning.histories import load_history
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Budgets, RunRecipe
-from flcav.pipeline.results import Run
+from flcav.pipeline.results.run import Run
 from flcav.report import style
 from flcav.report.charts import plans
 

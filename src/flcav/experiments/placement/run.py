@@ -25,10 +25,12 @@ from flcav.perception.outcomes import Outcomes, as_measurable
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Names, resolve_settings
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels import choose_labels
+from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results import ERRORS, OUTCOMES, Placed, Run
+from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.saved import ERRORS, OUTCOMES
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.placement import draw_gains

@@ -12,11 +12,14 @@ from queue import SimpleQueue
 from typing import Any
 
 from flcav.config import InputError
+from flcav.federation.runtimes.blocks import Parcel, SharedBlock
 from flcav.federation.trainable import Trainable, Update, Weights
+from flcav.memory import keep_freed_memory
 from flcav.processes import exit_with_parent, start_server
 from flcav.threads import use_threads
 
 _clients: Mapping[str, Trainable] = {}  # in a client process
+_block = SharedBlock(0)  # in a client process: shared with the one that started it
 
 
 class ClientKilled(RuntimeError):
@@ -36,24 +39,23 @@ class ClientProcesses:
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             raise InputError(f"clients cannot be sent to processes ({error}); train them in one process") from None
         self.count = count
-        self._free: SimpleQueue[ProcessPoolExecutor] = SimpleQueue()
-        self._all: list[ProcessPoolExecutor] = []
+        self._free: SimpleQueue[_Process] = SimpleQueue()
+        self._all: list[_Process] = []
 
     def __enter__(self) -> "ClientProcesses":
-        self._all = [self._make() for _ in range(self.count)]
+        self._all = [_Process(self._pickled) for _ in range(self.count)]
         for each in self._all:
             self._free.put(each)
         return self
 
     def __exit__(self, *exception: object) -> None:
         for each in self._all:
-            for process in list((each._processes or {}).values()):
-                process.terminate()  # between trainings, or after an error
-            each.shutdown(cancel_futures=True)
+            each.end()
 
-    def _make(self) -> ProcessPoolExecutor:
-        """Return a pool of one process: where it breaks, it is known whose training broke it."""
-        return ProcessPoolExecutor(1, mp_context=start_server(), initializer=_start, initargs=(self._pickled,))
+    @property
+    def pids(self) -> list[int]:
+        """Return the ids of the processes that have started."""
+        return [pid for each in self._all for pid in each.pids]
 
     def _train(self, name: str, weights: Weights, how: Mapping[str, Any]) -> Update:
         """Return what the client's `train` does in the first free process; raises what it raises.
@@ -62,15 +64,44 @@ class ClientProcesses:
         """
         process = self._free.get()
         try:
-            return process.submit(_train_here, name, weights, how).result()
+            return process.train(name, weights, how)
         except BrokenProcessPool:
-            process.shutdown(wait=False)
+            process.end()
             self._all.remove(process)
-            process = self._make()
+            process = _Process(self._pickled)
             self._all.append(process)
             raise ClientKilled("its process was killed while it trained") from None
         finally:
             self._free.put(process)
+
+
+class _Process:
+    """A client process, which starts with its first training, and the memory that arrays go there and back in."""
+
+    def __init__(self, clients: bytes) -> None:
+        self._clients = clients
+        self._pool: ProcessPoolExecutor | None = None  # of one process: where it breaks, it is known whose fault it was
+        self._block = SharedBlock(0)
+
+    @property
+    def pids(self) -> list[int]:
+        return [] if self._pool is None else [*(self._pool._processes or {})]
+
+    def train(self, name: str, weights: Weights, how: Mapping[str, Any]) -> Update:
+        if self._pool is None:
+            self._block = SharedBlock(
+                2 * sum(array.nbytes for array in weights.values())
+            )  # some send arrays beside them
+            given = self._clients, self._block
+            self._pool = ProcessPoolExecutor(1, mp_context=start_server(), initializer=_start, initargs=given)
+        return self._block.read(self._pool.submit(_train_here, self._block.write((name, weights, how))).result())
+
+    def end(self) -> None:
+        if self._pool is not None:
+            for process in list((self._pool._processes or {}).values()):
+                process.terminate()  # between trainings, or after an error
+            self._pool.shutdown(cancel_futures=True)
+        self._block.close()
 
 
 class RemoteClients(Mapping[str, Trainable]):
@@ -100,12 +131,14 @@ class _Remote:
         return self._processes._train(self._name, weights, how)
 
 
-def _start(pickled: bytes) -> None:
-    global _clients
+def _start(pickled: bytes, block: SharedBlock) -> None:
+    global _clients, _block
     exit_with_parent()
     use_threads(1)
-    _clients = pickle.loads(pickled)
+    keep_freed_memory()  # gradients of megabytes come and go in every step
+    _clients, _block = pickle.loads(pickled), block
 
 
-def _train_here(name: str, weights: Weights, how: Mapping[str, Any]) -> Update:
-    return _clients[name].train(weights, **how)
+def _train_here(asked: Parcel) -> Parcel:
+    name, weights, how = _block.read(asked)
+    return _block.write(_clients[name].train(weights, **how))

@@ -10,6 +10,8 @@ from flcav.federation.trainable import Update, Weights
 
 NO_MEAN = "clients cannot be averaged by shares of {}: they must be 0 or more, not all 0"
 
+BLOCK = 1 << 15  # numbers that are added at a time: their products stay in the cache
+
 
 class RunningMean:
     """Weighted mean of arrays by name, sum_i share_i w_i / sum_i share_i, to which clients are added one by one.
@@ -23,6 +25,7 @@ class RunningMean:
         self._others: Weights = {}  # its arrays that are not floating
         self._sums: dict[str, NDArray[np.float64]] = {}
         self._shares: list[float] = []
+        self._products = np.empty(BLOCK)
 
     def add(self, weights: Weights, share: float) -> None:
         """Add a client.
@@ -41,7 +44,12 @@ class RunningMean:
             raise ValueError("clients sent arrays of different names or shapes: they train different networks")
         self._shares.append(share)
         for name, total in self._sums.items():
-            total += share * weights[name].astype(np.float64)
+            values, sums = weights[name].reshape(-1), total.reshape(-1)
+            for start in range(0, values.size, BLOCK):
+                part = values[start : start + BLOCK]
+                sums[start : start + BLOCK] += np.multiply(
+                    part, share, out=self._products[: part.size], dtype=np.float64
+                )
 
     def mean(self) -> dict[str, NDArray[np.number]]:
         """Return the mean, in the first client's types; raises ValueError where all shares are 0."""

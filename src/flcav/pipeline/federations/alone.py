@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from flcav.config import InputError
 from flcav.files import atomic_path
@@ -16,11 +15,14 @@ from flcav.pipeline.arms import check_federations
 from flcav.pipeline.federations.checkpoint import DAMAGED, LAST, Checkpoint
 from flcav.pipeline.federations.rounds import LOSS
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.graph import Graph
+from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
-from flcav.pipeline.results import WEIGHTS, Round, Saved, StageResult, Watched
+from flcav.pipeline.results.saved import WEIGHTS, Saved
+from flcav.pipeline.results.training import Round, StageResult, Watched
 from flcav.pipeline.steps import Notify, Stale, Step, ignore_steps, run_steps
+from flcav.pipeline.work.edge import EdgeSettings, edge_step
+from flcav.pipeline.work.settings import make_step
 
 WORK, RESULTS = "work", "federation.json"
 FEDERATE = "federate"  # in the names of the steps
@@ -104,9 +106,9 @@ def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapp
     edge = next(step for step in graph.steps if step.name == graph.names.edge(arm, region, task))
     frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
     name = next(name for name, about in list_federations(graph, arm).items() if about == (arm, region, task))
-    arguments: Mapping[str, Any] = {**edge.arguments, "validation": frames}
-    needs = tuple(dict.fromkeys((*edge.needs, *frames.values())))
-    return replace(edge, name=name, arguments=arguments, needs=needs, means=means)
+    asked: EdgeSettings = edge.arguments["settings"]
+    scored = make_step(name, edge_step, asked.model_copy(update={"validation": frames}))
+    return replace(scored, means=means)
 
 
 def _needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:

@@ -4,30 +4,24 @@ Round n of a region is driven in one of the scenes of its training data, in turn
 roadside units are on the poles of its sensors.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from flcav.config import InputError
-from flcav.federation.rules import RegionalModels, Rules
-from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Outage
 from flcav.federation.selection import Selection
-from flcav.federation.strategies import exchanges_more
-from flcav.network.clock.records import ClientTiming, RoundRecord, save_rounds
+from flcav.network.clock.records import ClientTiming, RoundRecord
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
 from flcav.network.clock.work import ClientWork
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.recorded import link_scene
-from flcav.perception.weights import to_arrays
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.placing import find_sites, read_traces
-from flcav.pipeline.recipe import CLOUD, Federation
-from flcav.pipeline.results import Placed
-from flcav.pipeline.stages import Learning
-from flcav.pipeline.steps import Work
+from flcav.pipeline.recipe import CLOUD
+from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.stages.placement import find_sites, read_traces
 from flcav.world.map.census import measure_traffic_density
 
 CLOCK = "clock"  # begins the names of the files of rounds on the network, by region
@@ -158,43 +152,6 @@ def _find_slow(fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: 
     """Return the clients whose update is not predicted to arrive within `deadline_s` [s] of the round's start."""
     timings = _time(fleet, links, clients, number, PATIENT)
     return {name for name, t in timings.items() if t.dropped or t.end_s - t.start_s > deadline_s}
-
-
-def open_network(
-    work: Work,
-    learning: Learning,
-    how: Federation,
-    region: str,
-    clients: Sequence[str],
-    steps: Mapping[str, Any],
-    earlier: int,
-    train_s: float,
-    speeds: Mapping[str, float],
-) -> Callable[[Rules, Sequence[int]], DrivenRounds]:
-    """Return what simulates a region's rounds over the radio network, by rules and by the seeds of the rounds.
-
-    It writes their clock. Without a network no client is lost.
-    """
-    settings = how.network
-    if settings is None:
-        return lambda rules, seeds: DrivenRounds(rules, {}, ())
-    weights = to_arrays(learning.build_network())
-    both = isinstance(how.personal, RegionalModels)  # the region's and the global model go down together
-    sizes = (
-        update_bytes(weights, exchanging=both),
-        update_bytes(weights, how.upload, exchanging=exchanges_more(how.strategy)),
-    )
-    fleet = Fleet(region, tuple(clients), *sizes, train_s, speeds)
-    split, placed = Frames.open(work.inputs[steps["frames"]]), Placed.load(work.inputs[steps["place"]])
-    scenes: list[RadioLinks] = []
-
-    def drive(rules: Rules, seeds: Sequence[int]) -> DrivenRounds:
-        scenes[:] = link_scenes(split, placed, settings, earlier + len(seeds), learning.seed, scenes)
-        driven = drive_rounds(fleet, scenes, settings, rules, seeds, earlier)
-        save_rounds(driven.records, work.folder / f"{CLOCK}-{region}.parquet")
-        return driven
-
-    return drive
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.messages import send_to_vehicles
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import EDGE
-from flcav.pipeline.results import Pretrained
-from flcav.pipeline.stages import Learning
+from flcav.pipeline.results.training import Pretrained
+from flcav.pipeline.stages.learning import Learning
 from flcav.pipeline.steps import Work
 from flcav.seeds import stream
 

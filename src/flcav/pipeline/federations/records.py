@@ -12,7 +12,9 @@ from flcav.network.ledger import BYTES_PER_MB, Ledger
 from flcav.perception.training.run import event_files
 from flcav.pipeline.federations.checkpoint import LAST, Checkpoint
 from flcav.pipeline.recipe import CLOUD
-from flcav.pipeline.results import LEDGER, FederatedRound, Run, StageResult
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.saved import LEDGER
+from flcav.pipeline.results.training import FederatedRound, StageResult
 
 ROUNDS, EVENTS = "rounds.parquet", "events"  # of a run, beside its results
 SCHEMA = pa.schema(

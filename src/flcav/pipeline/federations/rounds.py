@@ -17,7 +17,7 @@ from flcav.network.ledger import Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays, save_network, to_arrays
 from flcav.pipeline.federations.checkpoint import Checkpoint, find_checkpoint
-from flcav.pipeline.results import LEDGER, WEIGHTS
+from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.progress import Report
 
 LOSS = "loss"  # begins the note of a round

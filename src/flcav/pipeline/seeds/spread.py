@@ -13,7 +13,8 @@ from pathlib import Path
 
 from flcav.config import InputError
 from flcav.intervals import Spread, pool_spreads
-from flcav.pipeline.results import Difference, Run
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.tests import Difference
 from flcav.pipeline.tables import read_table
 
 Key = tuple[str, str, str, str, str, str]  # task, region, arm, stage, and of a difference the arm and stage before

@@ -9,9 +9,11 @@ import numpy as np
 from flcav.intervals import MeanOverSeeds, mean_over_seeds
 from flcav.perception.outcomes import Outcomes, Values, share_test_scenes
 from flcav.perception.tasks import task_named
-from flcav.pipeline.findings import name_stage
+from flcav.pipeline.collecting.findings import name_stage
 from flcav.pipeline.recipe import MAIN
-from flcav.pipeline.results import OUTCOMES, Difference, Mean, Run, Summary, Test
+from flcav.pipeline.results.run import Mean, Run, Summary
+from flcav.pipeline.results.saved import OUTCOMES
+from flcav.pipeline.results.tests import Difference, Test
 from flcav.verdicts import Claim, judge
 
 

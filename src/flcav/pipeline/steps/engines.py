@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+from flcav.config import Config
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps.step import Record, Step, Work, read_value, write_done, write_started
 from flcav.processes import exit_with_parent, start_server
@@ -77,13 +78,12 @@ def perform(step: Step, folder: Path, record: Record, made_by: Provenance, repor
     return read_value(own)
 
 
-def find_seed(arguments: Mapping[str, Any]) -> int | None:
-    """Return the seed among a step's arguments or the fields of one of them, such as a recipe; None without one."""
-    for values in (arguments, *arguments.values()):
-        seed = values.get("seed") if isinstance(values, Mapping) else getattr(values, "seed", None)
-        if isinstance(seed, int):
-            return seed
-    return None
+def find_seed(arguments: Any) -> int | None:
+    """Return the seed among a step's arguments, or that of one of them, such as a recipe; None without one."""
+    values: Any = dict(arguments) if isinstance(arguments, Mapping | Config) else getattr(arguments, "__dict__", {})
+    if isinstance(seed := values.get("seed"), int):
+        return seed
+    return next((seed for each in values.values() if (seed := find_seed(each)) is not None), None)
 
 
 def _start(queue: Any, variables: Mapping[str, str]) -> None:

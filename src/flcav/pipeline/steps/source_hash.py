@@ -25,6 +25,7 @@ from types import FunctionType, MethodType
 from typing import Any
 
 import flcav
+from flcav.config import Config
 
 Place = tuple[str, str]  # module, name that a statement at its top binds; WHOLE: all of them
 Target = tuple[str, str]  # module, dotted name in it, "" for the module itself
@@ -135,7 +136,8 @@ def _without_collector() -> Iterator[None]:
 def find_definitions(value: Any) -> Iterator[Place]:
     """Yield the definitions of all functions and classes in `value`, its fields, items and bound arguments included.
 
-    Fields of a dataclass with `compare=False` are left out.
+    Keys of mappings count: `module:NAME` may be one, with settings. Fields of a dataclass with `compare=False` are left
+    out.
     """
     if isinstance(value, MethodType):
         yield from find_definitions(value.__self__)
@@ -148,13 +150,15 @@ def find_definitions(value: Any) -> Iterator[Place]:
         if found := NAMED.fullmatch(value):
             yield found[1], found[2]
     elif isinstance(value, Mapping):
-        yield from find_definitions(tuple(value.values()))
+        yield from find_definitions((*value, *value.values()))
     elif isinstance(value, list | tuple | set | frozenset):
         for item in value:
             yield from find_definitions(item)
     else:
         yield from find_definitions(type(value))
-        if is_dataclass(value):
+        if isinstance(value, Config):
+            yield from find_definitions([getattr(value, name) for name in type(value).model_fields])
+        elif is_dataclass(value):
             yield from find_definitions([getattr(value, each.name) for each in fields(value) if each.compare])
 
 

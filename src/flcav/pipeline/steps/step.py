@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from flcav.config import InputError, read_json
+from flcav.config import Config, InputError, read_json
 from flcav.files import write_json
 from flcav.progress import Report
 
@@ -48,24 +48,28 @@ class Step:
 
     name: str
     run: Callable[..., Any]
-    arguments: Mapping[str, Any]  # JSON values, and frozen dataclasses of them
+    arguments: Mapping[str, Any]  # JSON values, and frozen records of them: dataclasses or `Config`
     needs: tuple[str, ...] = ()
     means: Mapping[str, int | str] = field(default_factory=dict)  # further arguments, which do not change the result
 
     def fingerprint(self, inputs: Mapping[str, str]) -> str:
         """Return a hash of what is asked: function, arguments, and the fingerprints of the needed steps (`inputs`).
 
-        Raises `TypeError` for an argument that is neither a JSON value nor a dataclass of them.
+        Raises `TypeError` for an argument that is neither a JSON value nor a record of them.
         """
         asked = [self.run.__module__, self.run.__qualname__, self.arguments, {n: inputs[n] for n in self.needs}]
         return digest(asked, default=_named)
 
 
 def _named(value: Any) -> list[Any]:
-    """Return the identity of a dataclass among a step's arguments as JSON: its class and its fields."""
-    if not is_dataclass(value):
-        raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a dataclass of them")
-    return [type(value).__module__, type(value).__qualname__, {f.name: getattr(value, f.name) for f in fields(value)}]
+    """Return the identity of a record among a step's arguments as JSON: its class and its fields."""
+    if isinstance(value, Config):
+        own: Any = value.model_dump(mode="json")
+    elif is_dataclass(value):
+        own = {each.name: getattr(value, each.name) for each in fields(value)}
+    else:
+        raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a record of them")
+    return [type(value).__module__, type(value).__qualname__, own]
 
 
 @dataclass(frozen=True)

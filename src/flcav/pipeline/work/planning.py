@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from flcav.config import InputError, read_config
+from flcav.config import Config, InputError, read_config
 from flcav.files import write_json
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Link
@@ -18,125 +18,130 @@ from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import PlanRule
 from flcav.pipeline.federations.prediction import link_drive, predict_air_s
-from flcav.pipeline.federations.replanning import price_rounds, settle
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.planning import (
-    PlanRequest,
-    PlanSettings,
-    UpdateForm,
-    count_carried_out,
-    make_plan,
-    model_mb,
-    parse_history,
-    remake_plan,
-)
-from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.results import PROBLEM, Plan, StageResult, Watched, average_last
+from flcav.pipeline.planning.allocation import PlanRequest, PlanSettings, make_plan
+from flcav.pipeline.planning.histories import parse_history
+from flcav.pipeline.planning.stages import count_carried_out, remake_plan
+from flcav.pipeline.planning.terms import price_rounds, settle
+from flcav.pipeline.planning.updates import UpdateForm, model_mb
+from flcav.pipeline.recipe import Budgets, FixedPlan, Limits
+from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.saved import PROBLEM
+from flcav.pipeline.results.training import StageResult, Watched, average_last
 from flcav.pipeline.steps import Work
-from flcav.pipeline.work import Fields
 from flcav.pipeline.work.budgets import read_entries
-from flcav.pipeline.work.uploads import plan_uploads
+from flcav.pipeline.work.settings import StepSettings
+from flcav.pipeline.work.uploads import UploadSettings, plan_uploads
 
 
-def plan_step(
-    work: Work,
-    recipe: Fields,
-    rule: PlanRule,
-    pools: Mapping[str, Sequence[str]],
-    histories: Mapping[str, str],
-    updates: Sequence[Fields] = (),
-    recorded: Mapping[str, Mapping[str, int]] | None = None,
-    uploads: Fields | None = None,
-    air: Fields | None = None,
-) -> None:
-    """Allocate both budgets to all tasks; by task, `pools`: steps that recorded pools, `histories`: CSV tables.
+class PlannedTask(Config):
+    """A task as the step that plans it is given it."""
 
-    `updates` are the forms of the arms' updates, of which the largest is planned with; default: whole updates.
-    `recorded`: of federating regions of recorded data, the vehicles with their numbers of training frames. `uploads`:
-    how the vehicles' uploads are planned, see `plan_uploads`; None: they are drawn. `air`: the network that counts in
-    the time of a round, its "range_m" of traffic, and by region the "drives" that it is predicted from; None: vehicles
-    train alone.
-    """
-    asked_for = RunRecipe.model_validate(recipe)
-    asked, held = [], _held_frames(asked_for, recorded or {})
-    forms = tuple(UpdateForm.model_validate(update) for update in updates) or (UpdateForm(),)
-    linked = {} if air is None else _link_drives(work, asked_for, recorded or {}, air)
-    for name in asked_for.tasks:
-        task, network = task_named(name), asked_for.tasks[name].network
-        config = find_configuration(task, network)
-        sizes = [
-            len(message)
-            for step in pools[name]
-            for split in (Frames.open(work.inputs[step]),)
-            for message in as_shared(task).pack_samples(split.data, config, split.vehicles)
-        ]
-        messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, network, forms))
-        own = asked_for.tasks[name]
-        history = parse_history(name, histories[name], name) if name in histories else None
-        whole_mb = model_mb(task, network) if linked else 0.0
-        air_s = {region: _predict(region, name, scenes, whole_mb, messages) for region, scenes in linked.items()}
-        asked.append(PlanRequest(name, own.weight, messages, len(sizes), history, own.plan, own.train_s, air_s))
-    budgets = Price(asked_for.budgets_mb.wireless, asked_for.budgets_mb.wireline)
-    k = asked_for.federation.edge_rounds_per_cloud_round
-    speeds = _list_speeds(asked_for, held, linked)
-    groups, samples = tuple(map(len, held.values())), tuple(sum(own.values()) for own in held.values())
-    frame = PlanSettings(budgets, asked_for.headroom, asked_for.limits, groups, k, samples, asked_for.horizon_s, speeds)
-    plan, problem = make_plan(tuple(asked), frame, rule)
+    network: str | None  # name of the configuration; None: the task's first
+    weight: float  # of its error in the objective
+    train_s: float  # time that a vehicle of speed 1 trains in a round [s]
+    fixed: FixedPlan | None  # a plan given by hand, instead of a history
+    history: str | None  # learning history, the text of a CSV table
+    pools: tuple[str, ...]  # recordings of the candidates for upload
+
+
+class AirSettings(Config):
+    """What the time of a round's messages on the air is predicted from."""
+
+    network: NetworkSettings
+    range_m: float  # of the traffic that the unit's pole is chosen by [m]
+    drives: Mapping[str, str]  # recording, by region
+    recorded: tuple[str, ...]  # regions that are recorded datasets
+
+
+class FirstPlanSettings(StepSettings):
+    """Settings of a run's first plan."""
+
+    rule: PlanRule
+    seed: int
+    budgets_mb: Budgets
+    headroom: float  # fraction of the budgets left unspent
+    limits: Limits
+    horizon_s: float | None  # longest time that a vehicle trains, over all rounds of all tasks [s]
+    edge_rounds_per_cloud_round: int
+    tasks: Mapping[str, PlannedTask]
+    held: Mapping[str, Mapping[str, int]]  # numbers of training frames, by federating region and vehicle
+    speeds: Mapping[str, float]  # of every vehicle, "region/vehicle"; empty: all train at the same speed
+    updates: tuple[UpdateForm, ...]  # forms of the arms' updates, of which the largest is planned with
+    uploads: UploadSettings | None  # None: uploads are drawn
+    air: AirSettings | None  # None: messages take no time
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Return the names of the steps whose results it takes."""
+        drives = () if self.air is None else self.air.drives.values()
+        return (*(step for task in self.tasks.values() for step in task.pools), *drives)
+
+
+class ReplanSettings(StepSettings):
+    """Settings of the plan of the rest of a run, made anew after a stage."""
+
+    stage: Literal["pretrain", "edge"]
+    first: str  # step of the first plan
+    plan: str  # step of the plan that was carried out in the stage
+    watched: Mapping[str, tuple[str, ...]]  # validations of the stage, by task
+    books: Mapping[str, tuple[str, ...]]  # steps whose ledgers count, by task
+    edges: Mapping[str, tuple[str, ...]]  # steps of stage II whose rounds were planned anew after each, by task
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Return the names of the steps whose results it takes."""
+        return (
+            self.first,
+            self.plan,
+            *(step for by in (self.watched, self.books) for own in by.values() for step in own),
+        )
+
+
+def plan_step(work: Work, settings: FirstPlanSettings) -> None:
+    """Allocate both budgets to all tasks."""
+    scenes = {} if settings.air is None else _link_drives(work, settings.air, settings.seed)
+    asked = tuple(_request(work, settings, name, scenes) for name in settings.tasks)
+    frame = PlanSettings(
+        budgets_mb=Price(settings.budgets_mb.wireless, settings.budgets_mb.wireline),
+        headroom=settings.headroom,
+        limits=settings.limits,
+        edge_groups=tuple(map(len, settings.held.values())),
+        edge_rounds_per_cloud_round=settings.edge_rounds_per_cloud_round,
+        group_samples=tuple(sum(own.values()) for own in settings.held.values()),
+        horizon_s=settings.horizon_s,
+        speeds=settings.speeds,
+    )
+    plan, problem = make_plan(asked, frame, settings.rule)
     if problem is not None:
         write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
-    if uploads is not None:
-        plan = plan_uploads(work, plan, pools, uploads, asked_for.seed)
+    if settings.uploads is not None:
+        pools = {name: own.pools for name, own in settings.tasks.items()}
+        plan = plan_uploads(work, plan, pools, settings.uploads, settings.seed)
     plan.save(work.folder)
 
 
-def replan_step(
-    work: Work,
-    first: str,
-    plan: str,
-    stage: Literal["pretrain", "edge"],
-    watched: Mapping[str, Sequence[str]],
-    books: Mapping[str, Sequence[str]],
-    edges: Mapping[str, Sequence[str]] = {},
-) -> None:
-    """Plan the rest of the run anew after `stage`: by task, `watched` are its validations, `books` its ledgers.
-
-    `first` is the step of the first plan, `plan` that of the one carried out in `stage`. `edges` are the steps of stage
-    II whose numbers of rounds were planned anew after each round.
-    """
-    problem = read_config(Problem, work.inputs[first] / PROBLEM)
-    done = Plan.load(work.inputs[plan])
-    reached: dict[str, float] = {}
-    used: dict[str, dict[Link, int]] = {task.name: dict.fromkeys(LINKS, 0) for task in problem.tasks}
-    for task in problem.tasks:
-        reached[task.name] = average_last([Watched.load(work.inputs[step]) for step in watched[task.name]])
-        for entry in read_entries(work, *books[task.name]):
-            used[task.name][entry.link] += entry.bytes * (entry.direction == "up")
-    sent = {task: Price(own["wireless"] / BYTES_PER_MB, own["wireline"] / BYTES_PER_MB) for task, own in used.items()}
-    used_mb = Price(*(sum(own[link] for own in used.values()) / BYTES_PER_MB for link in LINKS))
-    ran = {
-        task: count_carried_out(done.tasks[task], [StageResult.load(work.inputs[step]) for step in steps])
-        for task, steps in edges.items()
-    }
-    made = remake_plan(done, problem, stage, reached, used_mb, ran)
-    k = problem.edge_rounds_per_cloud_round
-    groups = problem.tasks[0].edge_groups
-    booked = {}
-    for task in edges:
-        own = made.tasks[task]
-        booked[task] = settle(own, price_rounds(own, groups, k, 0, own.cloud_rounds), sent[task])
-    replace(made, tasks={**made.tasks, **booked}).save(work.folder)
+def _request(
+    work: Work, settings: FirstPlanSettings, name: str, scenes: Mapping[str, Sequence[RadioLinks]]
+) -> PlanRequest:
+    """Return a task as the planner sees it; `scenes`: links of the vehicles' drives, by region."""
+    own, task = settings.tasks[name], task_named(name)
+    config, shared = find_configuration(task, own.network), as_shared(task)
+    pools = [Frames.open(work.inputs[step]) for step in own.pools]
+    sizes = [len(message) for split in pools for message in shared.pack_samples(split.data, config, split.vehicles)]
+    messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, own.network, settings.updates))
+    history = None if own.history is None else parse_history(name, own.history, name)
+    whole_mb = model_mb(task, own.network) if scenes else 0.0
+    air_s = {region: _predict(region, name, each, whole_mb, messages) for region, each in scenes.items()}
+    return PlanRequest(name, own.weight, messages, len(sizes), history, own.fixed, own.train_s, air_s)
 
 
-def _link_drives(
-    work: Work, recipe: RunRecipe, recorded: Mapping[str, Mapping[str, int]], air: Fields
-) -> dict[str, list[RadioLinks]]:
-    """Return the links of each region's drives, see `plan_step`."""
-    settings = NetworkSettings.model_validate(air["network"])
+def _link_drives(work: Work, air: AirSettings, seed: int) -> dict[str, list[RadioLinks]]:
+    """Return the links of each region's drives."""
+    opened = {region: Frames.open(work.inputs[step]) for region, step in air.drives.items()}
     return {
-        region: link_drive(
-            region, Frames.open(work.inputs[step]), settings, air["range_m"], recipe.seed, region in recorded
-        )
-        for region, step in air["drives"].items()
+        region: link_drive(region, drive, air.network, air.range_m, seed, region in air.recorded)
+        for region, drive in opened.items()
     }
 
 
@@ -150,24 +155,26 @@ def _predict(region: str, task: str, scenes: Sequence[RadioLinks], whole_mb: flo
     return found
 
 
-def _list_speeds(
-    recipe: RunRecipe, held: Mapping[str, Mapping[str, int]], linked: Mapping[str, Sequence[RadioLinks]]
-) -> dict[str, float]:
-    """Return the speed of every vehicle by its name in a federation; empty where no region gives any, nor links.
-
-    held: the vehicles of each federating region with their numbers of training frames.
-    """
-    if not linked and not any(recipe.regions[region].speed for region in held):
-        return {}
-    names = [(region, vehicle) for region, vehicles in held.items() for vehicle in vehicles]
-    return {f"{region}/{vehicle}": recipe.regions[region].speed.get(vehicle, 1.0) for region, vehicle in names}
-
-
-def _held_frames(recipe: RunRecipe, recorded: Mapping[str, Mapping[str, int]]) -> dict[str, Mapping[str, int]]:
-    """Return the vehicles of each federating region with their numbers of training frames."""
-    each = recipe.sized_splits.edge
-    return {
-        region: recorded.get(region)
-        or {f"cav{number}": each.scenes * each.spins for number in range(recipe.vehicles(region))}
-        for region in recipe.with_role("federate")
+def replan_step(work: Work, settings: ReplanSettings) -> None:
+    """Plan the rest of the run anew after a stage, from what was reached and sent."""
+    problem = read_config(Problem, work.inputs[settings.first] / PROBLEM)
+    done = Plan.load(work.inputs[settings.plan])
+    reached: dict[str, float] = {}
+    used: dict[str, dict[Link, int]] = {task.name: dict.fromkeys(LINKS, 0) for task in problem.tasks}
+    for task in problem.tasks:
+        reached[task.name] = average_last([Watched.load(work.inputs[step]) for step in settings.watched[task.name]])
+        for entry in read_entries(work, *settings.books[task.name]):
+            used[task.name][entry.link] += entry.bytes * (entry.direction == "up")
+    sent = {task: Price(own["wireless"] / BYTES_PER_MB, own["wireline"] / BYTES_PER_MB) for task, own in used.items()}
+    used_mb = Price(*(sum(own[link] for own in used.values()) / BYTES_PER_MB for link in LINKS))
+    ran = {
+        task: count_carried_out(done.tasks[task], [StageResult.load(work.inputs[step]) for step in steps])
+        for task, steps in settings.edges.items()
     }
+    made = remake_plan(done, problem, settings.stage, reached, used_mb, ran)
+    k, groups = problem.edge_rounds_per_cloud_round, problem.tasks[0].edge_groups
+    booked = {}
+    for task in settings.edges:
+        own = made.tasks[task]
+        booked[task] = settle(own, price_rounds(own, groups, k, 0, own.cloud_rounds), sent[task])
+    replace(made, tasks={**made.tasks, **booked}).save(work.folder)

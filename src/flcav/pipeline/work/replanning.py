@@ -1,27 +1,22 @@
 """Re-planning after each round, in the steps of stages II and III."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from flcav.config import Config, read_config
-from flcav.network.ledger import BYTES_PER_MB, LINKS, Ledger
+from flcav.config import read_config
+from flcav.network.ledger import BYTES_PER_MB, LINKS, Budget, Ledger
 from flcav.network.plan import Price
 from flcav.optimization.problem import Problem
-from flcav.pipeline.federations.replanning import Course, Follower, Planner, Terms, restrict_problem
+from flcav.pipeline.planning.course import Course
+from flcav.pipeline.planning.rounds import Follower, Planner, restrict_problem
+from flcav.pipeline.planning.terms import Terms
 from flcav.pipeline.recipe import CLOUD, EDGE
-from flcav.pipeline.results import PROBLEM, Plan, StageResult, TaskPlan
+from flcav.pipeline.results.plans import Plan, TaskPlan
+from flcav.pipeline.results.saved import PROBLEM
+from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.steps import Work
 from flcav.pipeline.work.budgets import read_entries, share_plan_budget
-
-
-class RoundPlans(Config):
-    """Settings of re-planning in a step: after each of its rounds, by the learning curve or as another step did."""
-
-    vehicles: Mapping[str, int]  # of each region
-    headroom: float  # fraction of the budgets left unspent
-    first: str | None = None  # step of the first plan, whose problem is solved for the rest
-    follows: str | None = None  # step whose rounds are kept to instead
-    frames: Mapping[str, str] = {}  # steps of the validation frames that rounds are scored on, by region
+from flcav.pipeline.work.settings import FederationSettings, RoundPlans
 
 
 @dataclass(frozen=True)
@@ -29,11 +24,9 @@ class Rest:
     """The rest of a stage of one task, which is planned anew after each of its rounds."""
 
     work: Work
+    settings: FederationSettings
+    how: RoundPlans  # those of the settings
     plan: Plan  # at the beginning of the stage
-    task: str
-    k: int  # edge rounds per cloud round
-    budget_mb: tuple[float, float]  # of the run: wireless, wireline
-    how: RoundPlans
     book: Ledger  # of the stage
 
     def open_edge(self, region: str, pretrained: str) -> Course:
@@ -41,40 +34,51 @@ class Rest:
         terms = self._edge_terms(region, pretrained)
         if self.how.first is None:
             return self._follow(terms)
-        problem = restrict_problem(self._problem(self.how.first), self.how.vehicles, region)
-        return Course(self._own, Planner(problem, self.plan, self.task, terms), self.book)
+        problem = restrict_problem(self._problem(self.how.first), self.settings.vehicles, region)
+        return Course(self._own, Planner(problem, self.plan, self._task, terms), self.book)
 
     def open_cloud(self, regions: Iterable[str]) -> Course:
         """Return the course of stage III of these regions."""
-        whole, kept = share_plan_budget(self.plan, self.budget_mb, self.task), 1 - self.how.headroom
+        whole, kept = self._share, 1 - self.how.headroom
         terms = Terms(
             CLOUD,
-            tuple(self.how.vehicles[region] for region in regions),
-            self.k,
+            tuple(self.settings.vehicles[region] for region in regions),
+            self._k,
             Price(kept * whole.wireless_mb, kept * whole.wireline_mb),
             Price(whole.wireless_mb, whole.wireline_mb),
         )
         if self.how.first is None:
             return self._follow(terms)
-        return Course(self._own, Planner(self._problem(self.how.first), self.plan, self.task, terms), self.book)
+        return Course(self._own, Planner(self._problem(self.how.first), self.plan, self._task, terms), self.book)
 
     def count_further(self, region: str, pretrained: str) -> int:
         """Return the number of further edge rounds in a region: those of the stage III followed, if they are paid."""
-        rounds = self._followed().rounds * self.k
+        rounds = self._followed().rounds * self._k
         further = replace(self._own, edge_rounds=rounds, cloud_rounds=0)
         return self._edge_terms(region, pretrained).cut(further, 0, _sum_sent(self.book)).edge_rounds
 
     @property
     def _own(self) -> TaskPlan:
-        return self.plan.tasks[self.task]
+        return self.plan.tasks[self._task]
+
+    @property
+    def _task(self) -> str:
+        return self.settings.learning.task
+
+    @property
+    def _k(self) -> int:
+        return self.settings.federation.edge_rounds_per_cloud_round
+
+    @property
+    def _share(self) -> Budget:
+        return share_plan_budget(self.plan, self.settings.budgets_mb, self._task)
 
     def _problem(self, first: str) -> Problem:
         return read_config(Problem, self.work.inputs[first] / PROBLEM)
 
     def _edge_terms(self, region: str, pretrained: str) -> Terms:
         """Return the terms of a region: its part of the wireless budget by vehicles, an equal part of the wireline."""
-        vehicles, headroom = self.how.vehicles, self.how.headroom
-        whole = share_plan_budget(self.plan, self.budget_mb, self.task)
+        vehicles, headroom, whole = self.settings.vehicles, self.how.headroom, self._share
         spent = read_entries(self.work, pretrained)
         uploaded = sum(entry.bytes for entry in spent if (entry.link, entry.direction) == ("wireline", "up"))
         part = vehicles[region] / sum(vehicles.values())
@@ -82,7 +86,7 @@ class Rest:
         budget = Price(self.book.budget.wireless_mb, wireline / len(vehicles))
         kept = Price(headroom * whole.wireless_mb * part, headroom * whole.wireline_mb / len(vehicles))
         allowed = Price(budget.wireless_mb - kept.wireless_mb, budget.wireline_mb - kept.wireline_mb)
-        return Terms(EDGE, (vehicles[region],), self.k, allowed, budget)
+        return Terms(EDGE, (vehicles[region],), self._k, allowed, budget)
 
     def _follow(self, terms: Terms) -> Course:
         """Return the course that keeps to the plans of another federation, no longer than that went on."""

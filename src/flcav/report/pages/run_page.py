@@ -14,14 +14,17 @@ from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.arms import Names, resolve_settings
+from flcav.pipeline.collecting.findings import WORDS
 from flcav.pipeline.federations.network import CLOCK
 from flcav.pipeline.federations.records import list_rounds
-from flcav.pipeline.findings import WORDS
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.graph import LOOK
-from flcav.pipeline.labels import choose_labels
+from flcav.pipeline.graph.testing import LOOK
+from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results import ERRORS, LinkUse, Placed, Run, SweepComparison, SweepDetections
+from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.results.run import LinkUse, Run
+from flcav.pipeline.results.saved import ERRORS
+from flcav.pipeline.results.tests import SweepComparison, SweepDetections
 from flcav.pipeline.running import WORK
 from flcav.report import style
 from flcav.report.charts import figures

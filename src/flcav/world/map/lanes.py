@@ -12,6 +12,7 @@ from shapely.geometry.base import BaseGeometry
 from flcav.world.map.layers import Arrow, ArrowKind, Crossing, MapLane, MapLayers
 from flcav.world.map.markings import generate_markings
 from flcav.world.map.paint import ARROW_M, list_outlines, outline_arrow, outline_dashes, outline_stripes
+from flcav.world.map.parking import paint_spaces
 from flcav.world.map.roads import Edge, Lane, RoadNet, read_net
 from flcav.world.map.town import Town
 
@@ -114,7 +115,7 @@ def map_layers(town: Town) -> MapLayers:
         roads=town.roads,
         sidewalks=town.sidewalks,
         lanes=tuple(_lanes(net)),
-        markings=tuple(generate_markings(net, roads, crossed)),
+        markings=(*generate_markings(net, roads, crossed), *paint_spaces(town.parameters.parking)),
         crossings=crossings,
         arrows=tuple(_arrows(net)),
     )

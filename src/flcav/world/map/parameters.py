@@ -132,6 +132,28 @@ class SignParameters(Config):
     height_m: Height = 2.2  # height of the plate's centre above the ground
 
 
+class SignalParameters(Config):
+    """A signal head of the map that a town was imported from."""
+
+    x: Ordinate  # place of its centre
+    y: Ordinate  # place of its centre
+    height_m: Height  # height of its centre above the ground
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)]  # direction that it faces, counter-clockwise from east
+    light: str  # "junction:link" of the net: the signal that it shows
+    reach_m: Annotated[float, Field(ge=-50, le=50)] = 0.0  # from its mast to the left of its direction; an arm bears it
+    controller: str = ""  # id of the map's controller; empty without one
+
+
+class ParkingParameters(Config):
+    """A parking space of the map that a town was imported from."""
+
+    x: Ordinate  # its middle
+    y: Ordinate  # its middle
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)]  # direction of its length, counter-clockwise from east
+    length_m: Annotated[float, Field(ge=1, le=30)]  # extent along that direction
+    width_m: Annotated[float, Field(ge=1, le=10)]  # extent across it
+
+
 class PostParameters(Config):
     """A pole of the map that a town was imported from."""
 
@@ -170,6 +192,9 @@ class TownParameters(Config):
     poles: tuple[PoleParameters, ...] = ()  # candidate sites of roadside sensors
     signs: tuple[SignParameters, ...] = ()  # signs of the map; signs of the same sort are not placed by rule then
     posts: tuple[PostParameters, ...] = ()  # poles of the map
+    signals: tuple[SignalParameters, ...] = ()  # signal heads of the map; approaches with one have no others
+    parking: tuple[ParkingParameters, ...] = ()  # parking spaces of the map
+    parking_taken: Share = 0.6  # fraction of these that are taken
 
     @model_validator(mode="after")
     def _known_shapes(self) -> "TownParameters":

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString
 
 from flcav.geometry import left_vectors
-from flcav.world.map.parameters import StreetParameters
+from flcav.world.map.parameters import SignalParameters, StreetParameters
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
 
@@ -38,16 +38,33 @@ class Signals:
         return cls(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)), ())
 
 
-def place_signals(net: RoadNet, sensors: Array) -> Signals:
+def place_signals(net: RoadNet, sensors: Array, known: tuple[SignalParameters, ...] = ()) -> Signals:
     """Return the signal heads of all approaches to traffic lights, in the net's order.
 
     There is no arm within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) [m], since it would block the view.
+    An approach for which heads are `known` has these, and no others.
     """
-    heads = [head for edge in net.streets for head in _approach(edge, net, sensors)]
+    given: dict[str, list[Head]] = {}
+    for signal in known:
+        given.setdefault(signal.light, []).append(_head(signal))
+    heads = [head for edge in net.streets for head in _given(edge, net, given) or _approach(edge, net, sensors)]
     if not heads:
         return Signals.none()
     position, yaw, foot, link = zip(*heads)
     return Signals(np.array(position), np.array(yaw), np.array(foot), link)
+
+
+def _head(signal: SignalParameters) -> Head:
+    yaw = float(np.radians(signal.yaw_deg))
+    foot = (signal.x, signal.y) - signal.reach_m * left_vectors(yaw)
+    return (signal.x, signal.y, signal.height_m), yaw, (float(foot[0]), float(foot[1])), signal.light
+
+
+def _given(edge: Edge, net: RoadNet, given: dict[str, list[Head]]) -> list[Head]:
+    """Return the known heads of one approach."""
+    lanes = {lane.id for lane in edge.lanes}
+    lights = dict.fromkeys(way.light for way in net.connections if way.light and way.start in lanes)
+    return [head for light in lights for head in given.get(light, ())]
 
 
 def _approach(edge: Edge, net: RoadNet, sensors: Array) -> Iterator[Head]:

@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 
 CORNER_M = 9.0  # a row of buildings may begin and end this far beyond its edge's ends
 STEP_M = 1.0  # shift along the street to the next try where something did not fit
+CELL_M = 20.0  # cells by which built land is searched
 CLEARANCE_M = 0.25  # least distance between solid objects
 SENSOR_CLEAR_M = 2.5  # no street lamp is nearer to a roadside sensor, since it would block the view
 KERBSIDE_M = 0.4  # from the kerb to the middle of what stands at it
@@ -47,7 +48,7 @@ class Plot:
         """Start without buildings; `closed` is the area that stays free, world frame [m]."""
         self._closed = closed
         shapely.prepare(self._closed)
-        self._taken: list[Polygon] = []
+        self._taken: dict[tuple[int, int], list[Polygon]] = {}  # by the cells of `CELL_M` that a footprint touches
 
     def build(self, shape: Polygon, apart_m: float = CLEARANCE_M) -> bool:
         """Reserve the footprint `shape` and return True; return False where it is not free.
@@ -56,10 +57,22 @@ class Plot:
         """
         if self._closed.intersects(shape):
             return False
-        if self._taken and shapely.dwithin(np.array(self._taken), shape, apart_m).any():
+        near = [other for cell in _list_cells(shape, apart_m) for other in self._taken.get(cell, ())]
+        if near and shapely.dwithin(np.array(near), shape, apart_m).any():
             return False
-        self._taken.append(shape)
+        for cell in _list_cells(shape, 0.0):
+            self._taken.setdefault(cell, []).append(shape)
         return True
+
+
+def _list_cells(shape: Polygon, around_m: float) -> list[tuple[int, int]]:
+    """Return the cells of `CELL_M` that the bounds of a shape touch, widened by `around_m` [m]."""
+    low_x, low_y, high_x, high_y = shape.bounds
+    columns, rows = (
+        range(int((low - around_m) // CELL_M), int((high + around_m) // CELL_M) + 1)
+        for low, high in ((low_x, high_x), (low_y, high_y))
+    )
+    return [(column, row) for column in columns for row in rows]
 
 
 @dataclass(frozen=True)

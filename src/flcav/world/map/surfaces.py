@@ -29,9 +29,14 @@ class GroundSurfaces:
     islands: MultiPolygon  # traffic islands: holes of the roads without a sidewalk in them
 
 
-def build_ground_surfaces(net: RoadNet, frontage_m: Mapping[str, float]) -> GroundSurfaces:
-    """Return the ground surfaces of a net; `frontage_m` is the width of paving behind the sidewalk, by street type."""
-    driven = [
+def build_ground_surfaces(
+    net: RoadNet, frontage_m: Mapping[str, float], parking: Sequence[Polygon] = ()
+) -> GroundSurfaces:
+    """Return the ground surfaces of a net; `frontage_m` is the width of paving behind the sidewalk, by street type.
+
+    Spaces for `parking` [m] are part of the road.
+    """
+    driven = [*parking] + [
         LineString(lane.shape).buffer(lane.width / 2, cap_style="flat", join_style="mitre")
         for edge in net.edges.values()
         for lane in edge.lanes

@@ -14,6 +14,7 @@ from flcav.config import InputError, read_config, shorten
 from flcav.seeds import stream
 from flcav.world.map import boundaries, street_furniture
 from flcav.world.map.parameters import GeoReference, TownParameters
+from flcav.world.map.parking import outline_space
 from flcav.world.map.relief import Relief
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.signals import Signals, place_signals
@@ -156,6 +157,10 @@ def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
     for pole in parameters.poles:
         if pole.edge not in walked:
             raise InputError(f"{origin}: pole {pole.id} stands on '{pole.edge}', which is no edge with a sidewalk")
+    lights = {way.light for way in net.connections}
+    for signal in parameters.signals:
+        if not signal.light or signal.light not in lights:
+            raise InputError(f"{origin}: a signal shows {shorten(signal.light)}, which is no light of the net")
 
 
 def lift_town(town: Town, relief: Relief) -> Town:
@@ -180,7 +185,8 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
 
     Ground first, then buildings, clutter, hedges and fences, trees, poles, signs, lamps and signals.
     """
-    ground = build_ground_surfaces(net, {kind: street.frontage_m for kind, street in parameters.streets.items()})
+    frontage = {kind: street.frontage_m for kind, street in parameters.streets.items()}
+    ground = build_ground_surfaces(net, frontage, [outline_space(space) for space in parameters.parking])
     rows = list(street_furniture.list_verges(net, parameters))
     paved = add(ground.roads, ground.sidewalks)
     land = street_furniture.Plot(paved)
@@ -225,5 +231,5 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
         ),
         posts=posts,
         lamps=street_furniture.place_lamps(rows, mounts, stream(parameters.seed, "lamps")),
-        signals=place_signals(net, mounts),
+        signals=place_signals(net, mounts, parameters.signals),
     )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flcav.config import SHOWN, InputError, shorten
-from flcav.world.opendrive.objects import read_limit
+from flcav.world.opendrive.objects.signs import read_limit
 from flcav.world.opendrive.standard import check_standard
 
 FASTEST = 100.0  # [m/s] a limit beyond is none
@@ -50,14 +50,15 @@ def read_map(path: Path) -> ElementTree.Element:
     header = root.find("header")
     if root.tag.lower() != "opendrive" or header is None:
         raise InputError(
-            f"{path}: not an OpenDRIVE map (its root is <{root.tag[:SHOWN]}>, expected <OpenDRIVE> with a <header>)"
+            f"{path}: not an OpenDRIVE map (its root is <{root.tag[:SHOWN]}>, "
+            "expected <OpenDRIVE> with a <header>: OpenDRIVE 1.8, 6.4)"
         )
     if header.get("revMajor") != "1":
         raise InputError(
             f"{path}: OpenDRIVE version {shorten(header.get('revMajor', ''))} is not supported; supported: 1.x"
         )
     if root.find("road") is None:
-        raise InputError(f"{path}: has no <road>")
+        raise InputError(f"{path}: has no <road> (OpenDRIVE 1.8, 10.1)")
     check_standard(root, path)
     return root
 

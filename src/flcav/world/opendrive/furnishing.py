@@ -9,8 +9,10 @@ from shapely.geometry import LineString
 from flcav.world.map.parameters import (
     GeoReference,
     MapSource,
+    ParkingParameters,
     PoleParameters,
     PostParameters,
+    SignalParameters,
     SignParameters,
     StreetParameters,
     TownParameters,
@@ -63,6 +65,8 @@ def furnish(
     source: MapSource,
     signs: tuple[SignParameters, ...] = (),
     posts: tuple[PostParameters, ...] = (),
+    signals: tuple[SignalParameters, ...] = (),
+    parking: tuple[ParkingParameters, ...] = (),
 ) -> TownParameters:
     """Return the parameters of a town on `net`; raises `KeyError` for a street type that is not in `STREETS`."""
     kinds = sorted({edge.type for edge in net.streets})
@@ -78,6 +82,8 @@ def furnish(
         poles=tuple(find_candidate_poles(net)),
         signs=signs,
         posts=posts,
+        signals=signals,
+        parking=parking,
     )
 
 

@@ -11,11 +11,13 @@ import subprocess
 import tempfile
 import xml.etree.ElementTree as ElementTree
 import zlib
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import yaml
+from shapely.geometry import LineString
 
 from flcav.config import InputError
 from flcav.extras import format_install_command
@@ -30,27 +32,34 @@ from flcav.world.opendrive.georeference import locate_origin
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map, mirror_parts
-from flcav.world.opendrive.objects import find_posts, find_signs
+from flcav.world.opendrive.objects.crossings import take_crosswalks
+from flcav.world.opendrive.objects.crosswalks import Crosswalk, find_crosswalks
+from flcav.world.opendrive.objects.parking_spaces import find_parking
+from flcav.world.opendrive.objects.signal_heads import count_controllers, find_heads
+from flcav.world.opendrive.objects.signs import find_posts, find_signs
 from flcav.world.opendrive.streets import rewrite_streets
 
+GAPS_M = 5000.0  # total length of the gaps between linked roads, in both directions, over which streets are drawn
 NETCONVERT_S = 300.0  # longest run of netconvert
 PARTS = ("nod", "edg", "con")  # netconvert's plain XML files: nodes, edges, connections
 OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}
 JOINING = {
     "offset.disable-normalization": "true",
     "no-turnarounds.except-deadend": "true",
-    "geometry.remove": "true",  # merge the edges at a node of one street,
-    "geometry.remove.min-length": "40",  # and a short edge even where it differs a little
-    "geometry.remove.width-tolerance": "1",
     "keep-edges.components": "1",
-    "crossings.guess": "true",
-    "crossings.guess.speed-threshold": "20",
     "walkingareas": "true",
     "junctions.corner-detail": "8",
     "junctions.internal-link-detail": "12",
     "roundabouts.guess": "true",
     "tls.default-type": "static",
     "tls.cycle.time": "60",
+}
+FIRST = {
+    "geometry.remove": "true",  # merge the edges at a node of one street,
+    "geometry.remove.min-length": "40",  # and a short edge even where it differs a little
+    "geometry.remove.width-tolerance": "1",
+    "crossings.guess": "true",
+    "crossings.guess.speed-threshold": "20",
 }
 
 
@@ -82,13 +91,29 @@ def split_map(root: ElementTree.Element, prefix: Path, origin: Path, *, left_han
         mirror_parts(prefix)
 
 
-def join_parts(prefix: Path, net: Path, origin: Path, *, left_hand: bool) -> None:
-    """Join the `PARTS` beside `prefix` to the net file `net`; raises `InputError` naming `origin` where that fails."""
-    options = {OPTIONS[part]: f"{prefix}.{part}.xml" for part in PARTS}
+def join_parts(
+    prefix: Path, net: Path, origin: Path, *, left_hand: bool, crosswalks: tuple[Crosswalk, ...] = ()
+) -> int:
+    """Join the `PARTS` beside `prefix` to the net file `net`; return how many of a map's crosswalks are its crossings.
+
+    Without `crosswalks` netconvert guesses where crossings are. Raises `InputError` naming `origin` where that fails.
+    """
     side = {"lefthand": "true"} if left_hand else {}
-    _run(options | JOINING | side | {"output-file": str(net)}, origin)
+    plain = prefix.with_name("joined")
+    also = {"plain-output-prefix": str(plain)} if crosswalks else {}
+    _run(_name_parts(prefix) | JOINING | FIRST | side | also | {"output-file": str(net)}, origin)
+    taken = 0
+    if crosswalks:
+        taken = take_crosswalks(plain, net, crosswalks)
+        _run(_name_parts(plain) | JOINING | side | {"output-file": str(net)}, origin)
     text = net.read_text(encoding="utf-8")
     net.write_text(re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL), encoding="utf-8")  # no dates and paths
+    return taken
+
+
+def _name_parts(prefix: Path) -> dict[str, str]:
+    """Return netconvert's options for reading the `PARTS` beside `prefix`."""
+    return {OPTIONS[part]: f"{prefix}.{part}.xml" for part in PARTS}
 
 
 def _run(options: dict[str, str], origin: Path) -> None:
@@ -111,15 +136,33 @@ def _run(options: dict[str, str], origin: Path) -> None:
         raise InputError(f"{origin}: netconvert cannot read this OpenDRIVE map ({errors[0].strip().rstrip('.')})")
 
 
-def _read_joined(path: Path, origin: Path) -> RoadNet:
-    """Return the net that netconvert made; raises `InputError` naming `origin` where no town can be made of it."""
+def _read_joined(path: Path, origin: Path, roads_m: float) -> RoadNet:
+    """Return the net that netconvert made; raises `InputError` naming `origin` where no town can be made of it.
+
+    netconvert joins roads that are linked by straight streets, wherever they are; `roads_m` is their own length.
+    """
     try:
         net = read_net(path)
     except InputError as error:
         raise InputError(f"{origin}: netconvert makes no net of it ({str(error).removeprefix(f'{path}: ')})") from None
     if not any(edge.lanes_of("driving") for edge in net.streets):
         raise InputError(f"{origin}: has no road with a lane for driving")
+    streets_m = sum(LineString(edge.lanes[0].shape).length for edge in net.streets)
+    if streets_m > 2 * roads_m + GAPS_M:  # both directions of each road, at most
+        raise InputError(
+            f"{origin}: roads that are linked lie apart: {streets_m / 1000:.0f} km of streets to join "
+            f"{roads_m / 1000:.3g} km of roads (OpenDRIVE 1.8, 10.3)"
+        )
     return net
+
+
+def _tell(what: str, taken: int, left: Counter[str], nowhere: int = 0) -> list[str]:
+    """Return a sentence on how many of a map's things were taken over, and why others were not; none without any."""
+    reasons = left + Counter({"no street between two sidewalks there": nowhere})
+    if not taken and not reasons:
+        return []
+    told = "".join(f"; left out: {count} ({reason})" for reason, count in sorted(reasons.items()))
+    return [f"{what} of the map taken over: {taken}{told}."]
 
 
 @dataclass(frozen=True)
@@ -152,8 +195,22 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         folder.mkdir()
         split_map(root, prefix, xodr, left_hand=document.left_hand)
         streets = rewrite_streets(prefix, document, xodr)
-        join_parts(prefix, folder / "town.net.xml", xodr, left_hand=document.left_hand)
-        net = _read_joined(folder / "town.net.xml", xodr)
+        crosswalks = find_crosswalks(root, streets.offset_m)
+        crossed = join_parts(
+            prefix, folder / "town.net.xml", xodr, left_hand=document.left_hand, crosswalks=crosswalks.found
+        )
+        roads_m = sum(float(road.attrib["length"]) for road in root.iterfind("road"))
+        net = _read_joined(folder / "town.net.xml", xodr, roads_m)
+        heads = find_heads(root, streets.offset_m, net)
+        parking = find_parking(root, streets.offset_m, net)
+        notes += [
+            *_tell("Crosswalks", crossed, crosswalks.left, len(crosswalks.found) - crossed),
+            *_tell("Signal heads", len(heads.found), heads.left),
+            *_tell("Parking spaces", len(parking.found), parking.left),
+        ]
+        several, alike = count_controllers(heads.found, folder / "town.net.xml")
+        if several:
+            notes.append(f"Controllers with several of these heads: {several}; switched alike here: {alike}.")
         dx, dy = streets.offset_m
         geo = locate_origin(document.geo_reference, -dx, -dy)
         if geo is None:
@@ -174,13 +231,15 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
             source=MapSource(file=xodr.name, offset_m=streets.offset_m),
             signs=find_signs(root, streets.offset_m),
             posts=find_posts(root, streets.offset_m),
+            signals=heads.found,
+            parking=parking.found,
         )
         values = parameters.model_dump(mode="json", exclude_defaults=True)
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
         (folder / "town.yaml").write_text(text, encoding="utf-8")
         if len(heights.points):
             Relief(heights.points + np.array([dx, dy, 0.0])).save(folder / HEIGHTS)
-        load_town(folder)
+        town = load_town(folder)
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(folder, out)
-    return ImportedTown(load_town(out), tuple(notes))
+    return ImportedTown(replace(town, net=out.absolute() / "town.net.xml"), tuple(notes))

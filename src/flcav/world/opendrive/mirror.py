@@ -15,6 +15,9 @@ TURNED: dict[str, tuple[str, ...]] = {  # attributes that change their sign, by 
     "laneOffset": tuple("abcd"),
     "signal": ("t", "hOffset"),
     "object": ("t", "hdg"),
+    "repeat": ("tStart", "tEnd"),
+    "cornerLocal": ("v",),
+    "cornerRoad": ("t",),
     "lane": ("id",),
     "laneLink": ("from", "to"),
 }

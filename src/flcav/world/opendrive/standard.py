@@ -10,8 +10,8 @@ from pathlib import Path
 
 from flcav.config import InputError, shorten
 
-LINES, ROADS = "9.2", "10"  # clauses
-ELEVATIONS, NUMBERS, LANES, WIDTHS, OFFSETS, JUNCTIONS = "10.5", "11.1", "11.3", "11.6", "11", "12"
+LINES, ROADS = "9.2", "10.1"  # clauses
+ELEVATIONS, NUMBERS, LANES, WIDTHS, OFFSETS, JUNCTIONS = "10.5", "11.1", "11.3", "11.6", "11.4", "12.2"
 SHAPES: dict[str, tuple[str, ...]] = {  # children of <geometry> with their coefficients
     "line": (),
     "arc": ("curvature",),

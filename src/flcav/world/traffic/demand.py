@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from shapely.geometry import LineString
 
 from flcav.geometry import wrap_angle
 from flcav.seeds import stream
 from flcav.world.map.parameters import TownParameters
+from flcav.world.map.parking import outline_space
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
 from flcav.world.shapes import SHAPES
@@ -26,6 +28,8 @@ KERB_GAP_M = (0.1, 0.3)  # limits of the gap between wheels and kerb
 BUMPER_GAP_M = (0.6, 1.8)  # limits of the gap between neighbours
 CROOKED = 0.12  # share of vehicles parked at a larger angle
 BACKWARDS = 0.06  # share of vehicles parked against the driving direction
+VANS = 0.1  # share of vans in the parking spaces of a map
+DOOR_M = 0.2  # by which a parking space is wider than the vehicle in it, at least
 OVERHANG_M = 0.1  # by which a vehicle may stand out of its lane, at most
 DRIVER = {  # attributes of SUMO's vehicle types by category, where they differ from the defaults
     "car": {"vClass": "passenger", "speedFactor": "normc(1,0.1,0.75,1.2)", "minGap": "2.0"},
@@ -56,8 +60,10 @@ class Parked:
 def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) -> list[Parked]:
     """Return the parked vehicles on the parking lanes of all streets, drawn by the parameters of the street types.
 
-    They do not overlap and stand out of their lane by `OVERHANG_M` at most.
+    They do not overlap and stand out of their lane by `OVERHANG_M` at most. Parking spaces of a map are taken at
+    random, and a parking lane with some has no other vehicles.
     """
+    spaces = shapely.union_all([outline_space(space) for space in parameters.parking])
     out = []
     for edge in net.streets:
         street = parameters.streets[edge.type]
@@ -65,6 +71,8 @@ def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) 
         shares = np.array([street.parked_mix[category] for category in categories])
         for lane in edge.lanes_of("parking"):
             verge = Verge(LineString(lane.shape), lane.width / 2, street, net.side)
+            if verge.line.buffer(lane.width / 2, cap_style="flat").intersects(spaces):
+                continue
             along = FROM_JUNCTION_M + random.uniform(0.0, 3.0)
             while True:
                 category = categories[int(random.choice(len(categories), p=shares / shares.sum()))]
@@ -84,7 +92,18 @@ def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) 
                     yaw = float(wrap_angle(heading + crooked + np.pi * backwards))
                     out.append(Parked(category, shape, x, y, yaw))
                 along += length + bumper_gap
-    return out
+    return out + list(_park_in_spaces(parameters, random))
+
+
+def _park_in_spaces(parameters: TownParameters, random: np.random.Generator) -> Iterator[Parked]:
+    """Yield the vehicles in the parking spaces of a map: of those that fit, in the middle, either way round."""
+    for space in parameters.parking:
+        taken, category = random.random() < parameters.parking_taken, "van" if random.random() < VANS else "car"
+        shape = int(random.choice(len(SHAPES[category]), p=parameters.shape_weights(category)))
+        yaw = np.radians(space.yaw_deg) + random.normal(0.0, 0.015) + np.pi * (random.random() < 0.5)
+        size = SHAPES[category][shape]
+        if taken and size.length <= space.length_m and size.width + DOOR_M <= space.width_m:
+            yield Parked(category, shape, space.x, space.y, float(wrap_angle(yaw)))
 
 
 def write_demand(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import shapely
-from shapely.geometry import LineString, Polygon
+from shapely.geometry import LineString, Point, Polygon
 
 from flcav.config import InputError, read_config
 from flcav.sources.recipe import Recipe
@@ -19,6 +19,7 @@ from flcav.world.map.town import Town, load_town
 from flcav.world.opendrive.document import read_map
 from flcav.world.opendrive.georeference import inverse_mercator, locate_origin
 from flcav.world.opendrive.importing import ImportedTown, import_town
+from flcav.world.opendrive.objects.crosswalks import find_crosswalks
 from flcav.world.traffic.traffic import simulate
 
 CROSS = Path(__file__).parents[3] / "data" / "cross.xodr"
@@ -132,6 +133,16 @@ def test_the_cross_is_furnished_and_its_traffic_flows(cross: ImportedTown) -> No
     assert got_on.slowest_third > 2.0
     assert got_on.gone > 0.8
     assert 0.5 < got_on.walking < 1.7
+
+
+def test_crosswalks_and_signal_heads_of_carlas_towns(carla: ImportedTown) -> None:
+    crosswalks, heads = {"Town02": (0, 24), "Town10HD": (16, 17)}[carla.town.name]
+    known = find_crosswalks(read_map(REAL / f"{carla.town.name}.xodr"), (0.0, 0.0)).found
+    assert (len(known), len(carla.town.parameters.signals)) == (crosswalks, heads)
+    lines = [LineString(crossing.centre_line) for crossing in map_layers(carla.town).crossings]
+    assert not crosswalks or len(lines) == crosswalks
+    for crosswalk in known:
+        assert min(line.distance(Point(crosswalk.centre)) for line in lines) < 0.2
 
 
 def test_carlas_town_is_furnished(carla: ImportedTown) -> None:

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shapely.affinity import scale
 from shapely.geometry import LineString, Point, Polygon
 
 from flcav.config import InputError
+from flcav.world.map.lanes import map_layers
 from flcav.world.map.roads import Edge, RoadNet, read_net
 from flcav.world.map.surfaces import subtract, unite
 from flcav.world.map.town import Town
@@ -22,6 +24,7 @@ from flcav.world.traffic.reach import find_driven, find_walked
 from flcav.world.traffic.traffic import simulate
 
 CROSS = Path(__file__).parents[3] / "data" / "cross.xodr"
+OBJECTS = CROSS.with_name("cross_with_objects.xodr")
 
 pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
 
@@ -36,7 +39,7 @@ def write(root: ElementTree.Element, path: Path) -> Path:
 
 
 def test_left_hand_traffic_is_the_mirror_image(tmp_path: Path) -> None:
-    root = read_map(CROSS)
+    root = read_map(OBJECTS)
     for geometry in root.iter("geometry"):  # the map at its origin, so that both towns are mirrored in the same axis
         geometry.set("x", str(float(geometry.attrib["x"]) - 458_000))
         geometry.set("y", str(float(geometry.attrib["y"]) - 5_428_000))
@@ -50,10 +53,16 @@ def test_left_hand_traffic_is_the_mirror_image(tmp_path: Path) -> None:
             assert min(line.hausdorff_distance(known) for known in lines(one, 1, kind)) < 0.1
             start = Point(line.coords[0])
             assert min(start.distance(Point(known.coords[0])) for known in lines(one, 1, kind)) < 0.1
-    for name in ("poles", "signs"):
+    for name in ("poles", "signs", "signals"):
         here, there = getattr(right, name), getattr(left, name)
         away = np.linalg.norm(here.position[:, None] - there.position * (1, -1, 1), axis=2)
         assert (away.min(axis=0) < 0.3).all(), name
+    crossings = [[Polygon(row.outline) for row in map_layers(town).crossings] for town in (right, left)]
+    assert len(crossings[0]) == len(crossings[1]) == 2
+    for area in crossings[0]:
+        mirrored = scale(area, 1, -1, origin=(0, 0))
+        assert min(mirrored.symmetric_difference(other).area for other in crossings[1]) < 0.3
+    assert len(left.parameters.parking) == len(right.parameters.parking) == 4
     trace = simulate(left, seed=1, cavs=1, times_s=np.array([20.0, 21.0]))
     _keeps_to_its_lanes(left, trace.position[:, np.char.startswith(trace.actor, "cav"), :2].reshape(-1, 2))
 
@@ -147,13 +156,24 @@ def test_limits_that_are_not_finite_are_left_out() -> None:
     assert [row.get("max") for row in root.iter("speed")] == ["13.9", "no limit"] * 2
 
 
+def test_roads_that_are_linked_across_a_country_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "map.xodr"
+    path.write_text(CROSS.read_text().replace('y="5428000.0000"', 'y="7"', 1))
+    with pytest.raises(InputError, match=r"roads that are linked lie apart: .* to join 0\.\d+ km of roads .*10\.3\)"):
+        import_town(path, tmp_path / "town")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ('length="60.0000"', 'length="nan"', r"road '1': <geometry> needs a number as 'length', not 'nan' .*9\.2"),
         ('length="60.0000"', 'length="6"', r"road '1' is 90 m long, and its geometry 36 m .*9\.2"),
         ('<arc curvature="0.02"/>', "", r"a <geometry> needs one of line, arc"),
-        ('id="2" junction', 'id="1" junction', r"each road needs an id of its own, and two have '1' .*10\)"),
+        ('id="2" junction', 'id="1" junction', r"each road needs an id of its own, and two have '1' .*10\.1\)"),
+        ('revMajor="1"', 'revMajor="2"', "version '2' is not supported"),
+        ("<header", "<heading", r"expected <OpenDRIVE> with a <header>: OpenDRIVE 1.8, 6\.4"),
+        ("<lanes>", '<lanes><laneOffset s="x"/>', r"<laneOffset> needs a number as 's', not 'x' .*11\.4\)"),
+        ("<junction ", '<junction id="10"/><junction ', r"each junction needs an id of its own.*12\.2\)"),
         ('<lane id="1" type', '<lane id="2" type', r"road '1': its left lanes are not numbered one by one .*11\.1"),
         ('a="3.5"', 'a="3500"', r"a lane is 3500 m wide"),
         ('<laneSection s="0">', '<laneSection s="">', r"<laneSection> needs a number as 's', not '' .*11\.3"),
@@ -161,7 +181,7 @@ def test_limits_that_are_not_finite_are_left_out() -> None:
     ],
 )
 def test_a_broken_rule_is_told_with_its_clause(old: str, new: str, message: str, tmp_path: Path) -> None:
-    text = CROSS.read_text()
+    text = CROSS.read_text().replace("</header>", f"</{new.removeprefix('<') if 'head' in new else 'header'}>")
     assert old in text
     path = tmp_path / "map.xodr"
     path.write_text(text.replace(old, new, 1))

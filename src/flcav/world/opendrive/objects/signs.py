@@ -2,13 +2,11 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
 from typing import Literal
-
-import numpy as np
 
 from flcav.world.map.parameters import PostParameters, SignParameters
 from flcav.world.map.street_furniture import SIGN_HEIGHT_M, SPEED_SIGNS
+from flcav.world.opendrive.objects.places import locate, read_number, repeat_object
 from flcav.world.opendrive.road_surface import Road
 
 SIGNS: dict[str, Literal["stop", "yield"]] = {"206": "stop", "205": "yield"}  # numbers of the German catalogue
@@ -28,12 +26,12 @@ def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> tupl
         road = Road(row)
         for signal in row.iterfind("signals/signal"):
             kind = SIGNS.get(signal.get("type", "")) or _limit_kind(signal)
-            place = _place(road, signal, offset_m)
+            place = locate(road, signal, offset_m)
             if kind is None or place is None or signal.get("dynamic") == "yes":
                 continue
             x, y, heading = place
             facing = heading if signal.get("orientation") == "-" else heading + math.pi
-            up = _number(signal, "zOffset") + _number(signal, "height") / 2
+            up = read_number(signal, "zOffset") + read_number(signal, "height") / 2
             out.append(
                 SignParameters(
                     kind=kind,
@@ -52,11 +50,11 @@ def find_posts(root: ElementTree.Element, offset_m: tuple[float, float]) -> tupl
     for row in root.iterfind("road"):
         road = Road(row)
         for thing in row.iterfind("objects/object"):
-            height = _number(thing, "height")
+            height = read_number(thing, "height")
             if thing.get("type") != "pole" or not POST_M[0] <= height <= POST_M[1]:
                 continue
-            for one in [thing, *_repeat(thing)]:
-                place = _place(road, one, offset_m)
+            for one in repeat_object(thing):
+                place = locate(road, one, offset_m)
                 if place is not None:
                     out.append(PostParameters(x=round(place[0], 3), y=round(place[1], 3), height_m=round(height, 2)))
     return tuple(out)
@@ -64,7 +62,7 @@ def find_posts(root: ElementTree.Element, offset_m: tuple[float, float]) -> tupl
 
 def read_limit(signal: ElementTree.Element) -> float | None:
     """Return the limit [m/s] of a speed-limit sign; None for other signs, and where it says no number."""
-    value = _number(signal, "value")
+    value = read_number(signal, "value")
     if signal.get("type") != LIMIT_SIGN or not 5 <= value * KMH.get(signal.get("unit", "km/h"), 1.0) <= 200:
         return None
     return value * KMH.get(signal.get("unit", "km/h"), 1.0) / 3.6
@@ -74,33 +72,3 @@ def _limit_kind(signal: ElementTree.Element) -> Literal["speed_30", "speed_60", 
     """Return the kind of sign that is nearest to a speed limit; None for other signs."""
     limit = read_limit(signal)
     return None if limit is None else SPEED_SIGNS[min(SPEED_SIGNS, key=lambda known: abs(known - 3.6 * limit))]
-
-
-def _repeat(thing: ElementTree.Element) -> Iterator[ElementTree.Element]:
-    """Yield the further copies of an object: every `distance` over a `length` from `s` on."""
-    for row in thing.iterfind("repeat"):
-        start, length, distance = (_number(row, name) for name in ("s", "length", "distance"))
-        count = int(length / distance) if distance > 0.5 and 0 < length < 1e4 else 0
-        for i in range(1, count + 1):
-            share = i * distance / length
-            t = (1 - share) * _number(row, "tStart") + share * _number(row, "tEnd")
-            yield ElementTree.Element("object", {"s": str(start + i * distance), "t": str(t)})
-
-
-def _place(road: Road, thing: ElementTree.Element, offset_m: tuple[float, float]) -> tuple[float, float, float] | None:
-    """Return x, y [m] and the road's heading [rad] where a thing stands; None where it says no place on the road."""
-    s, t = _number(thing, "s", math.nan), _number(thing, "t", math.nan)
-    if not (0 <= s <= road.length and abs(t) < 100):
-        return None
-    x, y, _ = road.point(np.array([s]), np.array([t]))[0].tolist()
-    heading = float(road.line.at(np.array([s]))[0, 2])
-    return x + offset_m[0], y + offset_m[1], heading
-
-
-def _number(row: ElementTree.Element, name: str, otherwise: float = 0.0) -> float:
-    """Return an attribute as a finite number, `otherwise` where it is none."""
-    try:
-        value = float(row.get(name, ""))
-    except ValueError:
-        return otherwise
-    return value if math.isfinite(value) else otherwise

@@ -24,25 +24,24 @@ from flcav.fusion.distillation import (
 from flcav.fusion.pose_graph import Sighting
 from flcav.fusion.posts import find_posts, posts_of
 from flcav.fusion.road import RoadView
-from flcav.geometry import Boxes, inverse, transform_points
+from flcav.geometry import Boxes, transform_points
 from flcav.network.ledger import Direction, Ledger
 from flcav.network.messages import send
-from flcav.perception.metrics import match
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import Second, second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.truth import asked_of, choose_lidar, in_range, network_from_lidar
+from flcav.perception.objects.truth import choose_lidar
 from flcav.perception.weights import from_arrays
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels import road_views
+from flcav.pipeline.labels.pseudo_labels import road_views
+from flcav.pipeline.labels.quality import LABELS, measure_labels, read_history
 from flcav.pipeline.recipe import EDGE
-from flcav.pipeline.results import LabelHistory, LabelQuality
+from flcav.pipeline.results.training import LabelHistory
 from flcav.progress import Report, ignore_progress
 from flcav.seeds import stream
 
-LABELS = "labels.json"  # quality of the labels before each round, in the folder of a stage
 SURVEYED = np.eye(4)  # road sensors tell of boxes in the world frame
 
 
@@ -154,36 +153,3 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
     def _send(self, direction: Direction, i: int, round_: int, message: bytes) -> bytes:
         about: Any = {"stage": self._stage, "task": OBJECTS.name, "link": "wireless", "client": self._name(i)}
         return send(self._book, message, **about, direction=direction, round_=round_)
-
-
-def read_history(folder: Path) -> LabelHistory:
-    """Return the quality of the labels of the rounds so far in a stage's folder."""
-    return LabelHistory.load(folder, LABELS) if (folder / LABELS).exists() else LabelHistory()
-
-
-def measure_labels(
-    round_: int,
-    split: Frames,
-    frames: Sequence[int],
-    region: str,
-    samples: Mapping[str, Sequence[Sample]],
-    config: SecondConfig,
-) -> LabelQuality:
-    """Return precision and recall of the labels of vehicles' `frames`, whose samples are in the order of the frames.
-
-    They are compared with ground truth, which nobody learns from here.
-    """
-    each = {name: iter(own) for name, own in samples.items()}
-    found, targets, neutral = [], [], []
-    for i in frames:
-        frame, sample = split.data.frame(i), next(each[f"{region}/{split.data.keys[i].agent}"])
-        truth, move = asked_of(frame, config), network_from_lidar(frame, config)
-        boxes = sample.boxes[in_range(sample.boxes, config)]
-        boxes = boxes if move is None else boxes.transform(inverse(move))
-        found.append(Boxes.from_array(boxes.array(), boxes.label, np.ones(len(boxes))))
-        targets.append(truth.targets)
-        neutral.append(truth.neutral)
-    matches = match(found, targets, neutral, 0.5)
-    right, there = int(matches.hit.sum()), int(matches.targets.sum())
-    count = len(matches.hit)
-    return LabelQuality(round_, count, there, right / count if count else None, right / there if there else None)

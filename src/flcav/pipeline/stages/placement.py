@@ -12,7 +12,7 @@ from flcav.optimization.placement.solve import coverage, place
 from flcav.perception.errors import PerceptionError
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import Placement
-from flcav.pipeline.results import Placed, Pole
+from flcav.pipeline.results.placement import Placed, Pole
 from flcav.seeds import stream
 from flcav.world.map.census import measure_traffic_density
 from flcav.world.trace import Trace

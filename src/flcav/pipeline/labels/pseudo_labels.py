@@ -1,18 +1,15 @@
-"""Labels of stages II and III: pseudo-labels by the pretrained network and roadside sensors, or ground truth."""
+"""Pseudo-labels by the pretrained network and roadside sensors, and ground truth as labels."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from flcav.config import InputError
 from flcav.fusion.detector import road_detector
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView, build_road_view, label_ideally
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send
-from flcav.perception.client import as_shared
 from flcav.perception.metrics import match
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
@@ -20,46 +17,12 @@ from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import asked_of, choose_lidar
 from flcav.perception.task import Task
-from flcav.perception.tasks import task_named
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import EDGE
 from flcav.progress import Report
 from flcav.world.map.relief import Relief
 
 PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
-
-
-@dataclass(frozen=True)
-class LabelSource:
-    """A source of labels."""
-
-    from_detections: bool = False  # pseudo-labels of the frozen stage I network
-    from_poles: bool = False  # boxes of roadside sensors
-    trained: bool = False  # these boxes are a trained detector's, not an ideal one's
-    averaged: bool = False  # the road average of a spin's poles and vehicles, renewed before each round of stage II
-    caveat: str = ""  # stated with every result that depends on them
-
-
-LABEL_SOURCES: Mapping[str, LabelSource] = {
-    "own-detections": LabelSource(from_detections=True),
-    "road": LabelSource(from_detections=True, from_poles=True, trained=True, caveat="trained road detector"),
-    "road-average": LabelSource(
-        from_detections=True, from_poles=True, trained=True, averaged=True, caveat="trained road detector"
-    ),
-    "ideal-road": LabelSource(from_detections=True, from_poles=True, caveat="ideal road detector, upper bound"),
-    "annotated": LabelSource(caveat="ground truth as labels, upper bound"),
-    "future": LabelSource(
-        caveat="every vehicle knows all tracks around it, upper bound"
-    ),  # the recorded future of each track
-}
-
-
-def choose_labels(task: str, asked: str | None) -> str:
-    """Return the kind of labels of a task (None: its first); raises `InputError` for one the task does not have."""
-    known = as_shared(task_named(task)).labels
-    if asked is not None and asked not in known:
-        raise InputError(f"labels of '{task}': '{asked}' is none of {', '.join(known)}")
-    return asked or known[0]
 
 
 def fit_label_threshold(network: Second, splits: Sequence[Frames]) -> float:

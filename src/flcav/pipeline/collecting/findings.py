@@ -7,8 +7,10 @@ if the interval contains 0 or the spread is not known: another training on the s
 
 from collections.abc import Mapping, Sequence
 
+from flcav.pipeline.arms import Setting
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
-from flcav.pipeline.results import ArmResult, Difference, Finding, Test
+from flcav.pipeline.results.run import ArmResult
+from flcav.pipeline.results.tests import Difference, Finding, Test
 from flcav.verdicts import UNDECIDED, explain_verdict, signed, verdict
 
 WORDS = {
@@ -18,6 +20,8 @@ WORDS = {
     CLOUD: "edge + cloud FL",
     CENTRAL: "central training",
 }
+
+TRAINED = ("plan", "labels", "distillation", "federation", "training", "central")  # settings besides the placement
 
 
 def name_stage(arm: str, stage: str) -> str:
@@ -29,17 +33,18 @@ def findings(
     differences: Sequence[Difference],
     tests: Sequence[Test],
     arms: Mapping[str, ArmResult],
-    rules: Mapping[str, str],
+    settings: Mapping[str, Setting],
     roles: Mapping[str, str],
     caveats: Mapping[str, str],
 ) -> tuple[Finding, ...]:
     """Return a finding for each difference of the run itself.
 
-    `rules`: placement rule of each arm. `roles`: role of each region. `caveats`: those of the labels, by task.
+    `settings`: those of each arm. `roles`: role of each region. `caveats`: those of the labels, by task.
     """
+    rules = {name: setting.placement.rule for name, setting in settings.items()}
     values = {(test.arm, test.stage, test.region, test.task): test for test in tests}
     return tuple(
-        _finding(each, _question(each, rules, roles), values, arms, caveats.get(each.task, ""))
+        _finding(each, _question(each, rules, roles), values, _tell_same_poles(each, arms, settings), caveats)
         for each in differences
         if each.arm == MAIN
     )
@@ -49,19 +54,15 @@ def _finding(
     each: Difference,
     question: str,
     values: Mapping[tuple[str, str, str, str], Test],
-    arms: Mapping[str, ArmResult],
-    caveat: str,
+    same: str | None,
+    caveats: Mapping[str, str],
 ) -> Finding:
+    """Return the finding of a difference; `same`: what is said where nothing differs."""
     after = values[each.arm, each.stage, each.region, each.task].result
     before = _before(each, values).result
     place = f"{each.region}, {each.task}"
-    same = _same_poles(each, arms)
     if same is not None:
-        sentence = (
-            f"{_poles(same)}, placed by VRCSP, is also where traffic is densest: there is nothing to compare, so this "
-            f"run does not decide."
-        )
-        return Finding(place, question, UNDECIDED, sentence)
+        return Finding(place, question, UNDECIDED, f"{same}: there is nothing to compare, so this run does not decide.")
     mean, low, high = each.estimate.mean, each.estimate.low, each.estimate.high
     told = (
         f"On {each.region}, {after.measure} of {each.task} was {before.estimate.mean:.3f} "
@@ -71,7 +72,7 @@ def _finding(
     over = f"{after.frames} test frames of {after.scenes} scenes"
     if low is None or high is None:
         return Finding(place, question, UNDECIDED, f"{told}, over {over}: too few scenes for an interval.")
-    rests = f" ({caveat})" if caveat else ""
+    rests = f" ({caveats[each.task]})" if caveats.get(each.task) else ""
     if each.spread is None:
         unknown = "how much another training on the same frames would differ is not known, so this run does not decide"
         sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over} alone; {unknown}{rests}."
@@ -102,16 +103,25 @@ def _question(each: Difference, rules: Mapping[str, str], roles: Mapping[str, st
     return f"Does the run beat its arm '{each.before_arm}'?"
 
 
-def _same_poles(each: Difference, arms: Mapping[str, ArmResult]) -> tuple[int, ...] | None:
-    """Return the poles of both arms where their rules chose the same ones, so that nothing differs; else None."""
-    if each.before_arm == MAIN or each.estimate.mean or each.estimate.low or each.estimate.high:
+def _tell_same_poles(each: Difference, arms: Mapping[str, ArmResult], settings: Mapping[str, Setting]) -> str | None:
+    """Return that two arms chose the same poles, in words, where that is why nothing differs; else None.
+
+    Arms that differ in more than the placement may come to the same figures, too: that is a difference of 0.
+    """
+    ours, other = settings[each.arm], settings[each.before_arm]
+    if each.before_arm == MAIN or each.stage != each.before_stage:
         return None
-    chosen = [
+    if any(getattr(ours, name) != getattr(other, name) for name in TRAINED):
+        return None
+    if each.estimate.mean or each.estimate.low or each.estimate.high:
+        return None
+    chosen, others = (
         next((placed.chosen for placed in arms[arm].placed if placed.region == each.region), ())
         for arm in (each.arm, each.before_arm)
-    ]
-    return chosen[0] if chosen[0] and set(chosen[0]) == set(chosen[1]) else None
-
-
-def _poles(numbers: Sequence[int]) -> str:
-    return f"Pole {numbers[0]}" if len(numbers) == 1 else f"Each of the poles {', '.join(map(str, numbers))}"
+    )
+    if not chosen or set(chosen) != set(others):
+        return None
+    poles = f"Pole {chosen[0]}" if len(chosen) == 1 else f"Each of the poles {', '.join(map(str, chosen))}"
+    if (ours.placement.rule, other.placement.rule) == ("vrcsp", "densest"):
+        return f"{poles}, placed by VRCSP, is also where traffic is densest"
+    return f"{poles} has a sensor in both arms"

@@ -1,0 +1,97 @@
+"""Assembly of a run's results from its finished steps."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from flcav.network.ledger import LINKS, Budget, Ledger
+from flcav.perception.tasks import task_named
+from flcav.pipeline.arms import Setting
+from flcav.pipeline.collecting.differences import list_differences
+from flcav.pipeline.collecting.findings import findings
+from flcav.pipeline.collecting.history import gaps_closed
+from flcav.pipeline.collecting.tests import collect_regional_tests, collect_test
+from flcav.pipeline.graph.graph import Graph
+from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.provenance import provenance
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
+from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.run import ArmResult, LinkUse, Run, Spent
+from flcav.pipeline.results.saved import LEDGER
+from flcav.pipeline.results.training import Pretrained, StageResult, Watched
+
+
+def collect_results(graph: Graph, work: Path) -> Run:
+    """Collect the results of the finished steps in `work`, and write each arm's ledger to `ledgers` beside it."""
+    recipe, names, main = graph.recipe, graph.names, graph.settings[MAIN]
+    settings = {name: setting for name, setting in graph.settings.items() if not setting.repeat}
+    tests = [
+        collect_test(graph, work, arm.name, stage, region, task)
+        for arm in settings.values()
+        for stage, region, task in graph.tested(arm)
+    ]
+    watched = [
+        Watched.load(work / names.rounds(names.stage(MAIN, stage, region, task), region))
+        for stage, region, task in graph.watched()
+    ]
+    arms = {name: _arm(graph, work, arm) for name, arm in settings.items()}
+    differences = list_differences(graph, work)
+    roles = {name: region.role for name, region in recipe.regions.items()}
+    rests = {task: LABEL_SOURCES[kind].caveat for task, kind in main.labels.items()}
+    return Run(
+        recipe=recipe,
+        arms=arms,
+        pretrained=tuple(Pretrained.load(work / names.pretrain(MAIN, task)) for task in recipe.tasks),
+        watched=tuple(watched),
+        tested=tuple(tests),
+        differences=tuple(differences),
+        findings=findings(differences, tests, arms, settings, roles, rests),
+        gap_closed=gaps_closed(tests, recipe),
+        provenance=provenance(recipe.seed),
+        caveats=tuple(dict.fromkeys(filter(None, rests.values()))),
+    )
+
+
+def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
+    names, tasks = graph.names, graph.recipe.tasks
+    plans = dict.fromkeys(names.plan(arm.name, stage) for stage in (PRETRAIN, *arm.stages))
+    *earlier, plan = (Plan.load(work / name) for name in plans)
+    trained = [
+        names.stage(arm.name, stage, region, task)
+        for task in tasks
+        for stage in arm.stages
+        for region in (arm.regions if stage != CLOUD else arm.regions[:1])
+    ]
+    books = [Ledger.load(work / names.pretrain(arm.name, task) / LEDGER) for task in tasks]
+    if arm.stages != (CENTRAL,):
+        last = names.more_edge if MORE_EDGE in arm.stages else names.edge
+        books += [Ledger.load(work / last(arm.name, region, task) / LEDGER) for task in tasks for region in arm.regions]
+    if CLOUD in arm.stages:
+        books = [Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks]  # they include the others
+    budgets = graph.recipe.budgets_mb
+    book = Ledger(Budget(budgets.wireless, budgets.wireline), (entry for each in books for entry in each.entries))
+    book.save(work.parent / "ledgers" / f"{arm.name}.parquet")
+    stages = tuple(StageResult.load(work / step) for step in trained)
+    ended = {each.task: each.plans[-1].plan for each in stages if each.stage == CLOUD and each.plans}
+    plan = replace(plan, tasks={**plan.tasks, **ended})
+    return ArmResult(
+        plan=plan,
+        placed=tuple(Placed.load(work / names.place(arm.name, region)) for region in arm.regions),
+        stages=stages,
+        links={
+            link: LinkUse(
+                getattr(budgets, link),
+                sum(getattr(task, f"{link}_mb") for task in plan.tasks.values()),
+                book.used_mb(link),
+            )
+            for link in LINKS
+        },
+        spent=tuple(
+            Spent(stage, task, link, book.used_mb(link, stage=stage, task=task_named(task).name))
+            for task in tasks
+            for stage in (PRETRAIN, EDGE, CLOUD)
+            for link in LINKS
+        ),
+        earlier=tuple(earlier) or None,
+        regional=collect_regional_tests(graph, work, arm) or None,
+    )

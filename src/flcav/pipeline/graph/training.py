@@ -1,0 +1,116 @@
+"""Steps of the stages of training, and of centralised training in place of stage II."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from flcav.pipeline.arms import Setting
+from flcav.pipeline.graph.outline import Outline
+from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE
+from flcav.pipeline.steps import Step
+from flcav.pipeline.work.central import CentralSettings, central_step
+from flcav.pipeline.work.cloud import CloudSettings, cloud_step
+from flcav.pipeline.work.edge import EdgeSettings, edge_step
+from flcav.pipeline.work.pretraining import PretrainSettings, pretrain_step
+from flcav.pipeline.work.settings import RoundPlans, make_step
+
+
+def list_pretraining(outline: Outline, arm: Setting) -> Iterator[Step]:
+    """Yield stage I of an arm, for each task."""
+    recipe, names = outline.recipe, outline.names
+    for task in recipe.tasks:
+        kinds = [LABEL_SOURCES[each.labels[task]] for each in outline.settings.values()]
+        settings = PretrainSettings(
+            learning=outline.learning(arm, task),
+            plan=names.plan(arm.name),
+            pools=outline.pools(task),
+            validation=tuple(names.recording(region, "validation", task) for region in recipe.with_role("pretrain")),
+            budgets_mb=recipe.budgets_mb,
+            upload_seed=recipe.seed,
+            thresholded=any(kind.from_detections for kind in kinds),
+        )
+        yield make_step(names.pretrain(arm.name, task), pretrain_step, settings)
+
+
+def list_edge_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
+    """Yield stage II of an arm, or its centralised training, for each task and region."""
+    for task in outline.recipe.tasks:
+        averaged = any(LABEL_SOURCES[each.labels[task]].averaged for each in outline.settings.values())
+        for region in arm.regions:
+            if arm.central:
+                yield _centralise(outline, arm, region, task)
+                continue
+            name, inputs = outline.names.edge(arm.name, region, task), outline.inputs(arm, region, task, EDGE)
+            about = _federate(outline, arm, task, EDGE, _replan(outline, arm, task, EDGE, region, name))
+            yield make_step(name, edge_step, EdgeSettings(**about, inputs=inputs, scored=averaged))
+
+
+def list_further_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
+    """Yield what follows stage II in an arm, for each task: stage III or further edge rounds."""
+    names = outline.names
+    last = next((stage for stage in (CLOUD, MORE_EDGE) if stage in arm.stages), None)
+    if last is None:
+        return
+    for task in outline.recipe.tasks:
+        inputs = {
+            region: outline.inputs(arm, region, task, last).model_copy(
+                update={"edge": names.edge(arm.name, region, task)}
+            )
+            for region in arm.regions
+        }
+        if last == CLOUD:
+            name = names.cloud(arm.name, task)
+            about = _federate(outline, arm, task, CLOUD, _replan(outline, arm, task, CLOUD, None, name))
+            yield make_step(name, cloud_step, CloudSettings(**about, regions=inputs))
+            continue
+        for region, own in inputs.items():
+            name = names.more_edge(arm.name, region, task)
+            about = _federate(outline, arm, task, last, _replan(outline, arm, task, MORE_EDGE, region, name))
+            yield make_step(name, edge_step, EdgeSettings(**about, inputs=own))
+
+
+def _federate(outline: Outline, arm: Setting, task: str, stage: str, replan: RoundPlans | None) -> dict[str, Any]:
+    """Return the fields of `FederationSettings` of a stage of a task."""
+    recipe, timed = outline.recipe, arm.federation.network is not None
+    given = {name: recipe.regions[name].speed for name in outline.federating}
+    speeds = {f"{region}/{vehicle}": speed for region in given for vehicle, speed in given[region].items()}
+    return {
+        "learning": outline.learning(arm, task),
+        "federation": arm.federation if stage == CLOUD else arm.edge_federation,
+        "budgets_mb": recipe.budgets_mb,
+        "vehicles": outline.vehicles,
+        "labels": arm.labels[task],
+        "distillation": arm.distillation if LABEL_SOURCES[arm.labels[task]].averaged else None,
+        "train_s": recipe.tasks[task].train_s if timed else 0.0,
+        "speeds": speeds if timed else {},
+        "replan": replan,
+    }
+
+
+def _replan(outline: Outline, arm: Setting, task: str, stage: str, region: str | None, own: str) -> RoundPlans | None:
+    """Return how the step `own` plans its rest anew after each round; None where it does not.
+
+    The run itself plans, of stage II each region for itself; others keep to its rounds: further edge rounds to the
+    number of its stage III.
+    """
+    if not arm.by_round or outline.recipe.tasks[task].history is None:
+        return None
+    names, headroom = outline.names, outline.recipe.headroom
+    ours = names.edge(MAIN, region, task) if stage == EDGE and region else names.cloud(MAIN, task)
+    if own != ours:
+        return RoundPlans(headroom=headroom, follows=ours)
+    watched = {name: names.recording(name, "validation", task) for name in ([region] if region else arm.regions)}
+    return RoundPlans(headroom=headroom, first=names.plan(MAIN), frames=watched)
+
+
+def _centralise(outline: Outline, arm: Setting, region: str, task: str) -> Step:
+    by_round = arm.by_round and outline.recipe.tasks[task].history is not None
+    inputs = outline.inputs(arm, region, task, CENTRAL)
+    settings = CentralSettings(
+        learning=outline.learning(arm, task),
+        inputs=inputs.model_copy(update={"pools": outline.pools(task)}),
+        vehicles=outline.vehicles[region],
+        source=arm.central or "pretrain",
+        follows=outline.names.edge(MAIN, region, task) if by_round else None,
+    )
+    return make_step(outline.names.central(arm.name, region, task), central_step, settings)

@@ -1,0 +1,41 @@
+"""Sources of labels in stages II and III, by name."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from flcav.config import InputError
+from flcav.perception.client import as_shared
+from flcav.perception.tasks import task_named
+
+
+@dataclass(frozen=True)
+class LabelSource:
+    """A source of labels."""
+
+    from_detections: bool = False  # pseudo-labels of the frozen stage I network
+    from_poles: bool = False  # boxes of roadside sensors
+    trained: bool = False  # these boxes are a trained detector's, not an ideal one's
+    averaged: bool = False  # the road average of a spin's poles and vehicles, renewed before each round of stage II
+    caveat: str = ""  # stated with every result that depends on them
+
+
+LABEL_SOURCES: Mapping[str, LabelSource] = {
+    "own-detections": LabelSource(from_detections=True),
+    "road": LabelSource(from_detections=True, from_poles=True, trained=True, caveat="trained road detector"),
+    "road-average": LabelSource(
+        from_detections=True, from_poles=True, trained=True, averaged=True, caveat="trained road detector"
+    ),
+    "ideal-road": LabelSource(from_detections=True, from_poles=True, caveat="ideal road detector, upper bound"),
+    "annotated": LabelSource(caveat="ground truth as labels, upper bound"),
+    "future": LabelSource(
+        caveat="every vehicle knows all tracks around it, upper bound"
+    ),  # the recorded future of each track
+}
+
+
+def choose_labels(task: str, asked: str | None) -> str:
+    """Return the kind of labels of a task (None: its first); raises `InputError` for one the task does not have."""
+    known = as_shared(task_named(task)).labels
+    if asked is not None and asked not in known:
+        raise InputError(f"labels of '{task}': '{asked}' is none of {', '.join(known)}")
+    return asked or known[0]

@@ -1,0 +1,50 @@
+"""Forms and sizes of the updates that vehicles send, and the rounds that a plan gives each vehicle."""
+
+from collections.abc import Iterable, Sequence
+
+from flcav.config import Config
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.selection import Selection
+from flcav.federation.strategies import exchanges_more
+from flcav.federation.upload import Upload
+from flcav.network.ledger import BYTES_PER_MB
+from flcav.perception.task import Task, build_network, find_configuration
+from flcav.perception.weights import to_arrays
+from flcav.pipeline.arms import Setting
+from flcav.pipeline.recipe import Federation
+from flcav.pipeline.results.plans import TaskPlan
+
+
+class UpdateForm(Config):
+    """What a client's update is sent as, as far as its size depends on it."""
+
+    upload: Upload = Upload()
+    exchanging: bool = False  # with an array beside each that is learned
+
+
+def update_forms(settings: Iterable[Setting]) -> list[UpdateForm]:
+    """Return the different forms of the arms' updates, in the order of the arms."""
+    forms = []
+    for setting in settings:
+        how = setting.federation
+        form = UpdateForm(upload=how.upload, exchanging=exchanges_more(how.strategy))
+        if form not in forms and setting.central is None:
+            forms.append(form)
+    return forms
+
+
+def follow_plan(how: Federation, plan: TaskPlan, done: int) -> Rules:
+    """Return the rules by which vehicles join the rounds that the plan gives them, after `done` rounds.
+
+    Another selection than that of all vehicles goes before the plan's.
+    """
+    if plan.joins is None or how.selection.rule != "all":
+        return how
+    return how.model_copy(update={"selection": Selection(rule="planned", joins=plan.joins_after(done))})
+
+
+def model_mb(task: Task, network: str | None, forms: Sequence[UpdateForm] = (UpdateForm(),)) -> float:
+    """Return the serialised size of one model update [MB], the largest of its `forms`, by a dry run of the message."""
+    weights = to_arrays(build_network(task, find_configuration(task, network), 0))
+    return max(update_bytes(weights, form.upload, exchanging=form.exchanging) for form in forms) / BYTES_PER_MB

@@ -1,0 +1,1 @@
+"""Records of results: of the steps of a run, and of the run."""

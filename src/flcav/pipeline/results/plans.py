@@ -1,0 +1,58 @@
+"""Records of plans: samples and rounds of each task, before a run, between its stages and after its rounds."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+from flcav.network.plan import Price
+from flcav.pipeline.results.saved import Saved
+from flcav.records import LEFT_OUT, Record
+
+
+@dataclass(frozen=True)
+class TaskPlan:
+    """The plan of one task: its samples and rounds, and their price on both uplinks."""
+
+    samples: int
+    edge_rounds: int
+    cloud_rounds: int
+    wireless_mb: float  # uplink, all stages
+    wireline_mb: float
+    sample_mb: float  # of one sample
+    model_mb: float  # of one model update
+    predicted: Mapping[str, float] | None  # score after each stage, by the learning curve; None: a fixed plan
+    joins: Annotated[Mapping[str, tuple[int, ...]] | None, LEFT_OUT] = (
+        None  # by vehicle the rounds it joins, of 1 … edge rounds + k · cloud rounds; None: every vehicle joins all
+    )
+
+    uploads: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
+        None  # samples that each vehicle of the pretraining regions uploads; None: drawn from the frames of all
+    )
+
+    def joins_after(self, rounds: int) -> Mapping[str, tuple[int, ...]]:
+        """Return the rounds that each vehicle joins, numbered from 1 after the first `rounds`; empty: all join all."""
+        own = self.joins or {}
+        return {name: tuple(each - rounds for each in joined if each > rounds) for name, joined in own.items()}
+
+
+@dataclass(frozen=True)
+class Plan(Saved):
+    """The allocation of both budgets to tasks and stages."""
+
+    rule: str
+    tasks: Mapping[str, TaskPlan]
+    after: Annotated[str | None, LEFT_OUT] = None  # stage after which it was made anew; None: before the run
+    reached: Annotated[Mapping[str, float] | None, LEFT_OUT] = None  # score then, by task, which it rests on
+
+
+@dataclass(frozen=True)
+class RoundPlan(Record):
+    """The plan of the rest of a stage of a task, made anew after one of the stage's rounds."""
+
+    round: int  # of the stage
+    reached: float | None  # score on validation frames then; None: another federation's plan is followed
+    planned_mb: (
+        Price  # list price of what was done until then: of stage II of the region's rounds, of III of all stages
+    )
+    sent_mb: Price  # what was sent upwards for it
+    plan: TaskPlan  # counts in total; of stage II what the region itself sends, and its vehicles alone

@@ -1,0 +1,105 @@
+"""Records of a finished run, of its arms, and of the means over several seeds."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+from flcav.intervals import MeanOverSeeds
+from flcav.pipeline.provenance import Provenance
+from flcav.pipeline.recipe import RunRecipe
+from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.results.plans import Plan, RoundPlan
+from flcav.pipeline.results.saved import Saved
+from flcav.pipeline.results.tests import Difference, Finding, RegionalTest, Test, Tested
+from flcav.pipeline.results.training import Pretrained, StageResult, Watched
+from flcav.records import LEFT_OUT
+from flcav.verdicts import Judged
+
+
+@dataclass(frozen=True)
+class Spent:
+    """Uplink traffic of one stage of a task on one link."""
+
+    stage: str
+    task: str
+    link: str
+    mb: float
+
+
+@dataclass(frozen=True)
+class LinkUse:
+    """Budget, planned traffic and actual traffic of one uplink [MB]."""
+
+    budget_mb: float
+    planned_mb: float
+    used_mb: float
+
+
+@dataclass(frozen=True)
+class ArmResult:
+    """Results of one arm: its plans, placements, stages, and uplink traffic."""
+
+    plan: Plan  # carried out: the last one
+    placed: tuple[Placed, ...]
+    stages: tuple[StageResult, ...]
+    links: Mapping[str, LinkUse]
+    spent: tuple[Spent, ...]
+    regional: Annotated[tuple[RegionalTest, ...] | None, LEFT_OUT] = None  # of stage III, where regions keep arrays
+    earlier: Annotated[tuple[Plan, ...] | None, LEFT_OUT] = None  # plans that others took the place of, oldest first
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        """Return all plans in the order in which they were made."""
+        return (*(self.earlier or ()), self.plan)
+
+    @property
+    def round_plans(self) -> list[tuple[StageResult, RoundPlan]]:
+        """Return the plans that were made after rounds, with the stage of each."""
+        return [(stage, made) for stage in self.stages for made in stage.plans or ()]
+
+    def sent_mb(self, task: str, link: str) -> float:
+        """Return the uplink traffic of a task on a link, over all stages [MB]."""
+        return sum(row.mb for row in self.spent if (row.task, row.link) == (task, link))
+
+
+@dataclass(frozen=True)
+class Run(Saved):
+    """Results of a finished run."""
+
+    recipe: RunRecipe
+    arms: Mapping[str, ArmResult]
+    pretrained: tuple[Pretrained, ...]  # of the run itself
+    watched: tuple[Watched, ...]  # of the run itself
+    tested: tuple[Test, ...]
+    differences: tuple[Difference, ...]
+    findings: tuple[Finding, ...]
+    gap_closed: Mapping[str, float]  # fraction closed of the gap to centralised training
+    caveats: tuple[str, ...]  # of the kinds of labels
+    provenance: Provenance
+    elapsed_s: float = 0.0  # wall time of all starts together
+
+    def test(self, *, stage: str, region: str, task: str, arm: str = "main") -> Tested:
+        """Return the result of a test; raises `KeyError` for one that was not made."""
+        for each in self.tested:
+            if (each.arm, each.stage, each.region, each.task) == (arm, stage, region, task):
+                return each.result
+        raise KeyError((arm, stage, region, task))
+
+
+@dataclass(frozen=True)
+class Mean:
+    """The mean of a number over seeds, with its 95 % interval."""
+
+    name: str
+    estimate: MeanOverSeeds
+    judged: Annotated[Judged | None, LEFT_OUT] = None  # of the run's own differences: the claim that they are positive
+
+
+@dataclass(frozen=True)
+class Summary(Saved):
+    """Means over several seeds of a recipe; verdicts on differences are corrected together."""
+
+    seeds: tuple[int, ...]
+    measures: tuple[Mean, ...]
+    differences: tuple[Mean, ...]
+    gap_closed: tuple[Mean, ...]

@@ -1,0 +1,24 @@
+"""Results as JSON in the folders of their steps, and the names of the files beside them."""
+
+from pathlib import Path
+from typing import Self
+
+from flcav.config import read_json
+from flcav.files import write_json
+from flcav.records import Record
+
+RESULT, PROBLEM = "result.json", "problem.json"  # the latter: the allocation problem of a plan
+WEIGHTS, LEDGER, ERRORS, OUTCOMES = "weights.safetensors", "ledger.parquet", "errors.parquet", "outcomes.npz"
+
+
+class Saved(Record):
+    """A record that is saved as JSON in a folder."""
+
+    def save(self, folder: Path, name: str = RESULT) -> None:
+        """Write the record to `folder`, atomically; tasks and regions stay in their order."""
+        write_json(folder / name, self.as_json(), sort=False)
+
+    @classmethod
+    def load(cls, folder: Path, name: str = RESULT) -> Self:
+        """Return what `save` wrote; raises `InputError` where it is not there, or of another version."""
+        return cls.from_json(read_json(folder / name), str(folder / name))

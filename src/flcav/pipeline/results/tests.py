@@ -1,0 +1,92 @@
+"""Records of tests: of networks on test frames, of differences between them, and what follows from these."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from flcav.intervals import Estimate, Spread
+from flcav.pipeline.results.saved import Saved
+
+
+@dataclass(frozen=True)
+class Tested(Saved):
+    """Test of a network on a region's test frames; the outcome of each frame is in the same folder."""
+
+    region: str
+    task: str
+    measure: str  # name of what is estimated
+    estimate: Estimate
+    numbers: Mapping[str, float | None]  # other numbers of the task, by name
+    frames: int
+    scenes: int
+
+
+@dataclass(frozen=True)
+class Test:
+    """A test with the arm, stage, region and task that it is of."""
+
+    arm: str
+    stage: str
+    region: str
+    task: str
+    step: str  # its folder holds the outcomes
+    result: Tested  # its interval is over scenes alone
+    estimate: Estimate  # the interval is over scenes and, where the spread is known, over retrainings
+    spread: Spread | None  # over retrainings: of this run's own, or of the recipe's table; None: not known
+    retrained: tuple[float, ...] = ()  # the measure of each retraining of the arm, on the same frames
+
+
+@dataclass(frozen=True)
+class RegionalTest:
+    """A test of the model that a region keeps for itself, by `federation.personal`."""
+
+    model: str  # region whose model it is
+    region: str  # whose test frames
+    task: str
+    measure: str
+    estimate: Estimate  # the interval is over scenes
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Paired difference of a measure on the same test frames: `arm` at `stage` minus `before_arm` at its stage."""
+
+    name: str
+    arm: str
+    stage: str
+    before_arm: str
+    before_stage: str
+    region: str
+    task: str
+    estimate: Estimate  # the interval is over scenes and, where the spread is known, over retrainings
+    over_scenes: Estimate  # the interval is over scenes alone
+    spread: Spread | None  # as in `Test`
+    retrained: tuple[float, ...] = ()  # the difference in each retraining
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The verdict of a run on one claim."""
+
+    place: str  # region and task
+    question: str
+    verdict: str  # held | did not hold | undecided
+    sentence: str  # with the numbers behind it
+
+
+@dataclass(frozen=True)
+class SweepDetections:
+    """Detections of one network in a sweep, matched to the targets; boxes are in the LiDAR frame."""
+
+    boxes: tuple[tuple[float, ...], ...]  # x y z length width height yaw [m, rad]; without those of neutral objects
+    hit: tuple[bool, ...]  # whether each box matches a target
+    found: tuple[bool, ...]  # whether each target is matched
+
+
+@dataclass(frozen=True)
+class SweepComparison(Saved):
+    """Detections of two networks in the same test sweep."""
+
+    frame: int  # number in its dataset
+    targets: tuple[tuple[float, ...], ...]  # boxes as in `SweepDetections`
+    before: SweepDetections
+    after: SweepDetections

@@ -1,0 +1,119 @@
+"""Records of training: pretraining, federated stages with their rounds, and validation scores."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from flcav.pipeline.results.plans import RoundPlan
+from flcav.pipeline.results.saved import Saved
+from flcav.records import LEFT_OUT, Record
+
+
+@dataclass(frozen=True)
+class Validated:
+    """A validation during pretraining."""
+
+    step: int  # optimiser steps taken
+    loss: float  # mean since the validation before
+    score: float  # on validation frames
+
+
+@dataclass(frozen=True)
+class Pretrained(Saved):
+    """Result of stage I of a task; weights and ledger are in the same folder."""
+
+    task: str
+    network: str  # name of the configuration
+    uploaded: Mapping[str, tuple[int, ...]]  # frames by region
+    validated: tuple[Validated, ...]
+    steps: int  # of the optimiser
+    threshold: float | None  # lowest score of detections that serve as labels; None where none do
+
+
+@dataclass(frozen=True)
+class Round:
+    """A round of a federation and the validation score after it."""
+
+    round: int
+    score: float
+
+
+@dataclass(frozen=True)
+class FederatedRound(Record):
+    """One round of a federation: whose updates were combined, who failed and why, what was sent, loss and epsilon."""
+
+    server: str  # region of the edge server, or "cloud"
+    round: int  # from 1 in its stage
+    clients: tuple[str, ...]  # whose updates were combined
+    failed: Mapping[str, str]  # by client what was wrong
+    samples: int  # of the clients together
+    loss: float  # mean training loss, weighted by samples
+    up_bytes: int  # of all clients' messages, on their link
+    down_bytes: int
+    epsilon: float | None  # of differential privacy, of all rounds so far; None: without noise
+    seconds: float | None = None  # of the simulated network; None: without one
+
+
+@dataclass(frozen=True)
+class LabelQuality(Record):
+    """Precision and recall of the labels that vehicles train on, against ground truth that they do not know.
+
+    A label is right that matches a target at IoU 0.5 in 3D; labels on neutral objects do not count.
+    """
+
+    round: int  # of stage II that they are made before, from 1
+    labels: int
+    targets: int
+    precision: float | None  # None: no labels
+    recall: float | None  # None: no targets
+
+
+@dataclass(frozen=True)
+class LabelHistory(Saved):
+    """Quality of the labels before each round of a stage."""
+
+    rounds: tuple[LabelQuality, ...] = ()
+
+
+@dataclass(frozen=True)
+class StageResult(Saved):
+    """Result of a federated stage of a task, or of centralised training; the weights are in the same folder."""
+
+    stage: str
+    task: str
+    region: str | None  # None: all federating regions together
+    rounds: int
+    samples: int  # of all clients together
+    clients: int
+    poles: tuple[int, ...]  # whose sensors contributed labels
+    losses: tuple[float, ...] = ()  # mean training loss of each round
+    records: Annotated[tuple[FederatedRound, ...] | None, LEFT_OUT] = None  # of all servers; None: no federation
+    plans: Annotated[tuple[RoundPlan, ...] | None, LEFT_OUT] = None  # after each round; None: not made anew by rounds
+    labels: Annotated[tuple[LabelQuality, ...] | None, LEFT_OUT] = None  # before each round; None: not measured
+
+
+@dataclass(frozen=True)
+class Watched(Saved):
+    """Validation scores of a federation in a region after each round; of a pretrained network, as round 0."""
+
+    stage: str
+    task: str
+    region: str
+    frames: int
+    rounds: tuple[Round, ...]
+
+
+def average_regions(watched: Sequence[Watched]) -> tuple[Round, ...]:
+    """Return the mean score over regions of each round that all of `watched` have, weighted by frames."""
+    frames = [each.frames for each in watched]
+    return tuple(
+        Round(at[0].round, float(np.average([each.score for each in at], weights=frames)))
+        for at in zip(*(each.rounds for each in watched), strict=False)
+    )
+
+
+def average_last(watched: Sequence[Watched]) -> float:
+    """Return the mean over regions of the score after each one's last round, weighted by frames."""
+    return float(np.average([each.rounds[-1].score for each in watched], weights=[each.frames for each in watched]))

@@ -1,0 +1,149 @@
+"""Stage III: edge servers federate with the cloud, vehicles with edge servers."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from flcav.federation.rounds import OnRound
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account, Outage
+from flcav.federation.stages import EdgeServer, afford_cloud_rounds, federate
+from flcav.federation.state import FederationState
+from flcav.federation.strategies.fedavg import average
+from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.network.ledger import Ledger
+from flcav.perception.client import TaskClient
+from flcav.perception.distillation import SharedSamples
+from flcav.perception.outcomes import score_network
+from flcav.perception.weights import from_arrays, save_network, to_arrays
+from flcav.pipeline.federations.rounds import FederationCheckpoints, load_round_network
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.planning.course import Driven, Replanning
+from flcav.pipeline.recipe import CLOUD, EDGE
+from flcav.pipeline.stages.clients import Strategies, describe_federation, give_outputs
+from flcav.pipeline.stages.learning import Learning, load_stage_network, regional_weights
+from flcav.progress import Report
+
+
+@dataclass(frozen=True)
+class RegionStart:
+    """Where a region's edge server starts in stage III."""
+
+    clients: Mapping[str, TaskClient]  # its vehicles, by name
+    weights: Weights  # of stage II
+    earlier: int  # rounds of stage II
+
+
+@dataclass(frozen=True)
+class CloudFederation:
+    """The federation of edge servers with the cloud: what its rounds begin with, and where they are kept."""
+
+    learning: Learning
+    network: Any  # that the cloud begins with
+    regions: Mapping[str, RegionStart]
+    edge_rounds: int  # of an edge server in a cloud round
+    strategies: Strategies
+    book: Ledger
+    folder: Path  # of checkpoints, weights and ledger
+    report: Report
+    validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
+    shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
+
+    def score(self, round_: int) -> Mapping[str, float]:
+        """Return the scores, by region, of the network that a federation of so many rounds ends with."""
+        task, averaged = self.learning.task, self.learning.training.average_rounds
+        reached = load_round_network(task, self.network, self.folder, round_, averaged)
+        return {name: score_network(task, reached, own.data, own.vehicles) for name, own in self.validation.items()}
+
+    def afford(self, rules: Rules, rounds: int) -> int:
+        """Return as many of `rounds` as the privacy budget affords in every region; without one all."""
+        for own in self.regions.values() if rules.privacy is not None else ():
+            rounds = min(rounds, afford_cloud_rounds(rules, [*own.clients], rounds, self.edge_rounds, own.earlier))
+        return rounds
+
+    def open_servers(
+        self, rules: Rules, account: Account, done: int, states: Mapping[str, FederationState]
+    ) -> dict[str, EdgeServer]:
+        """Return the edge servers by region, after `done` cloud rounds; `states` are their own."""
+        return {
+            region: EdgeServer(
+                own.clients if self.shared is None else give_outputs(own.clients, self.shared, own.weights),
+                self.edge_rounds,
+                account,
+                own.weights,
+                cloud_rounds_done=done,
+                strategy=self.strategies.edge,
+                rules=rules,
+                state=states[region],
+                earlier=own.earlier,
+                distiller=self.shared,
+            )
+            for region, own in self.regions.items()
+        }
+
+
+def federate_cloud(
+    federation: CloudFederation,
+    rounds: int,
+    rules: Rules,
+    outages: Mapping[tuple[int, str], Outage] = {},
+    replanning: Replanning | None = None,
+) -> tuple[float, ...]:
+    """Run stage III; write weights and ledger, return each round's loss.
+
+    Edge rounds are run by `rules`, and lose the vehicles that `outages` names; the cloud's rounds need all edge
+    servers. Where rules make arrays personal, the weights have the mean of the regions' own, and each region's model is
+    beside them, as are regional models. A privacy budget may end it before `rounds`. `replanning` is as in
+    `federate_edge`.
+    """
+    own, learning, state = federation, federation.learning, FederationState()
+    own_states = {region: FederationState() for region in own.regions}
+    states = {CLOUD: state, **{f"{EDGE}/{region}": each for region, each in own_states.items()}}
+    rounds = own.afford(rules, rounds)
+    identity, scored = describe_federation(own.strategies, rules), own.score if own.validation else None
+    checkpoints = FederationCheckpoints(learning.task, own.folder, own.book, own.report, states, identity, scored)
+    rules.check_personal(to_arrays(own.network))
+    start, done = checkpoints.resume(to_arrays(own.network))
+    wireless = Account(own.book, CLOUD, learning.task.name, "wireless", outages)
+    wireline = Account(own.book, CLOUD, learning.task.name, "wireline")
+    servers = own.open_servers(rules, wireless, done, own_states)
+    earlier = max(each.earlier for each in own.regions.values())
+    schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier)
+    how: Any = {"strategy": own.strategies.cloud, "rules": rules.of_servers(), "state": state}
+
+    def make_saver(rounds: int) -> OnRound:
+        keep = checkpoints.make_saver(rounds)
+
+        def keep_whole(round_: int, weights: Weights, loss: float) -> None:
+            personal = [each.personal for each in own_states.values() if each.personal and rules.personal_arrays]
+            keep(round_, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
+
+        return keep_whole
+
+    if replanning is None:
+        federate(servers, start, schedule, wireline, **how, done=done, on_round=make_saver(rounds))
+    else:
+        course = replanning.course
+
+        def run_round(weights: Weights, number: int, driven: Driven) -> LocalUpdate | None:
+            if own.afford(rules, number) < number:
+                return None
+            for server in servers.values():
+                server.rules, server.account = driven.rules, replace(wireless, outages=driven.outages)
+            asked: Any = {**how, "done": number - 1, "on_round": make_saver(course.rounds)}
+            return federate(servers, weights, course.schedule(schedule, number), wireline, **asked)
+
+        replanning.run(start, done, checkpoints.scores, run_round)
+    checkpoints.finish(own.network, len(checkpoints.losses), learning.training.average_rounds)
+    if rules.personal:
+        _save_regional_models(learning, own.folder, own_states)
+    return tuple(checkpoints.losses)
+
+
+def _save_regional_models(learning: Learning, folder: Path, states: Mapping[str, FederationState]) -> None:
+    """Write each region's own model: the common weights with what its edge server keeps."""
+    for region, own in states.items():
+        model = load_stage_network(learning.task, folder)
+        from_arrays(model, {**to_arrays(model), **own.personal})
+        save_network(learning.task, model, folder / regional_weights(region))

@@ -1,0 +1,50 @@
+"""The step of centralised training in place of stage II, on ground truth."""
+
+from flcav.perception.weights import save_network
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.recipe import CENTRAL, Role
+from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.saved import WEIGHTS
+from flcav.pipeline.results.training import Pretrained, StageResult
+from flcav.pipeline.stages.centralised import train_centrally
+from flcav.pipeline.stages.learning import load_stage_network
+from flcav.pipeline.steps import Work
+from flcav.pipeline.work.labelling import select_group
+from flcav.pipeline.work.settings import LearningSettings, RegionInputs, StepSettings
+
+
+class CentralSettings(StepSettings):
+    """Settings of centralised training for a region."""
+
+    learning: LearningSettings
+    inputs: RegionInputs
+    vehicles: int  # of the region, whose local steps it takes
+    source: Role  # pretrain: the uploaded samples; federate: the training frames of the region's vehicles
+    follows: str | None = None  # step of the stage II whose number of rounds was planned anew
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Return the names of the steps whose results it takes."""
+        return (*self.inputs.needs, *(() if self.follows is None else (self.follows,)))
+
+
+def central_step(work: Work, settings: CentralSettings) -> None:
+    """Continue training centrally on ground truth, for as many optimiser steps as stage II takes in the region."""
+    learning, inputs = settings.learning.resolve(), settings.inputs
+    trained = load_stage_network(learning.task, work.inputs[inputs.pretrain])
+    if settings.source == "pretrain":
+        uploaded = Pretrained.load(work.inputs[inputs.pretrain]).uploaded
+        parts = [(Frames.open(work.inputs[inputs.pools[name]]), frames) for name, frames in uploaded.items()]
+    else:
+        split = Frames.open(work.inputs[inputs.frames])
+        parts = [(split, select_group(work, split, inputs))]
+    each = (learning.task.samples(split.data, trained.config, frames) for split, frames in parts)
+    samples = [own[number] for own in each for number in range(len(own))]  # in memory: each is drawn many times
+    if settings.follows is None:
+        rounds = Plan.load(work.inputs[inputs.plan]).tasks[settings.learning.task].edge_rounds
+    else:
+        rounds = StageResult.load(work.inputs[settings.follows]).rounds
+    losses = train_centrally(learning, trained, samples, rounds, settings.vehicles, settings.source)
+    save_network(learning.task, trained, work.folder / WEIGHTS)
+    about = (CENTRAL, settings.learning.task, inputs.region, rounds, len(samples), 1, ())
+    StageResult(*about, losses).save(work.folder)

@@ -1,0 +1,1 @@
+"""What an OpenDRIVE map has along its roads: signs, poles, signal heads, crosswalks and parking spaces."""

@@ -1,0 +1,208 @@
+"""Crossings of a town's net where the map has its crosswalks, in netconvert's plain files."""
+
+import copy
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from shapely.geometry import LineString, Point
+from shapely.ops import substring
+
+from flcav.world.map.roads import CARRIAGEWAY, Edge, Lane, RoadNet, read_net
+from flcav.world.opendrive.objects.crosswalks import Crosswalk
+
+Array = NDArray[np.float64]
+
+NEAR_M = 8.0  # from a crosswalk to the crossing at a junction that it is
+ALIGNED = np.cos(np.radians(30.0))  # least cosine of the angle between them
+ENDS_M = 12.0  # no crossing of a street is nearer to its ends than this: it is one of the junction
+ON_ROAD_M = 1.5  # from the middle of a crosswalk to the road that it crosses
+BEYOND_M = 3.0  # from the kerb of a street to the end of a crosswalk, at most
+SAME_M = 1.0  # between the middle lines of the two directions of a street
+
+
+@dataclass(frozen=True)
+class _Guess:
+    """A crossing that netconvert has guessed at a junction: its row, and its middle line (2, 2) [m]."""
+
+    row: ElementTree.Element
+    line: Array
+
+
+def take_crosswalks(prefix: Path, net: Path, crosswalks: tuple[Crosswalk, ...]) -> int:
+    """Replace the guessed crossings in the plain files beside `prefix` by a map's crosswalks; return how many.
+
+    `net` is the net with the guesses, of the same edges. A crosswalk at a junction takes the place of the guess next to
+    it; one across a street cuts the street in two there. Others are left out: they lead to no sidewalk.
+    """
+    trees = {part: ElementTree.parse(f"{prefix}.{part}.xml") for part in ("nod", "edg", "con")}
+    plain = {part: tree.getroot() for part, tree in trees.items()}
+    guesses = _guesses(plain["con"], net)
+    for row in plain["con"].findall("crossing"):
+        plain["con"].remove(row)
+    matched = _match(crosswalks, guesses)
+    for number, guess in matched.items():
+        plain["con"].append(_move(guesses[guess], crosswalks[number]))
+    streets = _Streets(plain, read_net(net))
+    others = [crosswalk for number, crosswalk in enumerate(crosswalks) if number not in matched]
+    crossed = [streets.cross(crosswalk, f"crosswalk{number}") for number, crosswalk in enumerate(others)]
+    for part, tree in trees.items():
+        tree.write(f"{prefix}.{part}.xml")
+    return len(matched) + sum(crossed)
+
+
+def _guesses(connections: ElementTree.Element, net: Path) -> list[_Guess]:
+    """Return the crossings of the plain connections with their middle lines, which the net alone has."""
+    lines: dict[tuple[str, frozenset[str]], Array] = {}
+    for row in ElementTree.parse(net).getroot().iterfind("edge"):
+        lane = row.find("lane")
+        if row.get("function") == "crossing" and lane is not None:
+            points = [point.split(",")[:2] for point in lane.get("shape", "").split()]
+            name = row.get("id", "")[1:].rpartition("_")[0], frozenset(row.get("crossingEdges", "").split())
+            lines[name] = np.array([points[0], points[-1]], dtype=np.float64)
+    found = [(row, (row.get("node", ""), frozenset(row.get("edges", "").split()))) for row in connections]
+    return [_Guess(row, lines[name]) for row, name in found if row.tag == "crossing" and name in lines]
+
+
+def _match(crosswalks: tuple[Crosswalk, ...], guesses: list[_Guess]) -> dict[int, int]:
+    """Return the guess of each crosswalk that has one, by their numbers: the nearest pairs first, each once."""
+    pairs = []
+    for i, crosswalk in enumerate(crosswalks):
+        for j, guess in enumerate(guesses):
+            way = guess.line[1] - guess.line[0]
+            length = float(np.hypot(*way))
+            apart = LineString(guess.line).distance(Point(crosswalk.centre))
+            if length and apart <= NEAR_M and float(crosswalk.along(way)[0] @ way) >= ALIGNED * length:
+                pairs.append((apart, i, j))
+    out: dict[int, int] = {}
+    for _, i, j in sorted(pairs):
+        if i not in out and j not in out.values():
+            out[i] = j
+    return out
+
+
+def _move(guess: _Guess, crosswalk: Crosswalk) -> ElementTree.Element:
+    """Return a guessed crossing moved onto the crosswalk: from kerb to kerb, in the middle of it and as wide.
+
+    It goes on as far as the crosswalk does, `BEYOND_M` at most: kerbs are farther apart in the corners of a junction.
+    """
+    way, length, width = crosswalk.along(guess.line[1] - guess.line[0])
+    low, high = (guess.line - crosswalk.centre) @ way
+    low, high = min(low, max(-length / 2, low - BEYOND_M)), max(high, min(length / 2, high + BEYOND_M))
+    ends = crosswalk.centre + np.outer((low, high), way)
+    return _crossing(guess.row.attrib["node"], guess.row.attrib["edges"], guess.row.get("priority", "0"), width, ends)
+
+
+def _crossing(node: str, edges: str, priority: str, width: float, line: Array) -> ElementTree.Element:
+    shape = " ".join(f"{x:.2f},{y:.2f}" for x, y in line)
+    values = {"node": node, "edges": edges, "priority": priority, "width": f"{width:.2f}", "shape": shape}
+    return ElementTree.Element("crossing", values)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One direction of a street, or of what is left of it after cuts: its plain row, line and sidewalk."""
+
+    row: ElementTree.Element
+    line: LineString  # of the plain row: the middle of the road [m]
+    sidewalk: Lane
+
+    def at(self, place: Array) -> float:
+        """Return how far along the line it is to the point nearest to `place` (2,) [m]."""
+        return float(self.line.project(Point(place)))
+
+
+class _Streets:
+    """The streets of the plain files, which crosswalks cut in two."""
+
+    def __init__(self, parts: dict[str, ElementTree.Element], net: RoadNet) -> None:
+        """Take netconvert's plain `nod`, `edg` and `con` files, and the net of the same edges."""
+        self._plain, self._net = parts, net
+        places = {row.attrib["id"]: f"{row.attrib['x']},{row.attrib['y']}" for row in parts["nod"].iterfind("node")}
+        self._rows: dict[str, list[tuple[ElementTree.Element, LineString]]] = {}  # by the edge that they were
+        for row in parts["edg"].iterfind("edge"):
+            text = row.get("shape", f"{places[row.attrib['from']]} {places[row.attrib['to']]}")
+            points = [[float(value) for value in point.split(",")[:2]] for point in text.split()]
+            self._rows[row.attrib["id"]] = [(row, LineString(points))]
+
+    def cross(self, crosswalk: Crosswalk, name: str) -> bool:
+        """Cut both directions of the street below a crosswalk at the new node `name`; return whether there is one.
+
+        Both need a sidewalk, and a place that is not near their ends.
+        """
+        found = self._find(crosswalk)
+        if found is None:
+            return False
+        one, other = found
+        across = [_nearest(part.sidewalk.shape, crosswalk.centre) for part in (other, one)]  # netconvert's direction
+        walked = across[1] - across[0]
+        way, _, width = crosswalk.along(walked)
+        if float(way @ walked) < ALIGNED * np.hypot(*walked):
+            return False
+        kerbs = [side * part.sidewalk.width / 2 for part, side in ((other, 1.0), (one, -1.0))]
+        ends = [crosswalk.centre + ((at - crosswalk.centre) @ way + in_) * way for at, in_ in zip(across, kerbs)]
+        middle = one.line.interpolate(one.at(crosswalk.centre))
+        kind = {"id": name, "x": f"{middle.x:.2f}", "y": f"{middle.y:.2f}", "type": "priority"}
+        self._plain["nod"].append(ElementTree.Element("node", kind))
+        _, back = self._cut(one, crosswalk.centre, name), self._cut(other, crosswalk.centre, name)
+        edges = f"{one.row.attrib['id']} {back}"
+        self._plain["con"].append(_crossing(name, edges, "1", width, np.array(ends)))
+        return True
+
+    def _find(self, crosswalk: Crosswalk) -> tuple[_Part, _Part] | None:
+        """Return both directions of the street below a crosswalk; None without two that can be cut there."""
+        near = []
+        for edge in self._net.streets:
+            lanes = [lane for lane in edge.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
+            middle = Point(crosswalk.centre)
+            apart = min((LineString(lane.shape).distance(middle) - lane.width / 2 for lane in lanes), default=np.inf)
+            if apart <= ON_ROAD_M and edge.lanes_of("sidewalk"):
+                near.append((apart, edge))
+        for _, edge in sorted(near, key=lambda item: (item[0], item[1].id)):
+            part = self._part(edge, crosswalk.centre)
+            for back in self._net.streets:
+                if (back.start, back.end) == (edge.end, edge.start) and back.lanes_of("sidewalk"):
+                    other = self._part(back, crosswalk.centre)
+                    if part and other and part.line.distance(other.line) < SAME_M:
+                        return part, other
+        return None
+
+    def _part(self, edge: Edge, place: Array) -> _Part | None:
+        """Return the part of an edge that is at `place`; None near the ends of it."""
+        rows = self._rows.get(edge.id, [])
+        if not rows:
+            return None
+        row, line = min(rows, key=lambda item: item[1].distance(Point(place)))
+        part = _Part(row, line, edge.lanes_of("sidewalk")[-1])
+        return part if ENDS_M <= part.at(place) <= line.length - ENDS_M else None
+
+    def _cut(self, part: _Part, place: Array, node: str) -> str:
+        """Cut a part at the node and return the id of the second piece, which takes the ways onward."""
+        before, along = part.row.attrib["id"], part.at(place)
+        after = f"{before}.{node}"
+        second = copy.deepcopy(part.row)
+        second.attrib |= {"id": after, "from": node}
+        part.row.attrib["to"] = node
+        for row in self._plain["con"]:
+            if row.get("from") == before:
+                row.set("from", after)
+            if row.tag == "crossing" and row.get("node") == second.get("to"):
+                row.set("edges", " ".join(after if edge == before else edge for edge in row.get("edges", "").split()))
+        lines = [LineString(substring(part.line, *span).coords) for span in ((0.0, along), (along, part.line.length))]
+        for row, line in zip((part.row, second), lines):
+            row.set("shape", " ".join(f"{x:.2f},{y:.2f}" for x, y in line.coords))
+        self._plain["edg"].append(second)
+        for known in self._rows.values():
+            if any(row is part.row for row, _ in known):
+                known[:] = [item for item in known if item[0] is not part.row]
+                known += zip((part.row, second), lines)
+        return after
+
+
+def _nearest(line: Array, place: Array) -> Array:
+    """Return the point (2,) of a line (K, 2) that is nearest to a place (2,)."""
+    whole = LineString(line)
+    at = whole.interpolate(whole.project(Point(place)))
+    return np.array([at.x, at.y])

@@ -1,0 +1,72 @@
+"""Places, outlines and repetitions of the objects and signals of an OpenDRIVE map (OpenDRIVE 1.8, 13 and 14)."""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.world.opendrive.road_surface import Road
+
+LARGEST_M = 200.0  # farthest corner of an object from its place
+
+
+def repeat_object(thing: ElementTree.Element) -> Iterator[ElementTree.Element]:
+    """Yield an object, and its further copies: every `distance` over a `length` from `s` on."""
+    yield thing
+    for row in thing.iterfind("repeat"):
+        start, length, distance = (read_number(row, name) for name in ("s", "length", "distance"))
+        count = int(length / distance) if distance > 0.5 and 0 < length < 1e4 else 0
+        for i in range(1, count + 1):
+            share = i * distance / length
+            t = (1 - share) * read_number(row, "tStart") + share * read_number(row, "tEnd")
+            one = ElementTree.Element("object", {**thing.attrib, "s": str(start + i * distance), "t": str(t)})
+            one.extend(thing.iterfind("outline"))
+            one.extend(thing.iterfind("outlines"))
+            yield one
+
+
+def outline_object(road: Road, thing: ElementTree.Element) -> NDArray[np.float64] | None:
+    """Return the outline (K, 2) of an object in the map [m]: its corners, or its length and width; None without.
+
+    Corners are in the object's own frame (u, v), which its heading turns against the road, or on the road (s, t).
+    """
+    place = locate(road, thing)
+    if place is None:
+        return None
+    corners = [*thing.iter("cornerLocal")]
+    if len(corners) > 2:
+        own = np.array([(read_number(row, "u"), read_number(row, "v")) for row in corners])
+    elif len(on_road := [*thing.iter("cornerRoad")]) > 2:
+        s, t = (np.array([read_number(row, name) for row in on_road]) for name in ("s", "t"))
+        return road.point(np.clip(s, 0.0, road.length), t)[:, :2]
+    else:
+        length, width = read_number(thing, "length") / 2, read_number(thing, "width") / 2
+        own = np.array([(length, width), (-length, width), (-length, -width), (length, -width)])
+    if not 0.0 < np.abs(own).max() < LARGEST_M:
+        return None
+    yaw = place[2] + read_number(thing, "hdg")
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return own @ np.array([[cos, sin], [-sin, cos]]) + place[:2]
+
+
+def locate(
+    road: Road, thing: ElementTree.Element, offset_m: tuple[float, float] = (0.0, 0.0)
+) -> tuple[float, float, float] | None:
+    """Return x, y [m] and the road's heading [rad] where a thing stands; None where it says no place on the road."""
+    s, t = read_number(thing, "s", math.nan), read_number(thing, "t", math.nan)
+    if not (0 <= s <= road.length and abs(t) < 100):
+        return None
+    x, y, _ = road.point(np.array([s]), np.array([t]))[0].tolist()
+    heading = float(road.line.at(np.array([s]))[0, 2])
+    return x + offset_m[0], y + offset_m[1], heading
+
+
+def read_number(row: ElementTree.Element, name: str, otherwise: float = 0.0) -> float:
+    """Return an attribute as a finite number, `otherwise` where it is none."""
+    try:
+        value = float(row.get(name, ""))
+    except ValueError:
+        return otherwise
+    return value if math.isfinite(value) else otherwise

@@ -1,0 +1,212 @@
+"""Signal heads of an OpenDRIVE map: where they stand, and which way of the net they are for (OpenDRIVE 1.8, 14)."""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString
+
+from flcav.geometry import heading_vectors, left_vectors
+from flcav.world.map.parameters import SignalParameters
+from flcav.world.map.roads import Connection, RoadNet
+from flcav.world.map.signals import ARM_HEAD_M, KERB_HEAD_M
+from flcav.world.opendrive.objects.places import locate, read_number
+from flcav.world.opendrive.road_surface import Road
+
+Array = NDArray[np.float64]
+Placed = tuple[ElementTree.Element, ElementTree.Element]  # a road, and a signal or a reference to one on it
+
+LIGHT = "1000001"  # type of a traffic light for vehicles
+HEAD_M = 1.0  # height of a head; a higher signal includes its post
+HEIGHT_M = (1.8, 9.0)  # heights of a head's centre that are believed
+PLACE_M = 15.0  # from the end of a road of the map to that of its lane in the net
+WAY_M = 40.0  # the same, of both ends of a way through a junction together
+ASKEW = np.cos(np.radians(60.0))  # a head whose axis is turned farther from its approach faces this instead
+KERB_M = 0.3  # from a mast to the road
+FARTHEST_M, STEP_M = 20.0, 0.25  # reach of an arm at most, and steps in which a place for its mast is sought
+
+
+@dataclass(frozen=True)
+class SignalHeads:
+    """The signal heads that a map describes, and how many were left out, by the reason."""
+
+    found: tuple[SignalParameters, ...]
+    left: Counter[str]
+
+
+def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet) -> SignalHeads:
+    """Return the heads of the traffic lights of a map that stand at a light of `net`, town = map + `offset_m` [m].
+
+    The way that a head is for follows from the roads that it, or a reference to it, is on. Its axis is that of the map,
+    and it faces the traffic there.
+    """
+    roads = {row.get("id", ""): row for row in root.iterfind("road")}
+    named = _list_references(root)
+    controllers = {row.get("signalId", ""): each.get("id", "") for each in root.iterfind("controller") for row in each}
+    ways = _Ways(net, offset_m)
+    found, left = [], Counter[str]()
+    for row in roads.values():
+        for signal in row.iterfind("signals/signal"):
+            if signal.get("dynamic") != "yes":
+                continue
+            name = signal.get("id", "")
+            place = locate(Road(row), signal, offset_m)
+            reason = "not a light for vehicles" if signal.get("type") != LIGHT else "" if place else "no place"
+            way = (
+                None if reason else ways.find([(roads[road], ref) for road, ref in named.get(name, ())], (row, signal))
+            )
+            if reason or way is None or place is None:
+                left[reason or "no junction with lights"] += 1
+                continue
+            head = _place(signal, place, way, ways, controllers.get(name, ""))
+            if head is None:
+                left["above a road, with no place for its mast"] += 1
+            else:
+                found.append(head)
+    return SignalHeads(tuple(found), left)
+
+
+def _list_references(root: ElementTree.Element) -> dict[str, list[tuple[str, ElementTree.Element]]]:
+    """Return the roads and references that name each signal."""
+    out: dict[str, list[tuple[str, ElementTree.Element]]] = {}
+    for row in root.iterfind("road"):
+        for reference in row.iterfind("signals/signalReference"):
+            out.setdefault(reference.get("id", ""), []).append((row.get("id", ""), reference))
+    return out
+
+
+class _Ways:
+    """The ways through the junctions of a net that have a light."""
+
+    def __init__(self, net: RoadNet, offset_m: tuple[float, float]) -> None:
+        self._lanes = {lane.id: lane for edge in net.edges.values() for lane in edge.lanes}
+        driven = {lane.id for edge in net.streets for lane in edge.lanes_of("driving")}
+        self._lit = [way for way in net.connections if way.light and way.start in driven]
+        self._offset = np.array(offset_m)
+        lanes = [lane for lane in self._lanes.values() if lane.kind == "driving" and len(lane.shape) > 1]
+        self._road = shapely.union_all([LineString(lane.shape).buffer(lane.width / 2) for lane in lanes])
+        shapely.prepare(self._road)
+
+    def find(self, references: list[Placed], own: Placed) -> Connection | None:
+        """Return the way that a signal is for: by its references in junctions, else by others, else by its own road.
+
+        Of several from the street of the nearest one, the straight one is taken first.
+        """
+        inside = [place for place in references if _is_inside(place)]
+        outside = [place for place in references if not _is_inside(place)]
+        for places in (inside, outside, [own]):
+            found = [
+                way
+                for row, signal in places
+                for start, end in _travelled(row, signal)
+                if (way := self._nearest(start + self._offset, end + self._offset, inside=_is_inside((row, signal))))
+            ]
+            if found:
+                street = min(found, key=lambda item: item[0])[1].start.rpartition("_")[0]
+                own_street = [way for _, way in found if way.start.rpartition("_")[0] == street]
+                return min(own_street, key=lambda way: way.turn != "s")
+        return None
+
+    def _nearest(self, start: Array, end: Array, *, inside: bool) -> tuple[float, Connection] | None:
+        """Return the way next to a road travelled from `start` to `end`, and how far it is [m].
+
+        Outside junctions only the end counts; of the ways of one lane the straight one is taken.
+        """
+        rated = []
+        for way in self._lit:
+            before, after = self._lanes[way.start], self._lanes[way.end]
+            apart = float(np.hypot(*(before.shape[-1] - (start if inside else end))))
+            if inside:
+                apart += float(np.hypot(*(after.shape[0] - end)))
+            elif (end - start) @ self.heading(way) < ASKEW * np.hypot(*(end - start)):
+                continue
+            if apart <= (WAY_M if inside else PLACE_M):
+                rated.append((round(apart, 3), way.turn != "s", way.light, way))
+        nearest = min(rated, key=lambda item: item[:3], default=None)
+        return None if nearest is None else (nearest[0], nearest[3])
+
+    def heading(self, way: Connection) -> Array:
+        """Return the unit vector in which traffic comes to the light of a way."""
+        step = np.diff(self._lanes[way.start].shape[-2:], axis=0)[0]
+        return step / max(float(np.hypot(*step)), 1e-9)
+
+    def on_road(self, x: float, y: float) -> bool:
+        """Return whether a place is on a lane, or within `KERB_M` of one."""
+        return bool(shapely.dwithin(self._road, shapely.Point(x, y), KERB_M))
+
+
+def _is_inside(place: Placed) -> bool:
+    """Return whether a road lies in a junction."""
+    return place[0].get("junction", "-1") != "-1"
+
+
+def _travelled(row: ElementTree.Element, signal: ElementTree.Element) -> Iterator[tuple[Array, Array]]:
+    """Yield both ends of a road in the direction of the traffic that a signal on it is for, in the map [m].
+
+    The direction is that of the lanes for which it is valid; where these go both ways, that of its orientation.
+    """
+    side = -1 if row.get("rule") == "LHT" else 1
+    lanes = [
+        int(lane.get("id", "0")) for lane in row.iterfind("lanes/laneSection/*/lane") if lane.get("type") == "driving"
+    ]
+    valid = signal.find("validity")
+    if valid is not None:
+        low, high = sorted(read_number(valid, name) for name in ("fromLane", "toLane"))
+        lanes = [lane for lane in lanes if low <= lane <= high] or lanes
+    ahead = {lane * side < 0 for lane in lanes if lane}
+    if len(ahead) != 1:
+        ahead = {"+": {True}, "-": {False}}.get(signal.get("orientation", ""), {True, False})
+    line = Road(row).line
+    ends = line.at(np.array([0.0, line.length]))[:, :2]
+    for forward in sorted(ahead):
+        yield (ends[0], ends[1]) if forward else (ends[1], ends[0])
+
+
+def _place(
+    signal: ElementTree.Element, place: tuple[float, float, float], way: Connection, ways: _Ways, controller: str
+) -> SignalParameters | None:
+    """Return the head of a signal at x, y and the road's heading; None where its mast would stand on the road."""
+    x, y, heading = place
+    come = ways.heading(way)
+    axis = heading_vectors(heading + read_number(signal, "hOffset"))
+    facing = -come if abs(axis @ come) < ASKEW else -np.sign(axis @ come) * axis
+    yaw = float(np.arctan2(facing[1], facing[0]))
+    low, high = read_number(signal, "zOffset"), read_number(signal, "height")
+    up = low + (high / 2 if high <= 2 * HEAD_M else high - HEAD_M / 2)
+    known = HEIGHT_M[0] <= up <= HEIGHT_M[1]
+    reach = 0.0
+    if ways.on_road(x, y):
+        left = left_vectors(yaw)
+        steps = (side * step for step in np.arange(STEP_M, FARTHEST_M, STEP_M) for side in (1, -1))
+        reach = next((r for r in steps if not ways.on_road(x - r * left[0], y - r * left[1])), math.nan)
+        if math.isnan(reach):
+            return None
+    return SignalParameters(
+        x=round(x, 3),
+        y=round(y, 3),
+        height_m=round(up, 2) if known else ARM_HEAD_M if reach else KERB_HEAD_M,
+        yaw_deg=round(math.degrees(yaw) % 360.0, 2),
+        reach_m=float(reach),
+        light=way.light,
+        controller=controller,
+    )
+
+
+def count_controllers(heads: tuple[SignalParameters, ...], net: Path) -> tuple[int, int]:
+    """Return the number of a map's controllers with several heads, and of those whose heads a net switches alike."""
+    states: dict[str, list[str]] = {}
+    for row in ElementTree.parse(net).getroot().iterfind("tlLogic"):
+        states[row.get("id", "")] = [phase.get("state", "") for phase in row.iterfind("phase")]
+    switched: dict[str, list[str]] = {}
+    for head in heads:
+        if head.controller:
+            light, _, link = head.light.rpartition(":")
+            switched.setdefault(head.controller, []).append("".join(state[int(link)] for state in states[light]))
+    several = [rows for rows in switched.values() if len(rows) > 1]
+    return len(several), sum(len({row.lower() for row in rows}) == 1 for rows in several)

@@ -1,0 +1,99 @@
+"""Crosswalks, signal heads and parking spaces of an OpenDRIVE map in the town that is made of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import LineString, Point, Polygon
+
+from flcav.config import InputError
+from flcav.seeds import stream
+from flcav.world.map.lanes import map_layers
+from flcav.world.map.roads import read_net
+from flcav.world.map.town import load_town
+from flcav.world.opendrive.importing import ImportedTown, import_town
+from flcav.world.traffic.demand import park
+from flcav.world.traffic.reach import find_walked
+
+MAP = Path(__file__).parents[3] / "data" / "cross_with_objects.xodr"
+
+pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
+
+
+@pytest.fixture(scope="module")
+def cross(tmp_path_factory: pytest.TempPathFactory) -> ImportedTown:
+    return import_town(MAP, tmp_path_factory.mktemp("towns") / "cross")
+
+
+def test_crossings_are_where_the_map_has_crosswalks(cross: ImportedTown) -> None:
+    found = {tuple(np.round(crossing.outline.mean(axis=0))): crossing for crossing in map_layers(cross.town).crossings}
+    assert sorted(found) == [(0.0, 55.0), (12.0, 0.0)]  # of three at the junction and two across a street
+    at_junction, across_street = Polygon(found[12.0, 0.0].outline), Polygon(found[0.0, 55.0].outline)
+    assert at_junction.symmetric_difference(shapely.box(10.0, -3.5, 13.0, 3.5)).area < 0.3
+    assert across_street.symmetric_difference(shapely.box(-3.5, 53.0, 3.5, 57.0)).area < 0.3
+    assert any("Crosswalks of the map taken over: 2; left out: 1 (no place or outline)" in note for note in cross.notes)
+
+
+def test_people_get_across_where_the_street_is_cut(cross: ImportedTown) -> None:
+    net = read_net(cross.town.net)
+    walked = [edge for edge in net.streets if edge.lanes_of("sidewalk")]
+    north = [i for i, edge in enumerate(walked) if "2.end" in (edge.start, edge.end)]
+    assert len(north) == 2
+    assert find_walked(net, walked)[np.ix_(north, north)].all()
+    areas = [Polygon(lane.shape) for edge in net.edges.values() for lane in edge.lanes if lane.kind == "walkingarea"]
+    beside = [area for area in areas if area.distance(Point(0.0, 55.0)) < 6]
+    assert [round(area.area) for area in beside] == [8, 8]  # 2 m of sidewalk by 4 m
+    assert all(area.is_valid for area in beside)
+
+
+def test_heads_stand_where_the_map_has_them(cross: ImportedTown) -> None:
+    signals, net = cross.town.signals, read_net(cross.town.net)
+    way = {way.light: way for way in net.connections if way.light}
+    from_arm = {}
+    for position, yaw, foot, light in zip(signals.position, signals.yaw, signals.foot, signals.link):
+        lane = next(lane for edge in net.streets for lane in edge.lanes if lane.id == way[light].start)
+        come = lane.shape[-1] - lane.shape[-2]
+        facing = np.array([np.cos(yaw), np.sin(yaw)])
+        assert facing @ come / np.hypot(*come) == pytest.approx(-1.0, abs=0.01)  # it is seen by those whom it stops
+        assert way[light].turn == "s"
+        from_arm[tuple(np.round(come / np.hypot(*come)).astype(int).tolist())] = (position, foot)
+    np.testing.assert_allclose(from_arm[-1, 0][0], (12.0, 4.2, 2.7), atol=0.01)  # height with its post: 3.2 - 1/2
+    np.testing.assert_allclose(from_arm[0, 1][0], (4.4, 13.0, 2.9), atol=0.01)  # beyond the junction, by a reference
+    np.testing.assert_allclose(from_arm[0, -1][0], (-1.5, -9.0, 5.5), atol=0.01)  # above the road, 5 m + 1 m / 2
+    np.testing.assert_allclose(from_arm[0, -1][1], (-4.0, -9.0), atol=0.3)  # its mast beside it
+    assert len(from_arm) == 4  # the fourth arm has none in the map: placed by rule
+    heads = cross.town.parameters.signals
+    assert [head.controller for head in heads] == ["", "7", "7"]
+    assert "Controllers with several of these heads: 1; switched alike here: 1." in cross.notes
+
+
+def test_parking_spaces_are_road_with_lines_and_vehicles(cross: ImportedTown) -> None:
+    spaces = cross.town.parameters.parking
+    assert sorted(space.x for space in spaces) == pytest.approx([-58, -52, -46, -40])
+    roads = shapely.union_all([Polygon(outline) for outline in cross.town.roads])
+    lines = [LineString(marking.line) for marking in map_layers(cross.town).markings]
+    net = read_net(cross.town.net)
+    parked = [car for seed in range(20) for car in park(net, cross.town.parameters, stream(seed, "parked"))]
+    assert 20 < len(parked) < 70  # of 80 places
+    for space in spaces:
+        outline = shapely.box(space.x - 2.75, 8.0 - 1.2, space.x + 2.75, 8.0 + 1.2)
+        assert roads.intersection(outline).area > 0.95 * outline.area
+        assert sum(line.length for line in lines if outline.contains(line)) == pytest.approx(2 * (5.5 + 2.4), abs=1.0)
+    places = {(round(car.x), round(car.y)) for car in parked}
+    assert places == {(round(space.x), 8) for space in spaces}
+    assert all(abs(np.sin(car.yaw)) < 0.1 for car in parked)
+    note = next(note for note in cross.notes if note.startswith("Parking"))
+    for reason in ("1 (no place or size of a parking space)", "1 (on a lane for vehicles)", "1 (on a sidewalk)"):
+        assert reason in note
+
+
+def test_a_signal_of_no_light_is_refused(cross: ImportedTown, tmp_path: Path) -> None:
+    folder = tmp_path / "town"
+    folder.mkdir()
+    for path in cross.town.net.parent.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    text = (folder / "town.yaml").read_text()
+    (folder / "town.yaml").write_text(text.replace("'10:4'", "'10:99'").replace('"10:4"', '"10:99"'))
+    with pytest.raises(InputError, match="a signal shows '10:99', which is no light of the net"):
+        load_town(folder)
