@@ -20,6 +20,8 @@ from flcav.experiments.attacks.faults import FaultsResult
 from flcav.experiments.attacks.leakage import LeakageResult
 from flcav.experiments.distillation import tables as distillation_tables
 from flcav.experiments.distillation.run import DistillationResult
+from flcav.experiments.exchanges import tables as exchange_tables
+from flcav.experiments.exchanges.run import ExchangeResult
 from flcav.experiments.fig3a import tables as fig3a_tables
 from flcav.experiments.fig3a.run import Fig3a
 from flcav.experiments.fig3b import tables as fig3b_tables
@@ -63,6 +65,7 @@ def _of_study(
 TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of (content of its result.json, path)
     "demo": _told(ArmsResult, arms_tables.tables),
     "distillation": _told(DistillationResult, distillation_tables.tables),
+    "exchange": _told(ExchangeResult, exchange_tables.tables),
     "faults": _told(FaultsResult, attack_tables.fault_tables),
     "fig3a": _told(Fig3a, fig3a_tables.tables),
     "fig3b": _told(Fig3b, fig3b_tables.tables),

@@ -23,8 +23,15 @@ STUDY = ("seeds", "scale", *RUN)  # options of targets that run over seeds
 TASK = "task-"  # before the name of a task's study
 OWN = "a task of your own that says how it is studied, as module:NAME"
 COMMON_SEEDS = 3
-DEMO_SIZE: Mapping[str, str | None] = {"size": "demo"}  # fields of a run recipe at the scale `quick`
-TOY_SIZE: Mapping[str, str | None] = {"size": "toy", "splits": None, "training": None}  # shows that it runs
+
+
+def _use_demo_size(recipe: "RunRecipe") -> "RunRecipe":
+    return recipe.model_copy(update={"size": "demo"})
+
+
+def _use_toy_size(recipe: "RunRecipe") -> "RunRecipe":
+    """Return a recipe that shows that it runs."""
+    return recipe.model_copy(update={"size": "toy", "splits": None, "training": None})
 
 
 class Target(StrEnum):
@@ -32,6 +39,7 @@ class Target(StrEnum):
 
     demo_arms = "demo-arms"
     distillation = "distillation"
+    federation_exchange = "federation-exchange"
     federation_faults = "federation-faults"
     federation_leakage = "federation-leakage"
     fig1b = "fig1b"
@@ -72,7 +80,7 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     **dict.fromkeys(ATTACKS, ("seeds",)),
     Target.sim_to_real: (*RUN, "kitti", "weights"),
 }
-SEEDS: Mapping[str, int] = {Target.demo_arms: 5, **dict.fromkeys(ATTACKS, 5)}
+SEEDS: Mapping[str, int] = dict.fromkeys((Target.demo_arms, Target.federation_exchange, *ATTACKS), 5)
 
 
 class Reproducible(click.Choice):
@@ -251,6 +259,19 @@ def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, 
         typer.echo(sentence)
 
 
+def _federation_exchange(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+    from flcav.experiments.exchanges.run import compare_exchanges, draw_results, shrink_recipe
+    from flcav.files import write_bytes, write_json
+
+    target = Target.federation_exchange
+    recipe, runs = _run_seeds(target, "exchange", out, seeds, scale, jobs, engine, stale, shrink_recipe)
+    results = compare_exchanges(recipe, runs, [out / f"seed{run.recipe.seed}" for run in runs])
+    write_json(out / "result.json", results.as_json())
+    write_bytes(out / "exchange.png", draw_results(results))
+    for sentence in results.sentences():
+        typer.echo(sentence)
+
+
 def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.experiments.placement.run import describe_overlaps, draw_proof, list_overlaps, prove_placement
     from flcav.files import write_bytes, write_json
@@ -260,7 +281,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
 
     asked = load_run_recipe(recipe_path("runs/placement"))
     typer.echo(describe_overlaps(list_overlaps(asked), asked.placement.range_m))
-    recipe, runs = _run_seeds(Target.placement, "placement", out, seeds, scale, jobs, engine, stale, TOY_SIZE)
+    recipe, runs = _run_seeds(Target.placement, "placement", out, seeds, scale, jobs, engine, stale, _use_toy_size)
     results = prove_placement(recipe, runs, [out / f"seed{run.recipe.seed}" / WORK for run in runs])
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "placement.png", draw_proof(results))
@@ -271,6 +292,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
 COMPARISONS: Mapping[str, Callable[[Path, int, str, int, Engine, Stale], None]] = {
     Target.demo_arms: _demo_arms,
     Target.distillation: _distillation,
+    Target.federation_exchange: _federation_exchange,
     Target.fig6a_allocation: _fig6a_allocation,
     Target.placement: _placement,
 }
@@ -286,25 +308,25 @@ def _run_seeds(
     jobs: int,
     engine: Engine,
     stale: Stale,
-    quick: Mapping[str, str | None] = DEMO_SIZE,
+    shrink: "Callable[[RunRecipe], RunRecipe]" = _use_demo_size,
 ) -> "tuple[RunRecipe, tuple[Run, ...]]":
-    """Run or finish the package's recipe `runs/<name>` with several seeds, with the fields `quick` if scale is that."""
+    """Run or finish the package's recipe `runs/<name>` with several seeds, with `shrink` applied if scale is quick."""
     from flcav.cli.steps import live_steps
     from flcav.pipeline.running import run_seeds
 
-    recipe = _load_sized(name, scale, quick)
+    recipe = _load_sized(name, scale, shrink)
     with live_steps(target.value) as notify:
         runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
     return recipe, runs
 
 
-def _load_sized(name: str, scale: str, quick: Mapping[str, str | None] = DEMO_SIZE) -> "RunRecipe":
-    """Return the package's recipe `runs/<name>`, with the fields `quick` unless scale is paper."""
+def _load_sized(name: str, scale: str, shrink: "Callable[[RunRecipe], RunRecipe]" = _use_demo_size) -> "RunRecipe":
+    """Return the package's recipe `runs/<name>`, with `shrink` applied unless scale is paper."""
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.sources.recipe import recipe_path
 
     recipe = load_run_recipe(recipe_path(f"runs/{name}"))
-    return recipe if scale == "paper" else recipe.model_copy(update=dict(quick))
+    return recipe if scale == "paper" else shrink(recipe)
 
 
 @when_interrupted()

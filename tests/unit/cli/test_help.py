@@ -27,6 +27,7 @@ def commands(command: click.Command, path: tuple[str, ...] = ()) -> Commands:
         yield from commands(each, (*path, name))
 
 
+WIDE = 600  # [columns] of a terminal in which no text is wrapped
 EVERY = dict(commands(typer.main.get_command(app)))
 each_command = pytest.mark.parametrize("path", EVERY, ids=lambda path: " ".join(path) or "flcav")
 
@@ -49,7 +50,7 @@ def words(text: str) -> str:
 
 @each_command
 def test_help_is_shown_as_it_was_written(path, shown):
-    command, told = EVERY[path], words(shown(path, 400))
+    command, told = EVERY[path], words(shown(path, WIDE))
     assert "…" not in told
     for paragraph in inspect.cleandoc(command.help or "").split("\n\n"):
         assert words(paragraph) in told
@@ -73,7 +74,7 @@ def test_in_a_narrow_terminal_help_is_wrapped_and_only_names_of_options_are_cut(
 
 @each_command
 def test_what_can_be_chosen_is_listed(path, shown):
-    told = words(shown(path, 400))
+    told = words(shown(path, WIDE))
     for parameter in EVERY[path].params:
         if isinstance(parameter.type, click.Choice):
             names = [str(choice) for choice in parameter.type.choices]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from pydantic import TypeAdapter
 
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.training import train
@@ -58,6 +59,29 @@ def test_subsampling_is_a_trained_mean():
         layer.factor[1], layer.bias[1] = 3.0, -1.0
     maps = torch.arange(8.0).reshape(1, 2, 2, 2)
     assert layer(maps).flatten().tolist() == [1.5, 3 * 5.5 - 1]
+
+
+def test_batch_normalisation_changes_nothing_before_it_has_learned_but_the_statistics():
+    plain, normalised = LeNet(LeNetConfig()), LeNet(LeNetConfig(normalised=True))
+    assert parameters(normalised) == parameters(plain) + 2 * (6 + 16)
+    for mine, theirs in zip(
+        (layer for layer in normalised.layers if not isinstance(layer, torch.nn.BatchNorm2d)), plain.layers, strict=True
+    ):
+        mine.load_state_dict(theirs.state_dict())
+    pictures = torch.rand(2, 3, 32, 32)
+    with torch.inference_mode():  # mean 0 and variance 1
+        assert torch.allclose(normalised.eval()(pictures), plain.eval()(pictures), atol=1e-4)
+        maps = normalised.train().layers[:2](pictures)
+    assert maps.mean((0, 2, 3)).tolist() == pytest.approx([0] * 6, abs=1e-5)
+    assert maps.std((0, 2, 3)).tolist() == pytest.approx([1] * 6, abs=1e-2)
+
+
+def test_the_published_network_is_not_normalised_and_others_are_described_as_before():
+    with pytest.raises(ValueError, match="has no batch normalisation"):
+        LeNetConfig(original=True, normalised=True)
+    adapter = TypeAdapter(LeNetConfig)
+    assert b"normalised" not in adapter.dump_json(LeNetConfig())
+    assert adapter.validate_json(adapter.dump_json(LeNetConfig(normalised=True))).normalised
 
 
 @pytest.mark.parametrize("name", ["tiny", "paper"])

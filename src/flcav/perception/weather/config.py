@@ -1,9 +1,9 @@
-"""Configurations of the weather classifier: classes, and LeNet-5 as published or modernised."""
+"""Configurations of the weather classifier: classes, and LeNet-5 as published, modernised, and normalised."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from flcav.world.weather import WEATHER_CLASSES
@@ -24,6 +24,17 @@ class LeNetConfig:
 
     classes: Classes = tuple(WEATHER_CLASSES)  # in the order of the scores
     original: bool = False  # tanh and subsampling as published in 1998; otherwise ReLU and max pooling
+    normalised: Annotated[bool, Field(exclude_if=lambda on: not on)] = False  # batch normalisation of C1 and C3
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if self.original and self.normalised:
+            raise ValueError("the network as published has no batch normalisation")
+        return self
 
 
-CONFIGURATIONS = {"tiny": LeNetConfig(), "paper": LeNetConfig(original=True)}
+CONFIGURATIONS = {
+    "tiny": LeNetConfig(),
+    "paper": LeNetConfig(original=True),
+    "normalised": LeNetConfig(normalised=True),
+}

@@ -1,7 +1,8 @@
 """LeNet-5: LeCun et al., "Gradient-Based Learning Applied to Document Recognition", Proc. IEEE 1998, sec. II-B.
 
-Two things differ from the paper in both configurations: images have three channels, and the output layer is linear with
-a softmax instead of radial basis functions around drawn prototypes of digits.
+Two things differ from the paper in all configurations: images have three channels, and the output layer is linear with
+a softmax instead of radial basis functions around drawn prototypes of digits. With batch normalisation (Ioffe and
+Szegedy, ICML 2015) the maps of C1 and C3 are normalised before the rectifiers.
 """
 
 import torch
@@ -74,9 +75,9 @@ class LeNet(Classifier):
         act = ScaledTanh if config.original else nn.ReLU
         self.layers = nn.Sequential(
             nn.Conv2d(3, 6, 5),  # C1: 28 x 28
-            *_halved(6, act, config.original),  # S2: 14 x 14
+            *_halved(6, act, config),  # S2: 14 x 14
             PartlyConnected() if config.original else nn.Conv2d(6, 16, 5),  # C3: 10 x 10
-            *_halved(16, act, config.original),  # S4: 5 x 5
+            *_halved(16, act, config),  # S4: 5 x 5
             nn.Conv2d(16, 120, 5),  # C5: 1 x 1
             act(),
             nn.Flatten(),
@@ -98,5 +99,7 @@ def uniform_over(inputs: Tensor) -> Tensor:
     return (2 * torch.rand(inputs.shape) - 1) * 2.4 / inputs
 
 
-def _halved(maps: int, act: type[nn.Module], original: bool) -> tuple[nn.Module, nn.Module]:
-    return (Subsampling(maps), act()) if original else (act(), nn.MaxPool2d(2))
+def _halved(maps: int, act: type[nn.Module], config: LeNetConfig) -> tuple[nn.Module, ...]:
+    if config.original:
+        return Subsampling(maps), act()
+    return (*([nn.BatchNorm2d(maps)] if config.normalised else []), act(), nn.MaxPool2d(2))

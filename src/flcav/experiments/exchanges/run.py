@@ -1,0 +1,219 @@
+"""Comparison of exchanges, the arms of recipes/runs/exchange.yaml: accuracy, bytes, seconds and epsilon of each.
+
+All arms of a seed have the same recordings, the same stage I and the same rounds. They differ in the form of the
+updates, in who takes part, in what regions keep for themselves, or in what stays private. The first arm sends whole
+weights (FedAvg). Every other one is compared with it, paired over seeds, which have recordings of their own; the
+verdicts are corrected together.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from flcav.experiments.exchanges.clock import link_regions, mean_round_s
+from flcav.files import Json
+from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.network.ledger import Direction, Ledger, Link
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.running import WORK
+from flcav.records import LEFT_OUT, Record
+from flcav.report import style
+from flcav.report.charts.exchanges import Mark, draw_exchanges
+from flcav.verdicts import Claim, Judged, judge
+
+TASK = "weather"
+NONE, WHOLE = "no federation", "whole weights (FedAvg)"
+ARMS: Mapping[str, Mapping[str, str]] = {  # by what they are about: name in the tables -> arm
+    "compared with": {NONE: PRETRAIN, WHOLE: MAIN},
+    "what is sent": {
+        "fp16": "fp16",
+        "int8": "int8",
+        "top 2 %, error feedback": "top_k",
+        "fully connected layers": "layers",
+        "outputs (FedMD)": "outputs",
+    },
+    "who takes part": {
+        "uniform, 2": "uniform",
+        "importance, 2": "importance",
+        "all that the radio allows": "radio",
+        "in time for a deadline": "deadline",
+    },
+    "what regions keep": {
+        "output layer (FedPer)": "heads",
+        "normalisation (FedBN)": "norms",
+        "statistics (SiloBN)": "statistics",
+        "models (Ditto)": "regional",
+    },
+    "what stays private": {
+        "secure aggregation": "masked",
+        "central noise, 1": "central",
+        "central noise, 0.03": "central_faint",
+        "local noise, 1": "local",
+        "local noise, 0.03": "local_faint",
+    },
+}
+NAMES: Mapping[str, str] = {name: arm for arms in ARMS.values() for name, arm in arms.items()}
+OWN, OTHERS, UNSEEN = "own region", "other regions", "unseen region"
+PLACES = (OWN, OTHERS, UNSEEN)
+QUICK_SAMPLES = 20  # of stage I at the scale `quick`
+
+
+@dataclass(frozen=True)
+class ExchangeArm:
+    """Results of one arm in one seed; megabytes are those of stages II and III, 1 MB = 10^6 bytes."""
+
+    accuracy: Mapping[str, float]  # by `PLACES`
+    wireless_up_mb: float
+    wireless_down_mb: float
+    wireline_up_mb: float
+    wireline_down_mb: float
+    clients: float  # whose updates are combined in a round of vehicles, mean
+    seconds: float | None  # of a round on the radio, mean; None: nothing is sent, or no vehicle gets through
+    epsilon: float | None  # of a vehicle's whole data after all rounds; None: without noise
+
+
+@dataclass(frozen=True)
+class ExchangeResult(Record):
+    """Results of the comparison: numbers by seed and arm, means over seeds, differences to whole weights."""
+
+    seeds: Mapping[str, Mapping[str, ExchangeArm]]  # by seed and arm
+    accuracy: Mapping[str, Mapping[str, MeanOverSeeds]]  # by arm and place
+    differences: Mapping[str, Mapping[str, MeanOverSeeds]]  # to whole weights, by arm and place
+    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None
+    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+
+    def sentences(self) -> list[str]:
+        """Return accuracy, uplink and the verdict on the difference to whole weights of each arm, in words."""
+        judged, told = judge_differences(self), []
+        for name in NAMES:
+            mean = self.accuracy[name][OWN]
+            sent = float(np.mean([seed[name].wireless_up_mb for seed in self.seeds.values()]))
+            words = f"{name}: accuracy in the own region {mean.describe()}, wireless uplink {sent:.2f} MB"
+            if name in judged:
+                found = self.differences[name][OWN].describe(sign=True)
+                words += f", difference {found}, {judged[name].describe()}"
+            told.append(words)
+        return told
+
+
+def shrink_recipe(recipe: RunRecipe) -> RunRecipe:
+    """Return the recipe at the scale `quick`: toy splits and trainings, and as few samples as they hold."""
+    tasks = {
+        name: own.model_copy(update={"plan": own.plan and own.plan.model_copy(update={"samples": QUICK_SAMPLES})})
+        for name, own in recipe.tasks.items()
+    }
+    return recipe.model_copy(update={"size": "toy", "splits": None, "training": None, "tasks": tasks})
+
+
+def compare_exchanges(recipe: RunRecipe, runs: Sequence[Run], folders: Sequence[Path]) -> ExchangeResult:
+    """Return the results of the arms of `recipe`, from a run of each seed in its folder.
+
+    `folders` hold the runs' steps and the arms' ledgers.
+    """
+    return summarise(
+        recipe, {str(run.recipe.seed): measure_seed(run, folder) for run, folder in zip(runs, folders, strict=True)}
+    )
+
+
+def summarise(recipe: RunRecipe, seeds: Mapping[str, Mapping[str, ExchangeArm]]) -> ExchangeResult:
+    """Return the means over seeds, with 95 % intervals."""
+
+    def values(name: str, place: str) -> np.ndarray:
+        return np.array([seed[name].accuracy[place] for seed in seeds.values()])
+
+    return ExchangeResult(
+        seeds=seeds,
+        accuracy={
+            name: {place: mean_over_seeds(values(name, place).tolist(), share=True) for place in PLACES}
+            for name in NAMES
+        },
+        differences={
+            name: {
+                place: mean_over_seeds((values(name, place) - values(WHOLE, place)).tolist()) for place in (OWN, UNSEEN)
+            }
+            for name in NAMES
+            if name != WHOLE
+        },
+        recipe=recipe.model_dump(mode="json", exclude={"seed"}),
+        provenance=provenance(),
+    )
+
+
+def measure_seed(run: Run, folder: Path) -> dict[str, ExchangeArm]:
+    """Return the numbers of every arm of one seed's run."""
+    plan = run.arms[MAIN].plan.tasks[TASK]
+    rounds = plan.edge_rounds + plan.cloud_rounds * run.recipe.federation.edge_rounds_per_cloud_round
+    links = link_regions(run.recipe, TASK, folder / WORK, rounds)
+    found = {NONE: ExchangeArm(measure_places(run, MAIN, PRETRAIN), 0.0, 0.0, 0.0, 0.0, 0.0, None, None)}
+    for name, arm in NAMES.items():
+        if name == NONE:
+            continue
+        book = Ledger.load(folder / "ledgers" / f"{arm}.parquet")
+        records = [each for stage in run.arms[arm].stages for each in stage.records or ()]
+        spent = [each.epsilon for each in records if each.epsilon is not None]
+        found[name] = ExchangeArm(
+            accuracy=measure_places(run, arm, CLOUD),
+            wireless_up_mb=_sent_mb(book, "wireless", "up"),
+            wireless_down_mb=_sent_mb(book, "wireless", "down"),
+            wireline_up_mb=_sent_mb(book, "wireline", "up"),
+            wireline_down_mb=_sent_mb(book, "wireline", "down"),
+            clients=float(np.mean([len(each.clients) for each in records if each.server != CLOUD])),
+            seconds=mean_round_s(book.entries, links, plan.edge_rounds),
+            epsilon=max(spent) if spent else None,
+        )
+    return found
+
+
+def measure_places(run: Run, arm: str, stage: str) -> dict[str, float]:
+    """Return the accuracy of what each federating region has after a stage: at home, in others, in the unseen one.
+
+    That is the region's own model where it keeps one, and else the model for all. Others are the regions of pretraining
+    and the other federating ones, averaged over both. In the unseen region, which has none, it is the model for all.
+    """
+    home, unseen = run.recipe.with_role("federate"), run.recipe.with_role("unseen")
+    known = [name for name in run.recipe.regions if name not in unseen]
+    kept = {
+        (each.model, each.region): each.estimate.mean
+        for each in (run.arms[arm].regional or () if stage == CLOUD else ())
+    }
+
+    def accuracy(model: str, region: str) -> float:
+        own = kept.get((model, region))
+        return run.test(arm=arm, stage=stage, region=region, task=TASK).estimate.mean if own is None else own
+
+    return {
+        OWN: float(np.mean([accuracy(region, region) for region in home])),
+        OTHERS: float(np.mean([accuracy(model, region) for model in home for region in known if region != model])),
+        UNSEEN: float(
+            np.mean([run.test(arm=arm, stage=stage, region=region, task=TASK).estimate.mean for region in unseen])
+        ),
+    }
+
+
+def _sent_mb(book: Ledger, link: Link, direction: Direction) -> float:
+    return sum(book.used_mb(link, stage=stage, direction=direction) for stage in (EDGE, CLOUD))
+
+
+def judge_differences(results: ExchangeResult) -> dict[str, Judged]:
+    """Return the verdicts on the differences in the own region, corrected together."""
+    judged = judge([Claim(each[OWN]) for each in results.differences.values()])
+    return dict(zip(results.differences, judged, strict=True))
+
+
+def draw_results(results: ExchangeResult) -> bytes:
+    """Return the figure of accuracy beside the bytes of the wireless uplink as a PNG."""
+
+    def sent(name: str) -> float:
+        return float(np.mean([seed[name].wireless_up_mb for seed in results.seeds.values()]))
+
+    marks = [
+        Mark(group, name, sent(name), results.accuracy[name][OWN], results.accuracy[name][UNSEEN])
+        for group, arms in ARMS.items()
+        for name in arms
+    ]
+    return style.png(draw_exchanges(marks))

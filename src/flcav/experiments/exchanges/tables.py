@@ -1,0 +1,79 @@
+"""Markdown tables of the comparison of exchanges."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from flcav.experiments.exchanges.run import (
+    ARMS,
+    NONE,
+    OWN,
+    PLACES,
+    UNSEEN,
+    ExchangeArm,
+    ExchangeResult,
+    judge_differences,
+)
+from flcav.intervals import MOST_SEEDS
+from flcav.markdown import format_table
+from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, format_p
+
+WORDS = {HELD: "higher", NOT_HELD: "lower", UNDECIDED: UNDECIDED}  # of the claim that a difference is positive
+
+
+def tables(results: ExchangeResult) -> dict[str, str]:
+    """Return Markdown by name: accuracy, costs, differences."""
+    return {"accuracy": _accuracy(results), "costs": _costs(results), "differences": _differences(results)}
+
+
+def _accuracy(results: ExchangeResult) -> str:
+    rows = [
+        [group, name, *(results.accuracy[name][place].describe() for place in PLACES)]
+        for group, arms in ARMS.items()
+        for name in arms
+    ]
+    return format_table(("", f"arm, {len(results.seeds)} seeds", *(f"accuracy, {place}" for place in PLACES)), rows)
+
+
+def _costs(results: ExchangeResult) -> str:
+    def mean(name: str, number: Callable[[ExchangeArm], float | None], digits: int) -> str:
+        known = [value for seed in results.seeds.values() if (value := number(seed[name])) is not None]
+        return f"{np.mean(known):.{digits}f}" if known else ""
+
+    numbers: tuple[tuple[Callable[[ExchangeArm], float | None], int], ...] = (
+        (lambda each: each.wireless_up_mb, 3),
+        (lambda each: each.wireless_down_mb, 2),
+        (lambda each: each.wireline_up_mb, 3),
+        (lambda each: each.wireline_down_mb, 2),
+        (lambda each: each.clients, 1),
+        (lambda each: each.seconds, 2),
+    )
+    rows = []
+    for arms in ARMS.values():
+        for name in arms:
+            if name != NONE:
+                private = next(iter(results.seeds.values()))[name].epsilon  # the same in all seeds
+                epsilon = "∞" if private is None else f"{private:.3g}"
+                rows.append([name, *(mean(name, number, digits) for number, digits in numbers), epsilon])
+    links = (f"{link} {way}, MB" for link in ("wireless", "wireline") for way in ("up", "down"))
+    return format_table(("arm", *links, "vehicles in a round of a region", "s a round", "ε"), rows)
+
+
+def _differences(results: ExchangeResult) -> str:
+    judged, rows = judge_differences(results), []
+    for name, places in results.differences.items():
+        one, seeds = judged[name], ""
+        if one.verdict == UNDECIDED and one.p is not None:
+            seeds = f"more than {MOST_SEEDS}" if one.seeds is None else str(one.seeds)
+        p = "" if one.p is None else format_p(one.p)
+        told = [places[place].describe(sign=True) for place in (OWN, UNSEEN)]
+        rows.append([name, told[0], p, WORDS[one.verdict], seeds, told[1]])
+    header = (
+        "arm",
+        f"accuracy - that of whole weights, {OWN}",
+        "p, corrected",
+        "verdict",
+        "if undecided: seeds that tell a difference of the size found",
+        f"the same, {UNSEEN}",
+    )
+    return format_table(header, rows)
