@@ -132,6 +132,7 @@ def test_tables_say_bytes_epsilon_and_how_many_seeds_an_undecided_difference_tak
     assert "| int8 | 14.000 | 14.00 | 1.000 | 1.00 | 3.5 | 0.40 | ∞ |" in shown["costs"]
     assert NONE not in shown["costs"]
     rows = {row.split(" | ")[0].strip("| "): row.split(" | ") for row in shown["differences"].splitlines()}
+    assert [*rows][2:] == [name for name in NAMES if name != WHOLE]
     assert rows["models (Ditto)"][3] == "higher"
     assert rows[NONE][3] == "lower"
     assert rows["int8"][3] == "undecided"

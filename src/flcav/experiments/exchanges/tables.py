@@ -6,6 +6,7 @@ import numpy as np
 
 from flcav.experiments.exchanges.run import (
     ARMS,
+    NAMES,
     NONE,
     OWN,
     PLACES,
@@ -53,7 +54,7 @@ def _costs(results: ExchangeResult) -> str:
         for name in arms:
             if name != NONE:
                 private = next(iter(results.seeds.values()))[name].epsilon  # the same in all seeds
-                epsilon = "∞" if private is None else f"{private:.3g}"
+                epsilon = "∞" if private is None else f"{float(f'{private:.3g}'):,g}"
                 rows.append([name, *(mean(name, number, digits) for number, digits in numbers), epsilon])
     links = (f"{link} {way}, MB" for link in ("wireless", "wireline") for way in ("up", "down"))
     return format_table(("arm", *links, "vehicles in a round of a region", "s a round", "ε"), rows)
@@ -61,8 +62,8 @@ def _costs(results: ExchangeResult) -> str:
 
 def _differences(results: ExchangeResult) -> str:
     judged, rows = judge_differences(results), []
-    for name, places in results.differences.items():
-        one, seeds = judged[name], ""
+    for name in (each for each in NAMES if each in results.differences):
+        one, places, seeds = judged[name], results.differences[name], ""
         if one.verdict == UNDECIDED and one.p is not None:
             seeds = f"more than {MOST_SEEDS}" if one.seeds is None else str(one.seeds)
         p = "" if one.p is None else format_p(one.p)
