@@ -123,19 +123,21 @@ def compare_exchanges(recipe: RunRecipe, runs: Sequence[Run], folders: Sequence[
 def summarise(recipe: RunRecipe, seeds: Mapping[str, Mapping[str, ExchangeArm]]) -> ExchangeResult:
     """Return the means over seeds, with 95 % intervals."""
 
-    def values(name: str, place: str) -> np.ndarray:
-        return np.array([seed[name].accuracy[place] for seed in seeds.values()])
+    def values(name: str, place: str) -> list[float]:
+        return [seed[name].accuracy[place] for seed in seeds.values()]
+
+    def differences(name: str, place: str) -> list[float]:
+        """Return the paired differences, rounded so that equal counts of right answers differ by 0."""
+        pairs = zip(values(name, place), values(WHOLE, place), strict=True)
+        return [round(own - whole, 9) for own, whole in pairs]
 
     return ExchangeResult(
         seeds=seeds,
         accuracy={
-            name: {place: mean_over_seeds(values(name, place).tolist(), share=True) for place in PLACES}
-            for name in NAMES
+            name: {place: mean_over_seeds(values(name, place), share=True) for place in PLACES} for name in NAMES
         },
         differences={
-            name: {
-                place: mean_over_seeds((values(name, place) - values(WHOLE, place)).tolist()) for place in (OWN, UNSEEN)
-            }
+            name: {place: mean_over_seeds(differences(name, place)) for place in (OWN, UNSEEN)}
             for name in NAMES
             if name != WHOLE
         },
