@@ -39,6 +39,7 @@ from flcav.world.opendrive.objects.signal_heads import count_controllers, find_h
 from flcav.world.opendrive.objects.signs import find_posts, find_signs
 from flcav.world.opendrive.streets import rewrite_streets
 
+WIDEST_M = 5e5  # farthest that a street is from the middle of the town
 GAPS_M = 5000.0  # total length of the gaps between linked roads, in both directions, over which streets are drawn
 NETCONVERT_S = 300.0  # longest run of netconvert
 PARTS = ("nod", "edg", "con")  # netconvert's plain XML files: nodes, edges, connections
@@ -153,6 +154,8 @@ def _read_joined(path: Path, origin: Path, roads_m: float) -> RoadNet:
             f"{origin}: roads that are linked lie apart: {streets_m / 1000:.0f} km of streets to join "
             f"{roads_m / 1000:.3g} km of roads (OpenDRIVE 1.8, 10.3)"
         )
+    if any(np.abs(lane.shape).max() > WIDEST_M for edge in net.streets for lane in edge.lanes):
+        raise InputError(f"{origin}: its streets lie more than {WIDEST_M / 1000:.0f} km from their middle")
     return net
 
 

@@ -112,7 +112,7 @@ def _build_trace(
     x, y, yaw, speed = np.moveaxis(state, 2, 0)
     forward = np.zeros((*yaw.shape, 3))
     forward[..., :2] = heading_vectors(yaw)
-    pedestrian = np.array([category == "pedestrian" for category, _ in kinds])
+    pedestrian = np.array([category == "pedestrian" for category, _ in kinds], dtype=bool)
     velocity, acceleration = speed[..., None] * forward, rates[..., :3]
     walking = np.flatnonzero(pedestrian)  # SUMO moves people aside without turning them
     velocity[:, walking], acceleration[:, walking] = (motion[:, walking] for motion in walk)

@@ -163,6 +163,13 @@ def test_roads_that_are_linked_across_a_country_are_refused(tmp_path: Path) -> N
         import_town(path, tmp_path / "town")
 
 
+def test_streets_that_lie_a_country_apart_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "map.xodr"
+    path.write_text(OBJECTS.read_text().replace('y="5428010.0000"', 'y="1000"', 1))
+    with pytest.raises(InputError, match="its streets lie more than 500 km from their middle"):
+        import_town(path, tmp_path / "town")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
