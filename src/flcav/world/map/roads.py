@@ -186,5 +186,5 @@ def _number(text: str) -> float:
     """Return a number; raises `ValueError` for NaN, for other text and beyond `FARTHEST_M`."""
     value = float(text)
     if not abs(value) <= FARTHEST_M:
-        raise ValueError(f"{text} is no place in a town")
+        raise ValueError(f"{shorten(text)} is no place in a town")
     return value

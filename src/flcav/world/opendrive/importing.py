@@ -24,7 +24,7 @@ from flcav.extras import format_install_command
 from flcav.files import find_existing
 from flcav.world.map.parameters import GeoReference, MapSource
 from flcav.world.map.relief import Relief
-from flcav.world.map.roads import RoadNet, read_net
+from flcav.world.map.roads import RoadNet
 from flcav.world.map.town import HEIGHTS, Town, load_town
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.furnishing import furnish
@@ -37,7 +37,7 @@ from flcav.world.opendrive.objects.crosswalks import Crosswalk, find_crosswalks
 from flcav.world.opendrive.objects.parking_spaces import find_parking
 from flcav.world.opendrive.objects.signal_heads import count_controllers, find_heads
 from flcav.world.opendrive.objects.signs import find_posts, find_signs
-from flcav.world.opendrive.streets import rewrite_streets
+from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 
 WIDEST_M = 5e5  # farthest that a street is from the middle of the town
 GAPS_M = 5000.0  # total length of the gaps between linked roads, in both directions, over which streets are drawn
@@ -142,10 +142,7 @@ def _read_joined(path: Path, origin: Path, roads_m: float) -> RoadNet:
 
     netconvert joins roads that are linked by straight streets, wherever they are; `roads_m` is their own length.
     """
-    try:
-        net = read_net(path)
-    except InputError as error:
-        raise InputError(f"{origin}: netconvert makes no net of it ({str(error).removeprefix(f'{path}: ')})") from None
+    net = read_made_net(path, origin)
     if not any(edge.lanes_of("driving") for edge in net.streets):
         raise InputError(f"{origin}: has no road with a lane for driving")
     streets_m = sum(LineString(edge.lanes[0].shape).length for edge in net.streets)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import InputError
-from flcav.world.map.roads import read_net
+from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.opendrive.document import OPEN_ROADS, Document, Road
 
 FAR_M = 5000.0  # a map that reaches farther than this from its origin is moved there
@@ -53,7 +53,7 @@ def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChange
     """Rewrite the plain files beside `prefix` in place; raises `InputError` naming `origin` without a driving lane."""
     nodes, edges, connections = (ElementTree.parse(f"{prefix}.{part}.xml") for part in ("nod", "edg", "con"))
     rows = edges.getroot().findall("edge")
-    _write_widths(rows, Path(f"{prefix}.net.xml"))
+    _write_widths(rows, read_made_net(Path(f"{prefix}.net.xml"), origin))
     add = not any(lane.get("type") in WALKED for row in rows for lane in _plain_lanes(row))
     kept: dict[str, dict[int, int]] = {}  # edge -> index of a lane with traffic in the map -> in the town
     added = False
@@ -83,9 +83,17 @@ def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChange
     return MapChanges(offset, added)
 
 
-def _write_widths(rows: list[ElementTree.Element], net: Path) -> None:
+def read_made_net(path: Path, origin: Path) -> RoadNet:
+    """Return a net that netconvert made of the map `origin`; raises `InputError` naming the map where it is none."""
+    try:
+        return read_net(path)
+    except InputError as error:
+        raise InputError(f"{origin}: netconvert makes no net of it ({str(error).removeprefix(f'{path}: ')})") from None
+
+
+def _write_widths(rows: list[ElementTree.Element], net: RoadNet) -> None:
     """Write each lane's width, read from the net, to its row: netconvert's plain edges leave out shared widths."""
-    width = {lane.id: lane.width for edge in read_net(net).edges.values() for lane in edge.lanes}
+    width = {lane.id: lane.width for edge in net.edges.values() for lane in edge.lanes}
     for row in rows:
         lanes = _plain_lanes(row)
         for child in row.findall("lane"):

@@ -127,7 +127,9 @@ def _build_trace(
     return Trace(
         town=town.name,
         time_s=time_s,
-        actor=np.array([*(str(raw["id"][i]) for i in order), *(f"parked{i}" for i in range(len(parked)))]),
+        actor=np.array(
+            [*(str(raw["id"][i]) for i in order), *(f"parked{i}" for i in range(len(parked)))], dtype=np.str_
+        ),
         category=np.array([category for category, _ in kinds], dtype=np.str_),
         shape=np.array([shape for _, shape in kinds], dtype=np.int64),
         size=size,
