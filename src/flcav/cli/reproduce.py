@@ -250,31 +250,22 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engi
 
 def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.experiments.distillation.run import compare_labels, draw_labels
-    from flcav.files import write_bytes, write_json
 
     results = compare_labels(*_run_seeds(Target.distillation, "distillation", out, seeds, scale, jobs, engine, stale))
-    write_json(out / "result.json", results.as_json())
-    write_bytes(out / "arms.png", draw_labels(results))
-    for sentence in results.sentences():
-        typer.echo(sentence)
+    _write_figures(out, results.as_json(), {"arms.png": draw_labels(results)}, results.sentences())
 
 
 def _federation_exchange(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.experiments.exchanges.run import compare_exchanges, draw_results, shrink_recipe
-    from flcav.files import write_bytes, write_json
 
     target = Target.federation_exchange
     recipe, runs = _run_seeds(target, "exchange", out, seeds, scale, jobs, engine, stale, shrink_recipe)
     results = compare_exchanges(recipe, runs, [out / f"seed{run.recipe.seed}" for run in runs])
-    write_json(out / "result.json", results.as_json())
-    write_bytes(out / "exchange.png", draw_results(results))
-    for sentence in results.sentences():
-        typer.echo(sentence)
+    _write_figures(out, results.as_json(), {"exchange.png": draw_results(results)}, results.sentences())
 
 
 def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.experiments.placement.run import describe_overlaps, draw_proof, list_overlaps, prove_placement
-    from flcav.files import write_bytes, write_json
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import WORK
     from flcav.sources.recipe import recipe_path
@@ -283,10 +274,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
     typer.echo(describe_overlaps(list_overlaps(asked), asked.placement.range_m))
     recipe, runs = _run_seeds(Target.placement, "placement", out, seeds, scale, jobs, engine, stale, _use_toy_size)
     results = prove_placement(recipe, runs, [out / f"seed{run.recipe.seed}" / WORK for run in runs])
-    write_json(out / "result.json", results.as_json())
-    write_bytes(out / "placement.png", draw_proof(results))
-    for sentence in results.sentences():
-        typer.echo(sentence)
+    _write_figures(out, results.as_json(), {"placement.png": draw_proof(results)}, results.sentences())
 
 
 COMPARISONS: Mapping[str, Callable[[Path, int, str, int, Engine, Stale], None]] = {

@@ -21,7 +21,7 @@ CELL_M = 0.3  # clouds are thinned to a point in each cell of this edge
 
 @dataclass(frozen=True)
 class Offset:
-    """How far one pose is from another."""
+    """The distance between two poses."""
 
     position_cm: float
     rotation_deg: float

@@ -38,7 +38,7 @@ def _one_plan(results: AtBudgets) -> PlanFinding:
     counts = ", ".join(f"{count} {COUNT_NAMES[name]}" for name, count in results.seeds[0].plans[JOINT].counts.items())
     realised, predicted = results.summary.realised[TOWN][JOINT], results.summary.predicted[JOINT]
     sentence = (
-        f"Both plans are the same, {counts}: the limits of rounds and of the pool, and not the budgets, decide. "
+        f"Both plans are the same, {counts}: there is no difference to judge. "
         f"On {TOWN}, AP50 was {realised[PRETRAIN].mean:.3f} pretrained, {realised[EDGE].mean:.3f} after edge FL and "
         f"{realised[CLOUD].mean:.3f} after cloud FL (predicted: {predicted[CLOUD]:.3f})."
     )

@@ -1,4 +1,4 @@
-"""What a federation leaves in its folder after each round, to go on from, and the network that it comes to."""
+"""The files that a federation writes after each round, to go on from, and the network that it comes to."""
 
 import hashlib
 from collections.abc import Callable, Mapping

@@ -17,7 +17,7 @@ from flcav.pipeline.results.plans import TaskPlan
 
 
 class UpdateForm(Config):
-    """What a client's update is sent as, as far as its size depends on it."""
+    """The form in which a client's update is sent, as far as its size depends on it."""
 
     upload: Upload = Upload()
     exchanging: bool = False  # with an array beside each that is learned

@@ -28,7 +28,7 @@ from flcav.progress import Report
 
 @dataclass(frozen=True)
 class RegionStart:
-    """Where a region's edge server starts in stage III."""
+    """The start of a region's edge server in stage III."""
 
     clients: Mapping[str, TaskClient]  # its vehicles, by name
     weights: Weights  # of stage II

@@ -46,7 +46,7 @@ class PlannedTask(Config):
 
 
 class AirSettings(Config):
-    """What the time of a round's messages on the air is predicted from."""
+    """Settings of the prediction of the time that a round's messages take on the air."""
 
     network: NetworkSettings
     range_m: float  # of the traffic that the unit's pole is chosen by [m]

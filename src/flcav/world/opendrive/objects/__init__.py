@@ -1,1 +1,1 @@
-"""What an OpenDRIVE map has along its roads: signs, poles, signal heads, crosswalks and parking spaces."""
+"""Objects and signals along the roads of an OpenDRIVE map: signs, poles, signal heads, crosswalks, parking spaces."""

@@ -5,11 +5,9 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
-from shapely.geometry import Polygon
 
-from flcav.world.opendrive.objects.places import locate, outline_object, read_number
+from flcav.world.opendrive.objects.places import enclose_outline, locate, outline_object, read_number
 from flcav.world.opendrive.road_surface import Road
 
 Array = NDArray[np.float64]
@@ -82,12 +80,10 @@ CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 
 def _enclose(outline: Array) -> Crosswalk | None:
     """Return the smallest rectangle around an outline (K, 2); None where its sides are not those of a crosswalk."""
-    rectangle = shapely.oriented_envelope(shapely.MultiPoint(outline))
-    if not isinstance(rectangle, Polygon):
+    found = enclose_outline(outline)
+    if found is None:
         return None
-    corners = np.asarray(rectangle.exterior.coords)
-    edges = np.diff(corners[:3], axis=0)
-    sides = np.hypot(*edges.T)
+    sides = found.sides
     if not (WIDE_M[0] <= sides.min() <= WIDE_M[1] and LONG_M[0] <= sides.max() <= LONG_M[1]):
         return None
-    return Crosswalk(corners[:4].mean(axis=0), edges / sides[:, None], sides)
+    return Crosswalk(found.centre, found.edges / sides[:, None], sides)

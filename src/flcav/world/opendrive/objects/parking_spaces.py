@@ -13,7 +13,7 @@ from shapely.geometry.base import BaseGeometry
 from flcav.world.map.parameters import ParkingParameters
 from flcav.world.map.parking import outline_space
 from flcav.world.map.roads import LaneKind, RoadNet
-from flcav.world.opendrive.objects.places import outline_object, repeat_object
+from flcav.world.opendrive.objects.places import enclose_outline, outline_object, repeat_object
 from flcav.world.opendrive.road_surface import Road
 
 LENGTH_M, WIDTH_M = (3.0, 20.0), (1.7, 6.0)  # extents that are believed
@@ -70,18 +70,15 @@ def _cover(net: RoadNet, kinds: tuple[LaneKind, ...]) -> BaseGeometry:
 
 def _enclose(outline: np.ndarray) -> ParkingParameters | None:
     """Return the smallest rectangle around an outline (K, 2) as a space; None where it is none for a vehicle."""
-    rectangle = shapely.oriented_envelope(shapely.MultiPoint(outline))
-    if not isinstance(rectangle, Polygon):
+    found = enclose_outline(outline)
+    if found is None:
         return None
-    corners = np.asarray(rectangle.exterior.coords)
-    edges = np.diff(corners[:3], axis=0)
-    sides = np.hypot(*edges.T)
-    long = int(np.argmax(sides))
-    length, width = sides[[long, 1 - long]].tolist()
+    long = int(np.argmax(found.sides))
+    length, width = found.sides[[long, 1 - long]].tolist()
     if not (LENGTH_M[0] <= length <= LENGTH_M[1] and WIDTH_M[0] <= width <= WIDTH_M[1]):
         return None
-    x, y = corners[:4].mean(axis=0).tolist()
-    yaw = math.degrees(math.atan2(edges[long, 1], edges[long, 0])) % 360.0
+    x, y = found.centre.tolist()
+    yaw = math.degrees(math.atan2(found.edges[long, 1], found.edges[long, 0])) % 360.0
     return ParkingParameters(
         x=round(x, 3), y=round(y, 3), yaw_deg=round(yaw, 2), length_m=round(length, 2), width_m=round(width, 2)
     )

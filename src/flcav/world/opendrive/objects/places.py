@@ -3,9 +3,12 @@
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry import Polygon
 
 from flcav.world.opendrive.road_surface import Road
 
@@ -49,6 +52,25 @@ def outline_object(road: Road, thing: ElementTree.Element) -> NDArray[np.float64
     yaw = place[2] + read_number(thing, "hdg")
     cos, sin = np.cos(yaw), np.sin(yaw)
     return own @ np.array([[cos, sin], [-sin, cos]]) + place[:2]
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A rectangle in the plane, by its centre (2,), two edges (2, 2), one a row, and their lengths (2,) [m]."""
+
+    centre: NDArray[np.float64]
+    edges: NDArray[np.float64]
+    sides: NDArray[np.float64]
+
+
+def enclose_outline(outline: NDArray[np.float64]) -> Rectangle | None:
+    """Return the smallest rectangle around an outline (K, 2); None where it has no area."""
+    rectangle = shapely.oriented_envelope(shapely.MultiPoint(outline))
+    if not isinstance(rectangle, Polygon):
+        return None
+    corners = np.asarray(rectangle.exterior.coords)
+    edges = np.diff(corners[:3], axis=0)
+    return Rectangle(corners[:4].mean(axis=0), edges, np.hypot(*edges.T))
 
 
 def locate(
