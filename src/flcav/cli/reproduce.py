@@ -217,6 +217,8 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
     write_bytes(out / "arms.png", draw_arms(results))
     for arm, closed in results.summary.gap_closed.items():
         typer.echo(f"{arm}: closes of the gap {closed.describe()}")
+    if results.summary.road_share is not None:
+        typer.echo(f"share of the gain with an ideal road detector: {results.summary.road_share.describe()}")
     for name, judged in judge_differences(results.summary).items():
         typer.echo(
             f"{name}: {results.summary.differences[name].describe(sign=True)}, {judged.verdict}: {judged.describe()}"

@@ -356,7 +356,7 @@ SIZES: Mapping[str, tuple[Splits, Training]] = {
             edge=Split(scenes=16, spins=5, cavs=4),
             test=Split(scenes=30, spins=1, cavs=4),
         ),
-        Training(steps=1100),
+        Training(steps=1000),
     ),
     "full": (
         Splits(
@@ -379,7 +379,7 @@ def load_run_recipe(path: Path | str) -> RunRecipe:
     >>> import flcav
     >>> demo = flcav.load_run_recipe("recipes/runs/demo.yaml")
     >>> demo.budgets_mb.wireless, list(demo.arms)
-    (80.0, ['densest'])
+    (80.0, ['densest', 'ideal'])
     """
     return parse_config(RunRecipe, read_yaml(Path(path)), str(path))
 

@@ -62,7 +62,7 @@ def test_every_kind_that_nobody_could_have_says_that_it_is_an_upper_bound() -> N
     measured = ("own-detections", "road", "road-average")
     assert all(("upper bound" in kind.caveat) != (name in measured) for name, kind in LABEL_SOURCES.items())
     assert LABEL_SOURCES["road"].caveat != LABEL_SOURCES["ideal-road"].caveat  # reports show which it was
-    assert choose_labels("objects", None) == "ideal-road"
+    assert choose_labels("objects", None) == "road"
     assert choose_labels("trajectory", None) == "future"
     with pytest.raises(InputError, match="labels of 'weather': 'ideal-road' is none of annotated"):
         choose_labels("weather", "ideal-road")

@@ -13,6 +13,7 @@ from typing import Annotated
 from flcav.files import Json
 from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds
 from flcav.pipeline.collecting.findings import name_stage
+from flcav.pipeline.collecting.history import gap_closed
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.placement import Pole
@@ -24,6 +25,7 @@ from flcav.verdicts import Claim, Judged, judge
 
 TASK = "objects"
 FURTHER = "edge FL, as many more rounds"  # instead of those of cloud FL
+IDEAL = "edge FL, VRCSP pole, ideal road detector"
 EFFECT = 0.02  # difference in AP50 that the comparison is to tell
 ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: name in the tables -> arm, stage
     "grid": {
@@ -32,6 +34,7 @@ ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: name in the tables -
         "edge FL, no road sensor": ("no_pole", EDGE),
         "edge FL, densest pole": ("densest", EDGE),
         "edge FL, VRCSP pole": (MAIN, EDGE),
+        IDEAL: ("ideal", EDGE),
         FURTHER: ("further", MORE_EDGE),
         "edge + cloud FL": (MAIN, CLOUD),
         "oracle": ("oracle", CENTRAL),
@@ -49,6 +52,7 @@ COMPARED = (  # (after, before): claims of the article and controls
     ("edge FL, VRCSP pole", "more pretraining"),
     ("edge FL, VRCSP pole", "edge FL, no road sensor"),
     ("edge FL, VRCSP pole", "edge FL, densest pole"),
+    ("edge FL, VRCSP pole", IDEAL),
     ("edge + cloud FL", "edge FL, VRCSP pole"),
     ("edge + cloud FL", FURTHER),
 )
@@ -126,7 +130,7 @@ class ArmsResult(Record):
     summary: ArmsSummary
     recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
-    note: str = "road labels come from an ideal road detector: arms with a pole are upper bounds"
+    note: Annotated[str | None, LEFT_OUT] = None  # of older results
 
 
 def compare_arms(recipe: RunRecipe, runs: Sequence[Run]) -> ArmsResult:
@@ -199,7 +203,13 @@ def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:
             name: mean_over_seeds([seed.differences[name].mean for seed in seeds]) for name in seeds[0].differences
         },
         gap_closed={arm: mean_over_seeds([seed.gap_closed[arm] for seed in seeds]) for arm in seeds[0].gap_closed},
+        road_share=mean_over_seeds([_road_share(seed.ap["grid"]) for seed in seeds]),
     )
+
+
+def _road_share(reached: Mapping[str, Reached]) -> float:
+    """Return the share of edge FL's gain with an ideal road detector that the trained one brings."""
+    return gap_closed(*(reached[arm].ap50 for arm in ("pretrained", "edge FL, VRCSP pole", IDEAL)))
 
 
 def judge_differences(summary: ArmsSummary) -> dict[str, Judged]:

@@ -104,4 +104,4 @@ class AllocationResult(Record):
     budgets: tuple[AtBudgets, ...]
     recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
-    note: str = "road labels come from an ideal road detector: AP after edge FL and cloud FL is an upper bound"
+    note: Annotated[str | None, LEFT_OUT] = None  # of older results

@@ -43,12 +43,11 @@ def findings(
 
     `settings`: those of each arm. `roles`: role of each region. `caveats`: those of the labels, by task.
     """
-    rules = {name: setting.placement.rule for name, setting in settings.items()}
     values = {(test.arm, test.stage, test.region, test.task): test for test in tests}
     own = [each for each in differences if each.arm == MAIN]
     same = [_tell_same_poles(each, arms, settings) for each in own]
     return tuple(
-        _finding(each, judged, _question(each, rules, roles), values, none_differs, caveats)
+        _finding(each, judged, _question(each, settings, roles), values, none_differs, caveats)
         for each, judged, none_differs in zip(own, _judge(own, values, same), same, strict=True)
     )
 
@@ -108,7 +107,7 @@ def _before(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) 
     return values.get(key) or values[MAIN, *key[1:]]
 
 
-def _question(each: Difference, rules: Mapping[str, str], roles: Mapping[str, str]) -> str:
+def _question(each: Difference, settings: Mapping[str, Setting], roles: Mapping[str, str]) -> str:
     if each.before_arm == MAIN:
         if each.stage == EDGE:
             return "Does federated learning beat pretraining alone?"
@@ -116,10 +115,13 @@ def _question(each: Difference, rules: Mapping[str, str], roles: Mapping[str, st
             return "Does cloud FL add to edge FL?"
         where = "in the town of pretraining, too" if roles[each.region] == "pretrain" else "where nobody learned"
         return f"Does federated learning help {where}?"
-    if rules[each.before_arm] == "densest" and rules[MAIN] == "vrcsp":
+    own, other = (settings[arm] for arm in (MAIN, each.before_arm))
+    if (own.placement.rule, other.placement.rule) == ("vrcsp", "densest"):
         return "Does the placed pole beat the pole with the densest traffic?"
-    if rules[each.before_arm] == "none" and rules[MAIN] != "none":
+    if other.placement.rule == "none" != own.placement.rule:
         return "Does the placed pole beat no pole?"
+    if (own.labels[each.task], other.labels[each.task]) == ("road", "ideal-road"):
+        return "Do labels of the trained road detector beat those of an ideal one?"
     return f"Does the run beat its arm '{each.before_arm}'?"
 
 
