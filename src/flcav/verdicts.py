@@ -93,6 +93,12 @@ def judge(claims: Sequence[Claim]) -> list[Judged]:
     ]
 
 
+def judge_known(claims: Sequence[Claim | None]) -> list[Judged | None]:
+    """Return `judge` of the claims that there are; None where there is none, which does not count."""
+    found = iter(judge([claim for claim in claims if claim is not None]))
+    return [None if claim is None else next(found) for claim in claims]
+
+
 def _judged(claim: Claim, p: float, family: int) -> Judged:
     above = claim.mean.mean > claim.than
     said = UNDECIDED if p > LEVEL else HELD if above != claim.at_most else NOT_HELD

@@ -13,7 +13,7 @@ from flcav.pipeline.arms import Setting
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference, Finding, Test
-from flcav.verdicts import UNDECIDED, Claim, Judged, explain_verdict, judge, signed
+from flcav.verdicts import UNDECIDED, Claim, Judged, explain_verdict, judge_known, signed
 
 WORDS = {
     PRETRAIN: "pretrained",
@@ -64,8 +64,7 @@ def _judge(
         scenes = values[each.arm, each.stage, each.region, each.task].result.scenes
         spread = each.spread if none_differs is None else None
         means.append(None if spread is None else of_one_training(each.over_scenes, scenes, spread))
-    found = iter(judge([Claim(mean) for mean in means if mean is not None]))
-    return [None if mean is None else next(found) for mean in means]
+    return judge_known([None if mean is None else Claim(mean) for mean in means])
 
 
 def _finding(

@@ -1,13 +1,13 @@
 """Paired comparison of two runs, over all tests that both made on the same frames."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from flcav.config import InputError
-from flcav.intervals import Estimate, combine_spreads, widen
+from flcav.intervals import Estimate, OneTraining, combine_spreads, of_one_training, widen
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.results.run import Run
@@ -15,7 +15,7 @@ from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import Test
 from flcav.pipeline.running import RESULTS, WORK, seed_folders
 from flcav.pipeline.seeds.summary import mean_of_tests
-from flcav.verdicts import UNDECIDED, Claim, judge, verdict
+from flcav.verdicts import UNDECIDED, Claim, judge, judge_known
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task
 
@@ -32,7 +32,7 @@ class Compared:
     first: float
     second: float
     difference: Estimate  # over scenes and retraining; over seeds and scenes where both runs have several seeds
-    verdict: str  # of the claim that the second is better; of several seeds corrected for the number of tests
+    verdict: str  # of the claim that the second is better, corrected for the number of tests
 
 
 def compare(first: Path, second: Path) -> tuple[Compared, ...]:
@@ -49,7 +49,7 @@ def compare(first: Path, second: Path) -> tuple[Compared, ...]:
     if not common:
         raise InputError(f"{first} and {second}: no test was made by both on the same frames, with the same seed")
     if len(rows) == 1:
-        return tuple(rows[0][key].compared for key in common)
+        return _judge_trainings([rows[0][key] for key in common])
     means = [mean_of_tests(key[3], *_listed([row[key] for row in rows])) for key in common]
     judged = judge([Claim(mean) for mean in means])
     return tuple(
@@ -62,6 +62,7 @@ def compare(first: Path, second: Path) -> tuple[Compared, ...]:
 class _Pair:
     compared: Compared  # of one seed
     folders: tuple[Path, Path]  # of the second run's test and of the first's
+    training: OneTraining | None  # the difference of one training each; None where the spread is not known
 
 
 def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, _Pair]:
@@ -78,12 +79,22 @@ def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, _Pair]:
         before, after = (own[key].result for own in tests)
         values = before.estimate.mean, after.estimate.mean
         spread = combine_spreads(*(own[key].spread for own in tests))
-        change = Estimate(mean, low, high) if spread is None else widen(Estimate(mean, low, high), spread)
-        said = UNDECIDED if spread is None else verdict(change.low, change.high)
-        one = Compared(*key, after.measure, *values, change, said)
-        found[key] = _Pair(one, (places[1], places[0]))
+        over_scenes = Estimate(mean, low, high)
+        change = over_scenes if spread is None else widen(over_scenes, spread)
+        training = None if spread is None else of_one_training(over_scenes, after.scenes, spread)
+        one = Compared(*key, after.measure, *values, change, UNDECIDED)
+        found[key] = _Pair(one, (places[1], places[0]), training)
     order = list(tests[0])
     return {key: found[key] for key in sorted(found, key=order.index)}
+
+
+def _judge_trainings(pairs: Sequence[_Pair]) -> tuple[Compared, ...]:
+    """Return the differences of one seed with their verdicts, judged together; unknown ones are undecided."""
+    judged = judge_known([None if pair.training is None else Claim(pair.training) for pair in pairs])
+    return tuple(
+        pair.compared if one is None else replace(pair.compared, verdict=one.verdict)
+        for pair, one in zip(pairs, judged, strict=True)
+    )
 
 
 def _key(test: Test) -> Key:
