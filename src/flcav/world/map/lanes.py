@@ -111,11 +111,12 @@ def map_layers(town: Town) -> MapLayers:
     roads = shapely.union_all([Polygon(outline) for outline in town.roads])
     crossings = tuple(_crossings(net, roads))
     crossed = shapely.union_all([Polygon(crossing.outline) for crossing in crossings])
+    stop_lines = {line.lane: line.before_end_m for line in town.parameters.stop_lines}
     return MapLayers(
         roads=town.roads,
         sidewalks=town.sidewalks,
         lanes=tuple(_lanes(net)),
-        markings=(*generate_markings(net, roads, crossed), *paint_spaces(town.parameters.parking)),
+        markings=(*generate_markings(net, roads, crossed, stop_lines), *paint_spaces(town.parameters.parking)),
         crossings=crossings,
         arrows=tuple(_arrows(net)),
     )

@@ -5,7 +5,7 @@ line, and by a double solid line where they have more than two driving lanes tog
 parking lanes; edge lines mark streets without a kerb and fast ones. Approaches end in a stop line or a give-way line.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -34,14 +34,17 @@ SHORTEST_M = 0.3  # shorter pieces of a line are left out
 SAME_LINE_M = 0.7  # left sides of two edges nearer than this are one line: the directions of one street
 
 
-def generate_markings(net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry) -> Iterator[Marking]:
+def generate_markings(
+    net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry, stop_lines: Mapping[str, float]
+) -> Iterator[Marking]:
     """Yield the road markings of a net, clipped to `roads` and left out on `crossings`.
 
-    Both areas are shapely geometry in the world frame [m].
+    Both areas are shapely geometry in the world frame [m]. Lanes with a key in `stop_lines` have one so far before
+    their ends [m]; their edges have no other one.
     """
     paper = roads.buffer(-0.01).difference(crossings)
     shapely.prepare(paper)
-    for marking in _generate_unclipped(net):
+    for marking in _generate_unclipped(net, stop_lines):
         width = marking.width_m / 2
         inside = paper.buffer(-width) if width > LINE_M else paper  # wide ones lie wholly on the road
         for part in _lines(LineString(marking.line).intersection(inside)):
@@ -50,7 +53,7 @@ def generate_markings(net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry
                 yield Marking(marking.kind, line, marking.width_m, marking.dash_m, marking.gap_m, marking.colour)
 
 
-def _generate_unclipped(net: RoadNet) -> Iterator[Marking]:
+def _generate_unclipped(net: RoadNet, stop_lines: Mapping[str, float]) -> Iterator[Marking]:
     """Yield all markings of a net before they are clipped, edge by edge."""
     bends = _bends(net)
     facing: dict[tuple[str, str], list[Edge]] = {}
@@ -74,7 +77,10 @@ def _generate_unclipped(net: RoadNet) -> Iterator[Marking]:
         if not kerb and not inside and lanes[0].kind == "driving":
             yield Marking("edge", _beside(lanes[0], INSET_M - lanes[0].width / 2, net.side), LINE_M, 0.0, 0.0)
         if not inside:
-            yield from _entry(net, edge)
+            known = [lane for lane in edge.lanes if lane.id in stop_lines]
+            yield from (_stop_line(lane, stop_lines[lane.id], net.side) for lane in known)
+            if not known:
+                yield from _entry(net, edge)
 
 
 def _between_lanes(lanes: list[Lane], approach: float, side: int) -> Iterator[Marking]:
@@ -119,6 +125,18 @@ def _broken(line: Array, approach: float, *, both_ends: bool = False) -> Iterato
         if high - low > SHORTEST_M:
             dash, gap = (DASH_M, GAP_M) if kind == "dashed" else (0.0, 0.0)
             yield Marking(kind, np.asarray(substring(whole, low, high).coords), LINE_M, dash, gap)
+
+
+def _stop_line(lane: Lane, before_end_m: float, side: int) -> Marking:
+    """Return the stop line across one lane; beyond the lane's end its direction goes straight on."""
+    line = LineString(lane.shape)
+    at = line.length - before_end_m
+    near = max(min(at, line.length) - 0.5, 0.0)
+    a, b = (np.array(line.interpolate(where).coords[0]) for where in (near, min(near + 0.5, line.length)))
+    forward = (b - a) / max(float(np.hypot(*(b - a))), 1e-9)
+    left = side * np.array([-forward[1], forward[0]])
+    middle = a + (at - near) * forward
+    return Marking("stop_line", middle + np.outer((-0.5, 0.5), lane.width * left), STOP_LINE_M, 0.0, 0.0)
 
 
 def _entry(net: RoadNet, edge: Edge) -> Iterator[Marking]:

@@ -144,6 +144,13 @@ class SignalParameters(Config):
     controller: str = ""  # id of the map's controller; empty without one
 
 
+class StopLineParameters(Config):
+    """A stop line of the map that a town was imported from, across one lane of its net."""
+
+    lane: str  # the lane of the net
+    before_end_m: Annotated[float, Field(ge=-50, le=50)]  # from the line's middle on to the end of the lane
+
+
 class ParkingParameters(Config):
     """A parking space of the map that a town was imported from."""
 
@@ -193,6 +200,7 @@ class TownParameters(Config):
     signs: tuple[SignParameters, ...] = ()  # signs of the map; signs of the same sort are not placed by rule then
     posts: tuple[PostParameters, ...] = ()  # poles of the map
     signals: tuple[SignalParameters, ...] = ()  # signal heads of the map; approaches with one have no others
+    stop_lines: tuple[StopLineParameters, ...] = ()  # stop lines of the map; approaches with one have no others
     parking: tuple[ParkingParameters, ...] = ()  # parking spaces of the map
     parking_taken: Share = 0.6  # fraction of these that are taken
 

@@ -157,6 +157,10 @@ def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
     for pole in parameters.poles:
         if pole.edge not in walked:
             raise InputError(f"{origin}: pole {pole.id} stands on '{pole.edge}', which is no edge with a sidewalk")
+    lanes = {lane.id for edge in net.streets for lane in edge.lanes}
+    for line in parameters.stop_lines:
+        if line.lane not in lanes:
+            raise InputError(f"{origin}: a stop line lies on {shorten(line.lane)}, which is no lane of the net")
     lights = {way.light for way in net.connections}
     for signal in parameters.signals:
         if not signal.light or signal.light not in lights:

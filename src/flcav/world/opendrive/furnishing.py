@@ -14,6 +14,7 @@ from flcav.world.map.parameters import (
     PostParameters,
     SignalParameters,
     SignParameters,
+    StopLineParameters,
     StreetParameters,
     TownParameters,
 )
@@ -66,6 +67,7 @@ def furnish(
     signs: tuple[SignParameters, ...] = (),
     posts: tuple[PostParameters, ...] = (),
     signals: tuple[SignalParameters, ...] = (),
+    stop_lines: tuple[StopLineParameters, ...] = (),
     parking: tuple[ParkingParameters, ...] = (),
 ) -> TownParameters:
     """Return the parameters of a town on `net`; raises `KeyError` for a street type that is not in `STREETS`."""
@@ -83,6 +85,7 @@ def furnish(
         signs=signs,
         posts=posts,
         signals=signals,
+        stop_lines=stop_lines,
         parking=parking,
     )
 

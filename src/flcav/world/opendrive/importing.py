@@ -37,6 +37,7 @@ from flcav.world.opendrive.objects.crosswalks import Crosswalk, find_crosswalks
 from flcav.world.opendrive.objects.parking_spaces import find_parking
 from flcav.world.opendrive.objects.signal_heads import count_controllers, find_heads
 from flcav.world.opendrive.objects.signs import find_posts, find_signs
+from flcav.world.opendrive.objects.stop_lines import add_crossing_lines, find_stop_lines, stop_at_lines
 from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 
 WIDEST_M = 5e5  # farthest that a street is from the middle of the town
@@ -203,9 +204,13 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         net = _read_joined(folder / "town.net.xml", xodr, roads_m)
         heads = find_heads(root, streets.offset_m, net)
         parking = find_parking(root, streets.offset_m, net)
+        stop_lines = find_stop_lines(root, streets.offset_m, net)
+        lines = add_crossing_lines(net, stop_lines.found) if crossed else stop_lines.found
+        stop_at_lines(folder / "town.net.xml", lines)
         notes += [
             *_tell("Crosswalks", crossed, crosswalks.left, len(crosswalks.found) - crossed),
             *_tell("Signal heads", len(heads.found), heads.left),
+            *_tell("Stop lines", stop_lines.taken, stop_lines.left),
             *_tell("Parking spaces", len(parking.found), parking.left),
         ]
         several, alike = count_controllers(heads.found, folder / "town.net.xml")
@@ -232,6 +237,7 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
             signs=find_signs(root, streets.offset_m),
             posts=find_posts(root, streets.offset_m),
             signals=heads.found,
+            stop_lines=lines,
             parking=parking.found,
         )
         values = parameters.model_dump(mode="json", exclude_defaults=True)

@@ -1,5 +1,7 @@
-"""Crosswalks, signal heads and parking spaces of an OpenDRIVE map in the town that is made of it."""
+"""Crosswalks, signal heads, stop lines and parking spaces of an OpenDRIVE map in the town that is made of it."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from flcav.world.map.town import load_town
 from flcav.world.opendrive.importing import ImportedTown, import_town
 from flcav.world.traffic.demand import park
 from flcav.world.traffic.reach import find_walked
+from flcav.world.traffic.traffic import simulate
 
 MAP = Path(__file__).parents[3] / "data" / "cross_with_objects.xodr"
 
@@ -88,12 +91,38 @@ def test_parking_spaces_are_road_with_lines_and_vehicles(cross: ImportedTown) ->
         assert reason in note
 
 
+def test_stop_lines_are_painted_where_the_map_has_them(cross: ImportedTown) -> None:
+    lines = [marking for marking in map_layers(cross.town).markings if marking.kind == "stop_line"]
+    painted = shapely.union_all([LineString(line.line).buffer(line.width_m / 2, cap_style="flat") for line in lines])
+    known = [shapely.box(-3.5, 14.75, 0.0, 15.25), shapely.box(-12.25, -3.5, -11.75, 0.0)]
+    before_crosswalk = shapely.box(13.35, 0.0, 13.85, 3.5)  # the map has the crosswalk, which ends at x = 13
+    for place in (*known, before_crosswalk):
+        assert painted.intersection(place.buffer(1.0)).symmetric_difference(place).area < 0.1
+    assert len(lines) == 4  # the fourth arm's, by rule
+    told = "Stop lines of the map taken over: 2; left out: 1 (no lane ends there); left out: 1 (no place or length)."
+    assert told in cross.notes
+
+
+def test_vehicles_stop_before_the_lines_of_the_map(cross: ImportedTown) -> None:
+    town = replace(cross.town, parameters=cross.town.parameters.model_copy(update={"vehicles": 12}))
+    trace = simulate(town, seed=1, cavs=0, times_s=np.arange(40.0, 100.0))
+    forward = np.stack((np.cos(trace.yaw), np.sin(trace.yaw)), axis=-1)
+    front = trace.position[..., :2] + forward * trace.size[:, :1] / 2
+    moves = [name.startswith("veh") for name in trace.actor]
+    stood = front[(np.linalg.norm(trace.velocity, axis=2) < 0.1) & moves]
+    southward = stood[(np.abs(stood[:, 0] + 1.75) < 0.5) & (stood[:, 1] > 10.0) & (stood[:, 1] < 20.0)]
+    westward = stood[(np.abs(stood[:, 1] - 1.75) < 0.5) & (stood[:, 0] > 10.0) & (stood[:, 0] < 18.0)]
+    assert np.median(southward[:, 1]) == pytest.approx(16.0, abs=0.1)  # 1 m before the line, SUMO's usual gap
+    assert len(westward) > 5
+    assert westward[:, 0].min() > 13.0  # none on the crosswalk
+
+
 def test_a_signal_of_no_light_is_refused(cross: ImportedTown, tmp_path: Path) -> None:
-    folder = tmp_path / "town"
-    folder.mkdir()
-    for path in cross.town.net.parent.iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
+    folder = shutil.copytree(cross.town.net.parent, tmp_path / "town")
     text = (folder / "town.yaml").read_text()
     (folder / "town.yaml").write_text(text.replace("'10:4'", "'10:99'").replace('"10:4"', '"10:99"'))
     with pytest.raises(InputError, match="a signal shows '10:99', which is no light of the net"):
+        load_town(folder)
+    (folder / "town.yaml").write_text(text.replace("'3_1'", "'3_9'"))
+    with pytest.raises(InputError, match="a stop line lies on '3_9', which is no lane of the net"):
         load_town(folder)

@@ -1,0 +1,196 @@
+"""Stop lines of an OpenDRIVE map: objects across a road, and markings that are signals (OpenDRIVE 1.8, 13 and 14)."""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString, Point
+
+from flcav.world.map.parameters import StopLineParameters
+from flcav.world.map.roads import Lane, RoadNet
+from flcav.world.opendrive.objects.places import locate, outline_object
+from flcav.world.opendrive.road_surface import Road
+
+Array = NDArray[np.float64]
+
+MARKING = "294"  # type of a signal that is a painted stop line: its number in the German catalogue
+SUBTYPE = "signalLines"  # of an object `roadMark` that is one
+WIDE_M = (1.5, 30.0)  # lengths of a line that are believed
+STOPPED = ("driving", "bicycle")  # lanes with stop lines
+ACROSS_M = 20.0  # from a signal to both sides, where the lanes that it is for are sought
+BEFORE_M, BEYOND_M = 25.0, 6.0  # from a line to the end of its lane in the net, which may lie on either side of it
+GAP_M = 1.0  # from a vehicle that stops to a line, SUMO's usual distance
+BEFORE_CROSSING_M = 0.6  # from the middle of a line to the crossing behind it
+ASKEW = math.cos(math.radians(60.0))  # of the least angle between a line and its lane
+AHEAD = math.cos(math.radians(30.0))  # of the largest angle between a lane and the direction a signal is for
+
+
+@dataclass(frozen=True)
+class StopLines:
+    """The stop lines that a map describes, one for each lane, how many lines these were, and how many were left out."""
+
+    found: tuple[StopLineParameters, ...]
+    taken: int
+    left: Counter[str]  # by the reason
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A line of the map in town coordinates."""
+
+    ends: Array  # (2, 2) both ends; of a signal `ACROSS_M` to both sides of it [m]
+    ahead: Array | None  # (2,) unit vector of the traffic that a signal is for; None of an object, whose ends are known
+
+
+@dataclass(frozen=True)
+class _Crossed:
+    """A lane that a line crosses, or would if the lane went straight on."""
+
+    edge: str
+    lane: str
+    before_end_m: float
+    aside_m: float  # from where the line is described
+
+
+def find_stop_lines(root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet) -> StopLines:
+    """Return the stop lines of a map at the ends of the lanes of `net`, town = map + `offset_m` [m]."""
+    found: dict[str, float] = {}
+    taken, left = 0, Counter[str]()
+    ends = [
+        (edge.id, lane, _go_on(lane))
+        for edge in net.streets
+        for lane in edge.lanes
+        if lane.kind in STOPPED and len(lane.shape) > 1
+    ]
+    for row in root.iterfind("road"):
+        for line in _list_lines(row, np.array(offset_m)):
+            lanes = [] if line is None else _choose(line, [*_cross(line, ends)], net)
+            if line is None:
+                left["no place or length"] += 1
+            elif not lanes:
+                left["no lane ends there"] += 1
+            else:
+                taken += 1
+                found |= {each.lane: each.before_end_m for each in lanes if each.lane not in found}
+    rows = (StopLineParameters(lane=lane, before_end_m=round(found[lane], 2)) for lane in found)
+    return StopLines(tuple(rows), taken, left)
+
+
+def _list_lines(row: ElementTree.Element, offset_m: Array) -> Iterator[_Line | None]:
+    """Yield the stop lines along one road of the map; None for one that does not say enough."""
+    things = [thing for thing in row.iterfind("objects/object") if _is_stop_line(thing)]
+    signals = [signal for signal in row.iterfind("signals/signal") if signal.get("type") == MARKING]
+    if not things and not signals:
+        return
+    road = Road(row)
+    for thing in things:
+        outline = outline_object(road, thing)
+        if outline is None:
+            yield None
+            continue
+        apart = np.hypot(*(outline[:, None] - outline[None]).T)
+        i, j = np.unravel_index(int(np.argmax(apart)), apart.shape)
+        believed = WIDE_M[0] <= apart[i, j] <= WIDE_M[1]
+        yield _Line(outline[[i, j]] + offset_m, None) if believed else None
+    for signal in signals:
+        place = locate(road, signal)
+        if place is None:
+            yield None
+            continue
+        heading = place[2] + (math.pi if signal.get("orientation") == "-" else 0.0)
+        ahead = np.array([math.cos(heading), math.sin(heading)])
+        across = ACROSS_M * np.array([-ahead[1], ahead[0]])
+        yield _Line(np.array([place[:2] - across, place[:2] + across]) + offset_m, ahead)
+
+
+def _is_stop_line(thing: ElementTree.Element) -> bool:
+    """Return whether an object is a stop line, by its subtype, or by its name where it has no type."""
+    if thing.get("type") == "roadMark" and thing.get("subtype") == SUBTYPE:
+        return True
+    return "".join(filter(str.isalpha, thing.get("name", ""))).lower().startswith("stopline")
+
+
+def _go_on(lane: Lane) -> LineString:
+    """Return the middle of a lane, continued straight on for `BEYOND_M`."""
+    step = lane.shape[-1] - lane.shape[-2]
+    beyond = lane.shape[-1] + BEYOND_M * step / max(float(np.hypot(*step)), 1e-9)
+    return LineString([*lane.shape, beyond])
+
+
+def _cross(line: _Line, ends: list[tuple[str, Lane, LineString]]) -> Iterator[_Crossed]:
+    """Yield the lanes that a line crosses near their ends."""
+    across = LineString(line.ends)
+    way = line.ends[1] - line.ends[0]
+    for edge, lane, longer in ends:
+        step = lane.shape[-1] - lane.shape[-2]
+        step = step / max(float(np.hypot(*step)), 1e-9)
+        if abs(step @ way) > ASKEW * np.hypot(*way) or (line.ahead is not None and step @ line.ahead < AHEAD):
+            continue
+        crossing = longer.intersection(across)
+        if crossing.is_empty:
+            continue
+        at = crossing.centroid
+        before = longer.length - BEYOND_M - longer.project(at)
+        if before < min(BEFORE_M, longer.length - BEYOND_M - 2 * GAP_M):
+            aside = at.distance(across.centroid)
+            yield _Crossed(edge, lane.id, before, max(aside - lane.width / 2, 0.0))
+
+
+def _choose(line: _Line, crossed: list[_Crossed], net: RoadNet) -> list[_Crossed]:
+    """Return the crossed lanes of one edge: that next to a signal, else that which ends next behind the line."""
+    if not crossed:
+        return []
+
+    def rate(each: _Crossed) -> tuple[float, bool, float]:
+        aside = 0.0 if line.ahead is None else round(each.aside_m, 1)
+        return aside, each.before_end_m < -0.5, abs(each.before_end_m)
+
+    edge = net.edges[min(crossed, key=rate).edge]
+    order = [lane.id for lane in edge.lanes]
+    return sorted((each for each in crossed if each.edge == edge.id), key=lambda each: order.index(each.lane))
+
+
+def add_crossing_lines(net: RoadNet, known: tuple[StopLineParameters, ...]) -> tuple[StopLineParameters, ...]:
+    """Return the known stop lines, and further ones where a crossing lies across the lanes before a light.
+
+    netconvert ends lanes before the crossings that it has placed; those of a map may lie in front of that.
+    """
+    taken = {line.lane.rpartition("_")[0] for line in known}
+    crossings = [
+        LineString(edge.lanes[0].shape).buffer(edge.lanes[0].width / 2, cap_style="flat")
+        for edge in net.edges.values()
+        if edge.function == "crossing" and len(edge.lanes[0].shape) > 1
+    ]
+    rows = []
+    for edge in net.streets:
+        if edge.id in taken or not net.junctions[edge.end].kind.startswith("traffic_light"):
+            continue
+        for lane in edge.lanes:
+            if lane.kind not in STOPPED or len(lane.shape) < 2:
+                continue
+            line = LineString(lane.shape)
+            inside = [line.intersection(area) for area in crossings if area.intersects(line)]
+            starts = [line.project(Point(xy)) for piece in inside for xy in shapely.get_coordinates(piece)]
+            near = [line.length - along + BEFORE_CROSSING_M for along in starts if along > line.length - BEFORE_M]
+            if near and max(near) < line.length - 2 * GAP_M:
+                rows.append(StopLineParameters(lane=lane.id, before_end_m=round(max(near), 2)))
+    return (*known, *rows)
+
+
+def stop_at_lines(net: Path, lines: tuple[StopLineParameters, ...]) -> None:
+    """Write into a net file that vehicles stop at these lines, as far as they lie before the ends of their lanes."""
+    before = {line.lane: line.before_end_m + GAP_M for line in lines if line.before_end_m > 0}
+    if not before:
+        return
+    tree = ElementTree.parse(net)
+    for row in tree.getroot().iterfind("edge/lane"):
+        offset = before.get(row.get("id", ""))
+        if offset is not None:
+            row.insert(0, ElementTree.Element("stopOffset", {"value": f"{offset:.2f}", "vClasses": "all"}))
+    tree.write(net, encoding="utf-8", xml_declaration=True)
