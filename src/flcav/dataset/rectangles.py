@@ -38,7 +38,7 @@ def select_rectangles(frame: Frame, camera: str, labels: str, min_pixels: int) -
         names, box, pixels = frame.annotations.boxes.label.tolist(), views.visible_box, views.pixels
     else:
         signs = frame.annotations.signs[camera]
-        names = [LIGHTS.get(state, "") if state else kind for kind, state in zip(signs.kind, signs.state)]
+        names = [LIGHTS.get(state, "") if kind == "signal" else kind for kind, state in zip(signs.kind, signs.state)]
         box, pixels = signs.box, signs.pixels
     number = {name: i for i, name in enumerate(CLASSES[labels])}
     label = np.array([number.get(name, -1) for name in names], np.int64)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from flcav.geometry import left_vectors
 from flcav.seeds import stream
 from flcav.world.map.relief import Relief
+from flcav.world.map.signals import Signals
 from flcav.world.map.town import KERB_M, Town
 from flcav.world.materials import Material
 from flcav.world.meshes.buildings import make_building
@@ -65,7 +66,7 @@ class StaticWorld(NamedTuple):
 class SignsAndSignals(NamedTuple):
     """The K traffic signs and signal heads of a town: first the signs, then the heads, in the town's order."""
 
-    kind: tuple[str, ...]  # (K,) stop | yield | speed_30 | speed_60 | speed_90 | signal
+    kind: tuple[str, ...]  # (K,) stop | yield | speed_30 | speed_60 | speed_90 | signal | walker_signal
     position: NDArray[np.float64]  # (K, 3) centre of the plate or head, world [m]
     yaw: NDArray[np.float64]  # (K,) direction it faces, world [rad]
     link: tuple[str, ...]  # (K,) the entry of `Trace.light` that a head shows; empty for signs
@@ -92,12 +93,17 @@ def list_signs_and_signals(town: Town) -> SignsAndSignals:
     for part, first in ((Part.SIGN, 0), (Part.SIGNAL, len(signs.kind))):
         face[world.part == part] = first + world.row[world.part == part]
     return SignsAndSignals(
-        kind=(*signs.kind, *("signal" for _ in signals.link)),
+        kind=(*signs.kind, *_head_kinds(signals)),
         position=np.concatenate((signs.position, signals.position)),
         yaw=np.concatenate((signs.yaw, signals.yaw)),
         link=(*("" for _ in signs.kind), *signals.link),
         face=face,
     )
+
+
+def _head_kinds(signals: Signals) -> list[str]:
+    """Return the kind of each signal head in `SignsAndSignals`."""
+    return ["signal"] * (len(signals.link) - signals.walkers) + ["walker_signal"] * signals.walkers
 
 
 _WORLDS: dict[str, StaticWorld] = {}  # by hash of the town: the last TOWNS_KEPT
@@ -214,9 +220,10 @@ def _furniture(town: Town) -> Iterator[Owned]:
 def _signals(town: Town) -> Iterator[Owned]:
     """Yield the signal heads with their masts."""
     signals = town.signals
-    for row, ((x, y, z), yaw, foot) in enumerate(zip(signals.position, signals.yaw, signals.foot)):
+    heads = zip(signals.position, signals.yaw, signals.foot, _head_kinds(signals))
+    for row, ((x, y, z), yaw, foot, kind) in enumerate(heads):
         left = left_vectors(yaw)
         reach = float(left @ ((x, y) - foot))
         ground = town.ground(*foot)
-        yield Part.SIGNAL, row, transform_mesh(signal_head(z - ground), x, y, ground, yaw)
+        yield Part.SIGNAL, row, transform_mesh(signal_head(kind, z - ground), x, y, ground, yaw)
         yield Part.POST, row, transform_mesh(signal_mast(z - ground, reach), foot[0], foot[1], ground, yaw)

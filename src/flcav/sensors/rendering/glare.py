@@ -8,12 +8,14 @@ from flcav.geometry import heading_vectors, inverse, transform_points
 from flcav.sensors.camera.lens import Lens, project
 from flcav.sensors.rendering.light import DARK, Light
 from flcav.sensors.rendering.state import AMBER, GREEN, RED, LampState, lamp_places
-from flcav.world.meshes.furniture import LENS_PITCH_M
+from flcav.world.materials import Material
+from flcav.world.meshes.furniture import LENS_PITCH_M, SIGNAL_LENSES
 from flcav.world.scene import Scene
 
 HEAD, TAIL, STREET, SIGNAL = 9.0, 0.55, 1.6, 0.35  # strengths of the halos
 HEAD_COLOUR, TAIL_COLOUR, STREET_COLOUR = (1.0, 0.95, 0.86), (1.0, 0.05, 0.03), (1.0, 0.74, 0.40)
 SIGNAL_COLOURS = {RED: (1.0, 0.05, 0.03), AMBER: (1.0, 0.5, 0.03), GREEN: (0.06, 1.0, 0.55)}
+FLAGS = {Material.LENS_RED: RED, Material.LENS_AMBER: AMBER, Material.LENS_GREEN: GREEN}
 FARTHEST_M = 150.0  # of lamps with halos
 SUN_RAYS, SUN_RAD, SUN_REACH_M = 16, 0.0046, 1000.0  # rays over the sun's disc, its angular radius, rays' length
 SUN_SPREAD_RAD, SUN_VEIL_RAD = 0.016, 0.16  # widths of the lens' narrow and wide scattering of the sun
@@ -114,8 +116,9 @@ def _glowing(
         for number, (place, yaw, kind) in enumerate(zip(things.position, things.yaw, things.kind)):
             cos, sin = heading_vectors(yaw)
             ahead = (eye - place) @ (cos, sin, 0.0)
-            if kind == "signal" and ahead > 0:
-                for place_up, lens in ((1, RED), (0, AMBER), (-1, GREEN)):
+            if kind in SIGNAL_LENSES and ahead > 0:
+                for material, place_up in SIGNAL_LENSES[kind]:
+                    lens = FLAGS[material]
                     if state.lens[number] & lens:
                         lit = place + np.array((0.2 * cos, 0.2 * sin, place_up * LENS_PITCH_M))
                         out.append((lit, SIGNAL_COLOURS[lens], SIGNAL * float(light.lamps)))

@@ -140,6 +140,7 @@ class SignalParameters(Config):
     height_m: Height  # height of its centre above the ground
     yaw_deg: Annotated[float, Field(ge=-360, le=360)]  # direction that it faces, counter-clockwise from east
     light: str  # "junction:link" of the net: the signal that it shows
+    walkers: bool = False  # it is for pedestrians
     reach_m: Annotated[float, Field(ge=-50, le=50)] = 0.0  # from its mast to the left of its direction; an arm bears it
     controller: str = ""  # id of the map's controller; empty without one
 

@@ -31,6 +31,7 @@ class Signals:
     yaw: Array  # (K,) direction it faces, towards the traffic it controls, world [rad]
     foot: Array  # (K, 2) foot of its mast, world [m]; heads on one mast share it
     link: tuple[str, ...]  # (K,) the entry of `Trace.light` it shows
+    walkers: int = 0  # the last so many heads are for pedestrians
 
     @classmethod
     def none(cls) -> "Signals":
@@ -39,19 +40,21 @@ class Signals:
 
 
 def place_signals(net: RoadNet, sensors: Array, known: tuple[SignalParameters, ...] = ()) -> Signals:
-    """Return the signal heads of all approaches to traffic lights, in the net's order.
+    """Return the signal heads of all approaches to traffic lights, in the net's order, and then those for pedestrians.
 
     There is no arm within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) [m], since it would block the view.
-    An approach for which heads are `known` has these, and no others.
+    An approach for which heads are `known` has these, and no others. Only those known are for pedestrians.
     """
     given: dict[str, list[Head]] = {}
     for signal in known:
-        given.setdefault(signal.light, []).append(_head(signal))
+        if not signal.walkers:
+            given.setdefault(signal.light, []).append(_head(signal))
     heads = [head for edge in net.streets for head in _given(edge, net, given) or _approach(edge, net, sensors)]
-    if not heads:
+    walkers = [_head(signal) for signal in known if signal.walkers]
+    if not heads and not walkers:
         return Signals.none()
-    position, yaw, foot, link = zip(*heads)
-    return Signals(np.array(position), np.array(yaw), np.array(foot), link)
+    position, yaw, foot, link = zip(*heads, *walkers)
+    return Signals(np.array(position), np.array(yaw), np.array(foot), link, len(walkers))
 
 
 def _head(signal: SignalParameters) -> Head:

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 GRID_M = 1e-3
 SLIVER_M = 0.25  # narrower pieces are dropped, narrower gaps closed, shorter lanes left out: artefacts of the net
 
+ISLAND_M = 25.0  # farthest that a place on a traffic island is from the road; wider land within roads is open ground
+
 
 @dataclass(frozen=True)
 class GroundSurfaces:
@@ -26,7 +28,7 @@ class GroundSurfaces:
 
     roads: MultiPolygon  # carriageways and junctions
     sidewalks: MultiPolygon  # with the paving behind them and the traffic islands
-    islands: MultiPolygon  # traffic islands: holes of the roads without a sidewalk in them
+    islands: MultiPolygon  # traffic islands: narrow holes of the roads without a sidewalk in them
 
 
 def build_ground_surfaces(
@@ -64,7 +66,7 @@ def build_ground_surfaces(
         [
             hole
             for hole in (Polygon(ring) for part in roads.geoms for ring in part.interiors)
-            if not hole.intersects(walked_area.buffer(-SLIVER_M))
+            if not hole.intersects(walked_area.buffer(-SLIVER_M)) and hole.buffer(-ISLAND_M).is_empty
         ]
     )
     return GroundSurfaces(roads, _clean(add(sidewalks, islands)), islands)

@@ -14,12 +14,15 @@ from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join_meshes, sheet, tu
 
 LEAVES = 360  # triangles of a crown; each stands for a cluster of leaves
 LEAF = 0.38  # size of a cluster over the crown's radius: the crown stops about two rays in three
-HEAD_M = (0.20, 0.36, 1.04)  # depth, width, height of a signal head's housing
+HEAD_M = (0.20, 0.36, 1.04)  # depth, width, height of the housing of three lenses; one fewer takes its pitch off
 LENS_RADIUS_M = 0.125
 LENS_PITCH_M = 0.32  # between the centres of neighbouring lenses
 VISOR_M = 0.20  # length of a visor
 LIGHT_MAST_BEHIND_M = 0.22  # from the head's centre back to its mast
-LENSES = (Material.LENS_RED, Material.LENS_AMBER, Material.LENS_GREEN)  # from top to bottom
+SIGNAL_LENSES = {  # kind of signal head -> its lenses and their places, in pitches above the head's centre
+    "signal": ((Material.LENS_RED, 1.0), (Material.LENS_AMBER, 0.0), (Material.LENS_GREEN, -1.0)),
+    "walker_signal": ((Material.LENS_RED, 0.5), (Material.LENS_GREEN, -0.5)),
+}
 SIGN_RADIUS_M = 0.36  # circumscribed radius of a sign's plate
 MAST_BEHIND_M = 0.40  # from a roadside sensor back to its mast
 
@@ -48,11 +51,13 @@ def scatter_leaves(center: ArrayLike, radii: ArrayLike, count: int, size_m: floa
     return Mesh(vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3), np.full(count, Material.LEAF, np.uint8))
 
 
-def signal_head(height: float) -> Mesh:
-    """Return a signal head of three lenses with visors, its centre `height` [m] above the origin, facing +x."""
+def signal_head(kind: str, height: float) -> Mesh:
+    """Return a signal head of a kind of `SIGNAL_LENSES`, its centre `height` [m] above the origin, facing +x."""
     front = HEAD_M[0] / 2
-    parts = [box((0, 0, height), HEAD_M, Material.TRIM)]
-    for place, material in zip((1, 0, -1), LENSES):
+    lenses = SIGNAL_LENSES[kind]
+    housing = (*HEAD_M[:2], HEAD_M[2] - (3 - len(lenses)) * LENS_PITCH_M)
+    parts = [box((0, 0, height), housing, Material.TRIM)]
+    for material, place in lenses:
         middle = np.array((front + 0.005, 0.0, height + place * LENS_PITCH_M))
         parts += [_lens(middle, material), _visor(middle)]
     return join_meshes(parts)

@@ -24,8 +24,11 @@ Array = NDArray[np.float64]
 Placed = tuple[ElementTree.Element, ElementTree.Element]  # a road, and a signal or a reference to one on it
 
 LIGHT, WALKERS = "1000001", "1000002"  # types of traffic lights: for vehicles, for pedestrians
-HEAD_M = 1.0  # height of a head; a higher signal includes its post
+HEAD_M, WALKERS_HEAD_M = 1.0, 0.7  # heights of heads, for pedestrians too; a higher signal includes its post
 HEIGHT_M = (1.8, 9.0)  # heights of a head's centre that are believed
+WALKERS_M = (1.5, 4.0)  # the same, of a head for pedestrians
+WALKERS_UP_M = 2.4  # height of the centre of such a head that says none to be believed
+KERB_SIDE_M = 6.0  # from such a head to its end of a crossing
 PLACE_M = 15.0  # from the end of a road of the map to that of its lane in the net
 WAY_M = 40.0  # the same, of both ends of a way through a junction together
 ASKEW = np.cos(np.radians(60.0))  # a head whose axis is turned farther from its approach faces this instead
@@ -45,7 +48,7 @@ def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: Ro
     """Return the heads of the traffic lights of a map that stand at a light of `net`, town = map + `offset_m` [m].
 
     The way that a head is for follows from the roads that it, or a reference to it, is on. Its axis is that of the map,
-    and it faces the traffic there.
+    and it faces the traffic there. A head for pedestrians belongs to the crossing of its road beside which it stands.
     """
     roads = {row.get("id", ""): row for row in root.iterfind("road")}
     named = _list_references(root)
@@ -56,26 +59,20 @@ def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: Ro
         for signal in row.iterfind("signals/signal"):
             if signal.get("dynamic") != "yes":
                 continue
-            name = signal.get("id", "")
+            name, kind = signal.get("id", ""), signal.get("type", "")
             place = locate(Road(row), signal, offset_m)
-            reason = _refuse_kind(signal.get("type", "")) or ("" if place else "no place")
-            way = (
-                None if reason else ways.find([(roads[road], ref) for road, ref in named.get(name, ())], (row, signal))
-            )
-            if reason or way is None or place is None:
-                left[reason or "no junction with lights"] += 1
-                continue
-            head = _place(signal, place, way, ways, controllers.get(name, ""))
-            if head is None:
-                left["above a road, with no place for its mast"] += 1
+            if kind not in (LIGHT, WALKERS) or place is None:
+                head = "no place" if kind in (LIGHT, WALKERS) else f"of the type {shorten(kind)}"
+            elif kind == WALKERS:
+                head = _place_walkers(signal, place, net, ways, controllers.get(name, ""))
+            else:
+                way = ways.find([(roads[road], ref) for road, ref in named.get(name, ())], (row, signal))
+                head = _place(signal, place, way, ways, controllers.get(name, ""))
+            if isinstance(head, str):
+                left[head] += 1
             else:
                 found.append(head)
     return SignalHeads(tuple(found), left)
-
-
-def _refuse_kind(kind: str) -> str:
-    """Return why a dynamic signal of this type has no head; empty where it has."""
-    return "" if kind == LIGHT else "for pedestrians" if kind == WALKERS else f"of the type {shorten(kind)}"
 
 
 def _list_references(root: ElementTree.Element) -> dict[str, list[tuple[str, ElementTree.Element]]]:
@@ -175,16 +172,17 @@ def _travelled(row: ElementTree.Element, signal: ElementTree.Element) -> Iterato
 
 
 def _place(
-    signal: ElementTree.Element, place: tuple[float, float, float], way: Connection, ways: _Ways, controller: str
-) -> SignalParameters | None:
-    """Return the head of a signal at x, y and the road's heading; None where its mast would stand on the road."""
+    signal: ElementTree.Element, place: tuple[float, float, float], way: Connection | None, ways: _Ways, controller: str
+) -> SignalParameters | str:
+    """Return the head of a signal at x, y and the road's heading, or the reason why there is none."""
+    if way is None:
+        return "no junction with lights"
     x, y, heading = place
     come = ways.heading(way)
     axis = heading_vectors(heading + read_number(signal, "hOffset"))
     facing = -come if abs(axis @ come) < ASKEW else -np.sign(axis @ come) * axis
     yaw = float(np.arctan2(facing[1], facing[0]))
-    low, high = read_number(signal, "zOffset"), read_number(signal, "height")
-    up = low + (high / 2 if high <= 2 * HEAD_M else high - HEAD_M / 2)
+    up = _read_height(signal, HEAD_M)
     known = HEIGHT_M[0] <= up <= HEIGHT_M[1]
     reach = 0.0
     if ways.on_road(x, y):
@@ -192,7 +190,7 @@ def _place(
         steps = (side * step for step in np.arange(STEP_M, FARTHEST_M, STEP_M) for side in (1, -1))
         reach = next((r for r in steps if not ways.on_road(x - r * left[0], y - r * left[1])), math.nan)
         if math.isnan(reach):
-            return None
+            return "above a road, with no place for its mast"
     return SignalParameters(
         x=round(x, 3),
         y=round(y, 3),
@@ -202,6 +200,52 @@ def _place(
         light=way.light,
         controller=controller,
     )
+
+
+def _find_crossing(net: RoadNet, place: tuple[float, float, float]) -> tuple[float, str] | None:
+    """Return the direction [rad] and the light of the crossing with an end near x, y; None without one.
+
+    It leads across the road, whose heading is the third number, and the direction is that from this end to the other.
+    """
+    along = heading_vectors(place[2])
+    lights = {way.end: way.light for way in net.connections if way.light}
+    rated = []
+    for edge in net.edges.values():
+        if edge.function != "crossing" or edge.lanes[0].id not in lights or len(edge.lanes[0].shape) < 2:
+            continue
+        shape = edge.lanes[0].shape
+        for here, there in ((shape[0], shape[-1]), (shape[-1], shape[0])):
+            apart, way = float(np.hypot(*(here - place[:2]))), there - here
+            if apart <= KERB_SIDE_M and abs(way @ along) <= ASKEW * np.hypot(*way):
+                rated.append((apart, float(np.arctan2(way[1], way[0])), lights[edge.lanes[0].id]))
+    return min(rated)[1:] if rated else None
+
+
+def _place_walkers(
+    signal: ElementTree.Element, place: tuple[float, float, float], net: RoadNet, ways: _Ways, controller: str
+) -> SignalParameters | str:
+    """Return the head for pedestrians of a signal at x, y, facing those who come across, or why there is none."""
+    facing = _find_crossing(net, place)
+    if facing is None:
+        return "for pedestrians, no crossing with lights"
+    if ways.on_road(*place[:2]):
+        return "for pedestrians, on a road"
+    up = _read_height(signal, WALKERS_HEAD_M)
+    return SignalParameters(
+        x=round(place[0], 3),
+        y=round(place[1], 3),
+        height_m=round(up, 2) if WALKERS_M[0] <= up <= WALKERS_M[1] else WALKERS_UP_M,
+        yaw_deg=round(math.degrees(facing[0]) % 360.0, 2),
+        light=facing[1],
+        walkers=True,
+        controller=controller,
+    )
+
+
+def _read_height(signal: ElementTree.Element, head_m: float) -> float:
+    """Return the height of the centre of a signal's head [m]; one twice as high as a head includes its post."""
+    low, high = read_number(signal, "zOffset"), read_number(signal, "height")
+    return low + (high / 2 if high <= 2 * head_m else high - head_m / 2)
 
 
 def count_controllers(heads: tuple[SignalParameters, ...], net: Path) -> tuple[int, int]:
