@@ -114,11 +114,12 @@ def test_night_is_darker_than_dusk_than_day(street: Scene):
     assert means[2] < 0.5 * means[0]
 
 
-@pytest.mark.parametrize(("letter", "band", "row"), [("r", 0, 1), ("G", 1, -1)])
+@pytest.mark.parametrize(("letter", "band", "row"), [("r", 0, 1), ("G", 1, -1), ("r", 0, 0.5), ("G", 1, -0.5)])
 def test_signals_show_their_state(
-    small_town: Callable[..., Town], standing: Callable[..., Trace], letter: str, band: int, row: int
+    small_town: Callable[..., Town], standing: Callable[..., Trace], letter: str, band: int, row: float
 ):
-    signals = Signals(np.array([[8.0, 0.0, 2.0]]), np.array([np.pi]), np.array([[8.0, -1.0]]), ("x:0",))
+    walkers = int(abs(row) < 1)  # a head of two lenses
+    signals = Signals(np.array([[8.0, 0.0, 2.0]]), np.array([np.pi]), np.array([[8.0, -1.0]]), ("x:0",), walkers)
     trace = replace(standing([]), light=np.array(["x:0"]), light_state=np.array([[letter]]))
     camera = Camera(width=320, height=192, noise=0)
     scene = Scene(small_town(signals=signals), trace)

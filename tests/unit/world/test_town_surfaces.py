@@ -1,4 +1,4 @@
-"""Cutting areas with holes into simple polygons."""
+"""Traffic islands, and cutting areas with holes into simple polygons."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import MultiPolygon, Polygon, box
 
-from flcav.world.map.surfaces import make_footprint, split_into_polygons
+from flcav.world.map.roads import Edge, Lane, RoadNet
+from flcav.world.map.surfaces import build_ground_surfaces, make_footprint, split_into_polygons
 
 holes = st.lists(st.tuples(st.floats(1, 16), st.floats(1, 16), st.floats(0.5, 3), st.floats(0, 3)), max_size=4)
 
@@ -32,3 +33,13 @@ def test_parts_stay_apart() -> None:
 def test_footprint_is_a_turned_rectangle() -> None:
     turned = make_footprint(1.0, 2.0, np.pi / 2, 4.0, 2.0)
     assert turned.bounds == pytest.approx((0.0, 0.0, 2.0, 4.0))
+
+
+@pytest.mark.parametrize(("radius_m", "islands"), [(20.0, 1), (60.0, 0)])
+def test_a_traffic_island_is_narrow(radius_m: float, islands: int) -> None:
+    angle = np.linspace(0.0, 2 * np.pi, 100)
+    circle = radius_m * np.column_stack((np.cos(angle), np.sin(angle)))
+    edge = Edge("a", "normal", "b", "b", "street", (Lane("a_0", "driving", circle, 4.0, 10.0),))
+    ground = build_ground_surfaces(RoadNet({"a": edge}, {}, frozenset(), {}, ()), {})
+    assert len(ground.islands.geoms) == islands
+    assert ground.sidewalks.area == pytest.approx(islands * np.pi * 18.0**2, rel=0.01)
