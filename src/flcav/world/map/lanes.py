@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from flcav.world.map.imported import paint_spaces
 from flcav.world.map.layers import Arrow, ArrowKind, Crossing, MapLane, MapLayers
 from flcav.world.map.markings import generate_markings
 from flcav.world.map.paint import ARROW_M, list_outlines, outline_arrow, outline_dashes, outline_stripes
-from flcav.world.map.parking import paint_spaces
 from flcav.world.map.roads import Edge, Lane, RoadNet, read_net
 from flcav.world.map.town import Town
 

@@ -162,6 +162,18 @@ class ParkingParameters(Config):
     width_m: Annotated[float, Field(ge=1, le=10)]  # extent across it
 
 
+class ObjectParameters(Config):
+    """An object beside the roads of the map that a town was imported from."""
+
+    kind: Literal["building", "tree", "hedge", "wall", "fence", "railing", "cabinet"]  # kind of object
+    x: Ordinate  # its middle
+    y: Ordinate  # its middle
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0  # direction of its length, counter-clockwise from east
+    length_m: Annotated[float, Field(ge=0.01, le=LARGEST_M)]  # extent along that direction
+    width_m: Annotated[float, Field(ge=0.01, le=LARGEST_M)]  # extent across it; that of a tree is its crown's
+    height_m: Annotated[float, Field(ge=0.1, le=200)]  # height above the ground
+
+
 class PostParameters(Config):
     """A pole of the map that a town was imported from."""
 
@@ -200,6 +212,7 @@ class TownParameters(Config):
     poles: tuple[PoleParameters, ...] = ()  # candidate sites of roadside sensors
     signs: tuple[SignParameters, ...] = ()  # signs of the map; signs of the same sort are not placed by rule then
     posts: tuple[PostParameters, ...] = ()  # poles of the map
+    objects: tuple[ObjectParameters, ...] = ()  # further objects of the map; with buildings or trees it has no others
     signals: tuple[SignalParameters, ...] = ()  # signal heads of the map; approaches with one have no others
     stop_lines: tuple[StopLineParameters, ...] = ()  # stop lines of the map; approaches with one have no others
     parking: tuple[ParkingParameters, ...] = ()  # parking spaces of the map

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, read_config, shorten
 from flcav.seeds import stream
-from flcav.world.map import boundaries, street_furniture
+from flcav.world.map import boundaries, imported, street_furniture
 from flcav.world.map.parameters import GeoReference, TownParameters
-from flcav.world.map.parking import outline_space
 from flcav.world.map.relief import Relief
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.signals import Signals, place_signals
@@ -190,21 +189,29 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
     Ground first, then buildings, clutter, hedges and fences, trees, poles, signs, lamps and signals.
     """
     frontage = {kind: street.frontage_m for kind, street in parameters.streets.items()}
-    ground = build_ground_surfaces(net, frontage, [outline_space(space) for space in parameters.parking])
+    ground = build_ground_surfaces(net, frontage, [imported.outline_space(space) for space in parameters.parking])
     rows = list(street_furniture.list_verges(net, parameters))
     paved = add(ground.roads, ground.sidewalks)
     land = street_furniture.Plot(paved)
-    buildings = street_furniture.place_buildings(rows, land, stream(parameters.seed, "buildings"))
+    for shape in (given := imported.outline_objects(parameters.objects)):
+        land.build(shape, 0.0)
+    buildings = imported.list_buildings(parameters.objects)
+    if not len(buildings):
+        buildings = street_furniture.place_buildings(rows, land, stream(parameters.seed, "buildings"))
     walked = unite([verge.line.buffer(verge.half_width, cap_style="flat") for verge in rows])
     facades = [
         street_furniture.make_footprint(x, y, yaw, length, width).buffer(0.1)
         for x, y, yaw, length, width, _ in buildings
     ]
     open_land = street_furniture.Plot(unite([ground.roads, walked, *facades]))
+    for shape in given:
+        open_land.build(shape, 0.0)
     clutter = street_furniture.place_clutter(rows, open_land, stream(parameters.seed, "clutter"))
     enclosing = boundaries.place_boundaries(rows, open_land, stream(parameters.seed, "boundaries"))
     kerbside = boundaries.place_kerbside(rows, stream(parameters.seed, "kerbside"))
-    trees = street_furniture.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
+    trees = imported.list_trees(parameters.objects)
+    if not len(trees):
+        trees = street_furniture.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
     poles = street_furniture.place_poles(net, parameters.poles)
     mounts = np.array([row[1] for row in poles], dtype=np.float64).reshape(-1, 3)
     signs = street_furniture.place_signs(net, parameters.signs)
@@ -221,7 +228,7 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
         kerbs=find_kerbs(ground),
         buildings=buildings,
         trees=trees,
-        clutter=boundaries.join_clutter(clutter, enclosing, kerbside),
+        clutter=boundaries.join_clutter(imported.list_clutter(parameters.objects), clutter, enclosing, kerbside),
         poles=Poles(
             id=np.array([row[0] for row in poles], dtype=np.int64),
             position=mounts,

@@ -9,6 +9,7 @@ from shapely.geometry import LineString
 from flcav.world.map.parameters import (
     GeoReference,
     MapSource,
+    ObjectParameters,
     ParkingParameters,
     PoleParameters,
     PostParameters,
@@ -66,6 +67,7 @@ def furnish(
     source: MapSource,
     signs: tuple[SignParameters, ...] = (),
     posts: tuple[PostParameters, ...] = (),
+    objects: tuple[ObjectParameters, ...] = (),
     signals: tuple[SignalParameters, ...] = (),
     stop_lines: tuple[StopLineParameters, ...] = (),
     parking: tuple[ParkingParameters, ...] = (),
@@ -84,6 +86,7 @@ def furnish(
         poles=tuple(find_candidate_poles(net)),
         signs=signs,
         posts=posts,
+        objects=objects,
         signals=signals,
         stop_lines=stop_lines,
         parking=parking,

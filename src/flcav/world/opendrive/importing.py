@@ -37,6 +37,7 @@ from flcav.world.opendrive.objects.crosswalks import Crosswalk, find_crosswalks
 from flcav.world.opendrive.objects.parking_spaces import find_parking
 from flcav.world.opendrive.objects.signal_heads import count_controllers, find_heads
 from flcav.world.opendrive.objects.signs import find_posts, find_signs
+from flcav.world.opendrive.objects.standing import find_objects
 from flcav.world.opendrive.objects.stop_lines import add_crossing_lines, find_stop_lines, stop_at_lines
 from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 
@@ -204,6 +205,7 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         net = _read_joined(folder / "town.net.xml", xodr, roads_m)
         heads = find_heads(root, streets.offset_m, net)
         parking = find_parking(root, streets.offset_m, net)
+        objects = find_objects(root, streets.offset_m, net)
         stop_lines = find_stop_lines(root, streets.offset_m, net)
         lines = add_crossing_lines(net, stop_lines.found) if crossed else stop_lines.found
         stop_at_lines(folder / "town.net.xml", lines)
@@ -212,6 +214,7 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
             *_tell("Signal heads", len(heads.found), heads.left),
             *_tell("Stop lines", stop_lines.taken, stop_lines.left),
             *_tell("Parking spaces", len(parking.found), parking.left),
+            *_tell("Buildings, plants, barriers and obstacles", objects.taken, objects.left),
         ]
         several, alike = count_controllers(heads.found, folder / "town.net.xml")
         if several:
@@ -236,6 +239,7 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
             source=MapSource(file=xodr.name, offset_m=streets.offset_m),
             signs=find_signs(root, streets.offset_m),
             posts=find_posts(root, streets.offset_m),
+            objects=objects.found,
             signals=heads.found,
             stop_lines=lines,
             parking=parking.found,

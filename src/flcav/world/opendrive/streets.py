@@ -17,7 +17,7 @@ from flcav.world.opendrive.document import OPEN_ROADS, Document, Road
 
 FAR_M = 5000.0  # a map that reaches farther than this from its origin is moved there
 SIDEWALK_M = 2.0  # width of an added sidewalk
-PARKING_M = 1.9  # least width of a shoulder beside a town street that becomes a parking lane
+PARKING_M = (1.9, 5.0)  # widths of a shoulder beside a town street that becomes a parking lane
 SHORT_M = 60.0  # edges shorter than this are too short to change lanes
 ARTERIAL = 16.0  # [m/s] from this limit on, or with several driving lanes a direction, a street is an arterial
 WALKED = ("sidewalk", "walking")  # types of lanes for pedestrians in OpenDRIVE
@@ -126,7 +126,7 @@ def _lanes(row: ElementTree.Element, road: Road, add_sidewalk: bool) -> list[_La
         width, kind = float(found[i].get("width", "3.2")), kinds[i]
         if kind == "sidewalk" and i != walked:
             kind = "shoulder"
-        if kind == "shoulder" and i < first_driven and town and width >= PARKING_M:
+        if kind == "shoulder" and i < first_driven and town and PARKING_M[0] <= width <= PARKING_M[1]:
             kind = "parking"
         out.append(_Lane(kind, width, i))
     return out

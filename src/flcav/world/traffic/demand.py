@@ -14,8 +14,8 @@ from shapely.geometry import LineString
 
 from flcav.geometry import wrap_angle
 from flcav.seeds import stream
+from flcav.world.map.imported import outline_space
 from flcav.world.map.parameters import TownParameters
-from flcav.world.map.parking import outline_space
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
 from flcav.world.shapes import SHAPES

@@ -13,6 +13,7 @@ from flcav.config import InputError
 from flcav.seeds import stream
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.roads import read_net
+from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import load_town
 from flcav.world.materials import Material
 from flcav.world.opendrive.importing import ImportedTown, import_town
@@ -107,6 +108,24 @@ def test_parking_spaces_are_road_with_lines_and_vehicles(cross: ImportedTown) ->
     note = next(note for note in cross.notes if note.startswith("Parking"))
     for reason in ("1 (no place or size of a parking space)", "1 (on a lane for vehicles)", "1 (on a sidewalk)"):
         assert reason in note
+
+
+def test_buildings_trees_and_fences_of_the_map_stand_there(cross: ImportedTown) -> None:
+    town = cross.town  # the road with them leads southwards from (0, -10): its left is in the east
+    assert town.buildings.shape == (1, 6)  # a map with buildings has no others
+    x, y, yaw, length, width, height = town.buildings[0]
+    house = make_footprint(x, y, yaw, length, width)
+    assert house.symmetric_difference(shapely.box(-35.0, -80.0, -25.0, -60.0)).area < 0.1
+    assert height == 9.0
+    np.testing.assert_allclose(town.trees, [(12.0, -40.0, 6.0, 1.5), (14.0, -50.0, 6.0, 1.5), (16.0, -60.0, 6.0, 1.5)])
+    fence = next(rows for kind, rows in town.clutter if kind == "fence")
+    outline = shapely.union_all([make_footprint(*row[:5]) for row in fence])
+    assert outline.symmetric_difference(shapely.box(8.9, -80.0, 9.1, -70.0)).area < 0.01
+    np.testing.assert_allclose(fence[:, 5], 1.0 - (fence[:, 1] + 70.0) / 10.0, atol=0.01)  # it rises from 1 m to 2 m
+    note = next(note for note in cross.notes if note.startswith("Buildings, plants"))
+    assert note.endswith("taken over: 5; left out: 1 (no place or size); left out: 1 (on a lane or sidewalk).")
+    others = [make_footprint(*row[:5]) for kind, rows in town.clutter if kind != "fence" for row in rows]
+    assert not any(other.intersects(house) for other in others)
 
 
 def test_stop_lines_are_painted_where_the_map_has_them(cross: ImportedTown) -> None:

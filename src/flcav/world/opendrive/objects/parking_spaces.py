@@ -10,8 +10,8 @@ import shapely
 from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from flcav.world.map.imported import outline_space
 from flcav.world.map.parameters import ParkingParameters
-from flcav.world.map.parking import outline_space
 from flcav.world.map.roads import LaneKind, RoadNet
 from flcav.world.opendrive.objects.places import enclose_outline, outline_object, repeat_object
 from flcav.world.opendrive.road_surface import Road
@@ -32,7 +32,7 @@ def find_parking(root: ElementTree.Element, offset_m: tuple[float, float], net: 
     """Return the parking spaces of a map beside the lanes of `net`, in town coordinates: map + `offset_m` [m]."""
     found: list[ParkingParameters] = []
     left = Counter[str]()
-    driven, walked = _cover(net, ("driving", "bicycle")), _cover(net, ("sidewalk", "walkingarea", "crossing"))
+    driven, walked = cover_lanes(net, ("driving", "bicycle")), cover_lanes(net, ("sidewalk", "walkingarea", "crossing"))
     taken: list[Polygon] = []
     for row in root.iterfind("road"):
         things = [thing for thing in row.iterfind("objects/object") if thing.get("type") == "parkingSpace"]
@@ -56,7 +56,7 @@ def find_parking(root: ElementTree.Element, offset_m: tuple[float, float], net: 
     return ParkingSpaces(tuple(found), left)
 
 
-def _cover(net: RoadNet, kinds: tuple[LaneKind, ...]) -> BaseGeometry:
+def cover_lanes(net: RoadNet, kinds: tuple[LaneKind, ...]) -> BaseGeometry:
     """Return the area of all lanes of these kinds [m]."""
     lanes = [lane for edge in net.edges.values() for lane in edge.lanes if lane.kind in kinds and len(lane.shape) > 1]
     areas = [

@@ -1,0 +1,155 @@
+"""Buildings, trees, hedges, walls and railings of an OpenDRIVE map (OpenDRIVE 1.8, 13)."""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from flcav.world.map.parameters import CLUTTER, ObjectParameters
+from flcav.world.map.roads import RoadNet
+from flcav.world.map.surfaces import make_footprint
+from flcav.world.opendrive.objects.parking_spaces import cover_lanes
+from flcav.world.opendrive.objects.places import (
+    Rectangle,
+    enclose_outline,
+    locate,
+    outline_object,
+    read_number,
+    repeat_object,
+)
+from flcav.world.opendrive.road_surface import Road
+
+Array = NDArray[np.float64]
+Kind = Literal["building", "tree", "hedge", "wall", "fence", "railing", "cabinet"]
+
+KINDS: dict[str, Kind] = {  # by the type of an object; an obstacle is a box like a cabinet
+    "building": "building",
+    "tree": "tree",
+    "vegetation": "hedge",
+    "barrier": "wall",
+    "soundBarrier": "wall",
+    "railing": "railing",
+    "obstacle": "cabinet",
+}
+SIDE_M, HEIGHT_M = (0.02, 200.0), (0.2, 150.0)  # extents that are believed
+TREE_M = 2.0  # an object with a radius that is at least so high is a tree
+PIECE_M = 4.0  # length of the straight pieces of what goes on along a road
+LONGEST_M = 20_000.0  # over which an object goes on
+TOUCHED = 0.1  # share of a footprint that may lie on a lane
+
+
+@dataclass(frozen=True)
+class StandingObjects:
+    """The objects that stand beside the roads of a map, how many it has, and how many were left out, by the reason."""
+
+    found: tuple[ObjectParameters, ...]  # what goes on along a road in pieces
+    taken: int
+    left: Counter[str]
+
+
+def find_objects(root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet) -> StandingObjects:
+    """Return the objects of a map of `KINDS` that stand on no lane or sidewalk; town = map + `offset_m` [m]."""
+    ways = cover_lanes(net, ("driving", "bicycle", "sidewalk", "walkingarea", "crossing"))
+    shapely.prepare(ways)
+    found: list[ObjectParameters] = []
+    taken, left = 0, Counter[str]()
+    for row in root.iterfind("road"):
+        things = [thing for thing in row.iterfind("objects/object") if thing.get("type") in KINDS]
+        if not things:
+            continue
+        road = Road(row)
+        for thing in things:
+            for pieces in _list_copies(road, thing, np.array(offset_m)):
+                free = [piece for piece in pieces if not _stands_on(piece, ways)]
+                found += free
+                taken += bool(free)
+                if not free:
+                    left["on a lane or sidewalk" if pieces else "no place or size"] += 1
+    return StandingObjects(tuple(found), taken, left)
+
+
+def _stands_on(piece: ObjectParameters, ways: shapely.Geometry) -> bool:
+    """Return whether more than `TOUCHED` of a footprint is on an area; of a tree, its trunk."""
+    if piece.kind == "tree":
+        return bool(shapely.intersects(ways, shapely.Point(piece.x, piece.y)))
+    shape = make_footprint(piece.x, piece.y, math.radians(piece.yaw_deg), piece.length_m, piece.width_m)
+    return bool(shapely.area(shapely.intersection(shape, ways)) > TOUCHED * shape.area)
+
+
+def _list_copies(road: Road, thing: ElementTree.Element, offset_m: Array) -> Iterator[list[ObjectParameters]]:
+    """Yield an object and its repetitions, each as its pieces; none where it does not say its place and size."""
+    kind = KINDS[thing.get("type", "")]
+    if kind == "wall" and "fence" in thing.get("name", "").lower():
+        kind = "fence"
+    along = [row for row in thing.iterfind("repeat") if read_number(row, "distance") == 0]
+    for row in along:
+        yield [*_go_along(road, thing, row, kind, offset_m)]
+    for one in [] if along else repeat_object(thing):
+        yield [*_stand(road, one, kind, offset_m)]
+
+
+def _go_along(
+    road: Road, thing: ElementTree.Element, row: ElementTree.Element, kind: Kind, offset_m: Array
+) -> Iterator[ObjectParameters]:
+    """Yield the pieces of an object that goes on along a road, its size and place interpolated as a repetition says."""
+    start = min(max(read_number(row, "s"), 0.0), road.length)
+    length = min(read_number(row, "length"), road.length - start, LONGEST_M)
+    if length <= 0:
+        return
+    share = np.linspace(0.0, 1.0, max(1, math.ceil(length / PIECE_M)) + 1)
+
+    def spread(name: str, otherwise: float) -> Array:
+        first = read_number(row, f"{name}Start", otherwise)
+        return first + share * (read_number(row, f"{name}End", first) - first)
+
+    t = spread("t", read_number(thing, "t"))
+    width = spread("width", read_number(thing, "width") or CLUTTER.get(kind, (0.0, 0.5, 0.0))[1])
+    top = spread("zOffset", read_number(thing, "zOffset")) + spread("height", read_number(thing, "height"))
+    points = road.point(start + share * length, t)[:, :2] + offset_m
+    for i in range(len(points) - 1):
+        step = points[i + 1] - points[i]
+        middle = (points[i] + points[i + 1]) / 2
+        sides = float(np.hypot(*step)), float(width[i : i + 2].mean())
+        yield from _describe(kind, middle, math.atan2(step[1], step[0]), sides, float(top[i : i + 2].mean()))
+
+
+def _stand(road: Road, thing: ElementTree.Element, kind: Kind, offset_m: Array) -> Iterator[ObjectParameters]:
+    """Yield an object that stands at one place."""
+    place = locate(road, thing)
+    if place is None:
+        return
+    heights = [read_number(corner, "height") for tag in ("cornerLocal", "cornerRoad") for corner in thing.iter(tag)]
+    top = read_number(thing, "zOffset") + (read_number(thing, "height") or max(heights, default=0.0))
+    radius = read_number(thing, "radius")
+    if radius > 0 and kind in ("tree", "hedge") and top >= TREE_M:
+        kind = "tree"
+    outline = outline_object(road, thing)
+    found: Rectangle | None = None if outline is None else enclose_outline(outline + offset_m)
+    if radius > 0:
+        yield from _describe(kind, place[:2] + offset_m, place[2], (2 * radius, 2 * radius), top)
+    elif found is not None:
+        long = int(np.argmax(found.sides))
+        yaw = math.atan2(found.edges[long, 1], found.edges[long, 0])
+        yield from _describe(kind, found.centre, yaw, (float(found.sides[long]), float(found.sides[1 - long])), top)
+
+
+def _describe(
+    kind: Kind, centre: Array, yaw: float, sides: tuple[float, float], height: float
+) -> Iterator[ObjectParameters]:
+    """Yield an object of these extents [m] and heading [rad]; none where they are not believed."""
+    if SIDE_M[0] <= min(sides) and max(sides) <= SIDE_M[1] and HEIGHT_M[0] <= height <= HEIGHT_M[1]:
+        yield ObjectParameters(
+            kind=kind,
+            x=round(float(centre[0]), 3),
+            y=round(float(centre[1]), 3),
+            yaw_deg=round(math.degrees(yaw) % 360.0, 2),
+            length_m=round(sides[0], 2),
+            width_m=round(sides[1], 2),
+            height_m=round(height, 2),
+        )
