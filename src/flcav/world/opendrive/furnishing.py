@@ -9,17 +9,12 @@ from shapely.geometry import LineString
 from flcav.world.map.parameters import (
     GeoReference,
     MapSource,
-    ObjectParameters,
-    ParkingParameters,
     PoleParameters,
-    PostParameters,
-    SignalParameters,
-    SignParameters,
-    StopLineParameters,
     StreetParameters,
     TownParameters,
 )
 from flcav.world.map.roads import Edge, RoadNet
+from flcav.world.opendrive.objects.taken import MapObjects
 
 VEHICLES_PER_KM = 9.0  # of driving lane
 PEDESTRIANS_PER_KM = 10.0  # of sidewalk
@@ -65,14 +60,12 @@ def furnish(
     seed: int,
     geo: GeoReference,
     source: MapSource,
-    signs: tuple[SignParameters, ...] = (),
-    posts: tuple[PostParameters, ...] = (),
-    objects: tuple[ObjectParameters, ...] = (),
-    signals: tuple[SignalParameters, ...] = (),
-    stop_lines: tuple[StopLineParameters, ...] = (),
-    parking: tuple[ParkingParameters, ...] = (),
+    found: MapObjects,
 ) -> TownParameters:
-    """Return the parameters of a town on `net`; raises `KeyError` for a street type that is not in `STREETS`."""
+    """Return the parameters of a town on `net` with the objects `found` in its map.
+
+    Raises `KeyError` for a street type that is not in `STREETS`.
+    """
     kinds = sorted({edge.type for edge in net.streets})
     return TownParameters(
         description=description,
@@ -84,12 +77,12 @@ def furnish(
         mix=MIX,
         streets={kind: STREETS[kind] for kind in kinds},
         poles=tuple(find_candidate_poles(net)),
-        signs=signs,
-        posts=posts,
-        objects=objects,
-        signals=signals,
-        stop_lines=stop_lines,
-        parking=parking,
+        signs=found.signs,
+        posts=found.posts,
+        objects=found.objects,
+        signals=found.signals,
+        stop_lines=found.stop_lines,
+        parking=found.parking,
     )
 
 

@@ -34,11 +34,7 @@ from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map, mirror_parts
 from flcav.world.opendrive.objects.crossings import take_crosswalks
 from flcav.world.opendrive.objects.crosswalks import Crosswalk, find_crosswalks
-from flcav.world.opendrive.objects.parking_spaces import find_parking
-from flcav.world.opendrive.objects.signal_heads import count_controllers, find_heads
-from flcav.world.opendrive.objects.signs import find_posts, find_signs
-from flcav.world.opendrive.objects.standing import find_objects
-from flcav.world.opendrive.objects.stop_lines import add_crossing_lines, find_stop_lines, stop_at_lines
+from flcav.world.opendrive.objects.taken import take_objects, tell
 from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 
 WIDEST_M = 5e5  # farthest that a street is from the middle of the town
@@ -158,15 +154,6 @@ def _read_joined(path: Path, origin: Path, roads_m: float) -> RoadNet:
     return net
 
 
-def _tell(what: str, taken: int, left: Counter[str], nowhere: int = 0) -> list[str]:
-    """Return a sentence on how many of a map's things were taken over, and why others were not; none without any."""
-    reasons = left + Counter({"no street between two sidewalks there": nowhere})
-    if not taken and not reasons:
-        return []
-    told = "".join(f"; left out: {count} ({reason})" for reason, count in sorted(reasons.items()))
-    return [f"{what} of the map taken over: {taken}{told}."]
-
-
 @dataclass(frozen=True)
 class ImportedTown:
     """An imported town, and notes on what differs from the map."""
@@ -203,22 +190,10 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         )
         roads_m = sum(float(road.attrib["length"]) for road in root.iterfind("road"))
         net = _read_joined(folder / "town.net.xml", xodr, roads_m)
-        heads = find_heads(root, streets.offset_m, net)
-        parking = find_parking(root, streets.offset_m, net)
-        objects = find_objects(root, streets.offset_m, net)
-        stop_lines = find_stop_lines(root, streets.offset_m, net)
-        lines = add_crossing_lines(net, stop_lines.found) if crossed else stop_lines.found
-        stop_at_lines(folder / "town.net.xml", lines)
-        notes += [
-            *_tell("Crosswalks", crossed, crosswalks.left, len(crosswalks.found) - crossed),
-            *_tell("Signal heads", len(heads.found), heads.left),
-            *_tell("Stop lines", stop_lines.taken, stop_lines.left),
-            *_tell("Parking spaces", len(parking.found), parking.left),
-            *_tell("Buildings, plants, barriers and obstacles", objects.taken, objects.left),
-        ]
-        several, alike = count_controllers(heads.found, folder / "town.net.xml")
-        if several:
-            notes.append(f"Controllers with several of these heads: {several}; switched alike here: {alike}.")
+        nowhere = Counter({"no street between two sidewalks there": len(crosswalks.found) - crossed})
+        notes += tell("Crosswalks", crossed, crosswalks.left + nowhere)
+        found = take_objects(root, streets.offset_m, net, folder / "town.net.xml", crosswalks=crossed > 0)
+        notes += found.notes
         dx, dy = streets.offset_m
         geo = locate_origin(document.geo_reference, -dx, -dy)
         if geo is None:
@@ -237,12 +212,7 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
             seed=zlib.crc32(xodr.read_bytes()) % 10_000,
             geo=geo,
             source=MapSource(file=xodr.name, offset_m=streets.offset_m),
-            signs=find_signs(root, streets.offset_m),
-            posts=find_posts(root, streets.offset_m),
-            objects=objects.found,
-            signals=heads.found,
-            stop_lines=lines,
-            parking=parking.found,
+            found=found,
         )
         values = parameters.model_dump(mode="json", exclude_defaults=True)
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)

@@ -1,6 +1,7 @@
 """Crosswalks, signal heads, stop lines and parking spaces of an OpenDRIVE map in the town that is made of it."""
 
 import shutil
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import load_town
 from flcav.world.materials import Material
 from flcav.world.opendrive.importing import ImportedTown, import_town
+from flcav.world.opendrive.objects.places import outline_object
+from flcav.world.opendrive.road_surface import Road
 from flcav.world.static import build_town_mesh, list_signs_and_signals
 from flcav.world.traffic.demand import park
 from flcav.world.traffic.reach import find_walked
@@ -126,6 +129,14 @@ def test_buildings_trees_and_fences_of_the_map_stand_there(cross: ImportedTown) 
     assert note.endswith("taken over: 5; left out: 1 (no place or size); left out: 1 (on a lane or sidewalk).")
     others = [make_footprint(*row[:5]) for kind, rows in town.clutter if kind != "fence" for row in rows]
     assert not any(other.intersects(house) for other in others)
+
+
+def test_outlines_far_from_their_road_are_left_out() -> None:
+    row = next(ElementTree.parse(MAP).getroot().iterfind("road"))
+    corner = '<cornerRoad s="{}" t="{}"/>'
+    outline = "".join(corner.format(s, t) for s, t in ((1, 0), (1, 1e9), (2, 1e9)))
+    thing = ElementTree.fromstring(f'<object s="1" t="0"><outline>{outline}</outline></object>')
+    assert outline_object(Road(row), thing) is None
 
 
 def test_stop_lines_are_painted_where_the_map_has_them(cross: ImportedTown) -> None:

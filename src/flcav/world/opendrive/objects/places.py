@@ -12,7 +12,7 @@ from shapely.geometry import Polygon
 
 from flcav.world.opendrive.road_surface import Road
 
-LARGEST_M = 200.0  # farthest corner of an object from its place
+LARGEST_M = 200.0  # farthest corner of an object from its place, or from the middle of its road
 
 
 def repeat_object(thing: ElementTree.Element) -> Iterator[ElementTree.Element]:
@@ -43,7 +43,7 @@ def outline_object(road: Road, thing: ElementTree.Element) -> NDArray[np.float64
         own = np.array([(read_number(row, "u"), read_number(row, "v")) for row in corners])
     elif len(on_road := [*thing.iter("cornerRoad")]) > 2:
         s, t = (np.array([read_number(row, name) for row in on_road]) for name in ("s", "t"))
-        return road.point(np.clip(s, 0.0, road.length), t)[:, :2]
+        return road.point(np.clip(s, 0.0, road.length), t)[:, :2] if np.abs(t).max() < LARGEST_M else None
     else:
         length, width = read_number(thing, "length") / 2, read_number(thing, "width") / 2
         own = np.array([(length, width), (-length, width), (-length, -width), (length, -width)])

@@ -16,6 +16,7 @@ from flcav.world.map.roads import RoadNet
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.opendrive.objects.parking_spaces import cover_lanes
 from flcav.world.opendrive.objects.places import (
+    LARGEST_M,
     Rectangle,
     enclose_outline,
     locate,
@@ -111,6 +112,8 @@ def _go_along(
     t = spread("t", read_number(thing, "t"))
     width = spread("width", read_number(thing, "width") or CLUTTER.get(kind, (0.0, 0.5, 0.0))[1])
     top = spread("zOffset", read_number(thing, "zOffset")) + spread("height", read_number(thing, "height"))
+    if np.abs(t).max() > LARGEST_M:
+        return
     points = road.point(start + share * length, t)[:, :2] + offset_m
     for i in range(len(points) - 1):
         step = points[i + 1] - points[i]
