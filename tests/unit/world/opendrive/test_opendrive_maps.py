@@ -101,6 +101,24 @@ def test_a_circle_without_junctions_is_driven(tmp_path: Path) -> None:
     assert trace.present[:, trace.actor == "cav0"].all()
 
 
+def test_shoulders_of_a_cars_width_are_for_parking(tmp_path: Path) -> None:
+    root = circles()
+    road = root.find("road/type")
+    assert road is not None
+    road.set("type", "town")
+    for side, number, width in (("left", "2", "6"), ("right", "-2", "2.5")):
+        lanes = root.find(f"road/lanes/laneSection/{side}")
+        assert lanes is not None
+        lane = ElementTree.SubElement(lanes, "lane", {"id": number, "type": "shoulder"})
+        ElementTree.SubElement(lane, "width", {"sOffset": "0", "a": width, "b": "0", "c": "0", "d": "0"})
+        if side == "left":
+            lanes.insert(0, lanes[-1])
+            del lanes[-1]
+    net = read_net(import_town(write(root, tmp_path / "ring.xodr"), tmp_path / "ring").town.net)
+    found = {(lane.kind, lane.width) for edge in net.streets for lane in edge.lanes}
+    assert found == {("sidewalk", 2.0), ("driving", 3.0), ("parking", 2.5), ("shoulder", 6.0)}
+
+
 def chain(*names: str) -> list[Edge]:
     """Return edges without lanes that matter, 50 m apart."""
     from flcav.world.map.roads import Lane
