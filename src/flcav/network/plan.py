@@ -9,6 +9,8 @@ class MessageSizes:
 
     sample_mb: float  # one labelled sample
     model_mb: float  # one model update
+    exchange_mb: float | None = None  # what a vehicle sends to be combined in a round; None: a model update
+    labels_mb: float | None = None  # what it sends to have its samples labelled; None: nothing
 
 
 @dataclass(frozen=True)
@@ -41,18 +43,26 @@ class Price:
 def price(plan: StagePlan, sizes: MessageSizes) -> Price:
     """Return the uplink traffic of `plan` on each link [MB].
 
-    wireless = samples * sample + (edge_rounds + k * cloud_rounds) * vehicles * model;
+    wireless = samples * sample + vehicles * ((edge_rounds + k * cloud_rounds) * exchange + labellings * labels);
     wireline = samples * sample + cloud_rounds * edge_servers * model.
+
+    Samples are labelled before each edge round of stage II, and once before the first cloud round.
 
     >>> from flcav import StagePlan, price
     >>> from flcav.network import MessageSizes
     >>> plan = StagePlan(samples=200, edge_rounds=6, cloud_rounds=3, edge_groups=(4, 3))
     >>> price(plan, MessageSizes(sample_mb=0.5, model_mb=1.0))
     Price(wireless_mb=163.0, wireline_mb=106.0)
+    >>> price(plan, MessageSizes(sample_mb=0.5, model_mb=1.0, exchange_mb=0.01, labels_mb=0.02))
+    Price(wireless_mb=101.61, wireline_mb=106.0)
     """
     wireless_rounds = plan.edge_rounds + plan.edge_rounds_per_cloud_round * plan.cloud_rounds
-    uploaded = plan.samples * sizes.sample_mb
+    labellings = plan.edge_rounds + (plan.cloud_rounds > 0)
+    uploaded, vehicles = plan.samples * sizes.sample_mb, sum(plan.edge_groups)
+    exchange_mb = sizes.model_mb if sizes.exchange_mb is None else sizes.exchange_mb
     return Price(
-        wireless_mb=uploaded + wireless_rounds * sum(plan.edge_groups) * sizes.model_mb,
+        wireless_mb=uploaded
+        + wireless_rounds * vehicles * exchange_mb
+        + labellings * vehicles * (sizes.labels_mb or 0.0),
         wireline_mb=uploaded + plan.cloud_rounds * len(plan.edge_groups) * sizes.model_mb,
     )

@@ -8,7 +8,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flcav.config import Config
+from flcav.network.plan import MessageSizes
 from flcav.optimization.curves.curves import STAGES, Additive, Curve, NonNegative, OwnCurve, Positive, Shared
+from flcav.records import LEFT_OUT
 
 MOST = 10**9  # largest count
 WORST = 1e6  # largest error that a curve may predict within the limits; that of a fitted curve is about 1
@@ -77,6 +79,10 @@ class AllocationTask(Quantities):
     weight: Positive = 1.0
     sample_mb: Positive  # one labelled sample
     model_mb: Positive  # one model update
+    exchange_mb: Annotated[Positive | None, LEFT_OUT] = None  # what a vehicle sends in an edge round; None: the model
+    labels_mb: Annotated[NonNegative | None, LEFT_OUT] = (
+        None  # what it sends to have its samples labelled: before each edge round of stage II, once before stage III
+    )
     edge_groups: Annotated[tuple[Vehicles, ...], Field(min_length=1)]  # vehicles per edge server
     uplink_mbps: Mapping[str, Uplink] | None = None  # by vehicle, in the order of the edge groups
     samples_held: Mapping[str, Count] = {}  # by vehicle; not limited for one that is not named
@@ -104,13 +110,19 @@ class AllocationTask(Quantities):
         """Names of the vehicles, in the order of the edge groups; none where they are not named."""
         return tuple(self.vehicle_train_s if self.uplink_mbps is None else self.uplink_mbps)
 
+    @property
+    def sizes(self) -> MessageSizes:
+        """Sizes of the messages."""
+        return MessageSizes(self.sample_mb, self.model_mb, self.exchange_mb, self.labels_mb)
+
     def sample_s(self, vehicle: str) -> float:
         """Return the time in which a vehicle sends one sample [s]; 0 where its link is not known."""
         return self._sending_s(vehicle, self.sample_mb)
 
     def round_s(self, vehicle: str) -> float:
-        """Return the time in which a vehicle trains in one round and sends its update [s]."""
-        return self.vehicle_train_s.get(vehicle, self.train_s) + self._sending_s(vehicle, self.model_mb)
+        """Return the time in which a vehicle trains in one round and sends its messages [s], labels included."""
+        sent_mb = (self.exchange_mb or self.model_mb) + (self.labels_mb or 0.0)
+        return self.vehicle_train_s.get(vehicle, self.train_s) + self._sending_s(vehicle, sent_mb)
 
     def _sending_s(self, vehicle: str, mb: float) -> float:
         return 0.0 if self.uplink_mbps is None else BITS_PER_BYTE * mb / self.uplink_mbps[vehicle].wireless

@@ -24,3 +24,11 @@ def test_price_counts_every_message(samples, edge, cloud, k, groups):
     plan = StagePlan(samples, edge, cloud, tuple(groups), k)
     cost = price(plan, MessageSizes(sample_mb=2.0, model_mb=30.0))
     assert (cost.wireless_mb, cost.wireline_mb) == (wireless, wireline)
+    for labelled in range(edge + 1):  # before each edge round, and once before the first cloud round
+        for vehicles in groups if labelled < edge or cloud else ():
+            wireless += 4.0 * vehicles
+    outputs = price(plan, MessageSizes(sample_mb=2.0, model_mb=30.0, exchange_mb=30.0, labels_mb=4.0))
+    assert (outputs.wireless_mb, outputs.wireline_mb) == (wireless, wireline)
+    less = price(plan, MessageSizes(sample_mb=2.0, model_mb=30.0, exchange_mb=1.0, labels_mb=4.0))
+    assert less.wireless_mb == wireless - 29.0 * sum(groups) * (edge + k * cloud)
+    assert less.wireline_mb == wireline

@@ -13,6 +13,8 @@ from made_problems import SMALL, parsed, searched, written
 
 from flcav.config import InputError
 from flcav.optimization.allocation.allocate import Allocation, allocate, weighted_error
+from flcav.optimization.allocation.baselines import baseline
+from flcav.optimization.allocation.replanning import PlanState, replan
 from flcav.optimization.solvers.instance import Infeasible, build_instance
 from flcav.optimization.solvers.separable import ContinuousOptimum, Separable, relax
 
@@ -152,6 +154,28 @@ def assert_within(values: dict, plan: Allocation) -> None:
         assert k > 0 or got.cloud_rounds <= 1
     assert spent == pytest.approx((plan.used_mb.wireless_mb, plan.used_mb.wireline_mb), rel=1e-9)
     assert np.all(spent <= np.array([*values["budgets_mb"].values()]) * (1 + 1e-11))
+
+
+def test_exchanges_and_labels_have_prices_of_their_own():
+    limits = {"samples": [20, 60], "edge_rounds": [0, 6], "cloud_rounds": [1, 5]}
+    values = written(5, 1, "additive", limits) | {"budgets_mb": {"wireless": 150.0, "wireline": 150.0}}
+    task, k = values["tasks"][0], values["edge_rounds_per_cloud_round"]
+    task |= {"model_mb": 12.0, "exchange_mb": 3.0, "labels_mb": 2.0}
+    vehicles, servers = sum(task["edge_groups"]), len(task["edge_groups"])
+    problem, best = parsed(values), (np.inf,)
+    for counts in itertools.product(range(20, 61), range(7), range(1, 6)):
+        samples, edge, cloud = counts
+        wireless = samples * task["sample_mb"] + vehicles * ((edge + k * cloud) * 3.0 + (edge + 1) * 2.0)
+        wireline = samples * task["sample_mb"] + servers * cloud * 12.0
+        if wireless <= 150.0 and wireline <= 150.0:
+            best = min(best, (float(problem.tasks[0].curve.error(*counts, k)), *counts, wireless, wireline))
+    plan = allocate(problem)
+    (own,) = plan.tasks
+    assert (own.samples, own.edge_rounds, own.cloud_rounds) == best[1:4]
+    assert (own.wireless_mb, own.wireline_mb) == pytest.approx(best[4:])
+    assert baseline(problem, "equal-stages").used_mb.wireless_mb <= 150.0
+    done = {"samples": own.samples, "edge_rounds": own.edge_rounds, "cloud_rounds": 1}
+    assert replan(problem, PlanState.model_validate({"tasks": {own.name: done}})).tasks[0].cloud_rounds == best[3]
 
 
 @pytest.mark.parametrize("model", ["additive", "effective"])

@@ -100,6 +100,8 @@ def test_the_largest_update_of_the_arms_is_planned_with() -> None:
     assert update_forms(settings({"adam": {"strategy": "fedadam"}})[1]) == [UpdateForm()]
     forms = update_forms(settings({"twice": {"strategy": "scaffold"}}, **fp16)[1])
     assert forms == [UpdateForm(**cast(Any, fp16)), UpdateForm(**cast(Any, fp16), exchanging=True)]
+    outputs = {"strategy": {"fedmd": {"frames": 8}}}
+    assert update_forms(settings({"outputs": outputs})[1]) == [UpdateForm(), UpdateForm(frames=8)]
     whole = model_mb(OBJECTS, "tiny")
     half, more = (model_mb(OBJECTS, "tiny", [form]) for form in forms)
     assert half == pytest.approx(whole / 2, rel=0.05)

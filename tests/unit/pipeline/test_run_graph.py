@@ -307,7 +307,11 @@ def test_arms_of_distillation_share_all_but_stage_two_and_have_their_labels_meas
     assert [several[f"grid-edge-fl-{task}"].scored for task in SEVERAL] == [True, False, False]
     before = {step.name: settings_of(step) for step in Graph(recipe_of(), Path()).steps}
     assert not any(getattr(own, name, False) for own in before.values() for name in ("scored", "distillation"))
-    same = {"grid-edge-fl-objects"}  # whose labels are measured now
+    same = {"grid-edge-fl-objects", "plan"}  # whose labels are measured now, and whose messages are priced
     assert all(settings[name] == own for name, own in before.items() if name not in same)
+    assert [own.labels is None for own in (before["plan"].tasks["objects"], settings["plan"].tasks["objects"])] == [
+        True,
+        False,
+    ]
     with pytest.raises(ValueError, match=r"arms\.odd\.distillation: .*terms"):
         recipe_of(arms={"odd": {"distillation": {"terms": ["outputs"]}}})

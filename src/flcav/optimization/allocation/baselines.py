@@ -22,7 +22,7 @@ from flcav.optimization.allocation.allocate import (
 from flcav.optimization.allocation.vehicles import split_plan, trains
 from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
-from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance
+from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance, price_once
 from flcav.optimization.solvers.rounding import trim
 from flcav.optimization.solvers.separable import relax
 from flcav.optimization.solvers.weighted import list_drifts, list_terms, minimise_weighted_error
@@ -130,7 +130,10 @@ def round_down_optimum(problem: Problem, made: Instance) -> Array:
 
 
 def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Problem:
-    """Return `problem` with other limits (N, 3) and budgets (L,): of both links, and the horizon if time is limited."""
+    """Return `problem` with other limits (N, 3) and budgets (L,): of both links, and the horizon if time is limited.
+
+    `price_once` comes on top of the wireless budget.
+    """
     tasks = []
     for task, least, most in zip(problem.tasks, low, high):
         limits = {
@@ -138,9 +141,11 @@ def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Proble
             for name, a, b in zip(("samples", "edge_rounds", "cloud_rounds"), least, most, strict=True)
         }
         tasks.append(task.model_copy(update={"limits": task.limits.model_copy(update=limits)}))
-    budgets = problem.budgets_mb.model_copy(update=dict(zip(("wireless", "wireline"), budget.tolist())))
+    limited = problem.model_copy(update={"tasks": tuple(tasks)})
+    links = {"wireless": float(budget[0]) + price_once(limited), "wireline": float(budget[1])}
+    budgets = problem.budgets_mb.model_copy(update=links)
     horizon_s = {"horizon_s": float(budget[2]) or None} if len(budget) > 2 else {}  # 0 s: only before the first round
-    return problem.model_copy(update={"budgets_mb": budgets, "tasks": tuple(tasks), **horizon_s})
+    return limited.model_copy(update={"budgets_mb": budgets, **horizon_s})
 
 
 BASELINES: dict[str, Callable[[Problem, Instance], Array]] = {

@@ -93,13 +93,16 @@ def split_plan(problem: Problem, plans: Sequence[TaskPlan]) -> Shares:
     subject = "the vehicles" if trains(problem) else "the vehicles' own links"
     counts = _split(parts, [plan for _, plan in planned], problem.horizon_s, subject)
     shares: Shares = {}
-    for task, _ in planned:
+    for task, plan in planned:
+        labelled_mb = (plan.edge_rounds + (plan.cloud_rounds > 0)) * (task.labels_mb or 0.0)
         own = [(part, row) for part, row in zip(parts, counts) if part.task is task]
         joined = _rounds([part.group for part, _ in own], [int(row[1]) for _, row in own], own[0][0].rounds)
         shares[task.name] = tuple(
             VehicleShare(
                 *(part.vehicle, int(row[0]), rounds),
-                wireless_mb=float(row[0] * task.sample_mb + len(rounds) * task.model_mb),
+                wireless_mb=float(
+                    row[0] * task.sample_mb + len(rounds) * (task.exchange_mb or task.model_mb) + labelled_mb
+                ),
                 busy_s=float(row[0] * part.sample_s + len(rounds) * part.round_s),
             )
             for (part, row), rounds in zip(own, joined)

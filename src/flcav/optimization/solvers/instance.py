@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult
 
 from flcav.config import InputError, shorten
-from flcav.network.plan import MessageSizes, Price, StagePlan, price
+from flcav.network.plan import Price, StagePlan, price
 from flcav.optimization.curves.curves import Additive
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.effective import Alone, EffectiveTasks, build_effective_tasks
@@ -155,13 +155,14 @@ def build_instance(problem: Problem, clocks: Sequence[Clock] = ()) -> Instance:
     a, b, x0, of = np.array(sorted(rows, key=lambda row: row[3])).T
     own_clock = shared_clock(problem)
     clocks = clocks if own_clock is None else (own_clock, *clocks)
-    links = (problem.budgets_mb.wireless, problem.budgets_mb.wireline)
+    once_mb = price_once(problem)
+    links = (problem.budgets_mb.wireless - once_mb, problem.budgets_mb.wireline)
     budget = np.array((*links, *(clock.seconds for clock in clocks)))
     k = problem.edge_rounds_per_cloud_round
     cost = np.column_stack((unit_costs(problem), *(_spent(clock, k) for clock in clocks)))
     own = None if len(of) == len(low) else of.astype(np.intp)
     powers = Separable(a, b, x0, low, high, cost, budget, own)
-    _refuse(powers)
+    _refuse(powers, once_mb)
     powers = replace(powers, high=np.minimum(high, low + room(powers)))
     effective = build_effective_tasks(alone, k, low, powers.high, powers.cost) if alone else None
     floor = sum(learner.weight * learner.curve.floor for task in problem.tasks for learner in task.learners)
@@ -176,13 +177,28 @@ def stage_plan(problem: Problem, task: AllocationTask, counts: Sequence[int]) ->
 
 def price_counts(problem: Problem, task: AllocationTask, counts: Sequence[int]) -> Price:
     """Return the cost on each uplink [MB] of `counts` = samples, edge rounds, cloud rounds of `task`."""
-    return price(stage_plan(problem, task, counts), MessageSizes(task.sample_mb, task.model_mb))
+    return price(stage_plan(problem, task, counts), task.sizes)
+
+
+def price_once(problem: Problem) -> float:
+    """Return the wireless uplink [MB] that labels take before the first cloud round, where limits allow one."""
+    return sum(
+        sum(task.edge_groups) * (task.labels_mb or 0.0) for task in problem.tasks if task.limits.cloud_rounds[1] > 0
+    )
 
 
 def unit_costs(problem: Problem) -> Array:
-    """Return the cost (3N, 2) [MB] of one sample, edge round and cloud round of each task: `price` is linear."""
-    prices = [price_counts(problem, task, unit) for task in problem.tasks for unit in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
-    return np.array([(each.wireless_mb, each.wireline_mb) for each in prices])
+    """Return the cost (3N, 2) [MB] of one sample, edge round and cloud round of each task.
+
+    Beside `price_once`, `price` is linear.
+    """
+    costs = []
+    for task in problem.tasks:
+        for unit in ((1, 0, 0), (0, 1, 0), (0, 0, 1)):
+            sizes = task.sizes if unit[1] else replace(task.sizes, labels_mb=None)
+            each = price(stage_plan(problem, task, unit), sizes)
+            costs.append((each.wireless_mb, each.wireline_mb))
+    return np.array(costs)
 
 
 def _range(problem: Problem, task: AllocationTask) -> tuple[Array, Array]:
@@ -204,16 +220,17 @@ def _spent(clock: Clock, k: int) -> Array:
     return np.column_stack((clock.per_sample, per_round, k * per_round)).ravel()
 
 
-def _refuse(problem: Separable) -> None:
+def _refuse(problem: Separable, once_mb: float) -> None:
     for need, have in zip(problem.spent(problem.low)[2:], problem.budget[2:]):
         if need > have * (1 + BUDGET_SLACK):
             raise Infeasible(
                 f"the least that the limits allow takes {need:.6g} s on a vehicle, {need - have:.6g} s more than "
                 f"horizon_s = {have:.6g}"
             )
-    for link, need, have in zip(("wireless", "wireline"), problem.spent(problem.low), problem.budget):
+    links = (("wireless", once_mb), ("wireline", 0.0))
+    for (link, once), need, have in zip(links, problem.spent(problem.low), problem.budget):
         if need > have * (1 + BUDGET_SLACK):
             raise Infeasible(
-                f"the least that the limits allow costs {need:.6g} MB of {link} uplink, {need - have:.6g} MB more than "
-                f"budgets_mb.{link} = {have:.6g}"
+                f"the least that the limits allow costs {need + once:.6g} MB of {link} uplink, {need - have:.6g} MB "
+                f"more than budgets_mb.{link} = {have + once:.6g}"
             )

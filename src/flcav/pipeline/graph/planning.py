@@ -3,6 +3,7 @@
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.graph.testing import list_validations
+from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.planning.histories import read_history
 from flcav.pipeline.planning.updates import update_forms
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
@@ -10,6 +11,7 @@ from flcav.pipeline.steps import Step
 from flcav.pipeline.work.planning import (
     AirSettings,
     FirstPlanSettings,
+    LabelSettings,
     PlannedTask,
     ReplanSettings,
     plan_step,
@@ -69,6 +71,26 @@ def _plan_task(outline: Outline, task: str) -> PlannedTask:
         fixed=own.plan,
         history=None if own.history is None else read_history(task, own.history, outline.beside),
         pools=tuple(outline.pools(task).values()),
+        labels=_label_task(outline, task),
+    )
+
+
+def _label_task(outline: Outline, task: str) -> LabelSettings | None:
+    """Return what the messages of labels are predicted from; None where no arm labels by the road average."""
+    arms = [arm for arm in outline.settings.values() if arm.central is None]
+    averaging = [arm.distillation for arm in arms if LABEL_SOURCES[arm.labels[task]].averaged]
+    if not averaging:
+        return None
+    placements, own = [arm.placement for arm in arms], outline.recipe.placement
+    split = "registry" if task in (*own.tasks, outline.placing_task) else "validation"
+    return LabelSettings(
+        distillation=averaging[0],
+        drives={region: outline.names.recording(region, split, task) for region in outline.federating},
+        recorded=tuple(outline.recorded),
+        poles=tuple(sorted({pole for each in placements for pole in each.poles})),
+        count=max((each.count for each in placements if each.rule not in ("fixed", "none")), default=0),
+        traffic_m=own.range_m,
+        near_m=own.group_range_m,
     )
 
 

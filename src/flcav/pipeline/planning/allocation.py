@@ -122,6 +122,8 @@ def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
         "weight": task.weight,
         "sample_mb": task.sizes.sample_mb,
         "model_mb": task.sizes.model_mb,
+        "exchange_mb": task.sizes.exchange_mb,
+        "labels_mb": task.sizes.labels_mb,
         "edge_groups": list(frame.edge_groups),
         "limits": {
             "samples": [min(least, most), most],
@@ -142,7 +144,7 @@ def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan
         raise InputError(f"tasks.{task.name}.plan: {fixed.samples} samples; the pools hold {task.pool}")
     counts = (fixed.samples, fixed.edge_rounds, fixed.cloud_rounds)
     cost = price(frame.stage_plan(*counts), task.sizes)
-    return TaskPlan(*counts, cost.wireless_mb, cost.wireline_mb, task.sizes.sample_mb, task.sizes.model_mb, None)
+    return _task_plan(counts, cost, task.sizes, None)
 
 
 def make_task_plan(sizes: MessageSizes, own: Allotted, problem: Problem, shares: Shares) -> TaskPlan:
@@ -152,4 +154,24 @@ def make_task_plan(sizes: MessageSizes, own: Allotted, problem: Problem, shares:
     spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}
     predicted = {stage: max(1 - float(curve.error(*each, k)), 0.0) for stage, each in spent.items()}
     joins = {each.vehicle: each.rounds for each in shares[own.name]} if own.name in shares else None
-    return TaskPlan(*counts, own.wireless_mb, own.wireline_mb, sizes.sample_mb, sizes.model_mb, predicted, joins)
+    return _task_plan(counts, Price(own.wireless_mb, own.wireline_mb), sizes, predicted, joins)
+
+
+def _task_plan(
+    counts: tuple[int, int, int],
+    cost: Price,
+    sizes: MessageSizes,
+    predicted: Mapping[str, float] | None,
+    joins: Mapping[str, tuple[int, ...]] | None = None,
+) -> TaskPlan:
+    return TaskPlan(
+        *counts,
+        wireless_mb=cost.wireless_mb,
+        wireline_mb=cost.wireline_mb,
+        sample_mb=sizes.sample_mb,
+        model_mb=sizes.model_mb,
+        predicted=predicted,
+        joins=joins,
+        exchange_mb=sizes.exchange_mb,
+        labels_mb=sizes.labels_mb,
+    )

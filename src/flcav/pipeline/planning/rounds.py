@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from flcav.network.ledger import LINKS
-from flcav.network.plan import MessageSizes, Price
+from flcav.network.plan import Price
 from flcav.optimization.allocation.replanning import PlanState, TaskState, condition_problem
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible, price_counts
@@ -88,7 +88,7 @@ class Planner:
         except Infeasible:
             return terms.settle(terms.cut(before, done, sent_mb), done, sent_mb)
         own = next(each for each in allotted if each.name == self.task)
-        new = make_task_plan(MessageSizes(before.sample_mb, before.model_mb), own, asked, shares)
+        new = make_task_plan(before.sizes, own, asked, shares)
         over = done if terms.stage == EDGE else before.edge_rounds + k * done
         past = (PRETRAIN,) if terms.stage == EDGE else (PRETRAIN, EDGE)
         predicted = {**(new.predicted or {}), **{each: (before.predicted or {})[each] for each in past}}

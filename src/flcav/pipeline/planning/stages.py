@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from flcav.network.plan import MessageSizes, Price
+from flcav.network.plan import Price
 from flcav.optimization.allocation.replanning import PlanState, Sent, TaskState, condition_problem
 from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import Infeasible
@@ -48,7 +48,7 @@ def remake_plan(
         allotted, shares = (), {}
     for own in allotted:
         before = tasks[own.name]
-        new = make_task_plan(MessageSizes(before.sample_mb, before.model_mb), own, rest, shares)
+        new = make_task_plan(before.sizes, own, rest, shares)
         assert new.predicted is not None
         assert before.predicted is not None
         past = (PRETRAIN,) if stage == PRETRAIN else (PRETRAIN, EDGE)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from flcav.network.plan import MessageSizes, Price, StagePlan, price
+from flcav.network.plan import Price, StagePlan, price
 from flcav.pipeline.recipe import CLOUD, EDGE
 from flcav.pipeline.results.plans import TaskPlan
 
@@ -40,16 +40,21 @@ class Terms:
         """Return the list price of what a plan does after `done` rounds of the stage, stages after it included."""
         edge = plan.edge_rounds - done if self.stage == EDGE else 0
         cloud = plan.cloud_rounds - (done if self.stage == CLOUD else 0)
-        return price_rounds(plan, self.groups, self.k, edge, cloud)
+        return price_rounds(self._labelled(plan), self.groups, self.k, edge, cloud)
 
     def cut(self, plan: TaskPlan, done: int, sent_mb: Price) -> TaskPlan:
         """Return the plan with no more rounds of the stage than the ledger pays, what comes after it included."""
         name = f"{self.stage}_rounds"
         after = self.price_rest(replace(plan, **{name: done}), done)
-        one = price_rounds(plan, self.groups, self.k, int(self.stage == EDGE), int(self.stage == CLOUD))
+        unit = (int(self.stage == EDGE), int(self.stage == CLOUD))
+        one = price_rounds(self._labelled(plan), self.groups, self.k, *unit)
         free = subtract(subtract(self.budget_mb, sent_mb), after)
         paid = [int(max(mb, 0.0) // cost) for mb, cost in zip(links_mb(free), links_mb(one), strict=True) if cost > 0]
         return replace(plan, **{name: min(self.rounds(plan), done + min(paid))})
+
+    def _labelled(self, plan: TaskPlan) -> TaskPlan:
+        """Return the plan as it is priced from within the stage: labels of stage III are sent before its rounds."""
+        return plan if self.stage == EDGE else replace(plan, labels_mb=None)
 
     def settle(self, plan: TaskPlan, done: int, sent_mb: Price) -> TaskPlan:
         """Return the plan with its megabytes: what was sent, and the list price of the rest."""
@@ -58,7 +63,7 @@ class Terms:
 
 def price_rounds(plan: TaskPlan, groups: tuple[int, ...], k: int, edge_rounds: int, cloud_rounds: int) -> Price:
     """Return the list price of rounds of a task; `groups`: vehicles of each edge server, `k`: as in `StagePlan`."""
-    return price(StagePlan(0, edge_rounds, cloud_rounds, groups, k), MessageSizes(plan.sample_mb, plan.model_mb))
+    return price(StagePlan(0, edge_rounds, cloud_rounds, groups, k), plan.sizes)
 
 
 def settle(plan: TaskPlan, rest: Price, sent_mb: Price) -> TaskPlan:

@@ -6,7 +6,8 @@ from flcav.config import Config
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.selection import Selection
-from flcav.federation.strategies import exchanges_more
+from flcav.federation.strategies import exchanges_more, strategy_named
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.upload import Upload
 from flcav.network.ledger import BYTES_PER_MB
 from flcav.perception.task import Task, build_network, find_configuration
@@ -21,6 +22,7 @@ class UpdateForm(Config):
 
     upload: Upload = Upload()
     exchanging: bool = False  # with an array beside each that is learned
+    frames: int | None = None  # class probabilities of so many shared frames instead; None: weights
 
 
 def update_forms(settings: Iterable[Setting]) -> list[UpdateForm]:
@@ -28,7 +30,9 @@ def update_forms(settings: Iterable[Setting]) -> list[UpdateForm]:
     forms = []
     for setting in settings:
         how = setting.federation
-        form = UpdateForm(upload=how.upload, exchanging=exchanges_more(how.strategy))
+        strategy = strategy_named(how.strategy)
+        frames = strategy.frames if isinstance(strategy, FedMD) else None
+        form = UpdateForm(upload=how.upload, exchanging=exchanges_more(how.strategy), frames=frames)
         if form not in forms and setting.central is None:
             forms.append(form)
     return forms

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from flcav.network.plan import Price
+from flcav.network.plan import MessageSizes, Price
 from flcav.pipeline.results.saved import Saved
 from flcav.records import LEFT_OUT, Record
 
@@ -28,6 +28,18 @@ class TaskPlan:
     uploads: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
         None  # samples that each vehicle of the pretraining regions uploads; None: drawn from the frames of all
     )
+
+    exchange_mb: Annotated[float | None, LEFT_OUT] = (
+        None  # what a vehicle sends to be combined in a round; None: a model update
+    )
+    labels_mb: Annotated[float | None, LEFT_OUT] = (
+        None  # what it sends to have its samples labelled: before each round of stage II, once before stage III
+    )
+
+    @property
+    def sizes(self) -> MessageSizes:
+        """Sizes of the task's messages."""
+        return MessageSizes(self.sample_mb, self.model_mb, self.exchange_mb, self.labels_mb)
 
     def joins_after(self, rounds: int) -> Mapping[str, tuple[int, ...]]:
         """Return the rounds that each vehicle joins, numbered from 1 after the first `rounds`; empty: all join all."""

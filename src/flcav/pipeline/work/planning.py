@@ -8,18 +8,21 @@ import numpy as np
 
 from flcav.config import Config, InputError, read_config
 from flcav.files import write_json
+from flcav.fusion.distillation import Distillation
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Link
 from flcav.network.plan import MessageSizes, Price
 from flcav.network.radio.links import RadioLinks
 from flcav.optimization.problem import Problem
 from flcav.perception.client import as_shared
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import PlanRule
 from flcav.pipeline.federations.prediction import link_drive, predict_air_s
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.planning.allocation import PlanRequest, PlanSettings, make_plan
+from flcav.pipeline.planning.exchanges import Held, Sensors, measure_exchange, measure_labels
 from flcav.pipeline.planning.histories import parse_history
 from flcav.pipeline.planning.stages import count_carried_out, remake_plan
 from flcav.pipeline.planning.terms import price_rounds, settle
@@ -34,6 +37,18 @@ from flcav.pipeline.work.settings import StepSettings
 from flcav.pipeline.work.uploads import UploadSettings, plan_uploads
 
 
+class LabelSettings(Config):
+    """Settings of the prediction of what vehicles send to have their samples labelled by the road average."""
+
+    distillation: Distillation
+    drives: Mapping[str, str]  # recording, by federating region
+    recorded: tuple[str, ...]  # regions that are recorded datasets
+    poles: tuple[int, ...]  # numbers of the poles that the arms name for sensors
+    count: int  # of the other sensors in a region, the most of the arms
+    traffic_m: float  # radius of the traffic around a pole [m]
+    near_m: float  # vehicles label frames recorded within this distance of a sensor [m]
+
+
 class PlannedTask(Config):
     """A task as the step that plans it is given it."""
 
@@ -43,6 +58,7 @@ class PlannedTask(Config):
     fixed: FixedPlan | None  # a plan given by hand, instead of a history
     history: str | None  # learning history, the text of a CSV table
     pools: tuple[str, ...]  # recordings of the candidates for upload
+    labels: LabelSettings | None = None  # of the labels "road-average" in any arm
 
 
 class AirSettings(Config):
@@ -75,7 +91,9 @@ class FirstPlanSettings(StepSettings):
     def needs(self) -> tuple[str, ...]:
         """Return the names of the steps whose results it takes."""
         drives = () if self.air is None else self.air.drives.values()
-        return (*(step for task in self.tasks.values() for step in task.pools), *drives)
+        labelled = [own.labels.drives.values() for own in self.tasks.values() if own.labels is not None]
+        pools = (step for task in self.tasks.values() for step in task.pools)
+        return (*pools, *drives, *(step for steps in labelled for step in steps))
 
 
 class ReplanSettings(StepSettings):
@@ -129,11 +147,29 @@ def _request(
     config, shared = find_configuration(task, own.network), as_shared(task)
     pools = [Frames.open(work.inputs[step]) for step in own.pools]
     sizes = [len(message) for split in pools for message in shared.pack_samples(split.data, config, split.vehicles)]
-    messages = MessageSizes(float(np.mean(sizes)) / 1e6, model_mb(task, own.network, settings.updates))
+    most = len(sizes) if own.fixed is None else own.fixed.samples
+    messages = MessageSizes(
+        sample_mb=float(np.mean(sizes)) / 1e6,
+        model_mb=model_mb(task, own.network, settings.updates),
+        exchange_mb=measure_exchange(task, config, pools, settings.updates, most, settings.seed),
+        labels_mb=None if own.labels is None else _measure_labels(work, own.labels, settings.held, config),
+    )
     history = None if own.history is None else parse_history(name, own.history, name)
     whole_mb = model_mb(task, own.network) if scenes else 0.0
     air_s = {region: _predict(region, name, each, whole_mb, messages) for region, each in scenes.items()}
     return PlanRequest(name, own.weight, messages, len(sizes), history, own.fixed, own.train_s, air_s)
+
+
+def _measure_labels(
+    work: Work, how: LabelSettings, held: Mapping[str, Mapping[str, int]], config: SecondConfig
+) -> float:
+    """Return what a vehicle sends to have its samples labelled once [MB]; `held` as in `FirstPlanSettings`."""
+    regions = [
+        Held(Frames.open(work.inputs[step]), region in how.recorded, sum(held[region].values()), len(held[region]))
+        for region, step in how.drives.items()
+    ]
+    sensors = Sensors(how.poles, how.count, how.traffic_m, how.near_m)
+    return measure_labels(regions, sensors, how.distillation, config)
 
 
 def _link_drives(work: Work, air: AirSettings, seed: int) -> dict[str, list[RadioLinks]]:
@@ -146,7 +182,8 @@ def _link_drives(work: Work, air: AirSettings, seed: int) -> dict[str, list[Radi
 
 
 def _predict(region: str, task: str, scenes: Sequence[RadioLinks], whole_mb: float, sizes: MessageSizes) -> float:
-    found = predict_air_s(scenes, round(whole_mb * BYTES_PER_MB), round(sizes.model_mb * BYTES_PER_MB))
+    sent_mb = sizes.model_mb if sizes.exchange_mb is None else sizes.exchange_mb
+    found = predict_air_s(scenes, round(whole_mb * BYTES_PER_MB), round(sent_mb * BYTES_PER_MB))
     if found is None:
         raise InputError(
             f"federation.network: no vehicle of '{region}' ends the messages of a round of '{task}' in its registry "

@@ -6,7 +6,7 @@ from typing import Any
 
 import networkx as nx
 
-from flcav.network.plan import MessageSizes, Price, StagePlan, price
+from flcav.network.plan import Price, StagePlan, price
 from flcav.optimization.allocation.allocate import Allocation, TaskPlan, resolve_problem
 from flcav.optimization.allocation.budget_sweep import LINKS, BudgetPoint
 from flcav.optimization.allocation.comparison import PlanComparison
@@ -109,9 +109,8 @@ def _parts(problem: Problem, plan: Allocation) -> list[plans.Part]:
 
 
 def _stage_prices(problem: Problem, task: AllocationTask, row: TaskPlan) -> dict[str, Price]:
-    sizes, k = MessageSizes(task.sample_mb, task.model_mb), problem.edge_rounds_per_cloud_round
-    none = StagePlan(0, 0, 0, task.edge_groups, k)
-    return {name: price(replace(none, **{field: getattr(row, field)}), sizes) for field, name in STAGES.items()}
+    none = StagePlan(0, 0, 0, task.edge_groups, problem.edge_rounds_per_cloud_round)
+    return {name: price(replace(none, **{field: getattr(row, field)}), task.sizes) for field, name in STAGES.items()}
 
 
 def _vehicles(problem: Problem, shares: Shares) -> list[dict[str, Any]]:
