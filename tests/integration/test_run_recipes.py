@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from performed_steps import in_mb, perform, uplinks
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
@@ -30,8 +31,9 @@ from flcav.pipeline.recipe import (
     load_run_recipe,
 )
 from flcav.pipeline.results import tests as results
+from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import WEIGHTS
+from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.tests import Difference
 from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.running import RESULTS, run, run_several
@@ -185,6 +187,24 @@ def test_the_rest_of_a_stage_is_planned_after_each_round(timed: tuple[Path, RunR
         assert use.used_mb <= use.budget_mb
     central = next(each for each in result.arms["oracle"].stages)
     assert central.rounds == edge.rounds
+
+
+def test_class_probabilities_are_priced_as_they_are_booked(timed: tuple[Path, RunRecipe, Run], tmp_path: Path) -> None:
+    made, recipe, result = timed
+    uploaded = sum(map(len, result.pretrained[0].uploaded.values()))
+    fixed = {"weather": {"plan": {"samples": uploaded, "edge_rounds": 2, "cloud_rounds": 1}}}
+    outputs = {"strategy": {"fedmd": {"frames": 2, "steps": 1}}}
+    changes = {"tasks": fixed, "federation": outputs, "arms": {}, "replan": "none", "horizon_s": None}
+    asked = RunRecipe.model_validate(recipe.model_dump() | changes)
+    perform(asked, made, tmp_path, ("plan", "ring-edge-fl-weather", "cloud-fl-weather"))
+    plan, book = Plan.load(tmp_path / "plan").tasks["weather"], Ledger.load(tmp_path / "cloud-fl-weather" / LEDGER)
+    rounds = [each for each in uplinks(book.entries, "wireless") if each.round]
+    assert plan.exchange_mb is not None
+    assert [each.bytes / 1e6 for each in rounds] == pytest.approx([plan.exchange_mb] * (2 * 3), rel=0.02)
+    assert plan.exchange_mb < plan.model_mb / 100
+    for link in ("wireless", "wireline"):
+        priced, booked = getattr(plan, f"{link}_mb"), in_mb(uplinks(book.entries, link))
+        assert priced == pytest.approx(booked, rel=asked.headroom)
 
 
 def test_signs_are_federated_and_their_errors_place_the_sensor(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 from flwr.app import Array, ArrayRecord, MetricRecord, RecordDict
 from flwr.common.serde import recorddict_to_proto
+from performed_steps import in_mb, perform, uplinks
 from PIL import Image
 from safetensors.numpy import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -39,9 +40,11 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import find_configuration
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.graph import Graph
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, load_run_recipe
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe, load_run_recipe
 from flcav.pipeline.results.placement import ErrorRegistry, Placed
+from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import FederatedRound, Pretrained, StageResult, Watched
 from flcav.pipeline.running import RESULTS, SUMMARY, run, run_seeds
 from flcav.pipeline.seeds.comparing import compare
@@ -216,6 +219,32 @@ def test_the_ledger_is_what_crossed_the_links(finished: Path, result: Run) -> No
         assert use.used_mb == pytest.approx(use.planned_mb + reported * (link == "wireless"), rel=1e-3)
         assert use.used_mb <= use.budget_mb == getattr(RECIPE.budgets_mb, link)
         assert sum(spent.mb for spent in main.spent if spent.link == link) == pytest.approx(use.used_mb)
+
+
+def test_boxes_of_the_road_average_are_priced_and_booked_in_stages_two_and_three(
+    finished: Path, result: Run, tmp_path: Path
+) -> None:
+    uploaded = sum(map(len, result.pretrained[0].uploaded.values()))
+    fixed = {"samples": uploaded, "edge_rounds": 1, "cloud_rounds": 1}
+    averaged = {"objects": {"network": "tiny", "labels": "road-average", "plan": fixed}}
+    regions = {name: RECIPE.regions[name] for name in ("suburb", "grid")}
+    placement = RECIPE.placement.model_copy(update={"group_range_m": 1000.0})  # every frame is near a sensor
+    changes = {"tasks": averaged, "regions": regions, "arms": {}, "placement": placement}
+    asked = RunRecipe.model_validate(RECIPE.model_dump() | changes)
+    perform(asked, finished, tmp_path, ("plan", "grid-edge-fl-objects", "cloud-fl-objects"))
+    plan, book = Plan.load(tmp_path / "plan").tasks["objects"], Ledger.load(tmp_path / "cloud-fl-objects" / LEDGER)
+    sent = uplinks(book.entries, "wireless")
+    rounds = [each for each in sent if each.round]
+    updates = [each for each in rounds if each.bytes > 0.9e6 * plan.model_mb]
+    boxes = [each for each in rounds if each not in updates]
+    held = StageResult.load(tmp_path / "grid-edge-fl-objects").samples
+    assert len(updates) == 2 * 2
+    assert [(each.stage, each.round) for each in boxes] == [(EDGE, 1)] * held + [(CLOUD, 1)] * held
+    assert plan.labels_mb is not None
+    assert 0.5 < 2 * 2 * plan.labels_mb / in_mb(boxes) < 2
+    priced = plan.samples * plan.sample_mb + 2 * 2 * (plan.model_mb + plan.labels_mb)
+    assert plan.wireless_mb == pytest.approx(priced)
+    assert plan.wireless_mb == pytest.approx(in_mb(sent), rel=asked.headroom)
 
 
 def rounds_of(result: Run, arm: str, stage: str, server: str) -> list[FederatedRound]:
