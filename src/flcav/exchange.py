@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.csv
-import pyarrow.parquet as pq
 
 from flcav.config import InputError
 from flcav.files import atomic_path
+from flcav.parquet import write_parquet
 
 ENDINGS = (".csv", ".parquet")
 
@@ -21,8 +21,8 @@ def check_ending(path: Path) -> None:
 def write_table(table: pa.Table, path: Path) -> None:
     """Write `table` atomically to `path`, as CSV or Parquet by its suffix; raises `InputError` for any other suffix."""
     check_ending(path)
+    if path.suffix == ".parquet":
+        write_parquet(table, path)
+        return
     with atomic_path(path) as temporary:
-        if path.suffix == ".csv":
-            pyarrow.csv.write_csv(table, temporary)
-        else:
-            pq.write_table(table, temporary)
+        pyarrow.csv.write_csv(table, temporary)

@@ -52,7 +52,7 @@ def check_writable(folder: Path) -> None:
         raise PermissionError(error.errno, error.strerror, str(folder)) from None
 
 
-def write_bytes(path: Path, data: bytes) -> None:
+def write_bytes(path: Path, data: bytes | memoryview) -> None:
     """Write `data` to `path` atomically."""
     with atomic_path(path) as temporary:
         write_in_pieces(temporary, data)

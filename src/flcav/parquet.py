@@ -1,4 +1,4 @@
-"""Strict reading of Parquet files."""
+"""Strict reading of Parquet files, and their writing as a whole."""
 
 from pathlib import Path
 
@@ -6,6 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flcav.config import InputError
+from flcav.files import write_bytes
 
 
 def read_parquet(path: Path) -> pa.Table:
@@ -21,3 +22,10 @@ def read_parquet(path: Path) -> pa.Table:
     except (pa.ArrowException, OSError, ValueError, OverflowError, MemoryError) as error:
         raise InputError(f"{path}: not a readable Parquet file ({error})") from None
     return table
+
+
+def write_parquet(table: pa.Table, path: Path) -> None:
+    """Write a table to a Parquet file atomically; raises `OSError` that names the file where the disk is full."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    write_bytes(path, memoryview(sink.getvalue()))

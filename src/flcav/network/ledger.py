@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from flcav.config import InputError
-from flcav.files import atomic_path
-from flcav.parquet import read_parquet
+from flcav.parquet import read_parquet, write_parquet
 
 Link = Literal["wireless", "wireline"]
 Direction = Literal["up", "down"]
@@ -148,9 +146,8 @@ class Ledger:
     def save(self, path: Path) -> None:
         """Write the ledger atomically to a Parquet file: a row per entry, the budget in the schema's metadata."""
         columns = {field.name: [getattr(entry, field.name) for entry in self._entries] for field in fields(LedgerEntry)}
-        table = pa.table(columns, schema=_SCHEMA.with_metadata({"budget": json.dumps(asdict(self.budget))}))
-        with atomic_path(path) as temporary:
-            pq.write_table(table, temporary)
+        schema = _SCHEMA.with_metadata({"budget": json.dumps(asdict(self.budget))})
+        write_parquet(pa.table(columns, schema=schema), path)
 
     @classmethod
     def load(cls, path: Path) -> "Ledger":

@@ -167,7 +167,7 @@ def test_a_full_disk_at_any_write_is_named_keeps_the_checkpoint_before_and_the_f
     monkeypatch.setattr(files, "write_in_pieces", full)
     weights, book = edge(tmp_path / "whole", Scaffold())
     writes = len(names)
-    assert writes == 3 * 3 + 2, "of each round weights, state and record; from the second on the record before"
+    assert writes == 3 * 4 + 2, "of each round weights, state, ledger and record; from the second on the record before"
     for fails in range(1, writes + 1):
         folder = tmp_path / str(fails)
         names.clear()

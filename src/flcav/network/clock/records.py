@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from flcav.config import InputError
-from flcav.files import atomic_path
-from flcav.parquet import read_parquet
+from flcav.parquet import read_parquet, write_parquet
 
 _TYPES: dict[Any, pa.DataType] = {str: pa.string(), int: pa.int64(), float: pa.float64()}
 
@@ -74,8 +72,7 @@ def rounds_table(records: Sequence[RoundRecord]) -> pa.Table:
 
 def save_rounds(records: Sequence[RoundRecord], path: Path) -> None:
     """Write `rounds_table` atomically to a Parquet file."""
-    with atomic_path(path) as temporary:
-        pq.write_table(rounds_table(records), temporary)
+    write_parquet(rounds_table(records), path)
 
 
 def load_rounds(path: Path) -> tuple[RoundRecord, ...]:
