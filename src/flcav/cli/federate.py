@@ -34,12 +34,13 @@ def federate(
 ) -> None:
     """Run stage II of a recipe alone, edge FL in every region; print each round with its scores on validation frames.
 
-    Writes federation.json, and the weights of each federation as safetensors.
+    Writes federation.json, and the weights of each federation as safetensors. At the end it prints each task's train_s:
+    the CPU time that a vehicle trained in a round, in the median.
     """
     use_threads(1)
     from flcav.cli.steps import live_steps
     from flcav.files import check_writable
-    from flcav.pipeline.federations.alone import RESULTS, federate_regions
+    from flcav.pipeline.federations.alone import RESULTS, federate_regions, measure_train_s
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.sources.recipe import find_recipe
 
@@ -50,13 +51,16 @@ def federate(
         told = notify if as_json else _telling(notify)
         how = {"beside": found.parent, "jobs": jobs, "runtime": runtime.value, "stale": stale.value}
         results = federate_regions(asked, out, arm=arm, notify=told, **how)
+    train_s = measure_train_s(results, out)
     if as_json:
-        print_json(results.as_json())
+        print_json(results.as_json() | {"train_s": train_s})
         return
     for each in results.federations:
         result = each.result
         told_rounds = f"{result.rounds} rounds, {result.clients} vehicles, {result.samples} samples"
         typer.echo(f"{out / each.weights}: {result.task} in {result.region}, {told_rounds}")
+    for task, seconds in train_s.items():
+        typer.echo(f"{task}: train_s {seconds:.3g}, the median CPU time of a vehicle's training in a round [s]")
     typer.echo(f"{out / RESULTS}: all rounds")
 
 

@@ -3,6 +3,7 @@
 import copy
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -158,11 +159,12 @@ def assert_within(values: dict, plan: Allocation) -> None:
 
 def test_exchanges_and_labels_have_prices_of_their_own():
     limits = {"samples": [20, 60], "edge_rounds": [0, 6], "cloud_rounds": [1, 5]}
-    values = written(5, 1, "additive", limits) | {"budgets_mb": {"wireless": 150.0, "wireline": 150.0}}
+    values: dict[str, Any] = written(5, 1, "additive", limits)
+    values["budgets_mb"] = {"wireless": 150.0, "wireline": 150.0}
     task, k = values["tasks"][0], values["edge_rounds_per_cloud_round"]
     task |= {"model_mb": 12.0, "exchange_mb": 3.0, "labels_mb": 2.0}
     vehicles, servers = sum(task["edge_groups"]), len(task["edge_groups"])
-    problem, best = parsed(values), (np.inf,)
+    problem, best = parsed(values), (np.inf, 0, 0, 0, 0.0, 0.0)
     for counts in itertools.product(range(20, 61), range(7), range(1, 6)):
         samples, edge, cloud = counts
         wireless = samples * task["sample_mb"] + vehicles * ((edge + k * cloud) * 3.0 + (edge + 1) * 2.0)

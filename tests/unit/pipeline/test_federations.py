@@ -1,5 +1,6 @@
 """Federations of a recipe: refused before anything is computed, planned with what they send, ended by their budgets."""
 
+import time
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,11 +15,13 @@ from flcav.federation.rules import Rules
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavgm import FedAvgM
+from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies, resolve_settings
+from flcav.pipeline.federations.timing import TIMES, read_times, time_clients
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
 from flcav.pipeline.recipe import Federation, RunRecipe, Training
 from flcav.pipeline.stages.clients import Strategies, make_clients
@@ -28,6 +31,7 @@ from flcav.pipeline.stages.learning import Learning, load_stage_network
 from flcav.progress import ignore_progress
 
 PRIVACY = {"clip": 1.0, "noise": 4.0}
+BUSY_S = 0.05  # CPU time of a training
 
 
 def settings(arms: dict[str, Any], **federation: Any) -> tuple[RunRecipe, Any]:
@@ -107,6 +111,38 @@ def test_the_largest_update_of_the_arms_is_planned_with() -> None:
     assert half == pytest.approx(whole / 2, rel=0.05)
     assert more == pytest.approx(1.5 * whole, rel=0.05)
     assert model_mb(OBJECTS, "tiny", forms) == more
+
+
+class Busy:
+    """A client that computes for some CPU time, and waits as long."""
+
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        end = time.process_time() + BUSY_S
+        while time.process_time() < end:
+            pass
+        time.sleep(BUSY_S)
+        return LocalUpdate(weights, 1, 0.0)
+
+
+def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Path) -> None:
+    (timed,) = time_clients({"a/cav0": Busy()}, tmp_path / "busy").values()
+    for seed in range(3):
+        timed.train({}, steps=1, learning_rate=0.1, seed=seed)
+    assert read_times(tmp_path / "busy") == pytest.approx([BUSY_S] * 3, rel=0.3)
+    (tmp_path / "busy" / TIMES).open("a").write("a/cav0,0.0")  # a kill
+    assert len(read_times(tmp_path / "busy")) == 3
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2), 3)
+    network = learning.build_network()
+    clients = make_clients(learning, Slope(), {f"a/cav{i}": [np.float32(i), np.float32(1)] for i in range(2)})
+    ends = []
+    for folder in (tmp_path / "timed", tmp_path / "plain"):
+        how = (FEDAVG, 0, Ledger(Budget(1.0, 1.0)), folder, ignore_progress)
+        federation = EdgeFederation(learning, network, clients, learning.schedule(3, 2, "edge", "a"), *how)
+        federate_edge(federation, Rules(), timed=folder.name == "timed")
+        ends.append({path.name: path.read_bytes() for path in folder.iterdir() if path.name != TIMES})
+    assert ends[0] == ends[1]
+    assert len(read_times(tmp_path / "timed")) == 3 * 2
+    assert read_times(tmp_path / "plain") == []
 
 
 def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:

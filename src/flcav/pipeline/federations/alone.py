@@ -9,11 +9,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from flcav.config import InputError
 from flcav.files import atomic_path
 from flcav.pipeline.arms import check_federations
 from flcav.pipeline.federations.checkpoint import DAMAGED, LAST, Checkpoint
 from flcav.pipeline.federations.rounds import LOSS
+from flcav.pipeline.federations.timing import read_times
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.provenance import Provenance, provenance
@@ -72,9 +75,8 @@ def federate_regions(
         raise InputError(f"--arm {arm}: it trains centrally, without a federation")
     check_federations(recipe, graph.settings.values())
     asked = list_federations(graph, arm)
-    alone = {
-        name: _federation_step(graph, *about, {"processes": jobs, "runtime": runtime}) for name, about in asked.items()
-    }
+    means = {"processes": jobs, "runtime": runtime, "timed": 1}
+    alone = {name: _federation_step(graph, *about, means) for name, about in asked.items()}
     before = _needed(graph.steps, alone.values())
     run_steps(before, out / WORK, jobs=jobs, notify=notify, stale=stale)
 
@@ -87,6 +89,17 @@ def federate_regions(
     results = Federations(recipe, arm, found, provenance(recipe.seed))
     results.save(out, RESULTS)
     return results
+
+
+def measure_train_s(results: Federations, out: Path) -> dict[str, float]:
+    """Return the median CPU time that a vehicle trained in a round [s], by task: a recipe's `train_s`.
+
+    `results` are those in the folder `out`. Tasks that were federated without a measurement are left out.
+    """
+    times: dict[str, list[float]] = {}
+    for each in results.federations:
+        times.setdefault(each.result.task, []).extend(read_times(out / WORK / Path(each.weights).stem))
+    return {task: float(np.median(own)) for task, own in times.items() if own}
 
 
 def tells_of_round(step: str, note: str) -> bool:

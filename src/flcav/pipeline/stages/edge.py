@@ -20,6 +20,7 @@ from flcav.perception.distillation import SharedSamples
 from flcav.perception.outcomes import score_network
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.rounds import FederationCheckpoints, load_round_network
+from flcav.pipeline.federations.timing import time_clients
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.planning.course import Driven, Replanning
 from flcav.pipeline.recipe import EDGE
@@ -77,12 +78,14 @@ def federate_edge(
     replanning: Replanning | None = None,
     processes: int = 1,
     runtime: str = "embedded",
+    timed: bool = False,
 ) -> tuple[float, ...]:
     """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
 
     A privacy budget may end it before the schedule's end. Vehicles train in so many `processes` of a `runtime` of
-    `RUNTIMES`, to the same weights. The vehicles that `outages` name by round are lost in it. Under `replanning` the
-    number of rounds, who joins them and who is lost are those of the plan before each.
+    `RUNTIMES`, to the same weights; where that is `timed`, their times are kept, see `read_times`. The vehicles that
+    `outages` name by round are lost in it. Under `replanning` the number of rounds, who joins them and who is lost are
+    those of the plan before each.
     """
     own, learning = federation, federation.learning
     state, schedule = FederationState(), own.schedule
@@ -98,6 +101,7 @@ def federate_edge(
         if own.shared is None
         else (partial(federate_outputs, own.shared), give_outputs(own.clients, own.shared, to_arrays(own.network)))
     )
+    clients = time_clients(clients, own.folder) if timed else clients
     with open_runtime(runtime, clients, processes) as where:
         how["runtime"] = where
         if replanning is None:

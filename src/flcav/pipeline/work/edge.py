@@ -58,11 +58,13 @@ class _Rounds:
     course: Course | None
 
 
-def edge_step(work: Work, settings: EdgeSettings, processes: int = 1, runtime: str = "embedded") -> None:
+def edge_step(
+    work: Work, settings: EdgeSettings, processes: int = 1, runtime: str = "embedded", timed: int = 0
+) -> None:
     """Run stage II of a task in a region, or its further edge rounds: as many as the region has in stage III.
 
-    Vehicles train in so many `processes` of a `runtime`. Raises `InputError` where labels that are renewed between
-    rounds would have to reach several.
+    Vehicles train in so many `processes` of a `runtime`; other than 0, `timed` keeps their times. Raises `InputError`
+    where labels that are renewed between rounds would have to reach several.
     """
     if settings.distillation is not None and (processes > 1 or runtime != "embedded"):
         raise InputError("labels 'road-average' are renewed between rounds: vehicles train in one process, --jobs 1")
@@ -74,12 +76,12 @@ def edge_step(work: Work, settings: EdgeSettings, processes: int = 1, runtime: s
     rounds = _count_rounds(work, settings, plan, book)
     federation = _open_federation(work, settings, labelled, rounds, book)
     drive = _open_drive(work, settings, federation)
+    where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
     if rounds.course is None:
         driven = drive(plan.tasks[settings.learning.task], rounds.planned)
-        losses = federate_edge(federation, driven.rules, driven.outages, processes=processes, runtime=runtime)
+        losses = federate_edge(federation, driven.rules, driven.outages, **where)
     else:
         replanning = Replanning(rounds.course, drive, lambda scores: scores[inputs.region])
-        where: Any = {"processes": processes, "runtime": runtime}
         losses = federate_edge(federation, settings.federation, replanning=replanning, **where)
         driven = drive(rounds.course.plan, len(losses))
     clients, labels = federation.clients, None
