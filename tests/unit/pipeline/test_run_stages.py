@@ -13,6 +13,7 @@ from safetensors.numpy import load_file, save
 
 from flcav import files
 from flcav.config import InputError
+from flcav.exchange import write_table
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import FederationState
@@ -21,12 +22,14 @@ from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.files import write_bytes
+from flcav.network.clock.records import save_rounds
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
 from flcav.perception.training import train
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.checkpoint import find_checkpoint
+from flcav.pipeline.federations.records import ROUNDS, SCHEMA
 from flcav.pipeline.federations.rounds import FederationCheckpoints, round_path
 from flcav.pipeline.recipe import Training
 from flcav.pipeline.results.saved import WEIGHTS
@@ -183,6 +186,29 @@ def test_a_full_disk_at_any_write_is_named_keeps_the_checkpoint_before_and_the_f
         resumed, own = edge(folder, Scaffold())
         assert all(np.array_equal(resumed[name], weights[name]) for name in weights)
         assert own.entries == book.entries
+
+
+def test_a_full_disk_leaves_the_tables_of_rounds_that_were_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        path.write_bytes(data[: len(data) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    clock, rounds = tmp_path / "clock.parquet", tmp_path / ROUNDS
+    writes: dict[Path, Callable[[], None]] = {
+        clock: lambda: save_rounds([], clock),
+        rounds: lambda: write_table(SCHEMA.empty_table(), rounds),
+    }
+    for write in writes.values():
+        write()
+    monkeypatch.setattr(files, "write_in_pieces", full)
+    for path, write in writes.items():
+        before = path.read_bytes()
+        with pytest.raises(OSError, match=f"No space left on device: '{path}'"):
+            write()
+        assert path.read_bytes() == before
+    assert {*tmp_path.iterdir()} == {*writes}
 
 
 def test_a_checkpoint_of_another_strategy_is_refused(tmp_path: Path) -> None:
