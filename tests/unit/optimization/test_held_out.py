@@ -13,6 +13,7 @@ from flcav.config import InputError
 from flcav.optimization.curves.fitting import fit
 from flcav.optimization.curves.held_out import attainable_correlation, hold_out_runs, noise_of_runs
 from flcav.optimization.curves.history import History
+from flcav.optimization.curves.levels import Levelled, level_seeds
 
 COUNTS = np.array([(s, e, 0) for s in (40, 80, 160, 320) for e in range(4)], dtype=float)
 RUNS = tuple(f"n{int(samples)}" for samples, _, _ in COUNTS)
@@ -66,6 +67,64 @@ def test_the_command_tells_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     with pytest.raises(SystemExit, match="0"):
         command(["fit", str(table), "--held-out"])
     assert "4 runs held out, 16 points" in " ".join(capsys.readouterr().out.split())
+
+
+SEEDS = np.repeat(["1", "2", "3"], len(COUNTS))
+FACTORS = np.array([1.3, 1.0, 0.8])
+
+
+def several_seeds(noise: float) -> History:
+    """Return runs of three seeds, whose errors are those of `history` times 1.3, 1 and 0.8."""
+    error = np.tile(1 - history(0).accuracy, 3) * np.repeat(FACTORS, len(COUNTS))
+    drawn = np.random.default_rng(3).normal(scale=noise, size=len(error))
+    runs = tuple(f"{seed}-{run}" for seed, run in zip(SEEDS, RUNS * 3, strict=True))
+    weight = np.random.default_rng(4).uniform(0.5, 2, len(error))
+    return History(np.tile(COUNTS, (3, 1)), 1 - error + drawn, weight, runs, tuple(SEEDS))
+
+
+def test_levels_of_seeds_are_the_effects_of_a_two_way_analysis_of_variance() -> None:
+    told = several_seeds(0.01).select(np.arange(3 * len(COUNTS)) != 5)  # unbalanced
+    points = [f"{s} {e}" for s, e, _ in told.resources]
+    dummies = np.column_stack(
+        [np.array(points) == point for point in dict.fromkeys(points)]
+        + [np.array(told.seeds) == seed for seed in ("2", "3")]
+    ).astype(float)
+    root = np.sqrt(told.weight)
+    effects = np.linalg.lstsq(dummies * root[:, None], np.log(1 - told.accuracy) * root, rcond=None)[0][-2:]
+    found = level_seeds(told)
+    assert np.log(found.of("2") / found.of("1")) == pytest.approx(effects[0])
+    assert np.log(found.of("3") / found.of("1")) == pytest.approx(effects[1])
+    level = sum(weight * np.log(found.of(seed)) for weight, seed in zip(told.weight, told.seeds, strict=True))
+    assert level == pytest.approx(0, abs=1e-9)
+    assert found.of("unknown") == 1
+
+
+def test_a_curve_is_that_of_a_mean_seed() -> None:
+    told = several_seeds(0.0)
+    found = level_seeds(told)
+    mean = np.exp(np.average(np.log(np.repeat(FACTORS, len(COUNTS))), weights=told.weight))
+    assert [found.of(seed) for seed in "123"] == pytest.approx((FACTORS / mean).tolist())
+    assert fit(told).curve.error(*COUNTS.T) == pytest.approx(mean * (1 - history(0).accuracy), abs=2e-3)
+    alone = history(0.0)
+    assert level_seeds(alone) == Levelled(alone, {})
+
+
+def test_seeds_held_out_are_predicted_without_their_level_and_then_from_pretraining() -> None:
+    told = several_seeds(0.0)
+    found = hold_out_runs(told, fit)
+    assert found.mean_error < 3e-3, "other runs of the seed tell its level"
+    new = found.new_seeds
+    assert new is not None
+    errors = []
+    for seed, factor in zip("123", FACTORS, strict=True):
+        rest = [other for other in FACTORS if other != factor]
+        weights = [told.weight[other == SEEDS].sum() for other in "123" if other != seed]
+        level = np.exp(np.average(np.log(rest), weights=weights))
+        later = COUNTS[:, 1] > 0
+        errors.append(np.abs((level - factor) * (1 - history(0).accuracy[later])).mean())
+    assert (new.points, new.mean_error) == (36, pytest.approx(np.mean(errors), rel=0.05))
+    assert new.mean_error_pretrained < 3e-3
+    assert new.rank_correlation_pretrained > max(0.99, new.rank_correlation)
 
 
 def test_noise_of_runs_and_what_it_leaves_attainable() -> None:

@@ -273,9 +273,10 @@ def test_a_history_of_the_package_falls_with_every_resource(name: str) -> None:
 
 
 def test_points_are_added_once_and_read_again(tmp_path) -> None:
-    point = HistoryPoint("t", samples=8, edge_rounds=1, cloud_rounds=0, accuracy=0.5, weight=9, run="a")
+    point = HistoryPoint("t", samples=8, edge_rounds=1, cloud_rounds=0, accuracy=0.5, weight=9, run="a", seed=1)
     for _ in range(2):
         append_records(tmp_path / "history.csv", [point, replace(point, edge_rounds=2, accuracy=0.6)])
     found = parse_history("t", (tmp_path / "history.csv").read_text(), "history.csv")
     assert found.resources.tolist() == [[8, 1, 0], [8, 2, 0]]
     assert json.dumps(found.accuracy.tolist()) == "[0.5, 0.6]"
+    assert (found.runs, found.seeds) == (("a", "a"), ("1", "1"))

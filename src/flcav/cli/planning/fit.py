@@ -42,7 +42,7 @@ def register(app: typer.Typer) -> None:
 def fit(
     history: Path = typer.Argument(
         ..., help="CSV: task, stage (pretrain, edge, cloud), resource, accuracy[, weight]; or [task,] samples, "
-        "edge_rounds, cloud_rounds, accuracy[, weight]. error = 1 - accuracy may stand for accuracy."
+        "edge_rounds, cloud_rounds, accuracy[, weight][, run][, seed]. error = 1 - accuracy may stand for accuracy."
     ),
     problem: Path | None = typer.Option(
         None, "--problem", help="YAML: put the curves into this problem for `flcav allocate`; where there is no such "
@@ -76,7 +76,8 @@ def fit(
     repeats: int = typer.Option(200, "--repeats", min=20, max=10**5, help="Bootstrap repeats of the bands."),
     seed: int = typer.Option(0, "--seed", min=0, help="Seed of the bootstrap."),
     held_out: bool = typer.Option(
-        False, "--held-out", help="Also predict each run (column run) by the curve of all other runs."
+        False, "--held-out", help="Also predict each run (column run) by the curve of all other runs, and each seed "
+        "by that of the others."
     ),
 ) -> None:  # fmt: skip
     """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
@@ -233,6 +234,13 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
                 f"runs differ by {checked['between_runs']:.4f}, their points by {checked['within_runs']:.4f} (standard"
                 f" deviations): the true curve would reach a rank correlation of {checked['attainable']:.3f}",
             )
+            if new := checked["new_seeds"]:
+                told += (
+                    f"seeds held out whole, {new['points']} points after pretraining: mean error "
+                    f"{new['mean_error']:.4f}, rank correlation {new['rank_correlation']:.3f} before the run; scaled to"
+                    f" what its run reached by pretraining {new['mean_error_pretrained']:.4f} and "
+                    f"{new['rank_correlation_pretrained']:.3f}",
+                )
             for line in told:
                 console.print(f"{answer['task']}: {line}")
         for warning in answer["warnings"]:

@@ -17,6 +17,7 @@ from flcav.optimization.curves.bands import Bands, bootstrap_bands
 from flcav.optimization.curves.curves import Additive
 from flcav.optimization.curves.fitting import Fit, fit_additive
 from flcav.optimization.curves.history import History, article_histories
+from flcav.optimization.curves.levels import level_seeds
 from flcav.optimization.graph import Layers, build_graph
 from flcav.pipeline.planning.histories import load_history
 from flcav.pipeline.provenance import Provenance, provenance
@@ -123,7 +124,7 @@ def _line(fit: Fit[Additive], found: Bands | None, where: Array) -> tuple[tuple[
 
 def _own_curves() -> OwnCurves:
     """Return a line for each number of samples in the history: pretrained, then edge rounds, then cloud rounds."""
-    history = load_history("objects")
+    history = level_seeds(load_history("objects")).history
     samples, edge_rounds, cloud_rounds = history.resources.T
     fit = fit_additive(samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
     points = np.column_stack((history.resources, history.accuracy)).tolist()

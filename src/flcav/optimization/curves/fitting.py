@@ -26,6 +26,7 @@ from flcav.optimization.curves.forms import (
     federated_forms,
 )
 from flcav.optimization.curves.history import History
+from flcav.optimization.curves.levels import level_seeds
 
 Array = NDArray[np.float64]
 
@@ -129,7 +130,8 @@ def fit(
     """Return the learning curve fitted to the history of one task: the error by samples, edge rounds and cloud rounds.
 
     `model` is `Additive`, `Effective` or `Federated`; the other settings belong to the last two, see `fit_effective`
-    and `fit_federated`. `group_samples` are those of all regions, or of each. Raises `InputError` where there are too
+    and `fit_federated`. `group_samples` are those of all regions, or of each. Where runs of several seeds are in the
+    history, the curve is that of a mean seed (`level_seeds`). Raises `InputError` where there are too
     few points, where the effective model lacks `group_samples` for a history with rounds, and as `fit_federated` does.
 
     >>> from flcav import fit
@@ -138,6 +140,7 @@ def fit(
     >>> found.points, float(found.curve.error(2500, 0, 0)) < float(found.curve.error(50, 0, 0))
     (5, True)
     """
+    history = level_seeds(history).history
     samples, edge_rounds, cloud_rounds = history.resources.T
     columns = (samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
     if model == "additive":

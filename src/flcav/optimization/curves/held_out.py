@@ -3,7 +3,8 @@
 What no curve can foresee is how a run's training turned out. `noise_of_runs` splits the residuals of a history into
 the differences between runs and the scatter within them, a random effect of the run (one-way analysis of variance by
 the method of moments, Searle, Casella and McCulloch, "Variance Components", 1992, sec. 3.6), and the rank correlation
-that a true curve would reach with as much noise says how far a prediction can get.
+that a true curve would reach with as much noise says how far a prediction can get. The level of a run's seed is known
+from the other runs of the seed; of a seed held out whole it is not, until its run has pretrained.
 """
 
 from collections.abc import Callable
@@ -14,8 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import rankdata
 
 from flcav.config import InputError
+from flcav.optimization.curves.curves import OwnCurve
 from flcav.optimization.curves.fitting import CurveFit
 from flcav.optimization.curves.history import Array, History
+from flcav.optimization.curves.levels import Levelled, level_seeds
 from flcav.seeds import stream
 
 SIMULATED = 400  # histories drawn for the attainable rank correlation
@@ -32,10 +35,24 @@ class HeldOut:
     between_runs: float  # standard deviation of a run's deviation from the curve of all runs
     within_runs: float  # standard deviation of a point about its run's
     attainable: float  # mean rank correlation of that curve with itself under such noise
+    new_seeds: "NewSeeds | None" = None  # None: the history has one seed
+
+
+@dataclass(frozen=True)
+class NewSeeds:
+    """Agreement over all points after pretraining, of seeds held out whole, before and after their runs pretrained."""
+
+    points: int
+    mean_error: float  # mean absolute difference, predicted before the run
+    rank_correlation: float
+    mean_error_pretrained: float  # of a curve that is scaled to the score after pretraining, as replanning does
+    rank_correlation_pretrained: float
 
 
 def hold_out_runs(history: History, fit: Callable[[History], CurveFit], k: int = 1) -> HeldOut:
     """Return how well curves fitted by `fit` to all runs but one predict that one; `k`: edge rounds per cloud round.
+
+    `fit` returns the curve of a mean seed, see `level_seeds`; the run's is that times the factor of its seed.
 
     Raises `InputError` for a history of fewer than three runs, and as `fit` does.
     """
@@ -48,9 +65,9 @@ def hold_out_runs(history: History, fit: Callable[[History], CurveFit], k: int =
     predicted = np.empty(len(names))
     for run in runs:
         held = names == run
-        curve = fit(history.select(~held)).curve
-        predicted[held] = 1 - curve.error(*history.resources[held].T, k=k)
-    expected = 1 - fit(history).curve.error(*history.resources.T, k=k)
+        others = history.select(~held)
+        predicted[held] = _predict(fit(others).curve, level_seeds(others), history.select(held), k)
+    expected = _predict(fit(history).curve, level_seeds(history), history, k)
     between, within = noise_of_runs(history.accuracy - expected, names)
     return HeldOut(
         len(runs),
@@ -60,6 +77,39 @@ def hold_out_runs(history: History, fit: Callable[[History], CurveFit], k: int =
         between,
         within,
         attainable_correlation(expected, names, between, within),
+        _hold_out_seeds(history, fit, k),
+    )
+
+
+def _predict(curve: OwnCurve, levelled: Levelled, history: History, k: int) -> Array:
+    """Return the accuracy (n,) that the curve of a mean seed predicts for the points of a history."""
+    factor = np.array([levelled.of(seed) for seed in history.seeds]) if history.seeds else 1.0
+    return 1 - factor * curve.error(*history.resources.T, k=k)
+
+
+def _hold_out_seeds(history: History, fit: Callable[[History], CurveFit], k: int) -> NewSeeds | None:
+    """Return how well curves fitted to all seeds but one predict that one; None for one seed."""
+    seeds, names = np.array(history.seeds), np.array(history.runs)
+    if len(np.unique(seeds)) < 2:
+        return None
+    pretrained = ~history.resources[:, 1:].any(axis=1)
+    before, after = np.empty((2, len(names)))
+    for seed in np.unique(seeds):
+        held = seeds == seed
+        curve = fit(history.select(~held)).curve
+        before[held] = 1 - curve.error(*history.resources[held].T, k=k)
+        for run in np.unique(names[held]):
+            own = held & (names == run)
+            reached = (1 - history.accuracy[own & pretrained]).mean() / (1 - before[own & pretrained]).mean()
+            after[own] = 1 - reached * (1 - before[own])
+    rest = ~pretrained
+    found = history.accuracy[rest]
+    return NewSeeds(
+        int(rest.sum()),
+        float(np.abs(before[rest] - found).mean()),
+        rank_correlation(before[rest], found),
+        float(np.abs(after[rest] - found).mean()),
+        rank_correlation(after[rest], found),
     )
 
 

@@ -4,7 +4,8 @@ Tables of two forms are read:
 
 - Long: `task, stage, resource, accuracy[, weight]`. A row gives the resource of its own stage. Stages follow each
   other, so its other resources are the largest of each earlier stage, and 0 of each later one.
-- Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight][, run]`, as the project's own runs write it.
+- Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight][, run][, seed]`, as the project's own runs
+  write it.
 
 Either may have `error`, which is 1 - accuracy, in place of `accuracy`.
 """
@@ -39,11 +40,12 @@ class History:
     accuracy: Array  # (n,) 0 ... 1
     weight: Array  # (n,) of each point's squared residual in a fit
     runs: tuple[str, ...] = ()  # that the points are of; none where the history does not name them
+    seeds: tuple[str, ...] = ()  # of the runs; runs of one seed share frames
 
     def select(self, chosen: NDArray[np.bool_]) -> "History":
         """Return the points that are true in `chosen` (n,)."""
-        runs = tuple(run for run, taken in zip(self.runs, chosen) if taken)
-        return History(self.resources[chosen], self.accuracy[chosen], self.weight[chosen], runs)
+        runs, seeds = (tuple(name for name, taken in zip(names, chosen) if taken) for names in (self.runs, self.seeds))
+        return History(self.resources[chosen], self.accuracy[chosen], self.weight[chosen], runs, seeds)
 
 
 def article_histories() -> dict[str, History]:
@@ -79,8 +81,10 @@ def parse_histories(columns: Table, origin: str, unnamed: str) -> dict[str, Hist
         own = amounts[rows]
         if not joint:
             own = accumulate_resources([str(columns["stage"][row]) for row in rows], own[:, 0])
-        runs = tuple(str(columns["run"][row]) for row in rows) if "run" in columns else ()
-        found[task] = History(own, accuracy[rows], weight[rows], runs)
+        runs, seeds = (
+            tuple(str(columns[name][row]) for row in rows) if name in columns else () for name in ("run", "seed")
+        )
+        found[task] = History(own, accuracy[rows], weight[rows], runs, seeds)
     return found
 
 

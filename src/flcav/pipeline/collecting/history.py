@@ -43,5 +43,5 @@ def make_history_points(result: Run, run: str) -> list[HistoryPoint]:
             frames = sum(watched.frames for watched in each)
             for at in average_regions(each):
                 counts = (own.edge_rounds, at.round) if stage == CLOUD else (at.round, 0)
-                points.append(HistoryPoint(task, own.samples, *counts, at.score, frames, run))
+                points.append(HistoryPoint(task, own.samples, *counts, at.score, frames, run, result.recipe.seed))
     return points

@@ -22,6 +22,7 @@ class HistoryPoint:
     accuracy: float
     weight: int  # validation frames
     run: str
+    seed: int
 
 
 def read_history(task: str, name: str, beside: Path) -> str:
