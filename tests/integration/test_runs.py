@@ -30,7 +30,8 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.arms.run import ARMS, ArmsResult, compare_arms
 from flcav.experiments.fig6a.results import AllocationResult
 from flcav.experiments.fig6a.run import compare_plans
-from flcav.experiments.placement.run import NEAR, TOWN, prove_placement
+from flcav.experiments.placement.records import COVERAGE, NEAR, TOWN, TRAFFIC
+from flcav.experiments.placement.run import prove_placement
 from flcav.experiments.run_tables import judge_anew
 from flcav.federation.privacy import account_epsilon
 from flcav.federation.rules import Rules
@@ -129,13 +130,15 @@ def test_sensors_stand_where_most_errors_or_most_traffic_is(result: Run) -> None
 
 def test_gains_of_a_pole_are_those_of_its_own_arm_over_the_run_itself(studied: Studied, result: Run) -> None:
     proof = prove_placement(RECIPE, [result], [studied[0] / "seed1" / "work"])
-    (seed,), site = proof.seeds, next(each for each in result.arms[MAIN].placed[0].poles if each.pole == 8)
-    (pole,) = seed.poles
+    (seed,), sites = proof.regions["grid"].seeds, result.arms[MAIN].placed[0].poles
+    (pole,), (site,) = seed.poles, (each for each in sites if each.pole == 8)
     reached = [result.test(arm=arm, stage=EDGE, region="grid", task="objects").estimate.mean for arm in ("pole8", MAIN)]
     assert result.arms["pole8"].placed[0].chosen == (pole.pole,) == (8,)
-    assert (pole.covered, pole.actors, seed.without[TOWN]) == (site.covered, site.actors, reached[1])
+    assert (pole.predictors[COVERAGE], pole.predictors[TRAFFIC]) == (site.covered, site.actors)
+    assert seed.without[TOWN] == reached[1]
     assert pole.gain[TOWN] == pytest.approx(reached[0] - reached[1])
     assert set(pole.gain) == {TOWN, NEAR}
+    assert list(proof.regions) == ["grid"]  # no arm has a single pole in `ring`
 
 
 def test_central_arms_take_as_many_steps_as_stage_two_on_their_own_samples(finished: Path, result: Run) -> None:

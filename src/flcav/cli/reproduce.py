@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 import typer
@@ -23,6 +23,7 @@ STUDY = ("seeds", "scale", *RUN)  # options of targets that run over seeds
 TASK = "task-"  # before the name of a task's study
 OWN = "a task of your own that says how it is studied, as module:NAME"
 COMMON_SEEDS = 3
+IMPORTED = "quarter"  # map of the package, imported into the folder of the proof of placement
 
 
 def _use_demo_size(recipe: "RunRecipe") -> "RunRecipe":
@@ -80,7 +81,10 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     **dict.fromkeys(ATTACKS, ("seeds",)),
     Target.sim_to_real: (*RUN, "kitti", "weights"),
 }
-SEEDS: Mapping[str, int] = dict.fromkeys((Target.demo_arms, Target.federation_exchange, *ATTACKS), 5)
+SEEDS: Mapping[str, int] = {
+    **dict.fromkeys((Target.demo_arms, Target.federation_exchange, *ATTACKS), 5),
+    Target.placement: 8,
+}
 
 
 class Reproducible(click.Choice):
@@ -103,7 +107,7 @@ def reproduce(
         None,
         "--seeds",
         min=1,
-        help="Number of seeds, from 1: 5 of demo-arms and federation-*, 3 of the others if not given.",
+        help="Number of seeds, from 1: 5 of demo-arms and federation-*, 8 of placement, 3 of the others if not given.",
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
@@ -267,16 +271,22 @@ def _federation_exchange(out: Path, seeds: int, scale: str, jobs: int, engine: E
 
 
 def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
-    from flcav.experiments.placement.run import describe_overlaps, draw_proof, list_overlaps, prove_placement
-    from flcav.pipeline.recipe import load_run_recipe
+    from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps
+    from flcav.experiments.placement.run import draw_proof, list_regions, prove_placement
     from flcav.pipeline.running import WORK
     from flcav.sources.recipe import recipe_path
+    from flcav.world.opendrive.importing import import_town
 
-    asked = load_run_recipe(recipe_path("runs/placement"))
-    typer.echo(describe_overlaps(list_overlaps(asked), asked.placement.range_m))
-    recipe, runs = _run_seeds(Target.placement, "placement", out, seeds, scale, jobs, engine, stale, _use_toy_size)
-    results = prove_placement(recipe, runs, [out / f"seed{run.recipe.seed}" / WORK for run in runs])
-    _write_figures(out, results.as_json(), {"placement.png": draw_proof(results)}, results.sentences())
+    asked = _load_sized("placement", scale, _use_toy_size)
+    if not (out / IMPORTED).exists():
+        import_town(recipe_path("runs/placement").parents[1] / "maps" / f"{IMPORTED}.xodr", out / IMPORTED)
+    overlaps = {region: list_overlaps(asked, region, out) for region in list_regions(asked)}
+    for sentence in describe_overlaps(overlaps, asked.placement.range_m):
+        typer.echo(sentence)
+    how: Any = (seeds, scale, jobs, engine, stale, _use_toy_size, out)
+    recipe, runs = _run_seeds(Target.placement, "placement", out, *how)
+    results = prove_placement(recipe, runs, [out / f"seed{run.recipe.seed}" / WORK for run in runs], out)
+    _write_figures(out, results.as_json(), draw_proof(results), results.sentences())
 
 
 COMPARISONS: Mapping[str, Callable[[Path, int, str, int, Engine, Stale], None]] = {
@@ -299,14 +309,19 @@ def _run_seeds(
     engine: Engine,
     stale: Stale,
     shrink: "Callable[[RunRecipe], RunRecipe]" = _use_demo_size,
+    beside: Path | None = None,
 ) -> "tuple[RunRecipe, tuple[Run, ...]]":
-    """Run or finish the package's recipe `runs/<name>` with several seeds, with `shrink` applied if scale is quick."""
+    """Run or finish the package's recipe `runs/<name>` with several seeds, with `shrink` applied if scale is quick.
+
+    Imported towns are looked for in `beside`.
+    """
     from flcav.cli.steps import live_steps
     from flcav.pipeline.running import run_seeds
 
     recipe = _load_sized(name, scale, shrink)
     with live_steps(target.value) as notify:
-        runs, _ = run_seeds(recipe, out, seeds=seeds, jobs=jobs, notify=notify, stale=stale, engine=engine)
+        how: Any = {"jobs": jobs, "notify": notify, "stale": stale, "engine": engine}
+        runs, _ = run_seeds(recipe, out, seeds=seeds, beside=beside, **how)
     return recipe, runs
 
 

@@ -1,6 +1,6 @@
 """The trained roadside detector: SECOND on the returns that stand before a pole's static background.
 
-Its weights come with the package (the network "road" of the task objects). It was trained in `suburb` and `arterial`;
+Its weights come with the package (the network "road" of the task objects). It was trained in the towns `TRAINED_IN`;
 its score threshold was fixed there, on frames of other scenes. A sensor that stands still knows the map around it, and
 what it takes for a car off the drivable surface is none. Where the map has heights, it sees the street flattened:
 each return as high above the sensor's foot as it is above the ground below it, since the network knows level streets.
@@ -28,6 +28,7 @@ from flcav.perception.weights import find_shipped, load_network
 from flcav.world.map.relief import Relief
 
 ROAD = "shipped/road.safetensors"  # relative to the folder of the task objects
+TRAINED_IN = ("arterial", "suburb")  # towns
 THRESHOLD = 0.7  # lowest score of a label
 OFF_ROAD_M = 0.5  # farthest that the centre of a car may lie from the drivable surface of the map
 CATEGORY = {"Car": "car"}  # actor category by detection class

@@ -9,10 +9,13 @@ import pytest
 from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
+from flcav.pipeline.arms import resolve_settings
+from flcav.pipeline.collecting.caveats import list_caveats
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels import pseudo_labels
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold, select_frames_near
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
+from flcav.pipeline.recipe import RunRecipe
 
 
 def cars(*places: tuple[float, float]) -> Boxes:
@@ -66,3 +69,23 @@ def test_every_kind_that_nobody_could_have_says_that_it_is_an_upper_bound() -> N
     assert choose_labels("trajectory", None) == "future"
     with pytest.raises(InputError, match="labels of 'weather': 'ideal-road' is none of annotated"):
         choose_labels("weather", "ideal-road")
+
+
+def test_the_road_detector_is_said_to_have_been_trained_where_it_labels() -> None:
+    def caveats(kind: str, town: str, arm: str | None = None) -> tuple[str, ...]:
+        recipe = RunRecipe.model_validate(
+            {
+                "tasks": {"objects": {"history": "objects", "labels": kind}},
+                "regions": {"suburb": {"role": "pretrain"}, "here": {"town": town, "role": "federate"}},
+                "budgets_mb": {"wireless": 1, "wireline": 1},
+                "arms": {} if arm is None else {"other": {"labels": {"objects": arm}}},
+            }
+        )
+        return list_caveats(recipe, (kind,), resolve_settings(recipe, {"objects": kind}).values())
+
+    told = "the road detector was trained in here, so that its labels are better there than elsewhere"
+    assert caveats("road", "grid") == ("trained road detector",)
+    assert caveats("road", "arterial") == ("trained road detector", told)
+    assert caveats("road-average", "hilly_suburb") == ("trained road detector", told)
+    assert caveats("own-detections", "arterial") == ()
+    assert caveats("own-detections", "arterial", arm="road") == (told,)

@@ -5,187 +5,172 @@ order; they differ in the poles whose sensors help to label them. The gain of po
 sensors minus that without any, on the same test frames: all of them, and the half with most registered errors around.
 If placement by coverage is right, poles that cover more errors have higher gains (Spearman's rank correlation; Wang et
 al., IEEE Network 37(3), 2023, finding iii), and the choice of VRCSP gains more than the densest or random poles.
+Each federating region with an arm of a single pole is a proof of its own. Regions of one seed share their pretraining,
+so that pooled numbers are means over regions first, and over seeds then.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.files import Json
+from flcav.experiments.placement.overlaps import list_overlaps
+from flcav.experiments.placement.predictors import count_added_labels, expect_labels
+from flcav.experiments.placement.records import (
+    ADDED,
+    COVERAGE,
+    EXPECTED,
+    FRAMES,
+    HALF_WIDTH,
+    NEAR,
+    PREDICTORS,
+    RULES,
+    TOWN,
+    TRAFFIC,
+    ByFrames,
+    ChoiceGain,
+    Means,
+    PlacementProof,
+    PoleGain,
+    RegionProof,
+    SeedGains,
+)
 from flcav.intervals import MOST_SEEDS, MeanOverSeeds, half_width, mean_over_seeds
 from flcav.optimization.curves.held_out import rank_correlation
-from flcav.perception.errors import load_errors
+from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.outcomes import Outcomes, as_measurable
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Names, resolve_settings
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.labels.pseudo_labels import select_frames_near
 from flcav.pipeline.labels.sources import choose_labels
-from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import ERRORS, OUTCOMES
-from flcav.records import LEFT_OUT, Record
+from flcav.pipeline.results.training import Pretrained
+from flcav.pipeline.stages.learning import load_stage_network
+from flcav.pipeline.stages.placement import find_sites, read_traces
 from flcav.report import style
 from flcav.report.charts.placement import draw_gains
-from flcav.world.map.town import load_town
 
 TASK = "objects"
-TOWN, NEAR = "all over the town", "near the errors"  # test frames
-RULES = {"vrcsp": "VRCSP", "densest": "traffic density", "random": "random"}  # by the rule in a recipe
-COVERAGE, TRAFFIC = "errors covered", "traffic density"  # what may predict a pole's gain
-HALF_WIDTH = 0.02  # of an interval in AP50 that seeds are planned for
 
-ByFrames = Mapping[str, float]  # a number by `TOWN` and `NEAR`
+Numbers = Mapping[str, ByFrames]  # by name and frames
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Two candidate poles whose circles of coverage overlap."""
+class _Folders:
+    """The steps of a run in one region that the proof reads."""
 
-    poles: tuple[int, int]
-    apart_m: float
-    overlap: float  # share of a circle that lies in the other one
+    test: Frames
+    registry: Frames
+    edge: Frames
+    errors: tuple[PerceptionError, ...]
+    pretrained: Path
 
-
-@dataclass(frozen=True)
-class PoleGain:
-    """Gain in AP of vehicles that learn from the sensor on one pole."""
-
-    pole: int
-    covered: int  # errors within range
-    actors: float  # mean number of road users within range
-    gain: ByFrames  # in AP50
-
-
-@dataclass(frozen=True)
-class ChoiceGain:
-    """Gain in AP of vehicles that learn from the sensors that a rule places."""
-
-    rule: str
-    count: int
-    poles: tuple[int, ...]  # none: the mean over all single poles
-    gain: ByFrames
+    @classmethod
+    def open(cls, run: Run, work: Path, region: str) -> "_Folders":
+        recipe = run.recipe
+        labels = {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()}
+        names = Names(resolve_settings(recipe, labels))
+        test, registry, edge = (
+            Frames.open(work / names.recording(region, split, TASK)) for split in ("test", "registry", EDGE)
+        )
+        errors = load_errors(work / names.errors(MAIN, region, TASK) / ERRORS)
+        return cls(test, registry, edge, errors, work / names.pretrain(MAIN, TASK))
 
 
-@dataclass(frozen=True)
-class SeedGains:
-    """Gains of one seed, and how well coverage and traffic order the poles by them."""
-
-    seed: int
-    errors: int  # registered
-    pretrained: ByFrames  # AP50
-    without: ByFrames  # AP50 of edge FL without sensors
-    poles: tuple[PoleGain, ...]  # that see road users
-    choices: tuple[ChoiceGain, ...]
-    correlation: Mapping[str, ByFrames]  # Spearman's, by predictor
+def list_regions(recipe: RunRecipe) -> tuple[str, ...]:
+    """Return the federating regions in which an arm has a sensor on a single pole; raises `InputError` for none."""
+    federating = recipe.with_role("federate")
+    single = [arm for arm in recipe.arms.values() if len(arm.placement.get("poles", ())) == 1]
+    found = tuple(region for region in federating if any(region in (arm.regions or federating) for arm in single))
+    if not found:
+        raise InputError("no arm has a sensor on a single pole")
+    return found
 
 
-@dataclass(frozen=True)
-class PlacementProof(Record):
-    """Gains by pole and by rule, over seeds."""
+def prove_placement(
+    recipe: RunRecipe, runs: Sequence[Run], works: Sequence[Path], beside: Path | None = None
+) -> PlacementProof:
+    """Return gains by pole and rule in the regions of `list_regions`, over the runs of the recipe's seeds.
 
-    region: str
-    range_m: float
-    overlaps: tuple[Pair, ...]  # of all pairs of poles that are nearer than two ranges
-    seeds: tuple[SeedGains, ...]
-    correlation: Mapping[str, Mapping[str, MeanOverSeeds]]  # by predictor and frames
-    gain: Mapping[str, Mapping[str, MeanOverSeeds]]  # by "count, rule" and frames
-    advantage: Mapping[str, Mapping[str, MeanOverSeeds]]  # of VRCSP over the rule, by "count, rule" and frames
-    pair_sd: ByFrames  # standard deviation over seeds of the difference of two poles' gains, over all pairs
-    seeds_wanted: Mapping[str, int | None]  # that make the half-width of such a difference `HALF_WIDTH`
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
-
-    def sentences(self) -> list[str]:
-        """Return correlations, advantages and the number of seeds in words."""
-        told = [
-            f"rank correlation of gain and {predictor}, {frames}: {mean.describe(sign=True)}"
-            for predictor, own in self.correlation.items()
-            for frames, mean in own.items()
-        ]
-        told += [
-            f"{name}: VRCSP gains {mean.describe(sign=True)} AP50 more {frames}"
-            for name, own in self.advantage.items()
-            for frames, mean in own.items()
-        ]
-        for frames, wanted in self.seeds_wanted.items():
-            if wanted is not None:
-                sd = self.pair_sd[frames]
-                told.append(
-                    f"two poles' gains differ by {sd:.3f} (standard deviation over seeds) {frames}: "
-                    f"{wanted} seeds make the half-width {HALF_WIDTH}"
-                )
-        return told
-
-
-def overlap_of_circles(apart: float, radius: float) -> float:
-    """Return the share of a circle's area that lies in another one of the same radius, `apart` between the centres."""
-    half = apart / (2 * radius)
-    if half >= 1:
-        return 0.0
-    return float(2 / np.pi * (np.arccos(half) - half * np.sqrt(1 - half**2)))
-
-
-def list_overlaps(recipe: RunRecipe, beside: Path | None = None) -> tuple[Pair, ...]:
-    """Return the pairs of candidate poles of the recipe's federating region whose circles overlap, the most first."""
-    region = _region(recipe)
-    poles, radius = load_town(recipe.regions[region].town or region, beside).poles, recipe.placement.range_m
-    pairs = []
-    for (one, here), (other, there) in combinations(zip(poles.id.tolist(), poles.position, strict=True), 2):
-        apart = float(np.linalg.norm(here[:2] - there[:2]))
-        if (share := overlap_of_circles(apart, radius)) > 0:
-            pairs.append(Pair((one, other), apart, share))
-    return tuple(sorted(pairs, key=lambda pair: -pair.overlap))
-
-
-def describe_overlaps(pairs: Sequence[Pair], range_m: float) -> str:
-    """Return in words how much the circles of candidate poles overlap."""
-    if not pairs:
-        return f"no two circles of {range_m:g} m around candidate poles overlap"
-    told = ", ".join(f"{pair.poles[0]} and {pair.poles[1]} by {pair.overlap:.0%}" for pair in pairs)
-    return f"circles of {range_m:g} m around candidate poles that overlap: {told}"
-
-
-def prove_placement(recipe: RunRecipe, runs: Sequence[Run], works: Sequence[Path]) -> PlacementProof:
-    """Return gains by pole and rule in the first federating region of the recipe, over the runs of its seeds.
-
-    `works`: the folder of each run's steps, with the outcomes of its tests. Raises `InputError` where a run has no arm
-    with a single pole, or the test frames hold nothing to find.
+    `works`: the folder of each run's steps, with the outcomes of its tests; `beside`: where towns are looked for.
+    Raises `InputError` where a run has no arm with a single pole, or the test frames hold nothing to find.
     """
-    return summarise_gains(recipe, tuple(measure_gains(run, work) for run, work in zip(runs, works, strict=True)))
+    measured = {
+        region: tuple(measure_gains(run, work, region) for run, work in zip(runs, works, strict=True))
+        for region in list_regions(recipe)
+    }
+    return summarise_gains(recipe, measured, beside)
 
 
-def summarise_gains(recipe: RunRecipe, seeds: tuple[SeedGains, ...]) -> PlacementProof:
-    """Return the means over seeds of gains, of VRCSP's advantages and of correlations, with 95 % intervals."""
-    gain, advantage = {}, {}
-    for number, choice in enumerate(seeds[0].choices):
-        name = f"{choice.count}, {choice.rule}"
-        own = [seed.choices[number].gain for seed in seeds]
-        gain[name] = _mean_by_frames(own)
-        if choice.rule != RULES["vrcsp"]:
-            best = [_find_choice(seed, RULES["vrcsp"], choice.count) for seed in seeds]
-            advantage[name] = _mean_by_frames([{f: a[f] - b[f] for f in b} for a, b in zip(best, own, strict=True)])
-    spread = {frames: _spread_of_pairs(seeds, frames) for frames in (TOWN, NEAR)}
+def summarise_gains(
+    recipe: RunRecipe, measured: Mapping[str, tuple[SeedGains, ...]], beside: Path | None = None
+) -> PlacementProof:
+    """Return the means over seeds of gains, of VRCSP's advantages and of correlations, with 95 % intervals.
+
+    measured: the same seeds of each region.
+    """
+    regions = {}
+    for region, seeds in measured.items():
+        spread = {frames: _spread_of_pairs(seeds, frames) for frames in FRAMES}
+        regions[region] = RegionProof(
+            town=recipe.regions[region].town or region,
+            overlaps=list_overlaps(recipe, region, beside),
+            seeds=seeds,
+            means=_mean([[seed] for seed in seeds]),
+            pair_sd=spread,
+            seeds_wanted={frames: plan_half_width(sd) if len(seeds) > 1 else None for frames, sd in spread.items()},
+        )
     return PlacementProof(
-        region=_region(recipe),
         range_m=recipe.placement.range_m,
-        overlaps=list_overlaps(recipe),
-        seeds=seeds,
-        correlation={each: _mean_by_frames([seed.correlation[each] for seed in seeds]) for each in (COVERAGE, TRAFFIC)},
-        gain=gain,
-        advantage=advantage,
-        pair_sd=spread,
-        seeds_wanted={frames: plan_half_width(sd) if len(seeds) > 1 else None for frames, sd in spread.items()},
+        regions=regions,
+        pooled=_mean(list(zip(*measured.values(), strict=True))),
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
         provenance=provenance(),
     )
+
+
+def _mean(seeds: Sequence[Sequence[SeedGains]]) -> Means:
+    """Return means over `seeds` of the mean over the regions of each."""
+    return Means(
+        correlation=_mean_numbers([[each.correlation for each in seed] for seed in seeds]),
+        gain=_mean_numbers([[_list_gains(each) for each in seed] for seed in seeds]),
+        advantage=_mean_numbers([[_list_advantages(each) for each in seed] for seed in seeds]),
+    )
+
+
+def _mean_numbers(seeds: Sequence[Sequence[Numbers]]) -> dict[str, dict[str, MeanOverSeeds]]:
+    """Return the means over seeds of the mean over regions, of the names that all have."""
+    every = [each for seed in seeds for each in seed]
+    names = [name for name in every[0] if all(name in each for each in every)]
+    return {
+        name: {
+            frames: mean_over_seeds([float(np.mean([each[name][frames] for each in seed])) for seed in seeds])
+            for frames in FRAMES
+        }
+        for name in names
+    }
+
+
+def _list_gains(seed: SeedGains) -> Numbers:
+    return {choice.name: choice.gain for choice in seed.choices}
+
+
+def _list_advantages(seed: SeedGains) -> Numbers:
+    best = {choice.count: choice.gain for choice in seed.choices if choice.rule == RULES["vrcsp"]}
+    return {
+        choice.name: {frames: best[choice.count][frames] - gain for frames, gain in choice.gain.items()}
+        for choice in seed.choices
+        if choice.rule != RULES["vrcsp"]
+    }
 
 
 def plan_half_width(sd: float, half: float = HALF_WIDTH) -> int | None:
@@ -205,16 +190,12 @@ def choose_near(places: NDArray[np.float64], errors: NDArray[np.float64], range_
     return near
 
 
-def measure_gains(run: Run, work: Path) -> SeedGains:
-    """Return the gains of one seed's run from the outcomes of its tests, whose folders are in `work`."""
-    recipe, region = run.recipe, _region(run.recipe)
-    names = Names(
-        resolve_settings(recipe, {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()})
-    )
-    split = Frames.open(work / names.recording(region, "test", TASK))
-    errors = load_errors(work / names.errors(MAIN, region, TASK) / ERRORS)
+def measure_gains(run: Run, work: Path, region: str) -> SeedGains:
+    """Return the gains of one seed's run in a region from the outcomes of its tests, whose folders are in `work`."""
+    recipe, folders = run.recipe, _Folders.open(run, work, region)
+    split = folders.test
     places = np.array([split.data.world_from_agent(number)[:2, 3] for number in split.vehicles])
-    spots = np.array([(error.x, error.y, error.z) for error in errors]).reshape(-1, 3)
+    spots = np.array([(error.x, error.y, error.z) for error in folders.errors]).reshape(-1, 3)
     counted = {
         TOWN: np.ones(len(places), dtype=np.bool_),
         NEAR: choose_near(places, spots, recipe.placement.range_m),
@@ -231,12 +212,7 @@ def measure_gains(run: Run, work: Path) -> SeedGains:
         if stage == EDGE
     }
     placed = {arm: _placed(run, arm, region) for arm in gains}
-    known = {site.pole: site for site in placed[MAIN].poles if site.actors > 0}
-    poles = tuple(
-        PoleGain(pole, known[pole].covered, known[pole].actors, gains[arm])
-        for arm, each in placed.items()
-        if each.rule == "fixed" and len(each.chosen) == 1 and (pole := each.chosen[0]) in known
-    )
+    poles = _measure_poles(recipe, folders, placed, gains)
     if not poles:
         raise InputError(f"region '{region}': no arm has a sensor on a single pole that sees road users")
     several = tuple(
@@ -251,15 +227,54 @@ def measure_gains(run: Run, work: Path) -> SeedGains:
         without=without,
         poles=poles,
         choices=(*_choose_one(poles), *sorted(several, key=lambda choice: choice.count)),
-        correlation={
-            COVERAGE: _correlate(poles, [each.covered for each in poles]),
-            TRAFFIC: _correlate(poles, [each.actors for each in poles]),
-        },
+        correlation={name: _correlate(poles, name) for name in PREDICTORS},
     )
 
 
-def _region(recipe: RunRecipe) -> str:
-    return recipe.with_role("federate")[0]
+def _measure_poles(
+    recipe: RunRecipe, folders: _Folders, placed: Mapping[str, Placed], gains: Mapping[str, ByFrames]
+) -> tuple[PoleGain, ...]:
+    """Return gains and predictors of the single poles of arms that see road users."""
+    known = {site.pole: site for site in placed[MAIN].poles if site.actors > 0}
+    single = {
+        pole: gains[arm]
+        for arm, each in placed.items()
+        if each.rule == "fixed" and len(each.chosen) == 1 and (pole := each.chosen[0]) in known
+    }
+    if not single:
+        return ()
+    sites, town = find_sites(folders.registry, None), folders.registry.data.town()
+    if town is None:
+        raise InputError(f"{folders.registry.data.folder}: recorded in no known town, so that no pole's sight is known")
+    where = dict(zip(sites.number.tolist(), sites.position, strict=True))
+    traces = read_traces(folders.registry.data, folders.registry.vehicles)
+    mounts = np.array([where[pole] for pole in single]).reshape(-1, 3)
+    expected = dict(zip(single, expect_labels(town, traces, folders.errors, mounts).tolist(), strict=True))
+    network, threshold = load_stage_network(task_named(TASK), folders.pretrained), _threshold(folders)
+    near = np.array([where[pole][:2] for each in placed.values() for pole in each.chosen]).reshape(-1, 2)
+    frames = select_frames_near(folders.edge, near, recipe.placement.group_range_m)
+    added = count_added_labels(network, threshold, folders.edge, frames, {pole: where[pole] for pole in single})
+    return tuple(
+        PoleGain(
+            pole,
+            {
+                COVERAGE: known[pole].covered,
+                TRAFFIC: known[pole].actors,
+                EXPECTED: round(expected[pole], 2),
+                ADDED: added[pole],
+            },
+            gain,
+        )
+        for pole, gain in single.items()
+    )
+
+
+def _threshold(folders: _Folders) -> float:
+    """Return the score threshold of pseudo-labels; raises `InputError` where labels do not come from detections."""
+    threshold = Pretrained.load(folders.pretrained).threshold
+    if threshold is None:
+        raise InputError("the labels of 'objects' come from no detections, so that no sensor adds any")
+    return threshold
 
 
 def _placed(run: Run, arm: str, region: str) -> Placed:
@@ -277,26 +292,18 @@ def _precision(path: Path, counted: Mapping[str, NDArray[np.bool_]]) -> dict[str
 
 def _choose_one(poles: Sequence[PoleGain]) -> tuple[ChoiceGain, ...]:
     """Return the gains of one sensor by each rule; at random it is the mean over all poles."""
-    best = max(poles, key=lambda pole: pole.covered)
-    dense = max(poles, key=lambda pole: pole.actors)
-    mean = {frames: float(np.mean([pole.gain[frames] for pole in poles])) for frames in best.gain}
+    rules = {RULES["vrcsp"]: COVERAGE, RULES["densest"]: TRAFFIC, EXPECTED: EXPECTED}
+    best = {rule: max(poles, key=lambda pole: pole.predictors[name]) for rule, name in rules.items()}
+    mean = {frames: float(np.mean([pole.gain[frames] for pole in poles])) for frames in FRAMES}
     return (
-        ChoiceGain(RULES["vrcsp"], 1, (best.pole,), best.gain),
-        ChoiceGain(RULES["densest"], 1, (dense.pole,), dense.gain),
+        *(ChoiceGain(rule, 1, (pole.pole,), pole.gain) for rule, pole in best.items()),
         ChoiceGain(RULES["random"], 1, (), mean),
     )
 
 
-def _correlate(poles: Sequence[PoleGain], predictor: Sequence[float]) -> dict[str, float]:
-    return {frames: rank_correlation([pole.gain[frames] for pole in poles], predictor) for frames in (TOWN, NEAR)}
-
-
-def _find_choice(seed: SeedGains, rule: str, count: int) -> ByFrames:
-    return next(each.gain for each in seed.choices if (each.rule, each.count) == (rule, count))
-
-
-def _mean_by_frames(values: Sequence[ByFrames]) -> dict[str, MeanOverSeeds]:
-    return {frames: mean_over_seeds([each[frames] for each in values]) for frames in (TOWN, NEAR)}
+def _correlate(poles: Sequence[PoleGain], name: str) -> dict[str, float]:
+    predictor = [pole.predictors[name] for pole in poles]
+    return {frames: rank_correlation([pole.gain[frames] for pole in poles], predictor) for frames in FRAMES}
 
 
 def _spread_of_pairs(seeds: Sequence[SeedGains], frames: str) -> float:
@@ -313,13 +320,16 @@ def _spread_of_pairs(seeds: Sequence[SeedGains], frames: str) -> float:
     return float(np.sqrt(np.mean(variances)))
 
 
-def draw_proof(results: PlacementProof) -> bytes:
-    """Return the picture of every pole's gain against its coverage and its traffic as a PNG."""
-    panels = {}
-    for frames in (TOWN, NEAR):
-        for predictor, field in ((COVERAGE, "covered"), (TRAFFIC, "actors")):
-            panels[frames, predictor] = {
-                seed.seed: [(float(getattr(pole, field)), pole.gain[frames]) for pole in seed.poles]
-                for seed in results.seeds
+def draw_proof(results: PlacementProof) -> dict[str, bytes]:
+    """Return by file name the pictures of every pole's gain against each predictor as PNG, one of each region."""
+    pictures = {}
+    for region, own in results.regions.items():
+        panels = {
+            (frames, name): {
+                seed.seed: [(pole.predictors[name], pole.gain[frames]) for pole in seed.poles] for seed in own.seeds
             }
-    return style.png(draw_gains(panels))
+            for frames in FRAMES
+            for name in PREDICTORS
+        }
+        pictures[f"placement-{region}.png"] = style.png(draw_gains(panels))
+    return pictures

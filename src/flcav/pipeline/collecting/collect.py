@@ -6,6 +6,7 @@ from pathlib import Path
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting
+from flcav.pipeline.collecting.caveats import list_caveats
 from flcav.pipeline.collecting.differences import list_differences
 from flcav.pipeline.collecting.findings import findings
 from flcav.pipeline.collecting.history import gaps_closed
@@ -48,7 +49,7 @@ def collect_results(graph: Graph, work: Path) -> Run:
         findings=findings(differences, tests, arms, settings, roles, rests),
         gap_closed=gaps_closed(tests, recipe),
         provenance=provenance(recipe.seed),
-        caveats=tuple(dict.fromkeys(filter(None, rests.values()))),
+        caveats=list_caveats(recipe, main.labels.values(), settings.values()),
     )
 
 

@@ -1,0 +1,34 @@
+"""Caveats of a run's labels, which are stated with its results."""
+
+from collections.abc import Iterable
+
+from flcav.fusion.detector import TRAINED_IN
+from flcav.pipeline.arms import Setting
+from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.recipe import RunRecipe
+from flcav.world.map.town import HILLY
+
+
+def list_caveats(recipe: RunRecipe, labels: Iterable[str], settings: Iterable[Setting]) -> tuple[str, ...]:
+    """Return the caveats of the kinds `labels`, and of the road detector where it labels in a town it was trained in.
+
+    settings: those of all arms.
+    """
+    own = dict.fromkeys(LABEL_SOURCES[kind].caveat for kind in labels)
+    labelled = {
+        region
+        for setting in settings
+        for region in setting.regions
+        if any(LABEL_SOURCES[kind].trained for kind in setting.labels.values())
+    }
+    known = [
+        region for region in recipe.with_role("federate") if region in labelled and _was_trained_in(recipe, region)
+    ]
+    told = f"the road detector was trained in {' and '.join(known)}, so that its labels are better there than elsewhere"
+    return (*filter(None, own), *([told] if known else []))
+
+
+def _was_trained_in(recipe: RunRecipe, region: str) -> bool:
+    own = recipe.regions[region]
+    town = own.town or region
+    return own.data is None and HILLY.get(town, town) in TRAINED_IN
