@@ -23,6 +23,7 @@ from pydantic import Field
 from flcav.config import Config
 from flcav.fusion.average import average_boxes, variance_of
 from flcav.fusion.labels import cell_centers
+from flcav.fusion.map_context import MapContext, snap_to_map
 from flcav.fusion.pose_graph import Navigation, Sighting, add_pose_variance, correct_poses, tell
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes, inverse, points_in_boxes, pose, spread_over_footprints, transform_points
@@ -50,6 +51,7 @@ class Distillation(Config):
     temperature: float = Field(default=0.1, ge=0.01, le=10)  # of the contrastive term
     position_m: float = Field(default=0.2, ge=0, le=10)  # standard deviation of a vehicle's position, along x and y
     heading_deg: float = Field(default=0.3, ge=0, le=45)  # standard deviation of its heading
+    map_context: bool = True  # whether headings and classes of the average are snapped to the map, where there is one
     pose_graph: bool = False  # whether a pose graph corrects vehicles' poses: needs the extra `fusion`
 
     @property
@@ -117,25 +119,28 @@ def average_spin(
     config: SecondConfig,
     threshold: float,
     posts: Array | None = None,
+    context: MapContext | None = None,
 ) -> list[Guidance]:
     """Return what the edge server tells each vehicle of a spin, in the order of the vehicles among the sightings.
 
     sightings: of vehicles, and of road sensors with actor categories as labels; views: of the road sensors. posts:
-    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses; None: poses are as told.
+    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses; None: poses are as told. context: of
+    the map that headings and classes are snapped to; None: they are as averaged. Of a single spin all speeds count as 0.
     """
     told = [_classify(each, config) if each.navigation is None else each for each in sightings]
     at_s = max((each.time_s for each in told), default=0.0)
     if posts is not None:
         told = correct_poses(told, posts, at_s)
     average = average_boxes([tell(each) for each in told], at_s)
-    road, sure = np.zeros(len(average.boxes), dtype=bool), np.zeros(len(average.boxes), dtype=np.int64)
+    boxes = average.boxes if context is None else snap_to_map(average.boxes, average.velocity, context)
+    road, sure = np.zeros(len(boxes), dtype=bool), np.zeros(len(boxes), dtype=np.int64)
     for each, member in zip(told, average.member, strict=True):
         road[member] |= each.navigation is None
         if each.navigation is not None and each.boxes.score is not None:
             sure[member] += each.boxes.score >= threshold  # an object has at most one box of a sighting
-    kept = select_labels(average.boxes, road, views, threshold)
+    kept = select_labels(boxes, road, views, threshold)
     confirmed = (road | (sure > 1))[kept]
-    return [place_in(average.boxes[kept], confirmed, each) for each in told if each.navigation is not None]
+    return [place_in(boxes[kept], confirmed, each) for each in told if each.navigation is not None]
 
 
 def _classify(seen: Sighting, config: SecondConfig) -> Sighting:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError, parse_config
+from flcav.fusion.average import YAW
 from flcav.fusion.distillation import (
     Distillation,
     Guidance,
@@ -19,6 +20,7 @@ from flcav.fusion.distillation import (
     share_of_free_ground,
     unpack_sighting,
 )
+from flcav.fusion.map_context import build_context
 from flcav.fusion.pose_graph import Navigation, Sighting
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes, concatenate, inverse, pose
@@ -33,6 +35,7 @@ from flcav.pipeline.labels.quality import measure_labels, read_history
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.work.edge import edge_step
 from flcav.sensors.frame import Annotations, Calibration, Frame
+from flcav.world.map.layers import MapLane, MapLayers
 
 CONFIG = second_tiny().config
 ACCURATE = Navigation(0.01, 0.001)
@@ -61,6 +64,12 @@ def spin(world_from_vehicle: np.ndarray | None = None) -> tuple[list[Sighting], 
     vehicle = Sighting("cav0", 1.0, at, told, navigation=ACCURATE)
     seen = concatenate([boxes(BOTH, ROAD_ALONE, label="van", sd=0.1), boxes((8.0, -12.0), label="bus")])
     return [vehicle, Sighting("pole 0", 1.0, np.eye(4), seen)], view(seen)
+
+
+def lane_through(place: tuple[float, float], yaw: float) -> MapLayers:
+    """Return the map of one lane, 16 m along `yaw`, with `place` in its middle."""
+    line = np.array(place) + np.array([[-8.0], [8.0]]) * (np.cos(yaw), np.sin(yaw))
+    return MapLayers((), (), (MapLane("l", "driving", line, 3.5, 13.9, "", "", "", ()),), (), (), ())
 
 
 def near(found: Boxes, place: tuple[float, float]) -> bool:
@@ -105,6 +114,23 @@ def test_nobody_tells_of_anything_and_that_is_an_average_too() -> None:
     pole = Sighting("pole 0", 1.0, np.eye(4), Boxes.empty())
     (guidance,) = average_spin([nothing, pole], [view(Boxes.empty())], CONFIG, 0.5)
     assert not len(Guidance.from_message(guidance.message()).boxes)
+
+
+def test_a_reversed_label_is_turned_by_the_lane_it_is_on() -> None:
+    told = replace(boxes(BOTH, ROAD_ALONE), yaw=np.full(2, np.pi - 0.1))
+    sightings = [
+        Sighting("cav0", 1.0, np.eye(4), told, navigation=ACCURATE),
+        Sighting("pole 0", 1.0, np.eye(4), replace(told, label=np.full(2, "car"))),
+    ]
+    (as_told,) = average_spin(sightings, [], CONFIG, 0.6)
+    np.testing.assert_allclose(as_told.boxes.yaw, np.pi - 0.1, atol=1e-6)
+    (turned,) = average_spin(sightings, [], CONFIG, 0.6, context=build_context(lane_through(BOTH, 0.0)))
+    on_lane = np.hypot(*(turned.boxes.center[:, :2] - BOTH).T) < 0.5
+    assert abs(turned.boxes.yaw[on_lane]) < 0.1  # between the lane's heading and what was told of the axis
+    np.testing.assert_allclose(turned.boxes.yaw[~on_lane], np.pi - 0.1, atol=1e-6)
+    assert turned.boxes.variance is not None
+    assert as_told.boxes.variance is not None
+    assert turned.boxes.variance[on_lane, YAW] < as_told.boxes.variance[on_lane, YAW]
 
 
 def test_a_pose_graph_places_a_vehicle_by_what_it_and_the_road_see() -> None:
@@ -252,7 +278,8 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     keys = [SimpleNamespace(scene="s", index=0, agent=f"cav{n}", time_s=0.0) for n in (1, 0)]
     spins = [frame([BOTH]), frame([BOTH, OUT_OF_SIGHT])]
     manifest = SimpleNamespace(recipe={"seed": 1})
-    data = SimpleNamespace(keys=keys, frame=lambda i: spins[i], manifest=manifest)
+    data = SimpleNamespace(keys=keys, frame=lambda i: spins[i], manifest=manifest, town=lambda: "town")
+    monkeypatch.setattr(road_average, "map_layers", lambda town: lane_through(BOTH, np.pi))
     found = [boxes(BOTH, z=-1.0), boxes(BOTH, OUT_OF_SIGHT, z=-1.0)]
     monkeypatch.setattr(road_average, "road_views", lambda *about, trained: {("s", 0): [seen]})
     seen_cars = {len(each.lidar["lidar"]): told for each, told in zip(spins, found, strict=True)}
@@ -275,6 +302,7 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     assert sorted(labels) == ["grid/cav0", "grid/cav1"]
     assert labels["grid/cav0"] is own  # a client holds it
     assert near(own[0].boxes, BOTH)
+    assert np.abs(own[0].boxes.yaw) == pytest.approx(np.pi, abs=0.05)  # as the lane leads
     assert near(own[0].ignore, OUT_OF_SIGHT)
     sent = book.entries[2:]
     assert [(e.direction, e.client) for e in sent] == [(d, f"grid/cav{n}") for d in ("up", "down") for n in (1, 0)]
@@ -290,6 +318,10 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     assert {entry.stage for entry in later.entries} == {"cloud"}
     np.testing.assert_array_equal(last["grid/cav0"][0].boxes.array(), own[0].boxes.array())
     assert read_history(tmp_path).rounds == history
+    mapless = (how.model_copy(update={"map_context": False}), *about[1:])
+    as_told = RoadAverageLabels(*mapless, "grid", Ledger(Budget(1.0, 0.0)), "cloud")
+    as_told.renew(1, weights)
+    assert as_told["grid/cav0"][0].boxes.yaw == pytest.approx(0, abs=0.05)
     with pytest.raises(BudgetExceeded, match="wireless uplink budget exceeded: grid/cav1"):
         RoadAverageLabels(*about, "grid", Ledger(Budget(1e-4, 0.0))).renew(3, weights)
 

@@ -21,6 +21,7 @@ from flcav.fusion.distillation import (
     pack_sighting,
     unpack_sighting,
 )
+from flcav.fusion.map_context import build_context
 from flcav.fusion.pose_graph import Sighting
 from flcav.fusion.posts import find_posts, posts_of
 from flcav.fusion.road import RoadView
@@ -41,6 +42,7 @@ from flcav.pipeline.recipe import EDGE
 from flcav.pipeline.results.training import LabelHistory
 from flcav.progress import Report, ignore_progress
 from flcav.seeds import stream
+from flcav.world.map.lanes import map_layers
 
 SURVEYED = np.eye(4)  # road sensors tell of boxes in the world frame
 
@@ -71,8 +73,9 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
         self._frames, self._book, self._stage, self._folder, self._report = frames, book, stage, folder, report
         self._views = road_views(split, poles, trained=True)
         self._seen_by = {i: self._views.get(self._spin(i), []) for i in frames}  # as each frame's vehicle has them
-        town = split.data.town() if how.pose_graph else None
-        self._posts = None if town is None else posts_of(town)
+        town = split.data.town() if how.pose_graph or how.map_context else None
+        self._posts = posts_of(town) if town is not None and how.pose_graph else None
+        self._context = build_context(map_layers(town)) if town is not None and how.map_context else None
         names = sorted({self._name(i) for i in frames})
         self._samples: dict[str, list[Sample]] = {
             name: [Sample(np.zeros((0, 4), np.float32), Boxes.empty()) for i in frames if self._name(i) == name]
@@ -121,7 +124,7 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
             views = self._views.get(spin, [])
             poles = [Sighting(f"pole {n}", told[frames[0]].time_s, SURVEYED, v.boxes) for n, v in enumerate(views)]
             sightings = [*(told[i] for i in frames), *poles]
-            found = average_spin(sightings, views, self._config, self._threshold, self._posts)
+            found = average_spin(sightings, views, self._config, self._threshold, self._posts, self._context)
             for i, guidance in zip(frames, found, strict=True):
                 given[i] = Guidance.from_message(self._send("down", i, round_, guidance.message()))
         place = dict.fromkeys(self._samples, 0)
