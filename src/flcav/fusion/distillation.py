@@ -124,8 +124,8 @@ def average_spin(
     """Return what the edge server tells each vehicle of a spin, in the order of the vehicles among the sightings.
 
     sightings: of vehicles, and of road sensors with actor categories as labels; views: of the road sensors. posts:
-    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses; None: poses are as told. context: of
-    the map that headings and classes are snapped to; None: they are as averaged. Of a single spin all speeds count as 0.
+    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses; None: poses are as told. context: the
+    map that headings and classes are snapped to; None: they are as averaged. Of a single spin all speeds count as 0.
     """
     told = [_classify(each, config) if each.navigation is None else each for each in sightings]
     at_s = max((each.time_s for each in told), default=0.0)

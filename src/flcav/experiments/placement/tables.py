@@ -2,7 +2,16 @@
 
 import numpy as np
 
-from flcav.experiments.placement.records import FRAMES, HALF_WIDTH, PREDICTORS, Means, PlacementProof, RegionProof
+from flcav.experiments.placement.records import (
+    EXPECTED,
+    FRAMES,
+    HALF_WIDTH,
+    PREDICTORS,
+    RULES,
+    Means,
+    PlacementProof,
+    RegionProof,
+)
 from flcav.intervals import MOST_SEEDS
 from flcav.markdown import format_table
 
@@ -22,9 +31,9 @@ def tables(results: PlacementProof) -> dict[str, str]:
 
 def _correlation(every: dict[str, Means]) -> str:
     rows = [
-        [region, predictor, *(own[frames].describe(sign=True) for frames in FRAMES)]
+        [region, name, *(means.correlation[name][frames].describe(sign=True) for frames in FRAMES)]
         for region, means in every.items()
-        for predictor, own in means.correlation.items()
+        for name in PREDICTORS
     ]
     return format_table(("region", "rank correlation of a pole's gain with its", *FRAMES), rows)
 
@@ -32,13 +41,20 @@ def _correlation(every: dict[str, Means]) -> str:
 def _rules(every: dict[str, Means]) -> str:
     rows = []
     for region, means in every.items():
-        for name, gain in means.gain.items():
-            count, rule = name.split(", ")
+        for count, rule in sorted((name.split(", ") for name in means.gain), key=_order):
+            name = f"{count}, {rule}"
+            gain = means.gain[name]
             beaten = means.advantage.get(name)
             told = [beaten[frames].describe(sign=True) if beaten else "" for frames in FRAMES]
             rows.append([region, count, rule, *(gain[frames].describe(sign=True) for frames in FRAMES), *told])
     header = ("sensors", "rule", *(f"gain in AP50 {f}" for f in FRAMES), *(f"VRCSP gains more {f}" for f in FRAMES))
     return format_table(("region", *header), rows)
+
+
+def _order(choice: list[str]) -> tuple[int, int]:
+    """Return the place in a table of "count" and "rule": files sort them by letters."""
+    count, rule = choice
+    return int(count), (*RULES.values(), EXPECTED).index(rule)
 
 
 def _poles(region: RegionProof) -> str:

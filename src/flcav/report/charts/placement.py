@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from flcav.report import style
 
 SEED_COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.VERMILLION)
+SEED_MARKERS = ("o", "s", "^")  # after so many seeds as there are colours the next one
 
 
 @style.styled
@@ -25,7 +26,8 @@ def draw_gains(panels: Mapping[tuple[str, str], Mapping[int, Sequence[tuple[floa
         for number, (seed, points) in enumerate(seeds.items()):
             x, y = np.array(points, dtype=np.float64).T
             colour = SEED_COLOURS[number % len(SEED_COLOURS)]
-            axes.plot(x, y, "o", color=colour, markersize=5, alpha=0.8, label=f"seed {seed}")
+            marker = SEED_MARKERS[number // len(SEED_COLOURS) % len(SEED_MARKERS)]
+            axes.plot(x, y, marker, color=colour, markersize=5, alpha=0.8, label=f"seed {seed}")
         axes.grid(axis="y")
         if frames == rows[-1]:
             axes.set_xlabel(f"{predictor} of the pole")
