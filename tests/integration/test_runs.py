@@ -141,6 +141,33 @@ def test_gains_of_a_pole_are_those_of_its_own_arm_over_the_run_itself(studied: S
     assert list(proof.regions) == ["grid"]  # no arm has a single pole in `ring`
 
 
+def test_place_compares_with_the_traffic_of_a_dataset_and_sees_no_errors_behind_houses(
+    finished: Path, result: Run, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    town, (x, y) = load_town("grid"), np.meshgrid(*2 * [np.arange(-100, 101, 10)])
+    lattice = "\n".join(f"{i},{j},1" for i, j in zip(x.ravel(), y.ravel()))
+    (tmp_path / "errors.csv").write_text(f"x,y,z\n{lattice}\n")
+    rows = (f"{number},{i},{j},{z}" for number, (i, j, z) in zip(town.poles.id, town.poles.position))
+    (tmp_path / "poles.csv").write_text("\n".join(("id,x,y,z", *rows)))
+    files = ["--errors", str(tmp_path / "errors.csv"), "--poles", str(tmp_path / "poles.csv")]
+    asked = [*files, "--range", "40", "--count", "1", "--data", str(finished / "work/grid-registry-objects/data")]
+    told = []
+    for more in ([], ["--line-of-sight"]):
+        with pytest.raises(SystemExit) as stopped:
+            command(["place", *asked, *more, "--json"])
+        assert not stopped.value.code
+        told.append(json.loads(capsys.readouterr().out))
+    whole, seen = told
+    apart = np.linalg.norm(np.c_[x.ravel(), y.ravel(), np.ones(x.size)] - town.poles.position[:, None], axis=2)
+    assert whole["covered"] == (apart <= 40).sum(axis=1).max()
+    assert 0 < seen["covered"] < whole["covered"]
+    (densest,) = result.arms["densest"].placed[0].chosen
+    assert whole["baselines"]["traffic-density"]["chosen"] == [{"pole": str(densest), "sensor": None}]
+    for each in told:
+        for name in ("traffic-density", "visible-objects"):
+            assert 0 < each["baselines"][name]["covered"] <= each["covered"]
+
+
 def test_central_arms_take_as_many_steps_as_stage_two_on_their_own_samples(finished: Path, result: Run) -> None:
     pretrained, plan = result.pretrained[0], result.arms[MAIN].plan.tasks["objects"]
     more, oracle = (StageResult.load(finished / f"work/grid-central-objects-{arm}") for arm in ("more", "oracle"))

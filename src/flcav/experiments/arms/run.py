@@ -120,6 +120,7 @@ class ArmsSummary:
     ap70: Mapping[str, Mapping[str, MeanOverSeeds]]
     differences: Mapping[str, MeanOverSeeds]
     gap_closed: Mapping[str, MeanOverSeeds]
+    road_share: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # of the ideal detector's gain; None: older results
 
 
 @dataclass(frozen=True)

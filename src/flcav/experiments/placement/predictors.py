@@ -44,8 +44,9 @@ def expect_labels(town: Town, traces: Sequence[Trace], errors: Sequence[Percepti
     places = np.array([(error.x, error.y, error.z) for error in missed]).reshape(-1, 3)
     apart = np.linalg.norm(sites[:, None, :2] - places[None, :, :2], axis=2)
     recall = np.append(RECALL, 0.0)[np.minimum(apart / BIN_M, len(RECALL)).astype(np.int64)]
-    pairs = np.nonzero(recall)
-    return np.bincount(pairs[0], recall[pairs] * find_visible(town, traces, sites, places, pairs), minlength=len(sites))
+    pole, error = (rows.astype(np.int64) for rows in np.nonzero(recall))
+    seen = find_visible(town, traces, sites, places, (pole, error))
+    return np.bincount(pole, recall[pole, error] * seen, minlength=len(sites)).astype(np.float64)
 
 
 def count_added_labels(
