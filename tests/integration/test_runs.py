@@ -162,7 +162,7 @@ def test_place_compares_with_the_traffic_of_a_dataset_and_sees_no_errors_behind_
     assert whole["covered"] == (apart <= 40).sum(axis=1).max()
     assert 0 < seen["covered"] < whole["covered"]
     (densest,) = result.arms["densest"].placed[0].chosen
-    assert whole["baselines"]["traffic-density"]["chosen"] == [{"pole": str(densest), "sensor": None}]
+    assert whole["baselines"]["traffic-density"]["chosen"] == [{"pole": densest, "sensor": None}]
     for each in told:
         for name in ("traffic-density", "visible-objects"):
             assert 0 < each["baselines"][name]["covered"] <= each["covered"]

@@ -42,8 +42,10 @@ from flcav.experiments.placement.records import (
 from flcav.intervals import MOST_SEEDS, MeanOverSeeds, half_width, mean_over_seeds
 from flcav.optimization.curves.held_out import rank_correlation
 from flcav.perception.errors import PerceptionError, load_errors
+from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import Outcomes, as_measurable
 from flcav.perception.tasks import task_named
+from flcav.perception.weights import load_network
 from flcav.pipeline.arms import Names, resolve_settings
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.pseudo_labels import select_frames_near
@@ -52,9 +54,8 @@ from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import ERRORS, OUTCOMES
+from flcav.pipeline.results.saved import ERRORS, OUTCOMES, WEIGHTS
 from flcav.pipeline.results.training import Pretrained
-from flcav.pipeline.stages.learning import load_stage_network
 from flcav.pipeline.stages.placement import find_sites, read_traces
 from flcav.report import style
 from flcav.report.charts.placement import draw_gains
@@ -250,7 +251,7 @@ def _measure_poles(
     traces = read_traces(folders.registry.data, folders.registry.vehicles)
     mounts = np.array([where[pole] for pole in single]).reshape(-1, 3)
     expected = dict(zip(single, expect_labels(town, traces, folders.errors, mounts).tolist(), strict=True))
-    network, threshold = load_stage_network(task_named(TASK), folders.pretrained), _threshold(folders)
+    network, threshold = load_network(OBJECTS, folders.pretrained / WEIGHTS), _threshold(folders)
     near = np.array([where[pole][:2] for each in placed.values() for pole in each.chosen]).reshape(-1, 2)
     frames = select_frames_near(folders.edge, near, recipe.placement.group_range_m)
     added = count_added_labels(network, threshold, folders.edge, frames, {pole: where[pole] for pole in single})
