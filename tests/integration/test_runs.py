@@ -424,7 +424,7 @@ def test_the_comparison_of_arms_is_that_of_the_run(studied: Studied, result: Run
             test = result.test(arm=arm, stage=stage, region=town, task="objects")
             assert seed.ap[town][name].ap50 == test.estimate.mean
     assert set(seed.gap_closed) == set(ARMS["grid"]) - {"pretrained", "oracle"}
-    assert len(seed.differences) == 6 + 4
+    assert len(seed.differences) == 7 + 4
     assert seed.used_mb["edge + cloud FL"]["wireless"] == result.arms[MAIN].links["wireless"].used_mb
     further, main = result.arms["further"], result.arms[MAIN]
     assert further.links["wireless"].used_mb == main.links["wireless"].used_mb  # an edge round instead of a cloud round
