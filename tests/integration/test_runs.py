@@ -39,6 +39,7 @@ from flcav.network.clock.records import load_rounds
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import find_configuration
+from flcav.pipeline.federations.alone import federate_regions
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe, load_run_recipe
@@ -465,7 +466,7 @@ def test_stage_two_alone_goes_on_with_a_run_and_ends_with_its_weights(
 ) -> None:
     work = without(finished, tmp_path, lambda name: name.startswith(("grid-edge-fl", "test-", "rounds-", "cloud-")))
     with pytest.raises(SystemExit) as stopped:
-        command(["federate", str(TOY), "--out", str(tmp_path), "--arm", "no_pole", "--jobs", "1"])
+        command(["federate", str(TOY), "--out", str(tmp_path), "--arm", "no_pole"])  # in two processes
     assert not stopped.value.code
     printed = capsys.readouterr().out.splitlines()
     name = "grid-federate-objects-no_pole"
@@ -478,6 +479,17 @@ def test_stage_two_alone_goes_on_with_a_run_and_ends_with_its_weights(
         folder / "weights.safetensors" for folder in (work / name, finished / "work/grid-edge-fl-objects-no_pole")
     )
     assert (tmp_path / f"{name}.safetensors").read_bytes() == own.read_bytes() == edge.read_bytes()
+
+
+def test_stage_two_alone_on_ray_ends_with_the_weights_of_a_run(finished: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="the extra 'ray' is not installed")
+    without(finished, tmp_path, lambda name: name.startswith(("grid-edge-fl", "test-", "rounds-", "cloud-")))
+    federate_regions(RECIPE, tmp_path, arm="no_pole", beside=TOY.parent, runtime="ray")
+    found = load_file(tmp_path / "grid-federate-objects-no_pole.safetensors")
+    wanted = load_file(finished / "work/grid-edge-fl-objects-no_pole/weights.safetensors")
+    assert found.keys() == wanted.keys()
+    for name, array in wanted.items():
+        np.testing.assert_allclose(found[name], array, rtol=1e-4, atol=1e-5)
 
 
 def killed_at(sign: Path, out: Path) -> None:
@@ -502,7 +514,7 @@ def test_a_run_killed_in_edge_fl_ends_the_same(finished: Path, tmp_path: Path) -
     work = without(finished, tmp_path, unwanted)
     killed_at(work / first / "round1.safetensors", tmp_path)
     assert not (work / first / "done.json").exists()
-    run(RECIPE, tmp_path, beside=TOY.parent)
+    run(RECIPE, tmp_path, beside=TOY.parent, jobs=2)  # alone, each stage has both workers
     assert timeless(tmp_path) == timeless(finished)
     for path in (f"{step}/{name}" for step in redone for name in ("weights.safetensors", "ledger.parquet")):
         assert (work / path).read_bytes() == (finished / "work" / path).read_bytes(), path
