@@ -341,6 +341,8 @@ def test_the_network_takes_time_and_loses_vehicles_by_name(finished: Path, resul
         assert record.clients == tuple(name for name, why in named.items() if not why)
         assert record.seconds is not None
         assert 0 < record.seconds <= 3
+    assert {path.stem for path in finished.glob("pictures/timeline*")} == {"timeline_grid_equal", "timeline_ring_equal"}
+    assert (finished / "report.html").read_text().count("(equal), on the clock") == 2
     slowest = max(rounds_of(result, "equal", CLOUD, region)[0].seconds or 0.0 for region in ("grid", "ring"))
     assert cloud[0].seconds == pytest.approx(slowest + 2 * (0.01 + 8 * 1337440 / 1e9), rel=1e-3)
     assert all(record.seconds is None for record in rounds_of(result, MAIN, EDGE, "grid"))
