@@ -1,8 +1,9 @@
 """The constants of the radio are those that other simulators have read from the same reports.
 
 ns-3 has TR 37.885: `ThreeGppV2vUrbanPropagationLossModel` and `...HighwayPropagationLossModel` of
-`src/propagation/model/three-gpp-v2v-propagation-loss-model.cc` (nsnam/ns-3-dev-git, 0891fa9). WiLabV2Xsim has TR 36.885:
-`MatFilesInit/initiatePhyParameters.m` and `MatFilesSINR/computeChannelGain.m` (V2Xgithub/WiLabV2Xsim, 0eeb610, 1b76966).
+`src/propagation/model/three-gpp-v2v-propagation-loss-model.cc` (nsnam/ns-3-dev-git, 0891fa9). WiLabV2Xsim has
+TR 36.885: `MatFilesInit/initiatePhyParameters.m` and `MatFilesSINR/computeChannelGain.m` (V2Xgithub/WiLabV2Xsim,
+0eeb610, 1b76966).
 SHARC has the uplink of TR 36.942, Annex A, but for its highest rate: `ul_attenuation_factor` and `ul_sinr_min` of its
 parameters, and `calculate_imt_tput` (Radio-Spectrum/SHARC).
 """

@@ -120,7 +120,8 @@ def federate_cloud(
     states = {CLOUD: state, **{f"{EDGE}/{region}": each for region, each in own_states.items()}}
     rounds = own.afford(rules, rounds)
     identity, scored = describe_federation(own.strategies, rules), own.score if own.validation else None
-    checkpoints = FederationCheckpoints(learning.task, own.folder, own.book, own.report, states, identity, scored)
+    kept: Any = (learning.task, own.folder, own.book, own.report, states, identity, scored, rules.privacy)
+    checkpoints = FederationCheckpoints(*kept)
     rules.check_personal(to_arrays(own.network))
     start, done = checkpoints.resume(to_arrays(own.network))
     wireless = Account(own.book, CLOUD, learning.task.name, "wireless", outages)

@@ -88,7 +88,7 @@ def federate_edge(
     state, schedule = FederationState(), own.schedule
     identity, scored = describe_federation(own.strategy, rules), own.score if own.validation else None
     checkpoints = FederationCheckpoints(
-        learning.task, own.folder, own.book, own.report, {EDGE: state}, identity, scored
+        learning.task, own.folder, own.book, own.report, {EDGE: state}, identity, scored, rules.privacy
     )
     start, done = checkpoints.resume(to_arrays(own.network))
     account = Account(own.book, EDGE, learning.task.name, "wireless", outages)

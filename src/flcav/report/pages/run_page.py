@@ -104,6 +104,7 @@ def page(run: Run) -> dict[str, Any]:
         "timelines": [
             {"name": name, "arm": arm, "region": region} for name, (arm, region) in _list_timelines(run).items()
         ],
+        "delta": f"{recipe.federation.privacy.delta:g}" if recipe.federation.privacy else None,
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
