@@ -25,11 +25,11 @@ from flcav.pipeline.arms import check_federations, find_strategies, resolve_sett
 from flcav.pipeline.federations.timing import TIMES, read_times, time_clients
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
 from flcav.pipeline.recipe import Federation, RunRecipe, Training
+from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
 from flcav.pipeline.stages.learning import Learning, load_stage_network
-from flcav.pipeline.results.saved import WEIGHTS
 from flcav.progress import ignore_progress
 
 PRIVACY = {"clip": 1.0, "noise": 4.0}
