@@ -192,7 +192,7 @@ def test_both_stages_in_two_processes_end_with_the_bytes_of_one_also_where_label
 
         def renew(round_: int, weights: Weights) -> None:
             for own in samples.values():
-                own[0] = np.float32(round_ + weights["bias"].item())
+                own[0] = np.float32(round_) + weights["bias"][0]
 
         regions = {name: {each: clients[each] for each in clients if each.startswith(name)} for name in ("a", "b")}
         folders = [tmp_path / f"{stage}-{processes}-{renewed}" for stage in ("edge", "cloud")]
