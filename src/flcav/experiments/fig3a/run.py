@@ -151,7 +151,7 @@ def _findings(article: Mapping[str, ArticleCurve], own: OwnCurves) -> tuple[str,
         f"Refitted to the article's points, a and b come {'' if near else 'not '}within {NEAR:.0%} of the printed "
         f"constants; the farthest is {name} of {task}, {worst:+.1%} off.",
         f"Our own history has {points} points at {len(own.lines)} sample sizes ({counts}); its curve is off them by "
-        f"{own.rmse:.3f} AP50 (root mean square).",
+        f"{own.rmse:.3f} AP50 (root mean square), without the levels of its seeds.",
     )
 
 
