@@ -20,6 +20,7 @@ Node = tuple[str, str]  # kind, name
 NAME_HEIGHT = 0.11  # of the axes: two lines of text
 SERIES_COLOURS = (style.ORANGE, style.BLUE, style.GREEN, style.PURPLE, style.VERMILLION)
 Route = Sequence[tuple[int, int]]  # edge rounds, cloud rounds, at each x
+MOST_TICKS = 14  # that fit below the picture's own curves
 
 
 @style.styled
@@ -139,7 +140,9 @@ def draw_own_curves(axes: Axes, curves: Sequence[Curve], route: Route) -> None:
             axes.axvline(places_of[0] - 0.5, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
             middle = (places_of[0] + places_of[-1]) / 2
             axes.text(middle, 0.02, stage, transform=axes.get_xaxis_transform(), ha="center", fontsize=style.SMALL)
-    axes.set_xticks(list(places), [str(cloud or edge) for edge, cloud in route])
+    step = 1 if len(route) <= MOST_TICKS else 2  # every second number of rounds, where all would touch
+    named = [place for place, (edge, cloud) in enumerate(route) if (cloud or edge) % step == 0]
+    axes.set_xticks(named, [str(route[place][1] or route[place][0]) for place in named])
     axes.set(xlabel="rounds of the stage; 0: pretrained", ylabel="AP50")
     axes.grid(axis="y")
 
