@@ -294,6 +294,8 @@ class EdgeServer:
     earlier: int = 0  # rounds of stage II, which a privacy budget counts
     runtime: ClientProcesses | None = None  # where the vehicles train; None: in this process
     distiller: Distiller | None = None  # where vehicles send outputs
+    begun: Weights = field(default_factory=dict)  # that its last cloud round began with
+    trained: Weights = field(default_factory=dict)  # that the edge rounds of that came to
 
     def train(
         self, weights: Weights, *, steps: int, learning_rate: float, seed: int, layers: Sequence[str] = ()
@@ -320,6 +322,7 @@ class EdgeServer:
         else:
             self.state.server = {}  # begins with the outputs of the cloud's network
             found = federate_outputs(self.distiller, *asked, **how)
+        self.begun, self.trained = start, found.weights
         names = [*found.weights] if regional else name_like(found.weights, self.rules.personal_arrays)
         self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
         return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody

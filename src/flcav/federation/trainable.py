@@ -23,6 +23,12 @@ def learned_names(weights: Weights) -> list[str]:
     ]
 
 
+def statistics_names(weights: Weights) -> list[str]:
+    """Return the names of the floating arrays that no gradient changes: batch normalisation's means and variances."""
+    learned = {*learned_names(weights)}
+    return [name for name, array in weights.items() if np.issubdtype(array.dtype, np.floating) and name not in learned]
+
+
 class Update(Protocol):
     """The result of one client's local training in one round."""
 

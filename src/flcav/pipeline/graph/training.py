@@ -61,7 +61,9 @@ def list_further_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
         if last == CLOUD:
             name = names.cloud(arm.name, task)
             about = _federate(outline, arm, task, CLOUD, _replan(outline, arm, task, CLOUD, None, name))
-            yield make_step(name, cloud_step, CloudSettings(**about, regions=inputs))
+            scored = arm.regions if arm.federation.score_statistics else ()
+            validation = {region: names.recording(region, "validation", task) for region in scored}
+            yield make_step(name, cloud_step, CloudSettings(**about, regions=inputs, validation=validation))
             continue
         for region, own in inputs.items():
             name = names.more_edge(arm.name, region, task)
