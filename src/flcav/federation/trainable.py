@@ -5,7 +5,7 @@ A federation knows weights and numbers alone; whatever satisfies `Trainable` can
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +92,22 @@ class Trainable(Protocol):
         `seed` determines the batches and the augmentation: the same arguments give the same update.
         """
         ...
+
+
+@runtime_checkable
+class Counts(Protocol):
+    """A client that says before it trains how many samples it will train on."""
+
+    def count_samples(self, steps: int) -> int:
+        """Return the number of distinct samples that `steps` local steps train on: the update's `samples`."""
+        ...
+
+
+def count_samples(client: Trainable, steps: int) -> int:
+    """Return what a client that `Counts` says; raises TypeError of any other."""
+    if not isinstance(client, Counts):
+        raise TypeError(f"{type(client).__name__} does not say how many samples it has: no count_samples")
+    return client.count_samples(steps)
 
 
 class Distiller(Protocol):

@@ -146,6 +146,8 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
         selection = setting.federation.selection
         if setting.federation.network is not None and selection.rule == "importance":
             raise InputError("federation.network: importance selection draws the clients after they have trained")
+        if setting.federation.network is not None and selection.unbiased:
+            raise InputError("federation.network: unbiased weights need known probabilities, and the radio loses any")
         if setting.federation.network is not None and selection.rule == "deadline" and setting.federation.privacy:
             raise InputError(
                 "federation.network: a deadline leaves other numbers of clients, and noise is for one number"
