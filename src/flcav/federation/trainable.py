@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 Weights = Mapping[str, NDArray[np.number]]  # name -> array, parameters and buffers, in a fixed order
-STATISTICS = ("running_mean", "running_var", "num_batches_tracked")  # of batch normalisation, last part of a name
+STATISTICS = (  # of batch normalisation, last part of a name: PyTorch's, and those of the package's own layer
+    "running_mean",
+    "running_var",
+    "running_variance",
+    "num_batches_tracked",
+)
 
 
 def learned_names(weights: Weights) -> list[str]:

@@ -16,7 +16,7 @@ from flcav.federation.rules import Rules
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavgm import FedAvgM
-from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
@@ -86,6 +86,9 @@ def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any
 def test_statistics_are_those_of_a_network_that_has_some() -> None:
     recipe, arms = settings({}, score_statistics=True)
     check_federations(recipe, arms)
+    for task, name in ((OBJECTS, "tiny"), (WEATHER, "normalised")):
+        network: Any = Learning(cast(Task, task), name, Training(), 3).build_network()
+        assert learned_names(to_arrays(network)) == [name for name, _ in network.named_parameters()]
     plain = recipe.model_copy(update={"tasks": {"weather": recipe.tasks["objects"]}})
     with pytest.raises(InputError, match=r"federation.score_statistics: the network of weather has no batch norm"):
         check_federations(plain, arms)
