@@ -66,6 +66,7 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "demo": _told(ArmsResult, arms_tables.tables),
     "distillation": _told(DistillationResult, distillation_tables.tables),
     "exchange": _told(ExchangeResult, exchange_tables.tables),
+    "exchange-objects": _told(ExchangeResult, exchange_tables.tables),
     "faults": _told(FaultsResult, attack_tables.fault_tables),
     "fig3a": _told(Fig3a, fig3a_tables.tables),
     "fig3b": _told(Fig3b, fig3b_tables.tables),

@@ -310,6 +310,24 @@ def test_every_round_is_in_the_results_with_its_bytes_and_its_loss(finished: Pat
     assert "Rounds of federated learning" in (finished / "report.html").read_text()
 
 
+def test_a_cloud_round_says_how_far_regions_were_apart(finished: Path, result: Run) -> None:
+    (cloud,) = (stage for stage in result.arms[MAIN].stages if stage.stage == CLOUD)
+    (record,) = rounds_of(result, MAIN, CLOUD, "cloud")
+    ends = [load_file(finished / f"work/{region}-edge-fl-objects/weights.safetensors") for region in ("grid", "ring")]
+    names = [name for name in ends[0] if not name.endswith("num_batches_tracked")]
+    grid, ring = (np.concatenate([end[name].ravel().astype(float) for name in names]) for end in ends)
+    assert record.divergence is not None
+    expected = np.linalg.norm(grid - ring) / np.linalg.norm(grid + ring)
+    assert record.divergence.begun.whole == pytest.approx(expected)
+    assert cloud.statistics is not None
+    scored = {each.region: each.averaged for each in cloud.statistics}
+    watched = {each.region: each.rounds[-1].score for each in result.watched if each.stage == CLOUD}
+    assert scored == pytest.approx(watched)  # the same network on the same frames
+    page = (finished / "report.html").read_text()
+    assert "Weight divergence of the regions" in page
+    assert "by the statistics of batch normalisation" in page
+
+
 def test_noise_and_masks_hold_in_a_whole_run(finished: Path, result: Run) -> None:
     arms = {MAIN: "", "masked": "-masked", "densest": "-densest"}  # the last with noise
     folders = {arm: finished / f"work/grid-edge-fl-objects{suffix}" for arm, suffix in arms.items()}

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +47,7 @@ class Target(StrEnum):
     demo_arms = "demo-arms"
     distillation = "distillation"
     federation_exchange = "federation-exchange"
+    federation_exchange_objects = "federation-exchange-objects"
     federation_faults = "federation-faults"
     federation_leakage = "federation-leakage"
     fig1b = "fig1b"
@@ -67,6 +69,10 @@ RECORDED = (  # recordings, no training
     Target.road_detector,
     Target.sensor_ranges,
 )
+EXCHANGES: Mapping[str, str] = {  # recipe of each
+    Target.federation_exchange: "exchange",
+    Target.federation_exchange_objects: "exchange_objects",
+}
 ATTACKS = (Target.federation_faults, Target.federation_leakage)  # one recording, several seeds
 
 
@@ -87,7 +93,7 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.sim_to_real: (*RUN, "kitti", "weights"),
 }
 SEEDS: Mapping[str, int] = {
-    **dict.fromkeys((Target.demo_arms, Target.federation_exchange, *ATTACKS), 5),
+    **dict.fromkeys((Target.demo_arms, *EXCHANGES, *ATTACKS), 5),
     Target.placement: 8,
 }
 
@@ -266,11 +272,12 @@ def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, 
     _write_figures(out, results.as_json(), {"arms.png": draw_labels(results)}, results.sentences())
 
 
-def _federation_exchange(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+def _federation_exchange(
+    target: Target, out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale
+) -> None:
     from flcav.experiments.exchanges.run import compare_exchanges, draw_results, shrink_recipe
 
-    target = Target.federation_exchange
-    recipe, runs = _run_seeds(target, "exchange", out, seeds, scale, jobs, engine, stale, shrink_recipe)
+    recipe, runs = _run_seeds(target, EXCHANGES[target], out, seeds, scale, jobs, engine, stale, shrink_recipe)
     results = compare_exchanges(recipe, runs, [out / f"seed{run.recipe.seed}" for run in runs])
     _write_figures(out, results.as_json(), {"exchange.png": draw_results(results)}, results.sentences())
 
@@ -297,7 +304,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
 COMPARISONS: Mapping[str, Callable[[Path, int, str, int, Engine, Stale], None]] = {
     Target.demo_arms: _demo_arms,
     Target.distillation: _distillation,
-    Target.federation_exchange: _federation_exchange,
+    **{target: partial(_federation_exchange, Target(target)) for target in EXCHANGES},
     Target.fig6a_allocation: _fig6a_allocation,
     Target.placement: _placement,
 }

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from flcav.experiments.cloud_rounds import cloud_tables
 from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
 from flcav.pipeline.arms import resolve_settings
@@ -15,7 +16,8 @@ from flcav.pipeline.results.training import StageResult
 
 
 def tables(run: Run) -> dict[str, str]:
-    """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, spread of retraining.
+    """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, what cloud rounds do,
+    spread of retraining.
 
     Findings are judged anew, so that results of before a change of the judging are judged as others are.
     """
@@ -27,6 +29,7 @@ def tables(run: Run) -> dict[str, str]:
         "plan": _plan(run),
         "budgets": _budgets(run),
         "sensors": _sensors(run),
+        **cloud_tables(run),
     }
     return own | {"spread": _spread(run)} if run.recipe.retrainings else own
 

@@ -8,13 +8,14 @@ from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
-from flcav.federation.encoding import encode, flatten
+from flcav.federation.encoding import encode, flatten, is_local
 from flcav.federation.privacy import change_norm
 from flcav.federation.records import (
     ARRAYS,
     ASK,
     CENTRE,
     CONFIG,
+    COUNT,
     EXTRA,
     LOSS,
     METRICS,
@@ -33,7 +34,7 @@ from flcav.federation.secure.masks import to_integers
 from flcav.federation.secure.messages import KEYS, MASKED, NAMES, SHARES, UNMASK, answer_secretly, mask_update
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
-from flcav.federation.trainable import Correction, LocalUpdate, Trainable, Update, Weights, learned_names
+from flcav.federation.trainable import Correction, LocalUpdate, Trainable, Update, Weights, count_samples, learned_names
 from flcav.federation.upload import Arrays, subtract
 from flcav.seeds import derive_seed
 
@@ -59,6 +60,8 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
             return answer_secretly(message, context, name)
         work = LocalWork.from_record(message.content.config_records[CONFIG])
         seed = derive_seed(work.seed, name)
+        if asked == COUNT:
+            return reply_norm(message, 0.0, count_samples(trainables[name], work.steps))
         if asked == SEND:
             start, update, extra = _recall(context)
         else:
@@ -70,9 +73,10 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
             return reply_norm(message, change_norm(subtract(update.weights, start, names)), update.samples)
         if asked == MASKED and rules.secure is not None:
             peers = len(message.content.config_records[ASK][NAMES]) + 1  # type: ignore[arg-type]
-            integers = to_integers(flatten(update, start, rules), rules.secure.largest, peers)
+            integers = to_integers(flatten(update, start, rules, seed), rules.secure.largest, peers)
             masked = {VECTOR: mask_update(message, context, integers)}
-            return reply(message, LocalUpdate(masked, update.samples, update.loss), {})
+            about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
+            return reply(message, LocalUpdate(masked, *about), {})
         sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed)
         _record(context, RESIDUAL, left)
         return reply(message, sent, extra)

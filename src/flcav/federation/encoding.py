@@ -12,7 +12,7 @@ from flcav.seeds import derive_seed, stream
 
 def is_changed(rules: Rules) -> bool:
     """Return whether the arrays of a message are changes of weights; otherwise they are weights."""
-    return rules.upload.compression != "none" or _is_local(rules)
+    return rules.upload.compression != "none" or is_local(rules)
 
 
 def encode(update: Update, start: Weights, rules: Rules, residual: Weights, seed: int) -> tuple[LocalUpdate, Arrays]:
@@ -25,12 +25,9 @@ def encode(update: Update, start: Weights, rules: Rules, residual: Weights, seed
     names, learned = upload.exchanged(start), set(learned_names(start))
     if not is_changed(rules):
         return LocalUpdate({name: weights[name] for name in names}, update.samples, update.loss), {}
-    change = subtract(weights, start, [name for name in names if name in learned])
-    if rules.privacy is not None and _is_local(rules):
-        privacy = rules.privacy
-        change = add_noise(clip_change(change, privacy.clip), privacy.noise * privacy.clip, stream(seed, "noise"))
+    change = _protect(subtract(weights, start, [name for name in names if name in learned]), rules, seed)
     sent, kept = compress(upload, change, residual.get(VALUES), derive_seed(seed, "rounding"))
-    if _is_local(rules):
+    if is_local(rules):
         return LocalUpdate(sent, 1, 0.0), kept
     rest = {name: weights[name] for name in names if name not in learned}
     return LocalUpdate({**sent, **rest}, update.samples, update.loss), kept
@@ -48,14 +45,22 @@ def decode(sent: Weights, start: Weights, rules: Rules) -> Weights:
         return {name: sent.get(name, array) for name, array in start.items()}
     like = {name: start[name] for name in names if name in learned}
     weights = add(start, decompress(rules.upload, sent, like))
-    rest = () if _is_local(rules) else [name for name in names if name not in learned]
+    rest = () if is_local(rules) else [name for name in names if name not in learned]
     return weights | {name: sent[name] for name in rest}
 
 
-def flatten(update: Update, start: Weights, rules: Rules) -> NDArray[np.float64]:
-    """Return the change of all floating arrays that are sent, one after another (coordinates,)."""
-    change = subtract(update.weights, start, _floating(start, rules))
+def flatten(update: Update, start: Weights, rules: Rules, seed: int) -> NDArray[np.float64]:
+    """Return the change of all floating arrays that are sent, one after another (coordinates,).
+
+    Under local privacy these are the learned ones, clipped and with noise; `seed` is that of the noise.
+    """
+    change = _protect(subtract(update.weights, start, _floating(start, rules)), rules, seed)
     return np.concatenate([np.ravel(array).astype(np.float64) for array in change.values()])
+
+
+def count_coordinates(start: Weights, rules: Rules) -> int:
+    """Return the number of values of which `flatten` makes a vector."""
+    return sum(start[name].size for name in _floating(start, rules))
 
 
 def unflatten(change: NDArray[np.float64], start: Weights, rules: Rules) -> Weights:
@@ -66,8 +71,21 @@ def unflatten(change: NDArray[np.float64], start: Weights, rules: Rules) -> Weig
 
 
 def _floating(start: Weights, rules: Rules) -> list[str]:
-    return [name for name in rules.upload.exchanged(start) if np.issubdtype(start[name].dtype, np.floating)]
+    names = rules.upload.exchanged(start)
+    if is_local(rules):
+        learned = {*learned_names(start)}
+        return [name for name in names if name in learned]
+    return [name for name in names if np.issubdtype(start[name].dtype, np.floating)]
 
 
-def _is_local(rules: Rules) -> bool:
+def _protect(change: Arrays, rules: Rules, seed: int) -> Arrays:
+    """Return a change of learned arrays clipped and with noise, where noise is the clients'; else as it is."""
+    privacy = rules.privacy
+    if privacy is None or not is_local(rules):
+        return change
+    return add_noise(clip_change(change, privacy.clip), privacy.noise * privacy.clip, stream(seed, "noise"))
+
+
+def is_local(rules: Rules) -> bool:
+    """Return whether each client adds noise to its own update; all that is not learned then stays with it."""
     return rules.privacy is not None and rules.privacy.where == "local"

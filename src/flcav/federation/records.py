@@ -18,6 +18,7 @@ CENTRE = "centre"  # the model that clients are pulled to, where it is not the r
 ASK = "ask"  # record and its entry: what is to be sent, where it is not the update after training
 VECTOR = "#masked"  # the one array of an update under secure aggregation
 NORM, SEND = "norm", "send"  # ask for the norm of the update after training; for the update whose norm was sent
+COUNT = "count"  # ask for the number of samples before training
 SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
 
 
@@ -114,7 +115,10 @@ def to_update(answer: Message) -> LocalUpdate:
 
 
 def reply_norm(message: Message, norm: float, samples: int) -> Message:
-    """Return the reply to a request for an update's norm: the norm and the number of samples, as metrics."""
+    """Return the reply to a request for an update's norm: the norm and the number of samples, as metrics.
+
+    Before training, where the number alone is asked for, the norm is 0.
+    """
     return Message(RecordDict({METRICS: MetricRecord({NORM: norm, SAMPLES: samples})}), reply_to=message)
 
 

@@ -16,13 +16,14 @@ from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
 from numpy.typing import NDArray
 
-from flcav.federation.encoding import decode, flatten, unflatten
+from flcav.federation.encoding import count_coordinates, decode, unflatten
 from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
 from flcav.federation.records import (
     ARRAYS,
     ASK,
     CENTRE,
     CONFIG,
+    COUNT,
     EXTRA,
     LOSS,
     NORM,
@@ -114,9 +115,9 @@ class Rounds(FlowerStrategy):
         self._start: Weights = {}
         self._chosen: list[str] = []  # who is to send an update in this round
         self._failed: dict[str, str] = {}  # by client what was wrong in this round
-        self._drawn: dict[str, float] = {}  # of importance selection: probability of the clients that were drawn
+        self._drawn: dict[str, float] = {}  # of unbiased selection: probability of the clients that were drawn
         self._secure: SecureSum | None = None  # of this round
-        self._shares: dict[str, float] = {}  # of importance selection: of all samples, by client
+        self._shares: dict[str, float] = {}  # of unbiased selection: of all samples, by client
 
     def summary(self) -> None:
         """Log nothing: the stage's own records hold the settings."""
@@ -127,7 +128,7 @@ class Rounds(FlowerStrategy):
         """Return one training message per chosen client: the round's weights and its local work.
 
         Under importance selection all clients train and report the norm of their update, and those that are drawn are
-        asked to send it.
+        asked to send it. Under other unbiased selections all first report their number of samples.
         """
         self._start = to_weights(arrays)
         work, records = self._work(self._done + server_round), {ARRAYS: arrays}
@@ -140,13 +141,24 @@ class Rounds(FlowerStrategy):
         self._failed = {}
         if self._rules.secure is not None:
             return self._begin_securely(grid, {**records, CONFIG: local}, self._rules.secure)
+        if selection.unbiased:
+            self._draw_unbiased(grid, local)
         if selection.rule != "importance":
             return self._address(self._chosen, {**records, CONFIG: local})
         asked = self._address(self._chosen, {**records, CONFIG: local, ASK: ConfigRecord({ASK: NORM})})
-        norms = self._receive_norms(grid.send_and_receive(asked))
+        norms = self._receive_norms(self._chosen, grid.send_and_receive(asked))
         self._drawn = selection.draw(norms, work.seed)
         self._chosen = [*self._drawn]
         return self._address(self._chosen, {CONFIG: local, ASK: ConfigRecord({ASK: SEND})})
+
+    def _draw_unbiased(self, grid: Grid, local: ConfigRecord) -> None:
+        """Ask all clients for their numbers of samples; note the shares, and the probabilities of those chosen."""
+        names = [*self._names.values()]
+        self._receive_norms(
+            names, grid.send_and_receive(self._address(names, {CONFIG: local, ASK: ConfigRecord({ASK: COUNT})}))
+        )
+        self._chosen = [name for name in self._chosen if name in self._shares]
+        self._drawn = dict.fromkeys(self._chosen, self._rules.selection.inclusion_probability(len(names)))
 
     def _begin_securely(self, grid: Grid, records: dict[str, Any], how: SecureAggregation) -> list[Message]:
         """Exchange keys and shares among the chosen clients, and return the messages to those who are left."""
@@ -194,10 +206,10 @@ class Rounds(FlowerStrategy):
         self._on_round(number, weights, loss)
         return to_arrays(weights), MetricRecord({SAMPLES: sum(received.samples.values()), LOSS: loss})
 
-    def _receive_norms(self, replies: Iterable[Message]) -> dict[str, float]:
+    def _receive_norms(self, asked: Iterable[str], replies: Iterable[Message]) -> dict[str, float]:
         """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
         told: dict[str, tuple[float, int]] = {}
-        for name, message in self._in_order(self._chosen, replies):
+        for name, message in self._in_order(asked, replies):
             norm, samples = to_norm(message)
             if np.isfinite(norm) and norm >= 0 and samples >= 0:
                 told[name] = norm, samples
@@ -230,7 +242,7 @@ class Rounds(FlowerStrategy):
     def _receive(self, replies: Iterable[Message]) -> Intake:
         """Return the usable updates, and note what is wrong with the others."""
         rules = self._rules
-        plain = rules.secure is None and rules.privacy is None and rules.selection.rule != "importance"
+        plain = rules.secure is None and rules.privacy is None and not rules.selection.weighs
         received = Intake(find_weigher(self._strategy) if plain else None)
         for name, message in self._in_order(self._chosen, replies):
             try:
@@ -251,7 +263,7 @@ class Rounds(FlowerStrategy):
 
     def _check_masked(self, sent: LocalUpdate) -> LocalUpdate:
         """Return a masked update; raises ValueError where it is none. Its values cannot be told from others."""
-        size, vector = len(flatten(LocalUpdate(self._start, 0, 0.0), self._start, self._rules)), sent.weights[VECTOR]
+        size, vector = count_coordinates(self._start, self._rules), sent.weights[VECTOR]
         if (vector.shape, vector.dtype) != ((size,), np.dtype(np.uint32)) or not np.isfinite(sent.loss):
             raise ValueError(f"{vector.dtype} {vector.shape} instead of uint32 ({size},), or a loss of {sent.loss}")
         return sent
@@ -277,7 +289,7 @@ class Rounds(FlowerStrategy):
                 expected = expected_clients(self._rules.selection, [*self._names.values()])
             mean = average_privately(start, each, names, privacy, expected, self._work(number).seed)
             each = [LocalUpdate(mean, 1, 0.0)]
-        elif self._rules.selection.rule == "importance" and updates:
+        elif self._rules.selection.weighs and updates:
             weights = {name: self._shares[name] / self._drawn[name] for name in updates}
             each = [LocalUpdate(average_inversely(start, updates, weights), 1, 0.0)]
         if not each:

@@ -36,11 +36,16 @@ class Selection(Config):
     the bound on the time of a client instead of their sum); clients that `seconds` does not name are in time. planned:
     those whose `joins` contain the round; clients that `joins` does not name join every round, and where none of those
     that join is there, all do.
+
+    unbiased: of uniform and poisson, changes are weighted by share of all samples / probability of taking part, so that
+    their sum is the Horvitz-Thompson estimate of the mean of all clients (Horvitz and Thompson, JASA 47, 1952; in
+    federated averaging scheme II of Li et al., ICLR 2020). Importance selection always is.
     """
 
     rule: Rule = "all"
     clients: int | None = Field(default=None, ge=1, le=10**6)  # per round
     probability: float | None = Field(default=None, gt=0, le=1)  # that a client takes part in a round
+    unbiased: bool = False  # weigh by the inverse of the probability of taking part, of uniform and poisson
     deadline_s: float | None = Field(default=None, gt=0)
     seconds: Mapping[str, float] = {}  # predicted time of a round, by client
     joins: Mapping[str, tuple[int, ...]] = {}  # rounds of a plan, by client
@@ -51,11 +56,18 @@ class Selection(Config):
         for name in ("clients", "probability", "deadline_s"):
             if (getattr(self, name) is not None) != (name == needed):
                 raise ValueError(f"the rule {self.rule} {'needs' if name == needed else 'takes no'} '{name}'")
+        if self.unbiased and self.rule not in ("uniform", "poisson"):
+            raise ValueError(f"the rule {self.rule} takes no 'unbiased'")
         if self.seconds and self.rule != "deadline":
             raise ValueError(f"the rule {self.rule} takes no 'seconds'")
         if self.joins and self.rule != "planned":
             raise ValueError(f"the rule {self.rule} takes no 'joins'")
         return self
+
+    @property
+    def weighs(self) -> bool:
+        """Return whether updates are weighted by the inverse of their clients' probability."""
+        return self.unbiased or self.rule == "importance"
 
     def check_clients(self, names: Sequence[str]) -> None:
         """Raise `InputError` where these clients cannot be selected so."""
@@ -84,6 +96,14 @@ class Selection(Config):
             case _:
                 chosen = set(range(len(names)))
         return [name for i, name in enumerate(names) if i in chosen]
+
+    def inclusion_probability(self, clients: int) -> float:
+        """Return the probability that a client takes part in a round, one of `clients`, by uniform or poisson."""
+        if self.rule == "uniform":
+            assert self.clients is not None
+            return self.clients / clients
+        assert self.probability is not None
+        return self.probability
 
     def draw(self, norms: Mapping[str, float], seed: int) -> dict[str, float]:
         """Return the clients that importance selection draws, with the probability of each.

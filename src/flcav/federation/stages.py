@@ -29,7 +29,7 @@ from flcav.federation.state import ClientStates, FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust
-from flcav.federation.trainable import Distiller, LocalUpdate, Trainable, Weights
+from flcav.federation.trainable import Counts, Distiller, LocalUpdate, Trainable, Weights
 from flcav.federation.upload import name_like
 from flcav.seeds import derive_seed
 
@@ -199,6 +199,11 @@ def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules
         check_arguments(clients, ["own", "imitation_steps"], "FedMD")
     if rules.upload.layers:
         check_arguments(clients, ["layers"], f"layers {', '.join(rules.upload.layers)}:")
+    if rules.selection.unbiased:
+        for name, client in clients.items():
+            if not isinstance(client, Counts):
+                told = f"and {name} ({type(client).__name__}) has no 'count_samples'"
+                raise InputError(f"selection: unbiased weights need clients that count their samples, {told}")
     if isinstance(rules.personal, RegionalModels):
         check_arguments(clients, ["proximal", "centre"], "personal:")
 
@@ -211,11 +216,14 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
     if least is not None and selection.rule not in ("poisson", "importance") and least > chosen:
         raise InputError(f"least_clients: {least} are wanted in a round, and {chosen} take part")
     single = isinstance(strategy, Robust | Exchanges)  # looks at each update
-    if selection.rule == "importance":
+    if selection.weighs:
         if single:
-            raise InputError(f"{told} looks at each update, and importance selection gives each a weight of its own")
-        if rules.privacy is not None:
+            kind = "unbiased" if selection.unbiased else "importance"
+            raise InputError(f"{told} looks at each update, and {kind} selection gives each a weight of its own")
+        if rules.privacy is not None and selection.rule == "importance":
             raise InputError("privacy: importance selection reads norms of the updates, which no noise covers")
+    if selection.unbiased and (alike := _count_alike(strategy, rules)):
+        raise InputError(f"selection: {alike} has clients count the same, and 'unbiased' weighs them by samples")
     if isinstance(strategy, FedMD):
         _check_outputs(rules)
     if isinstance(rules.personal, RegionalModels) and isinstance(strategy, Corrects):
@@ -235,6 +243,12 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
             raise InputError(f"{told} looks at each update, and central noise covers their sum alone")
 
 
+def _count_alike(strategy: Strategy, rules: Rules) -> str | None:
+    """Return what has all clients count the same, whatever their samples; None where nothing does."""
+    alike = {"FedMD": isinstance(strategy, FedMD), "privacy": rules.privacy, "secure aggregation": rules.secure}
+    return next((name for name, there in alike.items() if there), None)
+
+
 def _check_outputs(rules: Rules) -> None:
     if rules.upload.layers:
         raise InputError("FedMD sends class probabilities, and 'upload.layers' names arrays of weights")
@@ -252,8 +266,8 @@ def _check_secure(told: str, rules: Rules, secure: SecureAggregation, chosen: in
         raise InputError(f"secure aggregation needs a known number of clients, and {rules.selection.rule} draws any")
     if rules.upload.compression != "none":
         raise InputError(f"secure aggregation sums integers of 32 bits, and {rules.upload.compression} sends others")
-    if rules.privacy is not None:
-        raise InputError("secure aggregation is not to be combined with noise yet: neither clips before it masks")
+    if rules.privacy is not None and rules.privacy.where == "central":
+        raise InputError("secure aggregation goes with local noise: a server that adds noise clips each update first")
     if not max(chosen / 2, 1) < needed <= chosen:
         raise InputError(
             f"secure.threshold: more than half of the {chosen} clients of a round, 2 or more, and not {needed}"
@@ -295,6 +309,8 @@ class EdgeServer:
     earlier: int = 0  # rounds of stage II, which a privacy budget counts
     runtime: ClientProcesses | None = None  # where the vehicles train; None: in this process
     distiller: Distiller | None = None  # where vehicles send outputs
+    begun: Weights = field(default_factory=dict)  # that its last cloud round began with
+    trained: Weights = field(default_factory=dict)  # that the edge rounds of that came to
 
     def train(
         self, weights: Weights, *, steps: int, learning_rate: float, seed: int, layers: Sequence[str] = ()
@@ -321,6 +337,7 @@ class EdgeServer:
         else:
             self.state.server = {}  # begins with the outputs of the cloud's network
             found = federate_outputs(self.distiller, *asked, **how)
+        self.begun, self.trained = start, found.weights
         names = [*found.weights] if regional else name_like(found.weights, self.rules.personal_arrays)
         self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
         return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody

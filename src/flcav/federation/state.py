@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.records import Record
+from flcav.federation.divergence import RoundDivergence
+from flcav.records import LEFT_OUT, Record
 
 Arrays = dict[str, NDArray[np.number]]  # by name
 ClientStates = dict[str, dict[str, Arrays]]  # by client and kind
@@ -24,6 +26,7 @@ class RoundRecord(Record):
     epsilon: float | None = None  # of differential privacy, of all rounds so far; None: without noise
     loss: float = 0.0  # mean training loss, weighted by samples
     samples: int = 0  # of the clients together
+    divergence: Annotated[RoundDivergence | None, LEFT_OUT] = None  # of the regions; None: no cloud round of several
 
 
 @dataclass

@@ -5,13 +5,18 @@ A federation knows weights and numbers alone; whatever satisfies `Trainable` can
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 Weights = Mapping[str, NDArray[np.number]]  # name -> array, parameters and buffers, in a fixed order
-STATISTICS = ("running_mean", "running_var", "num_batches_tracked")  # of batch normalisation, last part of a name
+STATISTICS = (  # of batch normalisation, last part of a name: PyTorch's, and those of the package's own layer
+    "running_mean",
+    "running_var",
+    "running_variance",
+    "num_batches_tracked",
+)
 
 
 def learned_names(weights: Weights) -> list[str]:
@@ -21,6 +26,12 @@ def learned_names(weights: Weights) -> list[str]:
         for name, array in weights.items()
         if np.issubdtype(array.dtype, np.floating) and name.rpartition(".")[2] not in STATISTICS
     ]
+
+
+def statistics_names(weights: Weights) -> list[str]:
+    """Return the names of the floating arrays that no gradient changes: batch normalisation's means and variances."""
+    learned = {*learned_names(weights)}
+    return [name for name, array in weights.items() if np.issubdtype(array.dtype, np.floating) and name not in learned]
 
 
 class Update(Protocol):
@@ -86,6 +97,22 @@ class Trainable(Protocol):
         `seed` determines the batches and the augmentation: the same arguments give the same update.
         """
         ...
+
+
+@runtime_checkable
+class Counts(Protocol):
+    """A client that says before it trains how many samples it will train on."""
+
+    def count_samples(self, steps: int) -> int:
+        """Return the number of distinct samples that `steps` local steps train on: the update's `samples`."""
+        ...
+
+
+def count_samples(client: Trainable, steps: int) -> int:
+    """Return what a client that `Counts` says; raises TypeError of any other."""
+    if not isinstance(client, Counts):
+        raise TypeError(f"{type(client).__name__} does not say how many samples it has: no count_samples")
+    return client.count_samples(steps)
 
 
 class Distiller(Protocol):

@@ -151,9 +151,12 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
             seed=seed,
             correct=correction,
         )
-        seen = min(len(self.samples), steps * min(self.batch, len(self.samples)))
         gradient = correction.mean() if correction is not None and shift is not None else {}
-        return TrainedWeights(to_arrays(network), seen, loss, gradient)
+        return TrainedWeights(to_arrays(network), self.count_samples(steps), loss, gradient)
+
+    def count_samples(self, steps: int) -> int:
+        """Return the number of distinct samples that `steps` steps train on."""
+        return min(len(self.samples), steps * min(self.batch, len(self.samples)))
 
 
 def freeze_others(network: nn.Module, layers: Sequence[str]) -> None:

@@ -9,6 +9,7 @@ from flcav.federation.stages import check_rules
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects
+from flcav.federation.trainable import statistics_names
 from flcav.fusion.distillation import Distillation
 from flcav.perception.distillation import Imitates
 from flcav.perception.task import build_network, find_configuration
@@ -78,7 +79,8 @@ class Setting:
     @property
     def edge_federation(self) -> Federation:
         """Return the federation without what decides stage III alone."""
-        return self.federation.model_copy(update={"personal": (), "cloud_strategy": None})
+        of_cloud: Mapping[str, object] = {"personal": (), "cloud_strategy": None, "score_statistics": False}
+        return self.federation.model_copy(update=of_cloud)
 
 
 def resolve_settings(recipe: RunRecipe, labels: Mapping[str, str]) -> dict[str, Setting]:
@@ -144,6 +146,8 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
         selection = setting.federation.selection
         if setting.federation.network is not None and selection.rule == "importance":
             raise InputError("federation.network: importance selection draws the clients after they have trained")
+        if setting.federation.network is not None and selection.unbiased:
+            raise InputError("federation.network: unbiased weights need known probabilities, and the radio loses any")
         if setting.federation.network is not None and selection.rule == "deadline" and setting.federation.privacy:
             raise InputError(
                 "federation.network: a deadline leaves other numbers of clients, and noise is for one number"
@@ -155,7 +159,8 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
                 check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])
         if CLOUD in setting.stages:
             check_rules(cloud, setting.federation.of_servers(), setting.regions)
-        for task in recipe.tasks if setting.federation.personal or setting.federation.upload.layers else ():
+        how = setting.federation
+        for task in recipe.tasks if how.personal or how.upload.layers or how.score_statistics else ():
             _check_arrays(task, recipe.tasks[task].network, setting)
 
 
@@ -177,6 +182,8 @@ def _check_arrays(task: str, network: str | None, setting: Setting) -> None:
         setting.federation.upload.check_layers(weights)
     if CLOUD in setting.stages:
         setting.federation.check_personal(weights)
+        if setting.federation.score_statistics and not statistics_names(weights):
+            raise InputError(f"federation.score_statistics: the network of {task} has no batch normalisation")
 
 
 class Names:

@@ -1,5 +1,6 @@
 """The comparison of exchanges: whose accuracy counts where, seconds of rounds, means, verdicts, tables, the figure."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -22,12 +23,16 @@ from flcav.experiments.exchanges.run import (
     summarise,
 )
 from flcav.experiments.exchanges.tables import tables
+from flcav.federation.upload import name_like
 from flcav.network.ledger import LedgerEntry
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.propagation import State
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.task import build_network, find_configuration
+from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, resolve_settings
-from flcav.pipeline.recipe import CLOUD, MAIN, PRETRAIN, load_run_recipe
+from flcav.pipeline.recipe import CLOUD, MAIN, PRETRAIN, Federation, load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
 
@@ -37,6 +42,33 @@ RECIPE = load_run_recipe(recipe_path("runs/exchange"))
 def test_every_arm_of_the_recipe_is_compared_and_can_be_federated() -> None:
     assert set(NAMES.values()) == {PRETRAIN, MAIN, *RECIPE.arms}
     check_federations(RECIPE, resolve_settings(RECIPE, {"weather": "annotated"}).values())
+
+
+def test_arms_of_objects_have_the_names_of_those_of_the_weather() -> None:
+    recipe = load_run_recipe(recipe_path("runs/exchange_objects"))
+    assert {*recipe.arms} <= {*NAMES.values()}
+    check_federations(recipe, resolve_settings(recipe, {"objects": "road"}).values())
+    norms = Federation.model_validate(recipe.arms["norms"].federation)
+    network = build_network(OBJECTS, find_configuration(OBJECTS, "tiny"), 0)
+    kept = name_like(to_arrays(network), norms.personal_arrays)
+    normalised = {name.rpartition(".")[0] for name in to_arrays(network) if name.endswith("running_mean")}
+    assert kept == [name for name in to_arrays(network) if name.rpartition(".")[0] in normalised]
+
+
+def test_without_an_unseen_region_it_has_no_column() -> None:
+    names = (NONE, WHOLE, "int8", "output layer (FedPer)")
+    seeds = {}
+    for number in (1, 2):
+        own = replace(arm(0.5, 9.0), accuracy={OWN: 0.5 + 0.01 * number, OTHERS: 0.4})
+        seeds[str(number)] = dict.fromkeys(names, own) | {NONE: replace(own, wireless_up_mb=0.0)}
+    results = summarise(load_run_recipe(recipe_path("runs/exchange_objects")), seeds)
+    shown = tables(results)
+    assert shown["accuracy"].splitlines()[0] == "| | arm, 2 seeds | AP50, own region | AP50, other regions |"
+    assert "compared with | no federation" in shown["accuracy"].splitlines()[2]
+    assert len(shown["accuracy"].splitlines()) == 2 + len(names)
+    assert "unseen" not in shown["differences"]
+    assert len(shown["differences"].splitlines()) == 2 + len(names) - 1
+    assert draw_results(results).startswith(b"\x89PNG")
 
 
 def test_the_quick_recipe_uploads_no_more_than_its_pools_hold() -> None:

@@ -28,6 +28,9 @@ class Regression:
         count = weights["count"] + np.int64(steps)
         return LocalUpdate({"w": w.astype(np.float32), "count": count}, len(self.inputs), float(np.mean(losses)))
 
+    def count_samples(self, steps: int) -> int:
+        return len(self.inputs)
+
 
 START = {"w": np.zeros(3, dtype=np.float32), "count": np.array(0, dtype=np.int64)}
 TRUTH = np.array([1.0, -2.0, 0.5])

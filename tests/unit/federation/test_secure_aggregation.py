@@ -9,7 +9,7 @@ from cryptography.exceptions import InvalidTag
 from flwr.common.serde import recorddict_to_proto
 
 from flcav.config import InputError
-from flcav.federation.privacy import Privacy
+from flcav.federation.privacy import Privacy, account_epsilon
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.secure.masks import add_vectors, agree, draw_keys, expand, seal, to_integers, to_values, unseal
@@ -193,6 +193,25 @@ def test_a_vehicle_that_drops_out_is_named_and_the_sum_is_of_the_others():
         run(walks(cav0=(1,), cav1=(1,), cav2=(1,)), Rules(secure=SecureAggregation(), least_clients=1))
 
 
+def test_local_noise_is_under_the_masks():
+    privacy = Privacy(where="local", clip=0.25, noise=2.0)
+    noisy, masked = Rules(privacy=privacy), Rules(privacy=privacy, secure=SecureAggregation())
+    expected, told, _ = run(walks(), noisy)
+    found, state, _ = run(walks(), masked)
+    np.testing.assert_allclose(found["w"], expected["w"], atol=2e-6)  # the same draws, summed under masks
+    np.testing.assert_array_equal(found["norm.running_var"], START["norm.running_var"])  # no noise covers it
+    assert [(each.epsilon, each.samples, each.loss) for each in state.records] == [
+        (account_epsilon(privacy, Selection(), [*walks()], number), 5, 0.0) for number in (1, 2, 3)
+    ]
+    assert [each.epsilon for each in told.records] == [each.epsilon for each in state.records]
+    quiet = Rules(privacy=privacy.model_copy(update={"noise": 1e-9}), secure=SecureAggregation())
+    clipped = run(walks(), quiet)[0]["w"]
+    assert 0 < np.linalg.norm(clipped) <= 3 * 0.25 * (1 + 1e-5)  # a mean of three rounds' clipped changes
+    added = (found["w"] - clipped).ravel()
+    deviation = 2.0 * 0.25 * np.sqrt(3 / 5)  # of a mean of five, in three rounds
+    assert np.std(added) == pytest.approx(deviation, rel=4 / np.sqrt(2 * added.size))
+
+
 def test_the_server_is_sent_no_update_that_it_could_read(monkeypatch: pytest.MonkeyPatch):
     held: list[bytes] = []
     receive = MeteredGrid.send_and_receive
@@ -242,7 +261,11 @@ def test_what_makes_no_sense_is_one_sentence():
             Rules(secure=secure, upload=Upload(compression="fp16")),
             r"integers of 32 bits, and fp16 sends others",
         ),
-        (FEDAVG, Rules(secure=secure, privacy=Privacy(clip=1.0, noise=1.0)), r"not to be combined with noise"),
+        (
+            FEDAVG,
+            Rules(secure=secure, privacy=Privacy(clip=1.0, noise=1.0)),
+            r"goes with local noise: a server that adds",
+        ),
         (FEDAVG, Rules(secure=SecureAggregation(threshold=2)), r"secure.threshold: more than half of the 5 clients"),
         (FEDAVG, Rules(secure=SecureAggregation(threshold=6)), r"secure.threshold: .* and not 6"),
     ):

@@ -1,6 +1,8 @@
 """Who takes part in a round: rules, probabilities against an optimiser, the unbiased mean, what it costs."""
 
-from typing import Any
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any, cast
 
 import cvxpy
 import numpy as np
@@ -9,16 +11,18 @@ from pydantic import ValidationError
 from regression import START, ledger, vehicles
 
 from flcav.config import InputError
+from flcav.federation.privacy import Privacy
 from flcav.federation.rounds import average_inversely
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
+from flcav.federation.runtimes.processes import RemoteClients
 from flcav.federation.selection import Selection, optimal_probabilities
 from flcav.federation.stages import Schedule, check_federation, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.scaffold import Scaffold
-from flcav.federation.trainable import LocalUpdate
+from flcav.federation.trainable import LocalUpdate, count_samples
 from flcav.seeds import derive_seed
 
 SCHEDULE = Schedule(rounds=6, steps=5, learning_rate=0.05, final_learning_rate=0.02, seed=3)
@@ -116,6 +120,46 @@ def test_the_mean_under_importance_selection_is_unbiased():
     assert (np.abs(np.mean(estimates, axis=0) - mean) < 4 * error).all()
 
 
+def chances(selection: Selection, names: Sequence[str]) -> dict[tuple[str, ...], float]:
+    """Return the probability of every set of clients that a selection may choose."""
+    subsets = [set_ for size in range(len(names) + 1) for set_ in combinations(names, size)]
+    if selection.rule == "uniform":
+        drawn = [each for each in subsets if len(each) == selection.clients]
+        return dict.fromkeys(drawn, 1 / len(drawn))
+    p = selection.probability or 0.0
+    return {each: p ** len(each) * (1 - p) ** (len(names) - len(each)) for each in subsets}
+
+
+@pytest.mark.parametrize("rule", ["uniform", "poisson"])
+def test_unbiased_rounds_are_those_of_all_clients_in_the_mean_of_all_draws(rule: str, monkeypatch: Any):
+    clients: Any = vehicles("grid", 4)  # of 4, 5, 6 and 7 samples
+    one = Schedule(rounds=1, steps=5, learning_rate=0.05, final_learning_rate=0.05, seed=8)
+
+    def end(selection: Selection) -> np.ndarray:
+        account = Account(ledger(), "edge", "r", "wireless")
+        return federate(clients, START, one, account, rules=Rules(selection=selection)).weights["w"].astype(float)
+
+    everybody, expected, biased = end(Selection()), np.zeros(3), np.zeros(3)
+    plain = Selection(**RULES[rule])
+    for drawn, chance in chances(plain, [*clients]).items():
+        monkeypatch.setattr(Selection, "choose", lambda own, names, round_, seed, drawn=drawn: [*drawn])
+        expected += chance * end(Selection(**RULES[rule], unbiased=True))
+        biased += chance * end(plain)
+    np.testing.assert_allclose(expected, everybody, atol=1e-6)
+    assert np.abs(biased - everybody).max() > 1e-3  # a ratio of sums, and of poisson rounds without anybody
+
+
+def test_numbers_of_samples_are_messages_with_a_price():
+    _, state, account = run(Selection(**RULES["uniform"], unbiased=True))
+    up = [entry for entry in account.ledger.entries if entry.direction == "up" and entry.round == 1]
+    counts, updates = up[:6], up[6:]
+    assert [entry.client for entry in counts] == NAMES
+    assert [entry.client for entry in updates] == [*state.records[0].clients]
+    assert 0 < max(entry.bytes for entry in counts) < min(entry.bytes for entry in updates)
+    remote = RemoteClients(vehicles("grid", 2), cast(Any, None))  # counted here, wherever they train
+    assert [count_samples(remote[f"grid/cav{i}"], 5) for i in (0, 1)] == [4, 5]
+
+
 def test_norms_are_messages_with_a_price():
     _, state, account = run(Selection(**RULES["importance"]))
     some = next(record for record in state.records if record.clients)
@@ -138,12 +182,20 @@ def test_what_makes_no_sense_is_one_sentence():
         ),
         (Krum(), RULES["poisson"], r"Krum needs a known number of clients"),
         (Scaffold(), RULES["importance"], r"Scaffold looks at each update, and importance selection gives"),
+        (Scaffold(), {**RULES["uniform"], "unbiased": True}, r"Scaffold looks at each update, and unbiased selection"),
     ):
         with pytest.raises(InputError, match=said):
             check_federation(clients, strategy, Rules(selection=Selection(**selection)))
+    unbiased = Selection(**RULES["poisson"], unbiased=True)
+    with pytest.raises(InputError, match=r"selection: privacy has clients count the same, and 'unbiased' weighs"):
+        check_federation(clients, FEDAVG, Rules(selection=unbiased, privacy=Privacy(clip=1.0, noise=1.0)))
+    with pytest.raises(InputError, match=r"selection: unbiased weights need clients .* grid/cav0 \(object\) has no"):
+        check_federation({name: cast(Any, object()) for name in NAMES}, FEDAVG, Rules(selection=unbiased))
     wrong: tuple[tuple[dict[str, Any], str], ...] = (
         ({"rule": "uniform"}, "the rule uniform needs 'clients'"),
         ({"clients": 2}, "the rule all takes no 'clients'"),
+        ({"unbiased": True}, "the rule all takes no 'unbiased'"),
+        ({**RULES["importance"], "unbiased": True}, "the rule importance takes no 'unbiased'"),
         ({"rule": "poisson", "probability": 0}, "greater than 0"),
         ({"rule": "uniform", "clients": 1, "seconds": SECONDS}, "the rule uniform takes no 'seconds'"),
     )

@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -16,20 +17,24 @@ from flcav.federation.rules import Rules
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavgm import FedAvgM
-from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
+from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies, resolve_settings
 from flcav.pipeline.federations.timing import TIMES, read_times, time_clients
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
 from flcav.pipeline.recipe import Federation, RunRecipe, Training
 from flcav.pipeline.results.saved import WEIGHTS
+from flcav.pipeline.results.training import StatisticsScore
+from flcav.pipeline.stages import statistics
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
 from flcav.pipeline.stages.learning import Learning, load_stage_network
+from flcav.pipeline.stages.statistics import keep_statistics, score_statistics
 from flcav.progress import ignore_progress
 
 PRIVACY = {"clip": 1.0, "noise": 4.0}
@@ -78,6 +83,37 @@ def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any
     for recipe, arms in (settings({}, **federation), settings({"other": federation})):
         with pytest.raises(InputError, match=said):
             check_federations(recipe, arms)
+
+
+def test_statistics_are_those_of_a_network_that_has_some() -> None:
+    recipe, arms = settings({}, score_statistics=True)
+    check_federations(recipe, arms)
+    for task, name in ((OBJECTS, "tiny"), (WEATHER, "normalised")):
+        network: Any = Learning(cast(Task, task), name, Training(), 3).build_network()
+        assert learned_names(to_arrays(network)) == [name for name, _ in network.named_parameters()]
+    plain = recipe.model_copy(update={"tasks": {"weather": recipe.tasks["objects"]}})
+    with pytest.raises(InputError, match=r"federation.score_statistics: the network of weather has no batch norm"):
+        check_federations(plain, arms)
+
+
+def test_a_network_is_scored_with_each_region_s_own_statistics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    network = Learning(WEATHER, "normalised", Training(), 3).build_network()
+    averaged = to_arrays(network)
+    ring = {name: array + (5 if "running" in name else 1) for name, array in averaged.items()}
+    keep_statistics(ring, tmp_path, "ring")
+    seen: list[Any] = []
+
+    def score(task: Any, network: Any, data: Any, frames: Any) -> float:
+        seen.append(to_arrays(network))
+        return float(len(seen))
+
+    monkeypatch.setattr(statistics, "score_network", score)
+    frames: Any = SimpleNamespace(data=None, vehicles=[1, 2, 3])
+    found = score_statistics(cast(Task, WEATHER), network, tmp_path, {"grid": frames, "ring": frames})
+    assert found == (StatisticsScore("ring", 3, averaged=1.0, own=2.0),)  # none of grid were kept
+    for name, array in averaged.items():
+        assert np.array_equal(seen[0][name], array)
+        assert np.array_equal(seen[1][name], ring[name] if "running" in name else array)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,6 @@
-"""Comparison of exchanges, the arms of recipes/runs/exchange.yaml: accuracy, bytes, seconds and epsilon of each.
+"""Comparison of exchanges, the arms of a recipe: accuracy, bytes, seconds and epsilon of each.
+
+The recipes are recipes/runs/exchange.yaml, of the weather, and exchange_objects.yaml, which has some of its arms.
 
 All arms of a seed have the same recordings, the same stage I and the same rounds. They differ in the form of the
 updates, in who takes part, in what regions keep for themselves, or in what stays private. The first arm sends whole
@@ -26,7 +28,6 @@ from flcav.report import style
 from flcav.report.charts.exchanges import Mark, draw_exchanges
 from flcav.verdicts import Claim, Judged, judge
 
-TASK = "weather"
 NONE, WHOLE = "no federation", "whole weights (FedAvg)"
 ARMS: Mapping[str, Mapping[str, str]] = {  # by what they are about: name in the tables -> arm
     "compared with": {NONE: PRETRAIN, WHOLE: MAIN},
@@ -67,7 +68,7 @@ QUICK_SAMPLES = 20  # of stage I at the scale `quick`
 class ExchangeArm:
     """Results of one arm in one seed; megabytes are those of stages II and III, 1 MB = 10^6 bytes."""
 
-    accuracy: Mapping[str, float]  # by `PLACES`
+    accuracy: Mapping[str, float]  # the task's measure by `PLACES`; without an unseen region there is none of it
     wireless_up_mb: float
     wireless_down_mb: float
     wireline_up_mb: float
@@ -87,13 +88,30 @@ class ExchangeResult(Record):
     recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
+    @property
+    def measure(self) -> str:
+        """Return the name of the task's measure."""
+        tasks = (self.recipe or {}).get("tasks")
+        return "AP50" if isinstance(tasks, Mapping) and "objects" in tasks else "accuracy"
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Return those of `PLACES` that networks were tested in."""
+        return tuple(place for place in PLACES if place in self.accuracy[WHOLE])
+
+    @property
+    def groups(self) -> Mapping[str, tuple[str, ...]]:
+        """Return the names of the compared arms by what they are about."""
+        found = {group: tuple(name for name in arms if name in self.accuracy) for group, arms in ARMS.items()}
+        return {group: names for group, names in found.items() if names}
+
     def sentences(self) -> list[str]:
         """Return accuracy, uplink and the verdict on the difference to whole weights of each arm, in words."""
         judged, told = judge_differences(self), []
-        for name in NAMES:
+        for name in self.accuracy:
             mean = self.accuracy[name][OWN]
             sent = float(np.mean([seed[name].wireless_up_mb for seed in self.seeds.values()]))
-            words = f"{name}: accuracy in the own region {mean.describe()}, wireless uplink {sent:.2f} MB"
+            words = f"{name}: {self.measure} in the own region {mean.describe()}, wireless uplink {sent:.2f} MB"
             if name in judged:
                 found = self.differences[name][OWN].describe(sign=True)
                 words += f", difference {found}, {judged[name].describe()}"
@@ -131,14 +149,14 @@ def summarise(recipe: RunRecipe, seeds: Mapping[str, Mapping[str, ExchangeArm]])
         pairs = zip(values(name, place), values(WHOLE, place), strict=True)
         return [round(own - whole, 9) for own, whole in pairs]
 
+    arms = next(iter(seeds.values()))
+    places = tuple(place for place in PLACES if place in arms[WHOLE].accuracy)
     return ExchangeResult(
         seeds=seeds,
-        accuracy={
-            name: {place: mean_over_seeds(values(name, place), share=True) for place in PLACES} for name in NAMES
-        },
+        accuracy={name: {place: mean_over_seeds(values(name, place), share=True) for place in places} for name in arms},
         differences={
-            name: {place: mean_over_seeds(differences(name, place)) for place in (OWN, UNSEEN)}
-            for name in NAMES
+            name: {place: mean_over_seeds(differences(name, place)) for place in places if place != OTHERS}
+            for name in arms
             if name != WHOLE
         },
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
@@ -148,12 +166,13 @@ def summarise(recipe: RunRecipe, seeds: Mapping[str, Mapping[str, ExchangeArm]])
 
 def measure_seed(run: Run, folder: Path) -> dict[str, ExchangeArm]:
     """Return the numbers of every arm of one seed's run."""
-    plan = run.arms[MAIN].plan.tasks[TASK]
+    (task,) = run.recipe.tasks
+    plan = run.arms[MAIN].plan.tasks[task]
     rounds = plan.edge_rounds + plan.cloud_rounds * run.recipe.federation.edge_rounds_per_cloud_round
-    links = link_regions(run.recipe, TASK, folder / WORK, rounds)
+    links = link_regions(run.recipe, task, folder / WORK, rounds)
     found = {NONE: ExchangeArm(measure_places(run, MAIN, PRETRAIN), 0.0, 0.0, 0.0, 0.0, 0.0, None, None)}
     for name, arm in NAMES.items():
-        if name == NONE:
+        if name == NONE or arm not in run.arms:
             continue
         book = Ledger.load(folder / "ledgers" / f"{arm}.parquet")
         records = [each for stage in run.arms[arm].stages for each in stage.records or ()]
@@ -174,10 +193,11 @@ def measure_seed(run: Run, folder: Path) -> dict[str, ExchangeArm]:
 def measure_places(run: Run, arm: str, stage: str) -> dict[str, float]:
     """Return the accuracy of what each federating region has after a stage: at home, in others, in the unseen one.
 
-    That is the region's own model where it keeps one, and else the model for all. Others are the regions of pretraining
-    and the other federating ones, averaged over both. In the unseen region, which has none, it is the model for all.
+    It is by the task's measure, of the region's own model where it keeps one, and else of the model for all. Others are
+    the regions of pretraining and the other federating ones, averaged over both. In the unseen region, where there is
+    one, it is the model for all.
     """
-    home, unseen = run.recipe.with_role("federate"), run.recipe.with_role("unseen")
+    (task,), home, unseen = run.recipe.tasks, run.recipe.with_role("federate"), run.recipe.with_role("unseen")
     known = [name for name in run.recipe.regions if name not in unseen]
     kept = {
         (each.model, each.region): each.estimate.mean
@@ -186,15 +206,13 @@ def measure_places(run: Run, arm: str, stage: str) -> dict[str, float]:
 
     def accuracy(model: str, region: str) -> float:
         own = kept.get((model, region))
-        return run.test(arm=arm, stage=stage, region=region, task=TASK).estimate.mean if own is None else own
+        return run.test(arm=arm, stage=stage, region=region, task=task).estimate.mean if own is None else own
 
+    of_all = [run.test(arm=arm, stage=stage, region=region, task=task).estimate.mean for region in unseen]
     return {
         OWN: float(np.mean([accuracy(region, region) for region in home])),
         OTHERS: float(np.mean([accuracy(model, region) for model in home for region in known if region != model])),
-        UNSEEN: float(
-            np.mean([run.test(arm=arm, stage=stage, region=region, task=TASK).estimate.mean for region in unseen])
-        ),
-    }
+    } | ({UNSEEN: float(np.mean(of_all))} if of_all else {})
 
 
 def _sent_mb(book: Ledger, link: Link, direction: Direction) -> float:
@@ -214,8 +232,8 @@ def draw_results(results: ExchangeResult) -> bytes:
         return float(np.mean([seed[name].wireless_up_mb for seed in results.seeds.values()]))
 
     marks = [
-        Mark(group, name, sent(name), results.accuracy[name][OWN], results.accuracy[name][UNSEEN])
-        for group, arms in ARMS.items()
-        for name in arms
+        Mark(group, name, sent(name), results.accuracy[name][OWN], results.accuracy[name].get(UNSEEN))
+        for group, names in results.groups.items()
+        for name in names
     ]
-    return style.png(draw_exchanges(marks))
+    return style.png(draw_exchanges(marks, results.measure))

@@ -5,11 +5,8 @@ from collections.abc import Callable
 import numpy as np
 
 from flcav.experiments.exchanges.run import (
-    ARMS,
-    NAMES,
     NONE,
     OWN,
-    PLACES,
     UNSEEN,
     ExchangeArm,
     ExchangeResult,
@@ -29,11 +26,12 @@ def tables(results: ExchangeResult) -> dict[str, str]:
 
 def _accuracy(results: ExchangeResult) -> str:
     rows = [
-        [group, name, *(results.accuracy[name][place].describe() for place in PLACES)]
-        for group, arms in ARMS.items()
-        for name in arms
+        [group, name, *(results.accuracy[name][place].describe() for place in results.places)]
+        for group, names in results.groups.items()
+        for name in names
     ]
-    return format_table(("", f"arm, {len(results.seeds)} seeds", *(f"accuracy, {place}" for place in PLACES)), rows)
+    measured = (f"{results.measure}, {place}" for place in results.places)
+    return format_table(("", f"arm, {len(results.seeds)} seeds", *measured), rows)
 
 
 def _costs(results: ExchangeResult) -> str:
@@ -50,8 +48,8 @@ def _costs(results: ExchangeResult) -> str:
         (lambda each: each.seconds, 2),
     )
     rows = []
-    for arms in ARMS.values():
-        for name in arms:
+    for names in results.groups.values():
+        for name in names:
             if name != NONE:
                 private = next(iter(results.seeds.values()))[name].epsilon  # the same in all seeds
                 epsilon = "∞" if private is None else f"{float(f'{private:.3g}'):,g}"
@@ -62,19 +60,19 @@ def _costs(results: ExchangeResult) -> str:
 
 def _differences(results: ExchangeResult) -> str:
     judged, rows = judge_differences(results), []
-    for name in (each for each in NAMES if each in results.differences):
+    for name in (each for names in results.groups.values() for each in names if each in results.differences):
         one, places, seeds = judged[name], results.differences[name], ""
         if one.verdict == UNDECIDED and one.p is not None:
             seeds = f"more than {MOST_SEEDS}" if one.seeds is None else str(one.seeds)
         p = "" if one.p is None else format_p(one.p)
-        told = [places[place].describe(sign=True) for place in (OWN, UNSEEN)]
-        rows.append([name, told[0], p, WORDS[one.verdict], seeds, told[1]])
+        told = [places[place].describe(sign=True) for place in (OWN, UNSEEN) if place in places]
+        rows.append([name, told[0], p, WORDS[one.verdict], seeds, *told[1:]])
     header = (
         "arm",
-        f"accuracy - that of whole weights, {OWN}",
+        f"{results.measure} - that of whole weights, {OWN}",
         "p, corrected",
         "verdict",
         "if undecided: seeds that tell a difference of the size found",
-        f"the same, {UNSEEN}",
+        *([f"the same, {UNSEEN}"] if UNSEEN in results.places else []),
     )
     return format_table(header, rows)

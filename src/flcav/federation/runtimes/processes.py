@@ -14,7 +14,7 @@ from typing import Any
 
 from flcav.config import InputError
 from flcav.federation.runtimes.blocks import Parcel, SharedBlock
-from flcav.federation.trainable import Trainable, Update, Weights
+from flcav.federation.trainable import Trainable, Update, Weights, count_samples
 from flcav.memory import keep_freed_memory
 from flcav.processes import exit_with_parent, start_server
 from flcav.threads import use_threads
@@ -127,7 +127,7 @@ class RemoteClients(Mapping[str, Trainable]):
     def __getitem__(self, name: str) -> Trainable:
         if name not in self._names:
             raise KeyError(name)
-        return _Remote(name, self._processes)
+        return _Remote(name, self._processes, self._names)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -137,11 +137,14 @@ class RemoteClients(Mapping[str, Trainable]):
 
 
 class _Remote:
-    def __init__(self, name: str, processes: ClientProcesses) -> None:
-        self._name, self._processes = name, processes
+    def __init__(self, name: str, processes: ClientProcesses, clients: Mapping[str, Trainable]) -> None:
+        self._name, self._processes, self._clients = name, processes, clients
 
     def train(self, weights: Weights, **how: Any) -> Update:
         return self._processes._train(self._name, weights, how)
+
+    def count_samples(self, steps: int) -> int:
+        return count_samples(self._clients[self._name], steps)
 
 
 def _start(pickled: bytes, block: SharedBlock) -> None:

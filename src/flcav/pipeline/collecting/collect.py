@@ -5,12 +5,12 @@ from pathlib import Path
 
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.tasks import task_named
-from flcav.pipeline.arms import Setting
+from flcav.pipeline.arms import Setting, name_repeat
 from flcav.pipeline.collecting.caveats import list_caveats
 from flcav.pipeline.collecting.differences import list_differences
 from flcav.pipeline.collecting.findings import findings
 from flcav.pipeline.collecting.history import gaps_closed
-from flcav.pipeline.collecting.tests import collect_regional_tests, collect_test
+from flcav.pipeline.collecting.tests import collect_regional_tests, collect_test, number_retrainings
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.provenance import provenance
@@ -95,4 +95,12 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
         ),
         earlier=tuple(earlier) or None,
         regional=collect_regional_tests(graph, work, arm) or None,
+        retrained=_retrained(graph, work, arm) if CLOUD in arm.stages else None,
     )
+
+
+def _retrained(graph: Graph, work: Path, arm: Setting) -> tuple[StageResult, ...] | None:
+    """Return stage III of every task in an arm's retrainings; None where there are none."""
+    arms = [name_repeat(arm.name, number) for number in number_retrainings(graph)]
+    steps = [graph.names.cloud(name, task) for name in arms for task in graph.recipe.tasks]
+    return tuple(StageResult.load(work / step) for step in steps) or None

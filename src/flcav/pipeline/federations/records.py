@@ -58,7 +58,8 @@ def read_rounds(
             about = (record.clients, record.failed, record.samples, record.loss)
             took = seconds.get(server)
             lasted = took[record.round - 1] if took else None
-            found.append(FederatedRound(server, record.round, *about, sent["up"], sent["down"], record.epsilon, lasted))
+            told = (sent["up"], sent["down"], record.epsilon, lasted, record.divergence)
+            found.append(FederatedRound(server, record.round, *about, *told))
     return tuple(found)
 
 

@@ -62,8 +62,11 @@ def list_further_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
         if last == CLOUD:
             name = names.cloud(arm.name, task)
             about = _federate(outline, arm, task, CLOUD, _replan(outline, arm, task, CLOUD, None, name))
+            scored = arm.regions if arm.federation.score_statistics else ()
+            validation = {region: names.recording(region, "validation", task) for region in scored}
+            settings = CloudSettings(**about, regions=inputs, validation=validation)
             at_once = max(outline.vehicles[region] for region in arm.regions)  # of one edge server
-            yield make_step(name, cloud_step, CloudSettings(**about, regions=inputs), at_once)
+            yield make_step(name, cloud_step, settings, at_once)
             continue
         for region, own in inputs.items():
             name = names.more_edge(arm.name, region, task)

@@ -46,6 +46,9 @@ class ArmResult:
     spent: tuple[Spent, ...]
     regional: Annotated[tuple[RegionalTest, ...] | None, LEFT_OUT] = None  # of stage III, where regions keep arrays
     earlier: Annotated[tuple[Plan, ...] | None, LEFT_OUT] = None  # plans that others took the place of, oldest first
+    retrained: Annotated[tuple[StageResult, ...] | None, LEFT_OUT] = (
+        None  # stage III of each retraining, in their order
+    )
 
     @property
     def plans(self) -> tuple[Plan, ...]:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
+from flcav.federation.divergence import RoundDivergence
 from flcav.pipeline.results.plans import RoundPlan
 from flcav.pipeline.results.saved import Saved
 from flcav.records import LEFT_OUT, Record
@@ -54,6 +55,17 @@ class FederatedRound(Record):
     down_bytes: int
     epsilon: float | None  # of differential privacy, of all rounds so far; None: without noise
     seconds: float | None = None  # of the simulated network; None: without one
+    divergence: Annotated[RoundDivergence | None, LEFT_OUT] = None  # of the regions; None: no cloud round of several
+
+
+@dataclass(frozen=True)
+class StatisticsScore(Record):
+    """Validation scores in a region of stage III's network, by the statistics of its batch normalisation."""
+
+    region: str
+    frames: int
+    averaged: float  # with the statistics that the cloud averaged
+    own: float  # with those that the region's edge server ended with
 
 
 @dataclass(frozen=True)
@@ -92,6 +104,7 @@ class StageResult(Saved):
     records: Annotated[tuple[FederatedRound, ...] | None, LEFT_OUT] = None  # of all servers; None: no federation
     plans: Annotated[tuple[RoundPlan, ...] | None, LEFT_OUT] = None  # after each round; None: not made anew by rounds
     labels: Annotated[tuple[LabelQuality, ...] | None, LEFT_OUT] = None  # before each round; None: not measured
+    statistics: Annotated[tuple[StatisticsScore, ...] | None, LEFT_OUT] = None  # of stage III; None: not asked for
 
 
 @dataclass(frozen=True)

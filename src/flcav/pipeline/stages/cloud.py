@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from flcav.federation.divergence import RoundDivergence, measure_divergence
 from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.choice import open_processes
@@ -25,6 +26,7 @@ from flcav.pipeline.planning.course import Driven, Replanning
 from flcav.pipeline.recipe import CLOUD, EDGE
 from flcav.pipeline.stages.clients import Strategies, describe_federation, give_outputs
 from flcav.pipeline.stages.learning import Learning, load_stage_network, regional_weights
+from flcav.pipeline.stages.statistics import keep_statistics
 from flcav.progress import Report
 
 
@@ -51,6 +53,7 @@ class CloudFederation:
     report: Report
     validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
+    keeps_statistics: bool = False  # whether each region's statistics of batch normalisation are written, too
 
     def score(self, round_: int) -> Mapping[str, float]:
         """Return the scores, by region, of the network that a federation of so many rounds ends with."""
@@ -134,6 +137,12 @@ def federate_cloud(
         keep = checkpoints.make_saver(rounds)
 
         def keep_whole(round_: int, weights: Weights, loss: float) -> None:
+            if len(servers) > 1:
+                both = ([each.begun for each in servers.values()], [each.trained for each in servers.values()])
+                divergence = RoundDivergence(*(measure_divergence(models) for models in both))
+                state.records[-1] = replace(state.records[-1], divergence=divergence)
+            for region, server in servers.items() if own.keeps_statistics else ():
+                keep_statistics(server.trained, own.folder, region)
             personal = [each.personal for each in own_states.values() if each.personal and rules.personal_arrays]
             keep(round_, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
 

@@ -19,10 +19,11 @@ from flcav.pipeline.planning.course import Replanning, mean_by_frames
 from flcav.pipeline.planning.updates import follow_plan
 from flcav.pipeline.recipe import CLOUD
 from flcav.pipeline.results.plans import Plan, TaskPlan
-from flcav.pipeline.results.training import StageResult
+from flcav.pipeline.results.training import StageResult, StatisticsScore
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.learning import Learning, load_stage_network
+from flcav.pipeline.stages.statistics import score_statistics
 from flcav.pipeline.steps import Work
 from flcav.pipeline.work.budgets import read_entries, share_plan_budget
 from flcav.pipeline.work.driving import open_network
@@ -35,12 +36,17 @@ class CloudSettings(FederationSettings):
     """Settings of stage III."""
 
     regions: Mapping[str, RegionInputs]  # that federate, each with its stage II
+    validation: Mapping[str, str] = {}  # recordings that the regions' own statistics are scored on, by region
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Return the names of the steps whose results it takes."""
         replan = () if self.replan is None else self.replan.needs
-        return (*(step for inputs in self.regions.values() for step in inputs.needs), *replan)
+        return (
+            *(step for inputs in self.regions.values() for step in inputs.needs),
+            *replan,
+            *self.validation.values(),
+        )
 
     @property
     def first(self) -> RegionInputs:
@@ -103,6 +109,7 @@ def cloud_step(work: Work, settings: CloudSettings, processes: int = 1) -> None:
         losses=losses,
         records=read_rounds(work.folder, None, before, driven.seconds),
         plans=made,
+        statistics=_score_statistics(work, settings, federation) if settings.validation else None,
     ).save(work.folder)
 
 
@@ -139,7 +146,16 @@ def _open_federation(
     frames = {} if settings.replan is None else settings.replan.frames
     watched = {name: Frames.open(work.inputs[step]) for name, step in frames.items()}
     k, where = settings.federation.edge_rounds_per_cloud_round, (book, work.folder, work.report)
-    return CloudFederation(learning, start, servers.starts, k, strategies, *where, watched, shared)
+    kept = bool(settings.validation)
+    return CloudFederation(learning, start, servers.starts, k, strategies, *where, watched, shared, kept)
+
+
+def _score_statistics(work: Work, settings: CloudSettings, federation: CloudFederation) -> tuple[StatisticsScore, ...]:
+    task, frames = (
+        federation.learning.task,
+        {name: Frames.open(work.inputs[step]) for name, step in settings.validation.items()},
+    )
+    return score_statistics(task, load_stage_network(task, work.folder), work.folder, frames)
 
 
 def _open_drive(

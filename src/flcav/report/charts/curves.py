@@ -128,7 +128,6 @@ def draw_own_curves(axes: Axes, curves: Sequence[Curve], route: Route) -> None:
 
     `curves` has one for each number of samples, ascending.
     """
-    places = range(len(route))
     if len(curves) > 3:
         curves = [curves[0], curves[len(curves) // 2], curves[-1]]
     _draw(axes, curves, SERIES_COLOURS[1:])

@@ -22,12 +22,12 @@ class Mark:
     name: str
     up_mb: float  # 0: nothing is sent
     own: MeanOverSeeds
-    unseen: MeanOverSeeds
+    unseen: MeanOverSeeds | None  # None: there is no such region
 
 
 @style.styled
-def draw_exchanges(marks: Sequence[Mark]) -> Figure:
-    """Return the figure of a row per arm: accuracy, with 95 % intervals over seeds, and the uplink on a log axis.
+def draw_exchanges(marks: Sequence[Mark], measure: str) -> Figure:
+    """Return the figure of a row per arm: its `measure`, with 95 % intervals over seeds, and the uplink on a log axis.
 
     A line across the accuracies marks the first arm that sends something, which the others are compared with.
     """
@@ -40,7 +40,8 @@ def draw_exchanges(marks: Sequence[Mark]) -> Figure:
     for row, mark in zip(rows, marks, strict=True):
         colour = COLOURS[groups.index(mark.group) % len(COLOURS)]
         _draw_interval(left, row - 0.13, mark.own, colour, filled=True)
-        _draw_interval(left, row + 0.17, mark.unseen, colour, filled=False)
+        if mark.unseen is not None:
+            _draw_interval(left, row + 0.17, mark.unseen, colour, filled=False)
         if mark.up_mb > 0:
             right.plot(mark.up_mb, row, "o", color=colour, markersize=5)
             right.annotate(
@@ -56,7 +57,8 @@ def draw_exchanges(marks: Sequence[Mark]) -> Figure:
     for label, mark in zip(left.get_yticklabels(), marks, strict=True):
         label.set_color(COLOURS[groups.index(mark.group) % len(COLOURS)])
     left.set_ylim(rows[-1] + 0.7, -0.7)
-    left.set_xlabel("accuracy (95 % interval): own region ●, unseen region ○")
+    shown = "own region ●" + (", unseen region ○" if any(mark.unseen for mark in marks) else "")
+    left.set_xlabel(f"{measure} (95 % interval): {shown}")
     sent = [mark.up_mb for mark in marks if mark.up_mb > 0]
     right.set(xscale="log", xlabel="wireless uplink, stages II and III [MB]", xlim=(min(sent) / 1.6, max(sent) * 3))
     right.xaxis.set_major_formatter(FuncFormatter(lambda mb, _: f"{mb:g}"))

@@ -105,9 +105,11 @@ def page(run: Run) -> dict[str, Any]:
             {"name": name, "arm": arm, "region": region} for name, (arm, region) in _list_timelines(run).items()
         ],
         "delta": f"{recipe.federation.privacy.delta:g}" if recipe.federation.privacy else None,
+        "divergences": [row for row in rounds if row["divergence"] is not None],
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
+        "statistics": [(stage.task, each) for stage in main.stages for each in stage.statistics or ()],
         "caveats": run.caveats,
         "elapsed_s": run.elapsed_s,
         "provenance": run.provenance,

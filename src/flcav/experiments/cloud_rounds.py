@@ -1,0 +1,105 @@
+"""Cloud rounds over retrainings: weight divergence of the regions, and what their mean gains over stage II."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import cast
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from flcav.federation.divergence import Divergence
+from flcav.markdown import format_table
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.training import StageResult
+
+PARTS = ("whole", "learned", "statistics")  # of `Divergence`
+
+
+def cloud_tables(run: Run) -> dict[str, str]:
+    """Return Markdown by name: divergence and gain of each training of the run itself, and scores by statistics.
+
+    Only what the run's stage III measured: results of before have neither, and without retrainings there is no table.
+    """
+    found: dict[str, str] = {}
+    kept = {task: own for task in run.recipe.tasks if (own := [*_trainings(run, task)])}
+    if kept and run.recipe.retrainings and all(_divergences(stage) for own in kept.values() for stage in own):
+        found["divergence"] = "\n\n".join(_divergence(run, task, own) for task, own in kept.items())
+    if kept and all(stage.statistics for own in kept.values() for stage in own):
+        found["statistics"] = "\n\n".join(_statistics(task, own) for task, own in kept.items())
+    return found
+
+
+def _trainings(run: Run, task: str) -> Iterator[StageResult]:
+    """Yield stage III of a task, of the run and of its retrainings; the run's first."""
+    main = run.arms[MAIN]
+    for stage in (*main.stages, *(main.retrained or ())):
+        if (stage.stage, stage.task) == (CLOUD, task):
+            yield stage
+
+
+def _divergences(stage: StageResult) -> tuple[Divergence, Divergence] | None:
+    """Return the divergence that the first cloud round begins with, and that of what the last one averages."""
+    rounds = [each.divergence for each in stage.records or () if each.divergence is not None]
+    return (rounds[0].begun, rounds[-1].trained) if rounds else None
+
+
+def _gains(run: Run, task: str) -> Mapping[str, Sequence[float]]:
+    """Return edge + cloud FL minus edge FL in each federating region, in each training."""
+    asked = (MAIN, CLOUD, MAIN, EDGE, task)
+    return {
+        each.region: (each.over_scenes.mean, *each.retrained)
+        for each in run.differences
+        if (each.arm, each.stage, each.before_arm, each.before_stage, each.task) == asked
+    }
+
+
+def _divergence(run: Run, task: str, trainings: Sequence[StageResult]) -> str:
+    """Return a row per training, the means, and each column's rank correlation (Spearman's rho) with the mean gain."""
+    measured = [pair for stage in trainings if (pair := _divergences(stage)) is not None]
+    columns: dict[str, list[float]] = {}
+    for place, when in enumerate(("after edge FL", "before averaging")):
+        for part in PARTS:
+            values = [getattr(pair[place], part) for pair in measured]
+            if None not in values:
+                columns[f"{part}, {when}"] = values
+    gains = _gains(run, task)
+    gain = np.mean([*gains.values()], axis=0)
+    rows = [
+        [f"{task}, training {number}", *(f"{own[number - 1]:.4f}" for own in columns.values())]
+        + [f"{own[number - 1]:+.3f}" for own in (*gains.values(), gain)]
+        for number in range(1, len(trainings) + 1)
+    ]
+    means = [f"{np.mean(own):.4f}" for own in columns.values()]
+    rows.append(["mean", *means, *(f"{np.mean(own):+.3f}" for own in (*gains.values(), gain))])
+    ranks = [_correlate(own, gain) for own in columns.values()]
+    rows.append(["rank correlation with the mean gain", *ranks, *("" for _ in gains), ""])
+    return format_table(("", *columns, *(f"{region}: cloud - edge FL" for region in gains), "mean gain"), rows)
+
+
+def _correlate(values: Sequence[float], gain: Sequence[float]) -> str:
+    """Return Spearman's rho with its p-value; nothing where one side is constant, or of fewer than 3 trainings."""
+    if len(values) < 3 or len({*values}) == 1 or len({*gain}) == 1:
+        return ""
+    rho, p = cast(tuple[float, float], spearmanr(values, gain))
+    return f"{rho:+.2f} (p {p:.2f})"
+
+
+def _statistics(task: str, trainings: Sequence[StageResult]) -> str:
+    """Return a row per region: scores with averaged and with own statistics, and the mean of the paired differences."""
+    rows, regions = [], [each.region for each in trainings[0].statistics or ()]
+    for place, region in enumerate(regions):
+        scores = [stage.statistics[place] for stage in trainings if stage.statistics]
+        averaged, own = (np.array([getattr(each, kind) for each in scores]) for kind in ("averaged", "own"))
+        gained = own - averaged
+        spread = f", sd {np.std(gained, ddof=1):.3f}" if len(gained) > 1 else ""
+        means = (f"{averaged.mean():.3f}", f"{own.mean():.3f}", f"{gained.mean():+.3f}{spread}")
+        rows.append([f"{region}, {task}", len(scores), scores[0].frames, *means])
+    header = (
+        "region, task",
+        "trainings",
+        "validation frames",
+        "averaged statistics",
+        "own statistics",
+        "own - averaged",
+    )
+    return format_table(header, rows)
