@@ -3,6 +3,7 @@
 import socket
 import threading
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes
 from flcav.network import messages
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Budget, BudgetExceeded, Ledger
 from flcav.perception.errors import MISS, PerceptionError, Registry
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
@@ -145,6 +146,19 @@ def test_the_ledger_has_what_a_socket_carried_in_every_stage(wire: Wire, tmp_pat
     )
     kinds = {(entry.stage, entry.link, entry.direction) for entry in book.entries}
     assert len(kinds) == 2 + 3 + 4  # samples up; network, mistakes, views and rounds; edge and cloud rounds
+
+
+def test_an_update_over_the_budget_is_not_sent(wire: Wire) -> None:
+    start, schedule = {"w": np.zeros(300, np.float32)}, Schedule(2, 1, 0.1, 0.1, 3)
+    vehicles: dict[str, Trainable] = {f"grid/cav{i}": Walk() for i in range(3)}
+    free = Ledger(Budget(1.0, 1.0))
+    federate(vehicles, start, replace(schedule, rounds=1), Account(free, "edge", "objects", "wireless"))
+    wire.arrived.clear()
+    tight = Ledger(Budget(1.4 * free.used_mb("wireless"), 1.0))  # of the second round, for one more update of three
+    with pytest.raises(BudgetExceeded, match=r"grid/cav1 wants .* for round 2"):
+        federate(vehicles, start, schedule, Account(tight, "edge", "objects", "wireless"))
+    assert sorted(entry.bytes for entry in tight.entries) == sorted(wire.arrived)
+    assert [entry.direction for entry in tight.entries].count("up") == 4
 
 
 def test_sizes_are_those_of_flower_s_serialisation():

@@ -56,6 +56,17 @@ def test_an_arm_without_a_federation_is_refused(
     assert sentence in capsys.readouterr().err
 
 
+def test_labels_that_are_renewed_are_refused_on_ray_before_anything_is_done(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = tmp_path / "run.yaml", tmp_path / "out"
+    objects = {"network": "tiny", "labels": "road-average", "plan": {"samples": 4, "edge_rounds": 1, "cloud_rounds": 0}}
+    path.write_text(yaml.safe_dump(RECIPE | {"tasks": {"objects": objects}, "placement": {"range_m": 40}}))
+    assert federate(path, out, "--runtime", "ray") == 2
+    assert "labels 'road-average' are renewed between rounds" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def federate(recipe: Path, out: Path, *more: str) -> object:
     with pytest.raises(SystemExit) as stopped:
         command(["federate", str(recipe), "--out", str(out), *more])

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from flcav.pipeline.recipe import (
     PRETRAIN,
     SPLITS_OF,
     Arm,
+    Federation,
     Role,
     RunRecipe,
     Split,
@@ -38,6 +40,7 @@ from flcav.pipeline.results.tests import Difference
 from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.running import RESULTS, run, run_several
 from flcav.pipeline.seeds.learning_history import ORIGIN, HistoryOrigin
+from flcav.pipeline.steps import Step, ignore_steps, run_side_by_side
 from flcav.report.pages.run_page import page, write_report
 from flcav.verdicts import UNDECIDED
 from flcav.world.opendrive.importing import import_town
@@ -121,7 +124,10 @@ def timed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunRecipe, Ru
     few = {"scenes": 2, "spins": 1, "cavs": 2}
     recipe = RunRecipe.model_validate(
         {
-            "splits": dict.fromkeys(("pool", "validation", "registry", "edge", "test"), few),
+            "splits": {
+                **dict.fromkeys(("pool", "validation", "edge", "test"), few),
+                "registry": {"scenes": 1, "spins": 6, "cavs": 2},  # 20 s
+            },
             "training": {"steps": 1, "local_steps": 1},
             "tasks": {"weather": {"history": "own.csv", "train_s": 1.0}},
             "regions": {"suburb": {"role": "pretrain"}, "ring": {"role": "federate", "speed": {"cav1": 0.5}}},
@@ -166,6 +172,25 @@ def test_vehicles_join_the_rounds_that_they_have_time_for(timed: tuple[Path, Run
     tested = result.arms["regional"].regional
     assert {(test.model, test.region) for test in tested or ()} == {("ring", "suburb"), ("ring", "ring")}
     assert not (folder / "work/ring-edge-fl-weather-regional").exists()
+
+
+def test_a_plan_within_a_horizon_counts_the_time_on_the_air(timed: tuple[Path, RunRecipe, Run]) -> None:
+    folder, recipe, result = timed
+    bands = {name: {"network": {"radio": {"bandwidth_mhz": mhz}}} for name, mhz in (("wide", 20), ("narrow", 4))}
+    graphs = {
+        name: Graph(recipe.model_copy(update={"arms": {}, "federation": Federation.model_validate(own)}), folder.parent)
+        for name, own in bands.items()
+    }
+    steps: dict[Path, Sequence[Step]] = {folder / "work": Graph(recipe, folder.parent).steps}  # of the recordings
+    for name, graph in graphs.items():
+        (plan,) = (step for step in graph.steps if step.name == "plan")
+        steps[folder / name] = [step for step in graph.steps if step.name in plan.needs or step is plan]
+    run_side_by_side(steps, jobs=1, notify=ignore_steps)
+    plans = [Plan.load(folder / name / "plan").tasks["weather"] for name in graphs]
+    known = result.arms[MAIN]
+    assert known.earlier is not None
+    fast = [len((plan.joins or {})["ring/cav0"]) for plan in (known.earlier[0].tasks["weather"], *plans)]
+    assert 4 >= fast[0] >= fast[1] > fast[2] >= 1  # a round trains for 1 s, and narrow bands take as long again
 
 
 def test_the_rest_of_a_stage_is_planned_after_each_round(timed: tuple[Path, RunRecipe, Run]) -> None:

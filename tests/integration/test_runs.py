@@ -39,6 +39,7 @@ from flcav.network.clock.records import load_rounds
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import find_configuration
+from flcav.pipeline.federations.alone import federate_regions
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe, load_run_recipe
@@ -340,6 +341,8 @@ def test_the_network_takes_time_and_loses_vehicles_by_name(finished: Path, resul
         assert record.clients == tuple(name for name, why in named.items() if not why)
         assert record.seconds is not None
         assert 0 < record.seconds <= 3
+    assert {path.stem for path in finished.glob("pictures/timeline*")} == {"timeline_grid_equal", "timeline_ring_equal"}
+    assert (finished / "report.html").read_text().count("(equal), on the clock") == 2
     slowest = max(rounds_of(result, "equal", CLOUD, region)[0].seconds or 0.0 for region in ("grid", "ring"))
     assert cloud[0].seconds == pytest.approx(slowest + 2 * (0.01 + 8 * 1337440 / 1e9), rel=1e-3)
     assert all(record.seconds is None for record in rounds_of(result, MAIN, EDGE, "grid"))
@@ -465,7 +468,7 @@ def test_stage_two_alone_goes_on_with_a_run_and_ends_with_its_weights(
 ) -> None:
     work = without(finished, tmp_path, lambda name: name.startswith(("grid-edge-fl", "test-", "rounds-", "cloud-")))
     with pytest.raises(SystemExit) as stopped:
-        command(["federate", str(TOY), "--out", str(tmp_path), "--arm", "no_pole", "--jobs", "1"])
+        command(["federate", str(TOY), "--out", str(tmp_path), "--arm", "no_pole"])  # in two processes
     assert not stopped.value.code
     printed = capsys.readouterr().out.splitlines()
     name = "grid-federate-objects-no_pole"
@@ -478,6 +481,17 @@ def test_stage_two_alone_goes_on_with_a_run_and_ends_with_its_weights(
         folder / "weights.safetensors" for folder in (work / name, finished / "work/grid-edge-fl-objects-no_pole")
     )
     assert (tmp_path / f"{name}.safetensors").read_bytes() == own.read_bytes() == edge.read_bytes()
+
+
+def test_stage_two_alone_on_ray_ends_with_the_weights_of_a_run(finished: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="the extra 'ray' is not installed")
+    without(finished, tmp_path, lambda name: name.startswith(("grid-edge-fl", "test-", "rounds-", "cloud-")))
+    federate_regions(RECIPE, tmp_path, arm="no_pole", beside=TOY.parent, runtime="ray")
+    found = load_file(tmp_path / "grid-federate-objects-no_pole.safetensors")
+    wanted = load_file(finished / "work/grid-edge-fl-objects-no_pole/weights.safetensors")
+    assert found.keys() == wanted.keys()
+    for name, array in wanted.items():
+        np.testing.assert_allclose(found[name], array, rtol=1e-4, atol=1e-5)
 
 
 def killed_at(sign: Path, out: Path) -> None:
@@ -502,7 +516,7 @@ def test_a_run_killed_in_edge_fl_ends_the_same(finished: Path, tmp_path: Path) -
     work = without(finished, tmp_path, unwanted)
     killed_at(work / first / "round1.safetensors", tmp_path)
     assert not (work / first / "done.json").exists()
-    run(RECIPE, tmp_path, beside=TOY.parent)
+    run(RECIPE, tmp_path, beside=TOY.parent, jobs=2)  # alone, each stage has both workers
     assert timeless(tmp_path) == timeless(finished)
     for path in (f"{step}/{name}" for step in redone for name in ("weights.safetensors", "ledger.parquet")):
         assert (work / path).read_bytes() == (finished / "work" / path).read_bytes(), path

@@ -22,7 +22,7 @@ from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_wei
 from flcav.federation.rounds import OnRound, Rounds
 from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
-from flcav.federation.runtimes.metered import Account, MeteredGrid
+from flcav.federation.runtimes.metered import Account, BudgetedGrid, MeteredGrid
 from flcav.federation.runtimes.outages import LossyGrid
 from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
 from flcav.federation.state import ClientStates, FederationState
@@ -135,7 +135,8 @@ def federate(
 
         app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep, centre)
         lossy = LossyGrid(grid, account, nodes) if account.outages else grid
-        results.append(app.start(MeteredGrid(lossy, account, nodes), to_arrays(weights), rounds - done))
+        link = MeteredGrid(BudgetedGrid(lossy, account, nodes), account, nodes)
+        results.append(app.start(link, to_arrays(weights), rounds - done))
 
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"  # something on the clients
     make_app = partial(client_app, strategy=strategy, rules=rules)

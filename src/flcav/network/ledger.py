@@ -97,8 +97,8 @@ class Ledger:
         """Return all entries in the order in which they were entered."""
         return tuple(self._entries)
 
-    def enter(self, entry: LedgerEntry) -> None:
-        """Append `entry`; raises `BudgetExceeded` and appends nothing if it is an uplink message over the budget."""
+    def check(self, entry: LedgerEntry) -> None:
+        """Raise `BudgetExceeded` if `entry` is an uplink message over the budget."""
         if entry.direction == "up":
             used, budget = self._up[entry.link], self.budget.bytes_on(entry.link)
             if used + entry.bytes > budget:
@@ -107,6 +107,11 @@ class Ledger:
                     f"{entry.round} of stage {entry.stage!r} of {entry.task!r}, but {_mb(used)} of the "
                     f"{_mb(budget)} MB are spent"
                 )
+
+    def enter(self, entry: LedgerEntry) -> None:
+        """Append `entry`; raises `BudgetExceeded` and appends nothing if it is an uplink message over the budget."""
+        self.check(entry)
+        if entry.direction == "up":
             self._up[entry.link] += entry.bytes
         self._entries.append(entry)
 

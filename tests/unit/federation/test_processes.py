@@ -11,9 +11,10 @@ from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes.choice import open_processes
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.processes import ClientProcesses
-from flcav.federation.stages import Schedule, federate
+from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import LocalUpdate, Weights
@@ -68,6 +69,35 @@ def test_clients_in_two_processes_federate_to_the_same_bits_and_one_killed_is_na
     assert [each for each in account.ledger.entries if each.client != "grid/cav1"] == [*alone.ledger.entries]
 
 
-def test_clients_that_cannot_be_sent_are_refused():
+def federate_regions(runtime: ClientProcesses | None, clients: dict[str, Regression]) -> tuple[Weights, Any]:
+    """Federate as stage III does: two cloud rounds of two regions, each with two edge rounds of its vehicles."""
+    book = ledger()
+    own = {town: {name: each for name, each in clients.items() if name.startswith(town)} for town in ("grid", "ring")}
+    account = Account(book, "cloud", "regression", "wireless")
+    servers = {town: EdgeServer(each, 2, account, START, runtime=runtime) for town, each in own.items()}
+    found = federate(servers, START, replace(SCHEDULE, rounds=2), Account(book, "cloud", "regression", "wireline"))
+    return found.weights, book.entries
+
+
+def test_edge_servers_whose_vehicles_train_in_two_processes_federate_to_the_same_bits():
+    clients = {**vehicles("grid", 3), **vehicles("ring", 2)}
+    with ClientProcesses(clients, 2) as processes:
+        weights, entries = federate_regions(processes, clients)
+        wanted, booked = federate_regions(None, clients)
+        assert processes.pids
+        for each in clients.values():
+            each.targets = -each.targets
+        processes.renew(clients)
+        turned, _ = federate_regions(processes, clients)
+    np.testing.assert_array_equal(weights["w"], wanted["w"])
+    assert entries == booked
+    np.testing.assert_array_equal(turned["w"], federate_regions(None, clients)[0]["w"])
+    assert not np.array_equal(turned["w"], wanted["w"])
+
+
+def test_clients_that_cannot_be_sent_are_refused_or_train_in_this_process():
+    clients = {"cav0": Regression(np.zeros((1, 3)), (lambda: 0))}  # type: ignore[arg-type]
+    with open_processes(clients, 2) as processes:
+        assert processes is None
     with pytest.raises(InputError, match="clients cannot be sent to processes"):
-        ClientProcesses({"cav0": Regression(np.zeros((1, 3)), (lambda: 0))}, 2)  # type: ignore[arg-type]
+        ClientProcesses(clients, 2)

@@ -1,6 +1,7 @@
 """Federations of a recipe: refused before anything is computed, planned with what they send, ended by their budgets."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,6 +25,7 @@ from flcav.pipeline.arms import check_federations, find_strategies, resolve_sett
 from flcav.pipeline.federations.timing import TIMES, read_times, time_clients
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
 from flcav.pipeline.recipe import Federation, RunRecipe, Training
+from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
@@ -180,6 +182,32 @@ def test_regional_models_are_beside_that_of_all(tmp_path: Path) -> None:
         assert found[None][name] == pytest.approx((found["a"][name] + found["b"][name]) / 2)
 
 
+def test_both_stages_in_two_processes_end_with_the_bytes_of_one_also_where_labels_change(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2, average_rounds=1), 3)
+    network, schedule = learning.build_network(), learning.schedule(3, 2, "edge", "a")
+
+    def end(processes: int, renewed: bool = True) -> tuple[bytes, ...]:
+        samples = {name: [np.float32(1), np.float32(i)] for i, name in enumerate(("a/cav0", "a/cav1", "b/cav0"))}
+        clients = make_clients(learning, Slope(), samples)
+
+        def renew(round_: int, weights: Weights) -> None:
+            for own in samples.values():
+                own[0] = np.float32(round_) + weights["bias"][0]
+
+        regions = {name: {each: clients[each] for each in clients if each.startswith(name)} for name in ("a", "b")}
+        folders = [tmp_path / f"{stage}-{processes}-{renewed}" for stage in ("edge", "cloud")]
+        how = (Ledger(Budget(1.0, 1.0)), folders[0], ignore_progress)
+        edge = EdgeFederation(learning, network, regions["a"], schedule, FEDAVG, 0, *how)
+        federate_edge(replace(edge, before_round=renew if renewed else None), Rules(), processes=processes)
+        starts = {name: RegionStart(own, to_arrays(network), earlier=3) for name, own in regions.items()}
+        where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), folders[1], ignore_progress)
+        federate_cloud(CloudFederation(learning, network, starts, 2, *where), 2, Rules(), processes=processes)
+        return tuple((folder / WEIGHTS).read_bytes() for folder in folders)
+
+    assert end(2) == end(1)
+    assert end(1, renewed=False)[0] != end(1)[0]
+
+
 def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2), 3)
     network = learning.build_network()
@@ -212,7 +240,7 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
         return len(losses)
 
     assert (edge(3, 0), edge(9, 0), edge(9, 4)) == (3, 6, 2)
-    assert noted[-1].endswith(f"epsilon {sixth:.2f}")
+    assert noted[-1].endswith(f"epsilon {sixth:.2f} at delta 1e-05")
     starts = {region: RegionStart(own, to_arrays(network), earlier=2) for region, own in clients.items()}
 
     def cloud(edge_rounds: int) -> int:
@@ -222,6 +250,6 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
 
     assert (cloud(1), cloud(2), cloud(3)) == (4, 2, 1)
     fifth = account_epsilon(rules.privacy, rules.selection, [*clients["a"]], 5)
-    assert noted[-1].endswith(f"epsilon {fifth:.2f}")
+    assert noted[-1].endswith(f"epsilon {fifth:.2f} at delta 1e-05")
     with pytest.raises(InputError, match="the budget does not afford the 5 edge rounds of a cloud round"):
         cloud(5)

@@ -53,6 +53,14 @@ def sleep(work: Work) -> int:
     return 0
 
 
+def take(work: Work, until: str, processes: int = 1) -> int:
+    """Return the workers that the step has, once another step has begun."""
+    end = time.monotonic() + 30
+    while not (work.folder.parent / until).exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    return processes
+
+
 @dataclass(frozen=True)
 class Setting:
     share: float = 0.5
@@ -106,6 +114,17 @@ def test_steps_run_once_and_hand_their_values_on(tmp_path):
 def test_a_step_computes_on_one_thread(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
     assert run_steps([Step("threads", count_threads, {})], tmp_path, jobs=1, notify=quiet) == {"threads": 1}
+
+
+def test_a_step_has_the_workers_that_no_other_needs(tmp_path):
+    steps = [
+        Step("first", count, {"start": 1}),
+        Step("wide", take, {"until": "second"}, workers=2),
+        Step("second", take, {"until": "first"}, ("first",), workers=9),
+        Step("both", take, {"until": "first"}, ("second", "wide"), workers=2),
+    ]
+    assert run_steps(steps, tmp_path, jobs=3, notify=quiet) == {"first": 1, "wide": 2, "second": 1, "both": 2}
+    assert run_steps(steps, tmp_path, jobs=1, notify=quiet)["both"] == 2  # done before
 
 
 def test_what_most_others_wait_for_comes_first(tmp_path):

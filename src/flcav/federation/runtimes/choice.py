@@ -15,6 +15,17 @@ RUNTIMES = "embedded", "ray"
 
 
 @contextlib.contextmanager
+def open_processes(clients: Mapping[str, Trainable], count: int) -> Iterator[ClientProcesses | None]:
+    """Yield `count` processes for `clients`; None, for this one, where one is enough or they cannot be pickled."""
+    try:
+        own = ClientProcesses(clients, count) if count > 1 else None
+    except InputError:
+        own = None
+    with own or contextlib.nullcontext() as processes:
+        yield processes
+
+
+@contextlib.contextmanager
 def open_runtime(
     name: str, clients: Mapping[str, Trainable], count: int
 ) -> Iterator["ClientProcesses | RaySimulation | None"]:
@@ -24,11 +35,9 @@ def open_runtime(
     simulation with `count` actors. Raises `InputError` for another name.
     """
     match name:
-        case "embedded" if count > 1:
-            with ClientProcesses(clients, count) as processes:
-                yield processes
         case "embedded":
-            yield None
+            with open_processes(clients, count) as processes:
+                yield processes
         case "ray":
             from flcav.federation.runtimes.simulation import RaySimulation
 

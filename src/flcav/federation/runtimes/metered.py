@@ -1,4 +1,4 @@
-"""A Flower grid that enters every message in a ledger and enforces the budgets; it wraps any other grid."""
+"""Flower grids that enforce the budgets of a ledger before a message is sent, and enter it there; they wrap others."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -30,6 +30,46 @@ class Account:
     link: Link  # wireless or wireline
     outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by round and client
 
+    def describe(self, direction: Direction, round_: int, client: str, size: int) -> LedgerEntry:
+        """Return the entry of a message of `size` bytes."""
+        return LedgerEntry(self.stage, self.task, self.link, direction, round_, client, size)
+
+
+class BudgetedGrid(WrappedGrid):
+    """Grid whose nodes keep a reply that is over the budget of the uplink: `BudgetExceeded` is raised in its stead.
+
+    It stands at the near end of the link, `MeteredGrid` at the far end. Where nodes are elsewhere, as on Ray, both are
+    at the far end.
+    """
+
+    def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:
+        """Hold the nodes of `grid` to the budget of `account`; `names` are the clients' names by node id."""
+        self._grid, self._account, self._names = grid, account, names
+        self._round = 0
+
+    def _checked(self, reply: Message) -> Message:
+        if reply.has_content():
+            name = self._names[reply.metadata.src_node_id]
+            self._account.ledger.check(self._account.describe("up", self._round, name, wire_bytes(reply.content)))
+        return reply
+
+    def _noted(self, messages: Iterable[Message]) -> Iterator[Message]:
+        for message in messages:
+            self._round = _round(message)
+            yield message
+
+    def push_messages(self, messages: Iterable[Message]) -> list[str]:
+        """Send messages; return their ids."""
+        return list(self._grid.push_messages(self._noted(messages)))
+
+    def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
+        """Return replies within the budget; raises `BudgetExceeded` for another one."""
+        return [self._checked(reply) for reply in self._grid.pull_messages(message_ids)]
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
+        """Yield the replies as they come; raises `BudgetExceeded` for one over the budget."""
+        yield from map(self._checked, self._grid.send_and_receive(self._noted(messages), timeout=timeout))
+
 
 class MeteredGrid(WrappedGrid):
     """Grid that meters another one: a downlink entry for each message to a node, an uplink entry for each reply."""
@@ -41,17 +81,7 @@ class MeteredGrid(WrappedGrid):
 
     def _enter(self, direction: Direction, round_: int, size: int, node: int) -> None:
         account, self._round = self._account, round_
-        account.ledger.enter(
-            LedgerEntry(
-                stage=account.stage,
-                task=account.task,
-                link=account.link,
-                direction=direction,
-                round=round_,
-                client=self._names[node],
-                bytes=size,
-            )
-        )
+        account.ledger.enter(account.describe(direction, round_, self._names[node], size))
 
     def push_messages(self, messages: Iterable[Message]) -> list[str]:
         """Send messages, entering each as downlink first; return their ids."""

@@ -9,7 +9,6 @@ from flcav.federation.records import ARRAYS, CONFIG
 from flcav.federation.runtimes.embedded import CLIENT_APP_RAISED, wire_bytes
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.wrapped import WrappedGrid
-from flcav.network.ledger import LedgerEntry
 
 
 class LossyGrid(WrappedGrid):
@@ -46,7 +45,7 @@ class LossyGrid(WrappedGrid):
         if outage is None or not reply.has_content() or ARRAYS not in reply.content.array_records:
             return reply
         account, size = self._account, min(outage.sent_bytes or 0, wire_bytes(reply.content))
-        account.ledger.enter(LedgerEntry(account.stage, account.task, account.link, "up", round_, name, size))
+        account.ledger.enter(account.describe("up", round_, name, size))
         return self._fail(message)
 
     def push_messages(self, messages: Iterable[Message]) -> list[str]:

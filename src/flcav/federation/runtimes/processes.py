@@ -4,6 +4,7 @@ A process trains one client after another and has all of them, so that a client 
 a client returns does not depend on the process, nor on how many there are.
 """
 
+import contextlib
 import pickle
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -41,6 +42,13 @@ class ClientProcesses:
         self.count = count
         self._free: SimpleQueue[_Process] = SimpleQueue()
         self._all: list[_Process] = []
+
+    def renew(self, clients: Mapping[str, Trainable]) -> None:
+        """Hand the processes the clients as they are now; no client may be training."""
+        self._pickled = pickle.dumps(clients)
+        for each in self._all:
+            with contextlib.suppress(BrokenProcessPool):  # its next training says so
+                each.renew(self._pickled)
 
     def __enter__(self) -> "ClientProcesses":
         self._all = [_Process(self._pickled) for _ in range(self.count)]
@@ -96,6 +104,11 @@ class _Process:
             self._pool = ProcessPoolExecutor(1, mp_context=start_server(), initializer=_start, initargs=given)
         return self._block.read(self._pool.submit(_train_here, self._block.write((name, weights, how))).result())
 
+    def renew(self, clients: bytes) -> None:
+        self._clients = clients
+        if self._pool is not None:
+            self._pool.submit(_take, clients).result()
+
     def end(self) -> None:
         if self._pool is not None:
             for process in list((self._pool._processes or {}).values()):
@@ -132,11 +145,17 @@ class _Remote:
 
 
 def _start(pickled: bytes, block: SharedBlock) -> None:
-    global _clients, _block
+    global _block
     exit_with_parent()
     use_threads(1)
     keep_freed_memory()  # gradients of megabytes come and go in every step
-    _clients, _block = pickle.loads(pickled), block
+    _block = block
+    _take(pickled)
+
+
+def _take(pickled: bytes) -> None:
+    global _clients
+    _clients = pickle.loads(pickled)
 
 
 def _train_here(asked: Parcel) -> Parcel:

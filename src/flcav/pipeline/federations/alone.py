@@ -19,6 +19,7 @@ from flcav.pipeline.federations.rounds import LOSS
 from flcav.pipeline.federations.timing import read_times
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.graph import Graph
+from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
 from flcav.pipeline.results.saved import WEIGHTS, Saved
@@ -74,6 +75,8 @@ def federate_regions(
     if graph.settings[arm].central:
         raise InputError(f"--arm {arm}: it trains centrally, without a federation")
     check_federations(recipe, graph.settings.values())
+    if runtime != "embedded" and any(LABEL_SOURCES[kind].averaged for kind in graph.settings[arm].labels.values()):
+        raise InputError("labels 'road-average' are renewed between rounds, and Ray's actors get them once; not on Ray")
     asked = list_federations(graph, arm)
     means = {"processes": jobs, "runtime": runtime, "timed": 1}
     alone = {name: _federation_step(graph, *about, means) for name, about in asked.items()}

@@ -8,6 +8,7 @@ from typing import Any
 from safetensors.numpy import load_file, save
 
 from flcav.config import InputError
+from flcav.federation.privacy import Privacy
 from flcav.federation.rounds import OnRound
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedavg import average
@@ -35,15 +36,16 @@ class FederationCheckpoints:
         states: Mapping[str, FederationState] = {},
         identity: str = "",
         score: Callable[[int], Mapping[str, float]] | None = None,
+        privacy: Privacy | None = None,
     ) -> None:
         """Keep the checkpoints in `folder`.
 
         states: by name what federations keep between rounds, restored in place; of stage III also the edge servers'.
         identity: what the federation is by; a checkpoint of another one is refused. score: the scores on validation
-        frames after a round, by region.
+        frames after a round, by region. privacy: of the updates, whose delta is told with epsilon.
         """
         self._task, self._folder, self._book, self._report = task, folder, book, report
-        self._states, self._identity, self._score = states, identity, score
+        self._states, self._identity, self._score, self._privacy = states, identity, score, privacy
         self._hashes: dict[str, str] = {}  # of the files of weights, by name
         self.losses: list[float] = []
         self.scores: list[Mapping[str, float]] = []
@@ -95,13 +97,19 @@ class FederationCheckpoints:
             Checkpoint(*done, tuple(self.scores)).keep(self._folder)
             for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
                 (self._folder / name).unlink(missing_ok=True)
-            spent = [own.records[-1].epsilon for own in self._states.values() if own.records]
-            private = [epsilon for epsilon in spent if epsilon is not None]
-            note = [f"{LOSS} {loss:.3f}", *([f"epsilon {max(private):.2f}"] if private else [])]
+            note = [f"{LOSS} {loss:.3f}", *self._tell_privacy()]
             note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self._score else {}).items()]
             self._report(round_, rounds, ", ".join(note))
 
         return keep
+
+    def _tell_privacy(self) -> list[str]:
+        """Return the largest epsilon after the last round, with its delta, in words; none without noise."""
+        spent = [own.records[-1].epsilon for own in self._states.values() if own.records]
+        private = [epsilon for epsilon in spent if epsilon is not None]
+        if self._privacy is None or not private:
+            return []
+        return [f"epsilon {max(private):.2f} at delta {self._privacy.delta:g}"]
 
     def _write(self, name: str, data: bytes, hashes: dict[str, str]) -> None:
         write_bytes(self._folder / name, data)

@@ -42,7 +42,8 @@ def list_edge_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
                 continue
             name, inputs = outline.names.edge(arm.name, region, task), outline.inputs(arm, region, task, EDGE)
             about = _federate(outline, arm, task, EDGE, _replan(outline, arm, task, EDGE, region, name))
-            yield make_step(name, edge_step, EdgeSettings(**about, inputs=inputs, scored=averaged))
+            settings = EdgeSettings(**about, inputs=inputs, scored=averaged)
+            yield make_step(name, edge_step, settings, outline.vehicles[region])
 
 
 def list_further_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
@@ -61,12 +62,13 @@ def list_further_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
         if last == CLOUD:
             name = names.cloud(arm.name, task)
             about = _federate(outline, arm, task, CLOUD, _replan(outline, arm, task, CLOUD, None, name))
-            yield make_step(name, cloud_step, CloudSettings(**about, regions=inputs))
+            at_once = max(outline.vehicles[region] for region in arm.regions)  # of one edge server
+            yield make_step(name, cloud_step, CloudSettings(**about, regions=inputs), at_once)
             continue
         for region, own in inputs.items():
             name = names.more_edge(arm.name, region, task)
             about = _federate(outline, arm, task, last, _replan(outline, arm, task, MORE_EDGE, region, name))
-            yield make_step(name, edge_step, EdgeSettings(**about, inputs=own))
+            yield make_step(name, edge_step, EdgeSettings(**about, inputs=own), outline.vehicles[region])
 
 
 def _federate(outline: Outline, arm: Setting, task: str, stage: str, replan: RoundPlans | None) -> dict[str, Any]:

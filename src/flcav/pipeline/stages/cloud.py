@@ -7,11 +7,13 @@ from typing import Any
 
 from flcav.federation.rounds import OnRound
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes.choice import open_processes
 from flcav.federation.runtimes.metered import Account, Outage
+from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.stages import EdgeServer, afford_cloud_rounds, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedavg import average
-from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.ledger import Ledger
 from flcav.perception.client import TaskClient
 from flcav.perception.distillation import SharedSamples
@@ -62,13 +64,26 @@ class CloudFederation:
             rounds = min(rounds, afford_cloud_rounds(rules, [*own.clients], rounds, self.edge_rounds, own.earlier))
         return rounds
 
+    def vehicles(self, region: str) -> Mapping[str, Trainable]:
+        """Return the clients of a region's edge server, by name."""
+        own = self.regions[region]
+        return own.clients if self.shared is None else give_outputs(own.clients, self.shared, own.weights)
+
     def open_servers(
-        self, rules: Rules, account: Account, done: int, states: Mapping[str, FederationState]
+        self,
+        rules: Rules,
+        account: Account,
+        done: int,
+        states: Mapping[str, FederationState],
+        runtime: ClientProcesses | None,
     ) -> dict[str, EdgeServer]:
-        """Return the edge servers by region, after `done` cloud rounds; `states` are their own."""
+        """Return the edge servers by region, after `done` cloud rounds; `states` are their own.
+
+        The vehicles of one after another train, in the processes of `runtime`.
+        """
         return {
             region: EdgeServer(
-                own.clients if self.shared is None else give_outputs(own.clients, self.shared, own.weights),
+                self.vehicles(region),
                 self.edge_rounds,
                 account,
                 own.weights,
@@ -77,6 +92,7 @@ class CloudFederation:
                 rules=rules,
                 state=states[region],
                 earlier=own.earlier,
+                runtime=runtime,
                 distiller=self.shared,
             )
             for region, own in self.regions.items()
@@ -89,25 +105,27 @@ def federate_cloud(
     rules: Rules,
     outages: Mapping[tuple[int, str], Outage] = {},
     replanning: Replanning | None = None,
+    *,
+    processes: int = 1,
 ) -> tuple[float, ...]:
     """Run stage III; write weights and ledger, return each round's loss.
 
     Edge rounds are run by `rules`, and lose the vehicles that `outages` names; the cloud's rounds need all edge
     servers. Where rules make arrays personal, the weights have the mean of the regions' own, and each region's model is
     beside them, as are regional models. A privacy budget may end it before `rounds`. `replanning` is as in
-    `federate_edge`.
+    `federate_edge`, as are `processes`, in which the vehicles of one region after another train.
     """
     own, learning, state = federation, federation.learning, FederationState()
     own_states = {region: FederationState() for region in own.regions}
     states = {CLOUD: state, **{f"{EDGE}/{region}": each for region, each in own_states.items()}}
     rounds = own.afford(rules, rounds)
     identity, scored = describe_federation(own.strategies, rules), own.score if own.validation else None
-    checkpoints = FederationCheckpoints(learning.task, own.folder, own.book, own.report, states, identity, scored)
+    kept: Any = (learning.task, own.folder, own.book, own.report, states, identity, scored, rules.privacy)
+    checkpoints = FederationCheckpoints(*kept)
     rules.check_personal(to_arrays(own.network))
     start, done = checkpoints.resume(to_arrays(own.network))
     wireless = Account(own.book, CLOUD, learning.task.name, "wireless", outages)
     wireline = Account(own.book, CLOUD, learning.task.name, "wireline")
-    servers = own.open_servers(rules, wireless, done, own_states)
     earlier = max(each.earlier for each in own.regions.values())
     schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier)
     how: Any = {"strategy": own.strategies.cloud, "rules": rules.of_servers(), "state": state}
@@ -121,20 +139,23 @@ def federate_cloud(
 
         return keep_whole
 
-    if replanning is None:
-        federate(servers, start, schedule, wireline, **how, done=done, on_round=make_saver(rounds))
-    else:
-        course = replanning.course
+    everybody = {name: client for region in own.regions for name, client in own.vehicles(region).items()}
+    with open_processes(everybody, processes) as runtime:
+        servers = own.open_servers(rules, wireless, done, own_states, runtime)
+        if replanning is None:
+            federate(servers, start, schedule, wireline, **how, done=done, on_round=make_saver(rounds))
+        else:
+            course = replanning.course
 
-        def run_round(weights: Weights, number: int, driven: Driven) -> LocalUpdate | None:
-            if own.afford(rules, number) < number:
-                return None
-            for server in servers.values():
-                server.rules, server.account = driven.rules, replace(wireless, outages=driven.outages)
-            asked: Any = {**how, "done": number - 1, "on_round": make_saver(course.rounds)}
-            return federate(servers, weights, course.schedule(schedule, number), wireline, **asked)
+            def run_round(weights: Weights, number: int, driven: Driven) -> LocalUpdate | None:
+                if own.afford(rules, number) < number:
+                    return None
+                for server in servers.values():
+                    server.rules, server.account = driven.rules, replace(wireless, outages=driven.outages)
+                asked: Any = {**how, "done": number - 1, "on_round": make_saver(course.rounds)}
+                return federate(servers, weights, course.schedule(schedule, number), wireline, **asked)
 
-        replanning.run(start, done, checkpoints.scores, run_round)
+            replanning.run(start, done, checkpoints.scores, run_round)
     checkpoints.finish(own.network, len(checkpoints.losses), learning.training.average_rounds)
     if rules.personal:
         _save_regional_models(learning, own.folder, own_states)

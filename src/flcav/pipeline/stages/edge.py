@@ -10,6 +10,7 @@ from flcav.federation.privacy import affordable_rounds
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.choice import open_runtime
 from flcav.federation.runtimes.metered import Account, Outage
+from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.stages import Schedule, federate, federate_outputs
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
@@ -28,11 +29,7 @@ from flcav.pipeline.stages.clients import describe_federation, give_outputs
 from flcav.pipeline.stages.learning import Learning
 from flcav.progress import Report
 
-OnStart = Callable[[int, Weights], None]  # called before a round with its number and weights
-
-
-def _begin(round_: int, weights: Weights) -> None:
-    pass
+OnStart = Callable[[int, Weights], None]  # called before a round with its number and weights; changes the clients
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class EdgeFederation:
     report: Report
     validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
-    before_round: OnStart = _begin
+    before_round: OnStart | None = None
 
     @property
     def start_share(self) -> float:
@@ -91,7 +88,7 @@ def federate_edge(
     state, schedule = FederationState(), own.schedule
     identity, scored = describe_federation(own.strategy, rules), own.score if own.validation else None
     checkpoints = FederationCheckpoints(
-        learning.task, own.folder, own.book, own.report, {EDGE: state}, identity, scored
+        learning.task, own.folder, own.book, own.report, {EDGE: state}, identity, scored, rules.privacy
     )
     start, done = checkpoints.resume(to_arrays(own.network))
     account = Account(own.book, EDGE, learning.task.name, "wireless", outages)
@@ -104,16 +101,23 @@ def federate_edge(
     clients = time_clients(clients, own.folder) if timed else clients
     with open_runtime(runtime, clients, processes) as where:
         how["runtime"] = where
+
+        def begin(number: int, weights: Weights) -> None:
+            if own.before_round is not None:
+                own.before_round(number, weights)
+                if isinstance(where, ClientProcesses):
+                    where.renew(clients)
+
         if replanning is None:
             save, last = checkpoints.make_saver(schedule.rounds), own.afford(rules, schedule.rounds)
 
             def keep(round_: int, weights: Weights, loss: float) -> None:
                 save(round_, weights, loss)
                 if round_ < last:
-                    own.before_round(round_ + 1, weights)
+                    begin(round_ + 1, weights)
 
             if done < last:
-                own.before_round(done + 1, start)
+                begin(done + 1, start)
             run(clients, start, schedule, account, **how, rules=rules, done=done, on_round=keep)
         else:
             course = replanning.course
@@ -121,7 +125,7 @@ def federate_edge(
             def run_round(weights: Weights, number: int, driven: Driven) -> LocalUpdate | None:
                 if own.afford(rules, number) < number:
                     return None
-                own.before_round(number, weights)
+                begin(number, weights)
                 ending, lossy = course.schedule(schedule, number), replace(account, outages=driven.outages)
                 keep = checkpoints.make_saver(course.rounds)
                 given: Any = {**how, "rules": driven.rules, "done": number - 1, "on_round": keep}

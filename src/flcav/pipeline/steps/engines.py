@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,6 +29,7 @@ class Workers:
 
     submit: Callable[[Step, Record], Future[Any]]  # -> future value of the step
     reports: Any  # queue of (step, done, total, note)
+    lent: bool = False  # whether a step can have several: it starts processes where the other workers are
 
 
 class Engine(Protocol):
@@ -53,7 +55,7 @@ class Processes:
         made_by, started = replace(provenance(), threads=1), (queue, {**os.environ})
         with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start, initargs=started) as pool:
             try:
-                yield Workers(lambda step, record: pool.submit(_perform, step, folder, record, made_by), queue)
+                yield Workers(partial(_submit, pool, folder, made_by), queue, lent=True)
             except BrokenProcessPool:
                 raise OSError(KILLED) from None
             except BaseException:
@@ -94,6 +96,10 @@ def _start(queue: Any, variables: Mapping[str, str]) -> None:
     gc.freeze()  # modules stay: the collector of cyclic garbage need not look at them again and again
     exit_with_parent()
     use_threads(1)
+
+
+def _submit(pool: ProcessPoolExecutor, folder: Path, made_by: Provenance, step: Step, record: Record) -> Future[Any]:
+    return pool.submit(_perform, step, folder, record, made_by)
 
 
 def _perform(step: Step, folder: Path, record: Record, made_by: Provenance) -> Any:

@@ -70,7 +70,8 @@ def run_steps(
     """Run `steps`, given in topological order, in `folder`, and return their values by name.
 
     `jobs` workers of one thread each: processes, which end with this one however it ends, or actors on the machines of
-    a Ray cluster, see `flcav.pipeline.steps.cluster`. Steps begun or finished by other code are refused, done again
+    a Ray cluster, see `flcav.pipeline.steps.cluster`. Of the processes, those that no step waits for are lent to steps
+    that can make use of several, until these end. Steps begun or finished by other code are refused, done again
     ("redo") or kept ("keep", their records unchanged). Raises `InputError` where `folder` holds steps of other
     arguments or, where that is refused, of other code; `OSError` where a worker was killed.
     """
@@ -149,23 +150,34 @@ def _run(plan: _Plan, workers: Engine, jobs: int, notify: Notify, folders: Seque
     """Do the work that is left; steps that are finished in another of `folders` are taken over."""
     waiting, values = _most_waited_for_first(plan.waiting), plan.values
     with workers.hands(plan.folder, jobs) as hands:
-        running: dict[Future[Any], Step] = {}
+        running: dict[Future[Any], tuple[Step, int]] = {}
         while waiting or running:
             ready = [step for step in waiting if all(name in values for name in step.needs)]
-            for step in ready[: jobs - len(running)]:
+            free = jobs - sum(taken for _, taken in running.values())
+            for step, taken in _share_workers(ready, free, lent=hands.lent):
                 waiting.remove(step)
                 others = [folder / step.name for folder in folders if folder != plan.folder]
                 if take_over(plan.folder / step.name, plan.records[step.name], others):
                     values[step.name] = read_value(plan.folder / step.name)
                     notify(step.name, 1, 1, DONE_NOW)
                     continue
-                running[hands.submit(step, plan.records[step.name])] = step
+                running[hands.submit(step.on(taken), plan.records[step.name])] = step, taken
             finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
             _drain(hands.reports, notify)
             for future in finished:
-                step = running.pop(future)
+                step, _ = running.pop(future)
                 values[step.name] = future.result()
                 notify(step.name, 1, 1, DONE_NOW)
+
+
+def _share_workers(ready: Sequence[Step], free: int, *, lent: bool) -> list[tuple[Step, int]]:
+    """Return the steps that begin on `free` workers, and how many each has: one and, if `lent`, spare ones."""
+    spare, shares = max(0, free - len(ready)) if lent else 0, []
+    for step in ready[:free]:
+        more = min(step.workers - 1, spare)
+        spare -= more
+        shares.append((step, 1 + more))
+    return shares
 
 
 def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:

@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,11 @@ class Step:
     arguments: Mapping[str, Any]  # JSON values, and frozen records of them: dataclasses or `Config`
     needs: tuple[str, ...] = ()
     means: Mapping[str, int | str] = field(default_factory=dict)  # further arguments, which do not change the result
+    workers: int = 1  # most that it can make use of; where several, it takes how many they are as `processes`
+
+    def on(self, workers: int) -> "Step":
+        """Return the step with so many workers."""
+        return self if workers == 1 else replace(self, means={**self.means, "processes": workers})
 
     def fingerprint(self, inputs: Mapping[str, str]) -> str:
         """Return a hash of what is asked: function, arguments, and the fingerprints of the needed steps (`inputs`).

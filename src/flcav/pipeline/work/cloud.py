@@ -69,8 +69,11 @@ class _Servers:
         return sum(len(start.clients) for start in self.starts.values())
 
 
-def cloud_step(work: Work, settings: CloudSettings) -> None:
-    """Run stage III of a task: the edge servers of all regions federate with the cloud, vehicles with edge servers."""
+def cloud_step(work: Work, settings: CloudSettings, processes: int = 1) -> None:
+    """Run stage III of a task: the edge servers of all regions federate with the cloud, vehicles with edge servers.
+
+    Vehicles train in so many `processes`.
+    """
     first, task, learning = settings.first, settings.learning.task, settings.learning.resolve()
     plan, start = Plan.load(work.inputs[first.plan]), load_stage_network(learning.task, work.inputs[first.pretrain])
     share = share_plan_budget(plan, settings.budgets_mb, task)
@@ -83,11 +86,11 @@ def cloud_step(work: Work, settings: CloudSettings) -> None:
     drive = _open_drive(work, settings, federation, rounds)
     if settings.replan is None:
         driven = drive(plan.tasks[task], rounds)
-        losses = federate_cloud(federation, rounds, driven.rules, driven.outages)
+        losses = federate_cloud(federation, rounds, driven.rules, driven.outages, processes=processes)
     else:
         course = Rest(work, settings, settings.replan, plan, book).open_cloud(settings.regions)
         replanning = Replanning(course, drive, lambda scores: mean_by_frames(scores, federation.validation))
-        losses = federate_cloud(federation, rounds, settings.federation, replanning=replanning)
+        losses = federate_cloud(federation, rounds, settings.federation, replanning=replanning, processes=processes)
         driven, made = drive(course.plan, len(losses)), tuple(course.made)
     StageResult(
         stage=CLOUD,

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from flcav.config import InputError
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.network.ledger import Ledger
 from flcav.perception.distillation import SharedSamples
@@ -63,11 +62,8 @@ def edge_step(
 ) -> None:
     """Run stage II of a task in a region, or its further edge rounds: as many as the region has in stage III.
 
-    Vehicles train in so many `processes` of a `runtime`; other than 0, `timed` keeps their times. Raises `InputError`
-    where labels that are renewed between rounds would have to reach several.
+    Vehicles train in so many `processes` of a `runtime`; other than 0, `timed` keeps their times.
     """
-    if settings.distillation is not None and (processes > 1 or runtime != "embedded"):
-        raise InputError("labels 'road-average' are renewed between rounds: vehicles train in one process, --jobs 1")
     inputs, stage, plan = settings.inputs, settings.stage, Plan.load(work.inputs[settings.inputs.plan])
     book = _open_book(work, settings, plan)
     before, labelled = len(book.entries), label_samples(work, settings, inputs, book, EDGE)

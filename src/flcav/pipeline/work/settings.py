@@ -82,6 +82,6 @@ class FederationSettings(StepSettings):
     replan: RoundPlans | None = None  # None: the plan is not made anew after each round
 
 
-def make_step(name: str, run: Callable[..., None], settings: StepSettings) -> Step:
-    """Return the step that calls `run` with its settings, after those that they name."""
-    return Step(name, run, {"settings": settings}, tuple(dict.fromkeys(settings.needs)))
+def make_step(name: str, run: Callable[..., None], settings: StepSettings, workers: int = 1) -> Step:
+    """Return the step that calls `run` with its settings, after those that they name, on so many workers at most."""
+    return Step(name, run, {"settings": settings}, tuple(dict.fromkeys(settings.needs)), workers=workers)

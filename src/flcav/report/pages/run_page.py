@@ -101,6 +101,10 @@ def page(run: Run) -> dict[str, Any]:
             for stage in result.stages
             for labels in stage.labels or ()
         ],
+        "timelines": [
+            {"name": name, "arm": arm, "region": region} for name, (arm, region) in _list_timelines(run).items()
+        ],
+        "delta": f"{recipe.federation.privacy.delta:g}" if recipe.federation.privacy else None,
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
@@ -111,7 +115,7 @@ def page(run: Run) -> dict[str, Any]:
 
 
 def draw(run: Run, work: Path) -> dict[str, bytes]:
-    """Return the pictures as PNG files by name: maps, rounds by task, megabytes, before and after, overview."""
+    """Return the pictures as PNG files by name: maps, rounds by task and on the clock, and others."""
     main, drawn = run.arms[MAIN], {}
     scenes = [(placed, scene) for placed in main.placed if (scene := _map(run, work, placed)) is not None]
     for placed, scene in scenes:
@@ -130,15 +134,25 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
 
 
 def _timelines(run: Run, work: Path) -> dict[str, Figure]:
-    """Return the first rounds of stage II on the network, by region, of the first task; none without a network."""
-    main, task, names = run.arms[MAIN], next(iter(run.recipe.tasks)), _names(run)
-    drawn = {}
-    for region in dict.fromkeys(stage.region for stage in main.stages if stage.stage == EDGE and stage.region):
-        path = work / names.edge(MAIN, region, task) / f"{CLOCK}-{region}.parquet"
+    """Return the first rounds of stage II of each arm on a network, by `_list_timelines`."""
+    task, names, drawn = next(iter(run.recipe.tasks)), _names(run), {}
+    for name, (arm, region) in _list_timelines(run).items():
+        path = work / names.edge(arm, region, task) / f"{CLOCK}-{region}.parquet"
         records = load_rounds(path)[:SHOWN_ROUNDS] if path.exists() else ()
         if records:
-            drawn[f"timeline_{region}"] = timeline_of_rounds(records)
+            drawn[name] = timeline_of_rounds(records)
     return drawn
+
+
+def _list_timelines(run: Run) -> dict[str, tuple[str, str]]:
+    """Return arm and region of each federation of the first task, by the name of its picture; shared ones once."""
+    task, names, listed = next(iter(run.recipe.tasks)), _names(run), {}
+    for arm, result in run.arms.items():
+        for stage in result.stages:
+            if stage.stage == EDGE and stage.region:
+                end = stage.region if arm == MAIN else f"{stage.region}_{arm}"
+                listed.setdefault(names.edge(arm, stage.region, task), (f"timeline_{end}", (arm, stage.region)))
+    return dict(listed.values())
 
 
 def _file_name(task: str) -> str:
