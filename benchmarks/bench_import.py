@@ -1,4 +1,8 @@
-"""Decoding of a nuScenes-like scene from the page cache: MB/s of point payload, and memory against length, one thread.
+"""Imports: of a nuScenes-like scene, and with `--maps DIR` of each OpenDRIVE map in a folder instead.
+
+Maps: CPU seconds of the import, netconvert's included, which is to take at most 30.
+
+Scene: decoding of a nuScenes-like scene from the page cache: MB/s of point payload, and memory against length, one thread.
 
 A key frame has 34,720 points of 20 bytes in `LIDAR_TOP`, five radars of 125 echoes, six pictures and 35 boxes, about
 as many as nuScenes has. Clouds are decoded alone, and in whole frames, in which points in boxes are counted and boxes
@@ -7,6 +11,7 @@ are projected into pictures. Pictures themselves are not decoded: they are linke
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -17,8 +22,10 @@ from typing import Any
 import numpy as np
 from cpu_time import cpu_ms
 
+from flcav.config import InputError
 from flcav.dataset.formats.nuscenes.files import encode_radar
 from flcav.dataset.formats.nuscenes.read import NuscenesSource, read_cloud
+from flcav.world.opendrive.importing import import_town
 
 POINTS, ECHOES, BOXES = 34_720, 125, 35
 CAMERAS = tuple(f"CAM_{side}" for side in ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"))
@@ -118,15 +125,35 @@ def decode(tables: Path) -> None:
         pass
 
 
+def time_maps(folder: Path) -> None:
+    """Print a line for each OpenDRIVE map below `folder`: its size, and the CPU time of its import, or why not."""
+    for path in sorted(folder.rglob("*.xodr"), key=lambda path: path.stat().st_size):
+        roads = path.read_bytes().count(b"<road ")
+        began = os.times()
+        with tempfile.TemporaryDirectory() as scratch:
+            try:
+                import_town(path, Path(scratch) / "town")
+                said = ""
+            except InputError as error:
+                said = str(error)
+        spent = np.subtract(os.times()[:4], began[:4]).sum()  # this process and those that it started
+        row = {"map": path.name, "mb": round(path.stat().st_size / 1e6, 2), "roads": roads}
+        print(json.dumps({**row, "cpu_s": round(float(spent), 2), **({"refused": said} if said else {})}), flush=True)
+
+
 def main() -> None:
     """Print the figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--maps", type=Path, help="a folder of OpenDRIVE maps to import")
     parser.add_argument("--decode", type=Path, help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.decode:
         decode(asked.decode)
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
+        return
+    if asked.maps:
+        time_maps(asked.maps)
         return
     with tempfile.TemporaryDirectory() as scratch:
         short, long = Path(scratch) / "short", Path(scratch) / "long"

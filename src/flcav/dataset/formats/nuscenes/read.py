@@ -60,7 +60,7 @@ OCCLUSION = {
     "4": 0.1,
 }  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
 TOP = "LIDAR_TOP"
-BEAMS = 32  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders of the format do not say
+BEAMS, RANGE_M = 32, 70.0  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders do not say
 VERSIONS = ("v1.0-mini", "v1.0-trainval", "v1.0-test")  # nuScenes' own tables
 POINT = 5  # float32 of a point: x, y, z, intensity 0 to 255, ring
 
@@ -96,7 +96,8 @@ class NuscenesSource(LogSource):
         self._spins, split_of = self._order(table["scene"], table["log"], table["sample"])
         self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._read_notes(table)
-        self._beams = BEAMS if self._tables.name in VERSIONS else None
+        if self._tables.name in VERSIONS:
+            self._beams, self._range_m = BEAMS, RANGE_M
         self._labelled = bool(self._notes)
         self.notes = () if self._labelled else ("no annotations in its tables, so no boxes",)
 
