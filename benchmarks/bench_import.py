@@ -2,11 +2,10 @@
 
 Maps: CPU seconds of the import, netconvert's included, which is to take at most 30.
 
-Scene: decoding of a nuScenes-like scene from the page cache: MB/s of point payload, and memory against length, one thread.
-
-A key frame has 34,720 points of 20 bytes in `LIDAR_TOP`, five radars of 125 echoes, six pictures and 35 boxes, about
-as many as nuScenes has. Clouds are decoded alone, and in whole frames, in which points in boxes are counted and boxes
-are projected into pictures. Pictures themselves are not decoded: they are linked.
+Scene: decoding from the page cache, MB/s of point payload, and memory against length, one thread. A key frame has
+34,720 points of 20 bytes in `LIDAR_TOP`, five radars of 125 echoes, six pictures and 35 boxes, about as many as
+nuScenes has. Clouds are decoded alone, and in whole frames, in which points in boxes are counted and boxes are
+projected into pictures. Pictures themselves are not decoded: they are linked.
 """
 
 import argparse
