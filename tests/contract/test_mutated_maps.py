@@ -22,10 +22,12 @@ from flcav.world.opendrive.objects.crosswalks import find_crosswalks
 from flcav.world.opendrive.objects.parking_spaces import find_parking
 from flcav.world.opendrive.objects.signal_heads import find_heads
 from flcav.world.opendrive.objects.signs import find_posts, find_signs
+from flcav.world.opendrive.objects.standing import find_objects
+from flcav.world.opendrive.objects.stop_lines import find_stop_lines
 
 DATA = Path(__file__).parents[1] / "data"
 MAPS = ("cross", "cross_with_objects")
-READ, IMPORTED = 200, ((6, "cross"), (9, "cross"), (15, "cross_with_objects"))
+READ, IMPORTED = 200, ((6, "cross"), (9, "cross"), (30, "cross_with_objects"))
 LIMIT_S = 10  # of computing, for reading one map; it takes some 5 ms
 SLOPE = '<elevationProfile><elevation s="0" a="1" b="0.05" c="0" d="0"/></elevationProfile><lanes>'
 
@@ -69,7 +71,7 @@ def _read_whole(path: Path, place: Place) -> None:
 def _read_objects(root: ElementTree.Element, place: Place) -> None:
     for find in (find_signs, find_posts, find_crosswalks):
         find(root, place.offset_m)
-    for find in () if place.net is None else (find_heads, find_parking):
+    for find in () if place.net is None else (find_heads, find_parking, find_objects, find_stop_lines):
         find(root, place.offset_m, place.net)
 
 
