@@ -71,8 +71,9 @@ def _read_whole(path: Path, place: Place) -> None:
 def _read_objects(root: ElementTree.Element, place: Place) -> None:
     for find in (find_signs, find_posts, find_crosswalks):
         find(root, place.offset_m)
-    for find in () if place.net is None else (find_heads, find_parking, find_objects, find_stop_lines):
-        find(root, place.offset_m, place.net)
+    if place.net is not None:
+        for find in (find_heads, find_parking, find_objects, find_stop_lines):
+            find(root, place.offset_m, place.net)
 
 
 def test_mutated_maps_are_read_or_refused_in_a_sentence(sloping: dict[str, Path], place: Place, tmp_path: Path) -> None:

@@ -251,7 +251,8 @@ def test_signs_and_poles_of_the_map_stand_where_it_says(tmp_path: Path) -> None:
                 '<signal id="2" s="30" t="-5" type="274" value="50" orientation="+"/>'
                 '<signal id="3" s="30" t="-5" type="274" value="many"/>'
                 '<signal id="4" s="400" t="0" type="206"/><signal id="5" s="9" t="0" type="306"/>'
-                '<signal id="6" s="9" t="0" type="1000001" dynamic="yes"/><signal id="7" s="9" t="0" type="294"/></signals>'
+                '<signal id="6" s="9" t="0" type="1000001" dynamic="yes"/>'
+                '<signal id="7" s="9" t="0" type="294"/></signals>'
             )
         )
         road.append(
