@@ -8,7 +8,6 @@ import io
 import os
 import re
 import shutil
-import signal
 import sys
 import tempfile
 import traceback
@@ -16,10 +15,10 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 from mutations import Rng, link_tree, mutate, odd_number
+from time_limits import Slow, within
 
 from flcav.cli.main import run
 from flcav.perception.errors import RegistersErrors
@@ -60,10 +59,6 @@ class Outcome:
     said: str  # on stderr
     broken: str  # in what way the contract is; "" where it holds
     slow: bool = False
-
-
-class Slow(BaseException):
-    """The time for one case is over."""
 
 
 DATASET = ("data/*", "data/*/*")
@@ -250,7 +245,7 @@ def _run(arguments: list[str], limit_s: float) -> tuple[int, str, str, bool, str
         warnings.simplefilter("default", RuntimeWarning)
         warnings.simplefilter("default", UserWarning)
         try:
-            with contextlib.redirect_stdout(out), _within(limit_s):
+            with contextlib.redirect_stdout(out), within(limit_s):
                 run(arguments)
         except SystemExit as ended:
             code = int(ended.code or 0)
@@ -283,22 +278,3 @@ def _stderr() -> Iterator[io.StringIO]:
             os.close(kept)
             file.seek(0)
             said.write(file.read().decode(errors="replace"))
-
-
-@contextlib.contextmanager
-def _within(limit_s: float) -> Iterator[None]:
-    """Raise `Slow` in the block after so many seconds of computing, or ten times as many of waiting."""
-
-    def over(number: int, frame: FrameType | None) -> None:
-        raise Slow
-
-    clocks = ((signal.ITIMER_PROF, signal.SIGPROF, limit_s), (signal.ITIMER_REAL, signal.SIGALRM, 10 * limit_s))
-    before = [signal.signal(number, over) for _, number, _ in clocks]
-    for clock, _, seconds in clocks:
-        signal.setitimer(clock, seconds)
-    try:
-        yield
-    finally:
-        for (clock, number, _), handler in zip(clocks, before, strict=True):
-            signal.setitimer(clock, 0)
-            signal.signal(number, handler)

@@ -3,16 +3,15 @@
 A case is named by its number: the map, one to three mutations of it, and whether it is driven follow from it.
 """
 
-import signal
 import traceback
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 from mutations import MUTATIONS, mutate
+from time_limits import Slow, within
 
 from flcav.config import InputError
 from flcav.world.map.lanes import map_layers
@@ -33,10 +32,6 @@ class MapOutcome:
     done: str  # to the map
     said: str  # "town", or the sentence that refuses it
     broken: str  # traceback, or in what way the sentence is none; "" where all is well
-
-
-class _Hang(BaseException):
-    """The time for one case is over."""
 
 
 def mutate_often(path: Path, rng: np.random.Generator, times: int) -> Iterator[str]:
@@ -67,25 +62,19 @@ def try_map(maps: list[Path], number: int, folder: Path, *, limit_s: int, every:
     path.write_bytes(source.read_bytes())
     done = "; ".join(mutate_often(path, rng, int(rng.integers(1, 4))))
 
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        raise _Hang
-
-    signal.signal(signal.SIGALRM, stop)
-    signal.alarm(limit_s)
     said, broken = "town", ""
     try:
-        town = import_town(path, folder / "town").town
-        if number % every == 0:
-            build_town_mesh(town)
-            map_layers(town)
-            simulate(town, seed=number, cavs=0, times_s=DRIVEN_S)
+        with within(limit_s):
+            town = import_town(path, folder / "town").town
+            if number % every == 0:
+                build_town_mesh(town)
+                map_layers(town)
+                simulate(town, seed=number, cavs=0, times_s=DRIVEN_S)
     except InputError as error:
         said = str(error)
         broken = said if "\n" in said or not said.startswith(str(path)) else ""
-    except _Hang:
+    except Slow:
         broken = f"not done in {limit_s} s\n{traceback.format_exc()}"
     except Exception:
         broken = traceback.format_exc()
-    finally:
-        signal.alarm(0)
     return MapOutcome(number, source.name, done, said, broken)

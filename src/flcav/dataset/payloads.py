@@ -23,6 +23,7 @@ _DROPPED = 23 - DEPTH_BITS
 PLANES = {"rgb": "webp", "depth_m": "depth.zst", "semantic": "semantic.png", "instance": "instance.png"}
 PICTURES = ("webp", "png", "jpg", "jpeg")  # of colour images: recorded ones are WebP, imported ones as they were
 POINTS, TIMES, RADAR, INFRARED = "bin", "times.bin", "radar.bin", "infrared.png"
+TAIL = 4096  # bytes at the end of a JPEG or PNG in which its end is marked
 COLUMNS = {POINTS: 4, TIMES: 1, RADAR: 5}  # of little-endian float32 in row-major order
 
 
@@ -127,6 +128,29 @@ def read_image(path: Path, dtype: type[np.generic], channels: int = 1) -> NDArra
     if found != channels:
         raise InputError(f"{path}: not a readable image (it has {found} channels, not {channels})")
     return pixels.astype(dtype)
+
+
+def check_image(path: Path) -> None:
+    """Raise `InputError` where an image file is truncated or of no kind of PICTURES; it is not decoded.
+
+    A PNG ends in its chunk IEND (ISO/IEC 15948, 11.2.5), a JPEG in the marker FFD9 (ITU-T T.81, B.1.1.3), after which
+    some programs write more; the length of a WebP is in its header (RFC 9649, 2.3).
+    """
+    with path.open("rb") as file:
+        head = file.read(12)
+        size = file.seek(0, io.SEEK_END)
+        file.seek(max(0, size - TAIL))
+        tail = file.read()
+    if head.startswith(b"\x89PNG"):
+        whole = b"IEND" in tail
+    elif head.startswith(b"\xff\xd8"):
+        whole = b"\xff\xd9" in tail
+    elif head.startswith(b"RIFF") and head.endswith(b"WEBP"):
+        whole = size >= 8 + int.from_bytes(head[4:8], "little")
+    else:
+        raise InputError(f"{path}: not an image, or a truncated one")
+    if not whole:
+        raise InputError(f"{path}: a truncated image")
 
 
 def _read_depth(path: Path) -> NDArray[np.float32]:

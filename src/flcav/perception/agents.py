@@ -8,7 +8,7 @@ from typing import Any
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.files import Json
-from flcav.perception.task import KnowsRig, RigBound, Task
+from flcav.perception.task import KnownLidar, KnowsRig, RigBound, Task
 
 POLE = "pole"  # prefix of the names of roadside agents; all other agents are vehicles
 
@@ -36,13 +36,13 @@ class FrameSelection:
 
 
 def choose_frames(
-    task: Task, config: Any, data: Dataset, wanted: str | None = None, *, beams: int | None = None
+    task: Task, config: Any, data: Dataset, wanted: str | None = None, *, trained: KnownLidar | None = None
 ) -> FrameSelection:
     """Select the frames of the agents `wanted`: "all", "vehicles", "poles" or names, separated by commas.
 
     None selects the frames whose sensors are mounted as a network of `config` expects them (`RigBound.fitting`), and
-    all frames if the task is not bound to a rig. beams: of the LiDAR that the network was trained with; None: not
-    known. Raises `InputError` for an agent that the dataset lacks, and what `RigBound.fitting` raises.
+    all frames if the task is not bound to a rig. trained: the LiDAR that the network was trained with; None: nothing is
+    known of it. Raises `InputError` for an agent that the dataset lacks, and what `RigBound.fitting` raises.
     """
     if wanted is not None:
         frames = data.select(agents=_agents(data, wanted))
@@ -50,7 +50,7 @@ def choose_frames(
         frames = task.fitting(data, config) if isinstance(task, RigBound) else range(len(data))
     every, own = ([data.keys[i].agent for i in numbers] for numbers in (range(len(data)), frames))
     used = Counter(map(kind_of, own))
-    rig = task.compare_rig(data, config, frames, beams) if isinstance(task, KnowsRig) else ""
+    rig = task.compare_rig(data, config, frames, trained or KnownLidar()) if isinstance(task, KnowsRig) else ""
     return FrameSelection(tuple(frames), tuple(dict.fromkeys(own)), used, Counter(map(kind_of, every)) - used, rig)
 
 

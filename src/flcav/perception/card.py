@@ -12,6 +12,7 @@ from flcav.dataset.store import Dataset
 from flcav.files import Json, sha256, write_bytes
 from flcav.markdown import format_bullets, format_table
 from flcav.perception.agents import FrameSelection
+from flcav.perception.task import KnownLidar
 from flcav.records import LEFT_OUT, Record
 from flcav.sensors.rig import RIGS
 
@@ -116,21 +117,24 @@ def write_card(card: Card, path: Path) -> None:
     write_bytes(path, card.markdown().encode())
 
 
-def count_beams(recipe: Mapping[str, Json]) -> int | None:
-    """Return the beams of the vehicles' first LiDAR by the recipe of a recording, or as an import counted them.
+def read_lidar(recipe: Mapping[str, Json]) -> KnownLidar:
+    """Return beams and range of the vehicles' first LiDAR by the recipe of a recording, or as an import knows them.
 
-    recipe: of a manifest, or of a card's entry, which names the rig. None where it does not say, and where the beams
-    are drawn.
+    recipe: of a manifest, or of a card's entry, which names the rig. None where it does not say, and where they are
+    drawn.
     """
     if recipe.get("randomise") is not None:
-        return None
+        return KnownLidar()
     rig: Any = recipe.get("vehicle_rig")
     known: Any = RIGS[rig].model_dump(mode="json") if isinstance(rig, str) and rig in RIGS else rig
     try:
-        beams = next(iter(known["lidars"].values()))["settings"]["channels"]
+        settings = next(iter(known["lidars"].values()))["settings"]
+        beams, range_m = settings["channels"], settings.get("range_m")
     except (TypeError, KeyError, AttributeError, StopIteration):
-        beams = recipe.get("beams")
-    return beams if isinstance(beams, int) else None
+        beams, range_m = recipe.get("beams"), recipe.get("range_m")
+    return KnownLidar(
+        beams if isinstance(beams, int) else None, float(range_m) if isinstance(range_m, int | float) else None
+    )
 
 
 def _rig_name(rig: Any) -> str | None:

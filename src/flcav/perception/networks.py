@@ -16,7 +16,7 @@ from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.files import Json
 from flcav.perception.agents import FrameSelection, choose_frames
-from flcav.perception.card import Card, count_beams
+from flcav.perception.card import Card, read_lidar
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
 from flcav.perception.metrics.benchmark import evaluate_kitti, is_kitti
@@ -24,7 +24,7 @@ from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.objects.predict import look_around
 from flcav.perception.objects.task import ObjectsTask
 from flcav.perception.objects.truth import narrow_range
-from flcav.perception.task import ConfigT, Finding, NetworkT, SampleT, Scores, Task
+from flcav.perception.task import ConfigT, Finding, KnownLidar, NetworkT, SampleT, Scores, Task
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.tracking.evaluate import evaluate_tracks, group_sequences
 from flcav.perception.training.run import WEIGHTS, Request, train_network
@@ -143,7 +143,7 @@ def evaluate(
         return _evaluate_benchmark(learned, Path(data), network, device, progress)
     dataset = open_data(data)
     tested = _turned(learned, resolve_network(learned, network, device), around)
-    chosen = choose_frames(learned, tested.config, dataset, agents, beams=count_trained_beams(learned, network))
+    chosen = choose_frames(learned, tested.config, dataset, agents, trained=find_trained_lidar(learned, network))
     narrow = {} if within is None else {"asked": narrow_range(tested.config, within)}
     if tracks:
         group_sequences(dataset, chosen.frames)  # said before the long work
@@ -188,9 +188,9 @@ def infer(
     recorded = [path for path in paths if (path / MANIFEST).is_file()]
     if agents is not None and not recorded:
         raise InputError(f"--agents {agents}: only datasets have agents, and none is among the inputs")
-    beams = count_trained_beams(learned, network)
+    trained = find_trained_lidar(learned, network)
     chosen = {
-        path: choose_frames(learned, looking.config, Dataset.open(path), agents, beams=beams) for path in recorded
+        path: choose_frames(learned, looking.config, Dataset.open(path), agents, trained=trained) for path in recorded
     }
     frames = {path: choice.frames for path, choice in chosen.items()}
     lowest = threshold_of(learned, threshold)
@@ -228,7 +228,7 @@ def register_errors(
         able = [name for name in TASKS if isinstance(task_named(name), RegistersErrors)]
         raise InputError(f"task '{learned.name}': its mistakes have no place in a town; choose {', '.join(able)}")
     tested = _turned(learned, resolve_network(learned, network, device), around)
-    chosen = choose_frames(learned, tested.config, dataset, agents, beams=count_trained_beams(learned, network))
+    chosen = choose_frames(learned, tested.config, dataset, agents, trained=find_trained_lidar(learned, network))
     lowest = threshold_of(learned, threshold)
     return replace(learned.register_errors(tested, dataset, chosen.frames, lowest, progress), chosen=chosen)
 
@@ -263,16 +263,17 @@ def _check_around(task: Task, around: bool) -> None:
         raise InputError(f"--around: only objects are looked for to all sides, not '{task.name}'")
 
 
-def count_trained_beams(task: Task, network: Weights) -> int | None:
-    """Return the beams of the LiDAR that a network was trained with, by its card; None where that does not say."""
+def find_trained_lidar(task: Task, network: Weights) -> KnownLidar:
+    """Return the LiDAR that a network was trained with, by its card, as far as that says it and it is one."""
     if isinstance(network, nn.Module):
-        return None
+        return KnownLidar()
     try:
         card = read_card(Path(network or find_shipped(task)))
     except InputError:
-        return None
-    beams = {count_beams(entry.recipe) for entry in card.data}
-    return beams.pop() if len(beams) == 1 else None
+        return KnownLidar()
+    known = [read_lidar(entry.recipe) for entry in card.data]
+    beams, ranges = {lidar.beams for lidar in known}, {lidar.range_m for lidar in known}
+    return KnownLidar(beams.pop() if len(beams) == 1 else None, ranges.pop() if len(ranges) == 1 else None)
 
 
 def threshold_of(task: Task, threshold: float | None) -> float:

@@ -170,14 +170,22 @@ class RigBound(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class KnownLidar:
+    """What a recording says of the vehicles' first LiDAR."""
+
+    beams: int | None = None  # None: not known
+    range_m: float | None = None  # largest range; None: not known
+
+
 @runtime_checkable
 class KnowsRig(Protocol):
     """A task whose networks know the sensor rig that they were trained for."""
 
-    def compare_rig(self, data: Dataset, config: Any, frames: Sequence[int], beams: int | None) -> str:
+    def compare_rig(self, data: Dataset, config: Any, frames: Sequence[int], trained: KnownLidar) -> str:
         """Return how the rig of these frames differs from that of a network of `config`, in words, "" for not at all.
 
-        beams: of the LiDAR that the network was trained with; None: not known.
+        trained: the LiDAR that the network was trained with.
         """
         ...
 

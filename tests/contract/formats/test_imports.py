@@ -14,6 +14,7 @@ from flcav.dataset.checks.validate import find_leaks, validate
 from flcav.dataset.formats.export import FORMATS, export
 from flcav.dataset.formats.exporter import ExportOptions, split_scenes
 from flcav.dataset.formats.importing import READABLE, import_dataset
+from flcav.dataset.formats.kitti.read import KittiSource
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, wrap_angle
@@ -226,17 +227,18 @@ DAMAGES = {  # format -> pattern of a file, and the sentence where it is missing
     "kitti": [
         ("training/velodyne/*.bin", None, "truncated"),
         ("training/calib/*.txt", "no such file", "needs 12 numbers|no such file|needs 9 numbers"),
-        ("training/image_2/*.png", "no such file", None),
+        ("training/image_2/*.png", "no such file", "a truncated image"),
         ("training/label_2/*.txt", None, "is no KITTI label"),
     ],
     "nuscenes": [
         ("v1.0-flcav/ego_pose.json", "no such file", "not JSON"),
         ("samples/LIDAR_TOP/*.bin", "no such file", "truncated"),
         ("samples/RADAR_FRONT/*.pcd", "no such file", "truncated|not a binary PCD file"),
-        ("samples/CAM_FRONT/*.png", "no such file", None),
+        ("samples/CAM_FRONT/*.png", "no such file", "a truncated image"),
     ],
     "opv2v": [
         ("train/*/*/*.pcd", "no such file", "truncated"),
+        ("train/*/*/*_camera0.png", None, "a truncated image"),
         ("train/*/*/000000.yaml", None, "not a YAML file|not a frame of OPV2V"),
     ],
 }
@@ -266,6 +268,33 @@ def test_a_missing_or_truncated_file_names_itself(
         import_dataset(name, folder, tmp_path / "out")
     assert str(path) in str(error.value)
     assert not (tmp_path / "out" / "manifest.json").exists()
+
+
+def test_an_import_goes_on_once_a_file_is_replaced(
+    exported: dict[str, Path], imported: dict[str, Dataset], tmp_path: Path
+):
+    folder, out = shutil.copytree(exported["nuscenes"], tmp_path / "folder"), tmp_path / "out"
+    path = sorted((folder / "samples" / "LIDAR_TOP").iterdir())[-1]
+    data = path.read_bytes()
+    path.write_bytes(data[:-1])
+    with pytest.raises(InputError, match="truncated"):
+        import_dataset("nuscenes", folder, out)
+    path.write_bytes(data)
+    import_dataset("nuscenes", folder, out)
+    whole = imported["nuscenes"].folder
+    names = sorted(file.relative_to(whole) for file in whole.rglob("*") if file.is_file())
+    assert names == sorted(file.relative_to(out) for file in out.rglob("*") if file.is_file())
+    for name in names:
+        if name.name != "manifest.json":  # which says where it is from
+            assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def test_beams_and_range_are_known_of_kitti_itself(exported: dict[str, Path], tmp_path: Path):
+    folder = shutil.copytree(exported["kitti"], tmp_path / "kitti")
+    assert KittiSource(folder).describe().keys().isdisjoint({"beams", "range_m"})
+    (folder / "frames.csv").unlink()
+    described = KittiSource(folder).describe()
+    assert (described["beams"], described["range_m"]) == (64, 120)
 
 
 @pytest.mark.parametrize("name", READABLE)

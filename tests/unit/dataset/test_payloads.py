@@ -9,7 +9,15 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.dataset.payloads import encode_depth, encode_plane, encode_rows, read_image, read_plane, read_rows
+from flcav.dataset.payloads import (
+    check_image,
+    encode_depth,
+    encode_plane,
+    encode_rows,
+    read_image,
+    read_plane,
+    read_rows,
+)
 
 PLANES = {
     "rgb": lambda rng: rng.integers(0, 256, (24, 32, 3), dtype=np.uint8),
@@ -74,3 +82,20 @@ def test_rows_are_counted(tmp_path: Path):
     np.testing.assert_array_equal(read_rows(path, "radar.bin", 3), rows)
     with pytest.raises(InputError, match="60 bytes where 4 points take 80"):
         read_rows(path, "radar.bin", 4)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpeg", "webp"])
+def test_a_truncated_image_is_told_by_its_end(kind: str, tmp_path: Path):
+    whole, path = io.BytesIO(), tmp_path / f"a.{kind}"
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(whole, kind)
+    for more in (b"", b"\0" * 100):
+        path.write_bytes(whole.getvalue() + more)
+        check_image(path)
+    for share in (0.3, 0.7, 0.99):
+        path.write_bytes(whole.getvalue()[: int(share * len(whole.getvalue()))])
+        with pytest.raises(InputError, match=rf"a.{kind}: a truncated image"):
+            check_image(path)
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match="not an image, or a truncated one"):
+        check_image(path)

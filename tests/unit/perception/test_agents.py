@@ -14,15 +14,19 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import concatenate, pose
 from flcav.perception.agents import choose_frames
+from flcav.perception.card import read_lidar
+from flcav.perception.networks import find_trained_lidar
 from flcav.perception.objects import predict as prediction
 from flcav.perception.objects.model import second, second_tiny, small_config, tiny_config
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import narrow_range
+from flcav.perception.task import KnownLidar
 from flcav.perception.trajectory.config import CONFIGURATIONS as TRAJECTORIES
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import read_card, save_network
 from flcav.sensors.frame import Calibration, Frame
+from flcav.sensors.rig import RIGS
 
 from .frames import cloud_in, detections, frame
 
@@ -38,9 +42,11 @@ class Street:
     scene: tuple[str, ...] = ("a", "b")
     height_m: float = 1.8
     beams: int | None = None
+    range_m: float | None = None
 
     def describe(self) -> dict[str, Any]:
-        return {"town": "none", "split": "train", "seed": 0, "agents": self.agents, "beams": self.beams}
+        known = {"beams": self.beams, "range_m": self.range_m}
+        return {"town": "none", "split": "train", "seed": 0, "agents": self.agents, **known}
 
     def scenes(self) -> list[str]:
         return list(self.scene)
@@ -143,9 +149,28 @@ def test_a_rig_unlike_the_network_s_is_said_and_its_height_corrected(recorded):
     assert chosen.sentence == f"4 vehicle and 2 pole frames; {chosen.rig}"
     assert chosen.summary()["rig"] == chosen.rig
     assert choose_frames(OBJECTS, tiny_config(), taller, "poles").rig == ""
-    beams = choose_frames(OBJECTS, tiny_config(), recorded(beams=32), beams=64)
+    beams = choose_frames(OBJECTS, tiny_config(), recorded(beams=32), trained=KnownLidar(beams=64))
     assert beams.rig == "unlike in the network's training the LiDAR has 32 beams, not 64"
-    assert choose_frames(OBJECTS, tiny_config(), recorded(beams=64), beams=64).rig == ""
+    assert choose_frames(OBJECTS, tiny_config(), recorded(beams=64), trained=KnownLidar(64, 120)).rig == ""
+
+
+@pytest.mark.parametrize(
+    ("here", "trained", "said"), [(40, 100, True), (100, 40, True), (60, 120, False), (45, 50, False)]
+)
+def test_another_range_is_said_as_far_as_the_network_looks(recorded, here: float, trained: float, said: bool):
+    """A tiny network looks 48 m ahead and 24 m aside: 54 m."""
+    found = choose_frames(OBJECTS, tiny_config(), recorded(range_m=here), trained=KnownLidar(range_m=trained)).rig
+    assert found == (f"unlike in the network's training the LiDAR reaches {here} m, not {trained} m" if said else "")
+    assert choose_frames(OBJECTS, tiny_config(), recorded(range_m=here)).rig == ""
+
+
+def test_the_lidar_of_a_training_is_that_of_its_rig():
+    settings = RIGS["kitti_lidar"].lidars["velodyne"].settings
+    known = KnownLidar(settings.channels, settings.range_m)
+    assert known == KnownLidar(64, 120)
+    assert read_lidar({"vehicle_rig": "kitti_lidar"}) == known
+    assert read_lidar({"vehicle_rig": RIGS["kitti_lidar"].model_dump(mode="json")}) == known
+    assert find_trained_lidar(OBJECTS, None) == known
 
 
 def test_cameras_of_vehicles_and_poles_are_used_alike_and_paths_are_those_of_vehicles(street):

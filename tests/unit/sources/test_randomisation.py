@@ -7,7 +7,8 @@ from shapely.geometry import Polygon
 
 from flcav.config import InputError
 from flcav.geometry import inverse
-from flcav.perception.card import count_beams
+from flcav.perception.card import read_lidar
+from flcav.perception.task import KnownLidar
 from flcav.seeds import stream
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
@@ -94,7 +95,7 @@ def test_every_car_has_a_lidar_of_its_own(source: EmbeddedSource):
     assert 2.05 < heights.max() <= 2.13
     assert {lidar.settings.range_m for lidar in drawn} == {120.0}
     assert len({lidar.settings.channels for lidar in drawn}) > 8  # even patterns differ in it
-    assert count_beams(source.describe()) is None
+    assert read_lidar(source.describe()) == KnownLidar()
 
 
 def test_cars_alone_change_their_sizes(source: EmbeddedSource):

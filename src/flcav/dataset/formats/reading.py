@@ -42,6 +42,7 @@ class LogSource(ABC):
     _split_of: Mapping[str, str | None]  # scene -> its split
     _labelled: bool = True  # whether all frames have boxes
     _beams: int | None = None  # of the LiDAR, where the format settles them
+    _range_m: float | None = None  # of the LiDAR, the largest
 
     def describe(self) -> Mapping[str, Json]:
         """Return folder, splits and what is labelled."""
@@ -52,6 +53,7 @@ class LogSource(ABC):
             "labels": ["objects"] if self._labelled else [],
             "splits": name_splits(self._split_of),
             **({} if self._beams is None else {"beams": self._beams}),
+            **({} if self._range_m is None else {"range_m": self._range_m}),
         }
 
     def scenes(self) -> list[str]:

@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from flcav.dataset.calibration import encode_calibration
 from flcav.dataset.layout import CALIBRATION, FILES, TRACES, payload_path, table_path
-from flcav.dataset.payloads import encode_payloads
+from flcav.dataset.payloads import PICTURES, check_image, encode_payloads
 from flcav.dataset.rows import build_table, encode_frame
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
 from flcav.files import sha256, write_bytes, write_in_pieces
@@ -66,7 +66,8 @@ def perform(source: Source, task: Job, work: Path, wrote_frame: Callable[[], Non
     """Perform the job `task` below the folder `work`, replacing leftovers of an earlier attempt.
 
     Calls `wrote_frame` after each frame. Raises ValueError where the source violates its protocol: it has no traffic to
-    replay, yields a frame twice or of another scene, uses unsafe names, or moves sensors on their mounts.
+    replay, yields a frame twice or of another scene, uses unsafe names, or moves sensors on their mounts; and the
+    ValueError `InputError` where an image that is linked to is truncated.
     """
     if isinstance(task, Traffic):
         trace = source.trace(task.scene)
@@ -106,7 +107,10 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
         written.add(frame.key)
         links = frame.files if isinstance(frame, LinkedFrame) else {}
         for sensor, target in links.items():
-            name = payload_path(sensor, frame.key, target.suffix[1:].lower())
+            suffix = target.suffix[1:].lower()
+            if suffix in PICTURES:
+                check_image(target)
+            name = payload_path(sensor, frame.key, suffix)
             (part / PAYLOADS / name).parent.mkdir(parents=True, exist_ok=True)
             (part / PAYLOADS / name).symlink_to(target.resolve())
             files.append((name, target.stat().st_size, sha256(target)))

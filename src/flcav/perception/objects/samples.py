@@ -13,7 +13,7 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.agents import POLE, kind_of
-from flcav.perception.card import count_beams
+from flcav.perception.card import read_lidar
 from flcav.perception.foreground import frame_reader
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.truth import (
@@ -25,8 +25,10 @@ from flcav.perception.objects.truth import (
     network_from_lidar,
     turn_of,
 )
+from flcav.perception.task import KnownLidar
 from flcav.sensors.frame import Frame
 
+RANGE_SLACK = 0.2  # difference of a LiDAR's range from the one of the training that is not worth a word
 HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one that a network expects
 
 
@@ -137,11 +139,12 @@ def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
     return fitting or range(len(data))
 
 
-def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], beams: int | None) -> str:
+def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], trained: KnownLidar) -> str:
     """Return how the LiDAR of the vehicles' frames differs from the one of the network's training, in words.
 
-    That is by its number of beams, its height above the ground and its direction, of which the last two are corrected
-    (see `flcav.perception.objects.truth.network_from_lidar`). "" where it does not differ, or does by nothing known.
+    That is by its number of beams, its range as far as the network looks, its height above the ground and its
+    direction, of which the last two are corrected (see `flcav.perception.objects.truth.network_from_lidar`). "" where
+    it does not differ, or does by nothing known.
     """
     agents = {data.keys[i].agent: data.lidars(i)[0] for i in frames if data.lidars(i)}
     mounts = [
@@ -152,10 +155,14 @@ def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], beam
     moved = [mount for mount in mounts if level_mount(mount, config) is not None]
     heights = dict.fromkeys(f"{mount[2, 3]:.2f}" for mount in moved if abs(mount[2, 3] + config.ground_z_m) > LEVEL_M)
     turned = dict.fromkeys(f"{math.degrees(angle):.0f}" for mount in moved if (angle := turn_of(mount)) > LEVEL_RAD)
-    here = count_beams(data.manifest.recipe)
+    here = read_lidar(data.manifest.recipe) if mounts else KnownLidar()
     differences = []
-    if mounts and beams is not None and here is not None and here != beams:
-        differences.append(f"has {here} beams, not {beams}")
+    if trained.beams is not None and here.beams is not None and here.beams != trained.beams:
+        differences.append(f"has {here.beams} beams, not {trained.beams}")
+    if trained.range_m is not None and here.range_m is not None:
+        seen_m, known_m = (min(far_m, config.reach_m) for far_m in (here.range_m, trained.range_m))
+        if abs(seen_m - known_m) > RANGE_SLACK * known_m:
+            differences.append(f"reaches {here.range_m:g} m, not {trained.range_m:g} m")
     if heights:
         differences.append(f"is {', '.join(heights)} m above the ground, not {-config.ground_z_m:g} m (corrected)")
     if turned:

@@ -25,7 +25,7 @@ from flcav.perception.objects.predict import detect_frames, detect_in
 from flcav.perception.objects.samples import RecordedSweeps, Sample, compare_rig, select_fitting_frames
 from flcav.perception.objects.truth import target_criteria
 from flcav.perception.study import StudyRecipe
-from flcav.perception.task import Finding, Practice
+from flcav.perception.task import Finding, KnownLidar, Practice
 from flcav.progress import Report, ignore_progress
 
 
@@ -67,12 +67,12 @@ class ObjectsTask(ObjectsOutcomes):
         """
         return select_fitting_frames(data, config)
 
-    def compare_rig(self, data: Dataset, config: SecondConfig, frames: Sequence[int], beams: int | None) -> str:
+    def compare_rig(self, data: Dataset, config: SecondConfig, frames: Sequence[int], trained: KnownLidar) -> str:
         """Return how the frames' LiDAR differs from that of the network's training, in words.
 
         See `flcav.perception.objects.samples`.
         """
-        return compare_rig(data, config, frames, beams)
+        return compare_rig(data, config, frames, trained)
 
     def draw(self, samples: Sequence[Sample], index: int, config: SecondConfig, rng: np.random.Generator) -> Sample:
         """Return sample `index` augmented as `config.augmentation` says, ground-truth sampling first.

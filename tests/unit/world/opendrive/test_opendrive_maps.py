@@ -250,7 +250,9 @@ def test_signs_and_poles_of_the_map_stand_where_it_says(tmp_path: Path) -> None:
                 '<signals><signal id="1" s="20" t="-5" type="206" orientation="-" zOffset="1.9" height="0.8"/>'
                 '<signal id="2" s="30" t="-5" type="274" value="50" orientation="+"/>'
                 '<signal id="3" s="30" t="-5" type="274" value="many"/>'
-                '<signal id="4" s="400" t="0" type="206"/></signals>'
+                '<signal id="4" s="400" t="0" type="206"/><signal id="5" s="9" t="0" type="306"/>'
+                '<signal id="6" s="9" t="0" type="1000001" dynamic="yes"/>'
+                '<signal id="7" s="9" t="0" type="294"/></signals>'
             )
         )
         road.append(
@@ -259,7 +261,11 @@ def test_signs_and_poles_of_the_map_stand_where_it_says(tmp_path: Path) -> None:
                 'tStart="6" tEnd="8"/></object><object id="2" type="pole" s="1" t="1"/></objects>'
             )
         )
-    town = import_town(write(root, tmp_path / "map.xodr"), tmp_path / "town").town
+    imported = import_town(write(root, tmp_path / "map.xodr"), tmp_path / "town")
+    town = imported.town
+    told = "left out: 1 (a limit without a number); left out: 1 (no place on the road); left out: 1 (of the type '306')"
+    assert f"Signs of the map taken over: 2; {told}." in imported.notes
+    assert "Poles of the map taken over: 3; left out: 1 (no height of a pole)." in imported.notes
     assert sorted(town.signs.kind) == ["speed_60", "stop"]
     stop = town.signs.kind.index("stop")
     np.testing.assert_allclose(town.signs.position[stop], (30.0, -5.0, 2.3), atol=1e-3)  # the road begins at (10, 0)

@@ -52,6 +52,7 @@ CATEGORIES = {  # a bicycle of flcav's has a rider; Argoverse 2's without one ke
 SPLITS = ("train", "val", "test")  # folders of logs
 AXLE_M = 0.33  # height of the rear axle above the ground, which in the log 7fab2350 lies 0.33 to 0.37 m below it
 BEAMS = 64  # of both LiDARs: the lasers 0 to 63 of a sweep
+RANGE_M = 200.0  # of a VLP-32C, by its data sheet
 LIDAR, MOUNT = "lidar", "up_lidar"  # our name of both LiDARs, where they are taken to be
 LATE_NS = 50_000_000  # most time between a sweep and the picture of a camera that goes with it: it runs at 20 Hz
 TEXT = ("sensor_name", "track_uuid", "category")  # columns, of which all others are numbers
@@ -83,6 +84,7 @@ class Argoverse2Source(LogSource):
 
     FORMAT = "argoverse2"
     _beams = BEAMS
+    _range_m = RANGE_M
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where there is no log in `folder`, none of `split`, or a file of a log is missing."""

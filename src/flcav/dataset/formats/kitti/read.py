@@ -1,8 +1,9 @@
 """Reading of KITTI's object detection benchmark as a source of frames.
 
 Its frames are of no sequence: each is a scene of its own, at time 0 and at the world's origin. Only an export of
-flcav's says more, in `frames.csv`. The LiDAR stands where KITTI's does, HEIGHT_M above the ground (Geiger et al., IJRR
-32(11), 2013, fig. 3); a label's rectangle is of the whole object as far as it lies in the image.
+flcav's says more, in `frames.csv`. The LiDAR stands where KITTI's does, HEIGHT_M above the ground, and but for an
+export's has the BEAMS and RANGE_M of an HDL-64E (Geiger et al., IJRR 32(11), 2013, section 2 and fig. 3); a label's
+rectangle is of the whole object as far as it lies in the image.
 """
 
 import csv
@@ -44,7 +45,7 @@ CATEGORIES = {  # KITTI's other classes (Person_sitting, Tram, Misc) keep their 
     "Cyclist": "bicycle",
 }
 OCCLUSION = np.array([0.0, 0.3, 0.75, np.nan])  # share that stands for the levels 0 fully visible, 1, 2, 3 unknown
-HEIGHT_M = 1.73
+HEIGHT_M, BEAMS, RANGE_M = 1.73, 64, 120.0
 LIDAR, CAMERA = "velodyne", "image_2"
 FOLDERS = ("training", "testing")
 LISTS = ("train", "val", "test")
@@ -88,6 +89,8 @@ class KittiSource(LogSource):
                 agent = self._agent[shot.number] = names.of(shot.vehicle, text)
                 self._calibration.setdefault(agent, mounted)
         every = [shot for own in self._shots.values() for shot in own]
+        if not any(shot.exported for shot in every):
+            self._beams, self._range_m = BEAMS, RANGE_M
         bare = sum(not _path(shot, "label_2").is_file() for shot in every)
         self._labelled = not bare
         self.notes = (f"no label_2 of {bare} of {len(every)} frames, so no boxes there",) if bare else ()

@@ -4,17 +4,19 @@ The ego vehicle's frame is on the ground below the rear axle, the world is nuSce
 are in its devkit's code and not in its files; an export of flcav's has them, and its logs name scene and agent.
 """
 
+from array import array
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flcav.config import InputError, read_json, shorten
+from flcav.config import InputError, read_json
 from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, decode_radar
+from flcav.dataset.formats.nuscenes.rows import COLUMNS, Row, read_table, stream_table
 from flcav.dataset.formats.nuscenes.tables import VERSION
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
@@ -29,11 +31,11 @@ from flcav.dataset.formats.reading import (
     read_pictures,
     view_boxes,
 )
-from flcav.geometry import Boxes, inverse, yaw_of
+from flcav.geometry import Boxes, inverse
 from flcav.sensors.frame import Calibration, LinkedFrame
 
 Array = NDArray[np.float64]
-Row = Mapping[str, Any]  # of a table of nuScenes
+SMALL = [name for name in COLUMNS if name not in ("sample_data", "ego_pose", "sample_annotation")]  # kept as they are
 
 CATEGORIES = {  # other classes keep their names, and so do cycles without a rider
     "vehicle.car": "car",
@@ -58,31 +60,9 @@ OCCLUSION = {
     "4": 0.1,
 }  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
 TOP = "LIDAR_TOP"
-BEAMS = 32  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders of the format do not say
+BEAMS, RANGE_M = 32, 70.0  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders do not say
 VERSIONS = ("v1.0-mini", "v1.0-trainval", "v1.0-test")  # nuScenes' own tables
-NUMBERS = {"translation": 3, "size": 3, "rotation": 4}  # columns of so many numbers
-FARTHEST = 1e9
 POINT = 5  # float32 of a point: x, y, z, intensity 0 to 255, ring
-COLUMNS = {  # what is read of each table
-    "scene": ("name", "log_token", "first_sample_token"),
-    "log": ("logfile", "vehicle"),
-    "sample": ("timestamp", "scene_token"),
-    "sample_data": (
-        "sample_token",
-        "ego_pose_token",
-        "calibrated_sensor_token",
-        "is_key_frame",
-        "filename",
-        "timestamp",
-    ),
-    "ego_pose": ("translation", "rotation"),
-    "calibrated_sensor": ("sensor_token", "translation", "rotation", "camera_intrinsic"),
-    "sensor": ("channel", "modality"),
-    "category": ("name",),
-    "attribute": ("name",),
-    "instance": ("category_token",),
-    "sample_annotation": ("sample_token", "instance_token", "translation", "size", "rotation"),
-}
 
 
 class Spin(NamedTuple):
@@ -104,21 +84,21 @@ class NuscenesSource(LogSource):
         self._folder, self._split = folder, split
         self._tables = _find_tables(folder)
         self._root = self._tables.parent
-        table = {name: _read_table(self._tables / f"{name}.json", name) for name in COLUMNS}
+        table = {name: read_table(self._tables, name) for name in SMALL}
         self._data: dict[str, dict[str, Row]] = defaultdict(dict)  # sample -> channel -> row of sample_data
         self._mounted, self._channel = table["calibrated_sensor"], table["sensor"]
-        for row in table["sample_data"].values():
-            if row["is_key_frame"]:
-                mounted = self._at(self._mounted, row["calibrated_sensor_token"])
-                self._data[row["sample_token"]][self._at(self._channel, mounted["sensor_token"])["channel"]] = row
+        for row in stream_table(self._tables, "sample_data", lambda row: row["is_key_frame"]):
+            mounted = self._at(self._mounted, row["calibrated_sensor_token"])
+            self._data[row["sample_token"]][self._at(self._channel, mounted["sensor_token"])["channel"]] = row
         used = {row["ego_pose_token"] for rows in self._data.values() for row in rows.values()}
-        self._pose = {token: row for token, row in table["ego_pose"].items() if token in used}
+        self._pose = read_table(self._tables, "ego_pose", lambda row: row["token"] in used)
         self._calibration: dict[str, Calibration] = {}  # by agent
         self._spins, split_of = self._order(table["scene"], table["log"], table["sample"])
         self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._read_notes(table)
-        self._beams = BEAMS if self._tables.name in VERSIONS else None
-        self._labelled = bool(table["sample_annotation"])
+        if self._tables.name in VERSIONS:
+            self._beams, self._range_m = BEAMS, RANGE_M
+        self._labelled = bool(self._notes)
         self.notes = () if self._labelled else ("no annotations in its tables, so no boxes",)
 
     def _at(self, table: Mapping[str, Row], token: str) -> Row:
@@ -131,6 +111,12 @@ class NuscenesSource(LogSource):
         return self._at(self._channel, self._at(self._mounted, row["calibrated_sensor_token"])["sensor_token"])[
             "modality"
         ]
+
+    def _pixels(self, row: Row) -> tuple[int, int]:
+        """Return width and height of a picture, of its row of sample_data."""
+        if row.get("width") is None or row.get("height") is None:
+            raise InputError(f"{self._tables / 'sample_data.json'}: no width and height of '{row['filename']}'")
+        return row["width"], row["height"]
 
     def _fingerprint(self, data: Mapping[str, Row]) -> tuple[str, ...]:
         mounted = {channel: self._at(self._mounted, row["calibrated_sensor_token"]) for channel, row in data.items()}
@@ -190,28 +176,28 @@ class NuscenesSource(LogSource):
 
     def _read_notes(self, table: Mapping[str, Mapping[str, Row]]) -> None:
         """Keep the annotations: boxes in the global frame by sample, with velocities by their instances."""
-        rows = list(table["sample_annotation"].values())
         category = {
             token: self._at(table["category"], row["category_token"])["name"]
             for token, row in table["instance"].items()
         }
         attribute = {token: row["name"] for token, row in table["attribute"].items()}
-        track = np.array([row["instance_token"] for row in rows], np.str_)
-        time_s = np.array([self._at(table["sample"], row["sample_token"])["timestamp"] / 1e6 for row in rows])
-        center = np.array([row["translation"] for row in rows], np.float64).reshape(-1, 3)
-        width, length, height = np.array([row["size"] for row in rows], np.float64).reshape(-1, 3).T
-        yaw = np.array([yaw_of(_placed(row)) for row in rows])
-        label = []
-        for row in rows:
+        track, time_s, label, occlusion, numbers = [], array("d"), [], array("d"), array("d")
+        self._notes: dict[str, list[int]] = defaultdict(list)  # sample -> places of its annotations
+        for number, row in enumerate(stream_table(self._tables, "sample_annotation")):
+            self._notes[row["sample_token"]].append(number)
+            track.append(row["instance_token"])
+            time_s.append(self._at(table["sample"], row["sample_token"])["timestamp"] / 1e6)
+            numbers.extend((*row["translation"], *row["size"], *row["rotation"]))
             name = category.get(row["instance_token"], "")
             ridden = RIDER in (attribute.get(token) for token in row.get("attribute_tokens", ()))
             label.append(RIDDEN.get(name, name) if ridden else CATEGORIES.get(name, name))
-        self._track, self._velocity = track, difference_tracks(track, time_s, center)
-        self._boxes = Boxes(center, np.column_stack((length, width, height)), yaw, np.array(label, np.str_))
-        self._occlusion = np.array([OCCLUSION.get(row.get("visibility_token", ""), np.nan) for row in rows])
-        self._notes: dict[str, list[int]] = defaultdict(list)
-        for number, row in enumerate(rows):
-            self._notes[row["sample_token"]].append(number)
+            occlusion.append(OCCLUSION.get(row.get("visibility_token", ""), np.nan))
+        center, size, quaternion = np.split(np.reshape(numbers, (-1, 10)), (3, 6), axis=1)
+        turned = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix()
+        yaw = np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
+        self._track, self._occlusion = np.array(track, np.str_), np.array(occlusion)
+        self._velocity = difference_tracks(self._track, np.array(time_s), center)
+        self._boxes = Boxes(center, size[:, [1, 0, 2]], yaw, np.array(label, np.str_))
 
     def frame_count(self, scene: str) -> int:
         """Return the number of key frames of a scene."""
@@ -237,7 +223,7 @@ class NuscenesSource(LogSource):
         pictures = {
             name: Picture(
                 path[name],
-                pinhole(calibration.intrinsics[name], data[name]["width"], data[name]["height"]),
+                pinhole(calibration.intrinsics[name], *self._pixels(data[name])),
                 poses[name] @ mounts[name],
             )
             for name in cameras
@@ -294,40 +280,6 @@ def _find_tables(folder: Path) -> Path:
             f"{folder}: several folders of tables, {', '.join(path.name for path in found)}: name one of them"
         )
     return found[0]
-
-
-def _read_table(path: Path, name: str) -> dict[str, Row]:
-    """Return token -> row of a table; raises `InputError` where a row lacks one of COLUMNS."""
-    rows = read_json(path)
-    wanted = {"token", *COLUMNS[name]}
-    if not isinstance(rows, list):
-        raise InputError(f"{path}: not a table of nuScenes; a list of rows is wanted")
-    for number, row in enumerate(rows):
-        if not isinstance(row, dict) or not wanted <= row.keys():
-            lost = sorted(wanted - row.keys())[0] if isinstance(row, dict) else "token"
-            raise InputError(f"{path}: row {number} has no '{lost}'")
-        if odd := [column for column in sorted(wanted) if not _fits(column, row[column])]:
-            raise InputError(f"{path}: row {number} has a '{odd[0]}' that is none: {shorten(row[odd[0]])}")
-    return {row["token"]: row for row in rows}  # type: ignore[index, misc]
-
-
-def _fits(column: str, value: object) -> bool:
-    """Return whether a value can be one of a column of COLUMNS."""
-    if column in NUMBERS:
-        return _are_numbers(value, NUMBERS[column]) and (column != "rotation" or any(value))  # type: ignore[arg-type]
-    if column == "camera_intrinsic":
-        return value == [] or (isinstance(value, list) and len(value) == 3 and all(_are_numbers(r, 3) for r in value))
-    if column == "timestamp":
-        return isinstance(value, int)
-    return isinstance(value, bool if column == "is_key_frame" else str)
-
-
-def _are_numbers(values: object, count: int) -> bool:
-    return (
-        isinstance(values, list)
-        and len(values) == count
-        and all(isinstance(value, int | float) and abs(value) < FARTHEST for value in values)
-    )
 
 
 def _placed(row: Row) -> Array:

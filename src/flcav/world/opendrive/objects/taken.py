@@ -44,19 +44,22 @@ def take_objects(
     heads = find_heads(root, offset_m, net)
     parking = find_parking(root, offset_m, net)
     objects = find_objects(root, offset_m, net)
+    signs, posts = find_signs(root, offset_m), find_posts(root, offset_m)
     found = find_stop_lines(root, offset_m, net)
     lines = add_crossing_lines(net, found.found) if crosswalks else found.found
     stop_at_lines(path, lines)
     several, alike = count_controllers(heads.found, path)
     told = f"Controllers with several of these heads: {several}; switched alike here: {alike}."
     return MapObjects(
-        signs=find_signs(root, offset_m),
-        posts=find_posts(root, offset_m),
+        signs=signs.found,
+        posts=posts.found,
         objects=objects.found,
         signals=heads.found,
         stop_lines=lines,
         parking=parking.found,
         notes=(
+            *tell("Signs", len(signs.found), signs.left),
+            *tell("Poles", len(posts.found), posts.left),
             *tell("Signal heads", len(heads.found), heads.left),
             *tell("Stop lines", found.taken, found.left),
             *tell("Parking spaces", len(parking.found), parking.left),

@@ -1,0 +1,147 @@
+"""nuScenes' tables as streams of rows: a table of gigabytes is never in memory as a whole."""
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from json import JSONDecodeError, JSONDecoder
+from pathlib import Path
+from typing import Any, TextIO
+
+from flcav.config import InputError, read_json, shorten
+
+Row = Mapping[str, Any]  # column -> value
+
+CHUNK = 1 << 20  # characters read at a time
+COLUMNS = {  # what is read of each table
+    "scene": ("name", "log_token", "first_sample_token"),
+    "log": ("logfile", "vehicle"),
+    "sample": ("timestamp", "scene_token"),
+    "sample_data": (
+        "sample_token",
+        "ego_pose_token",
+        "calibrated_sensor_token",
+        "is_key_frame",
+        "filename",
+        "timestamp",
+    ),
+    "ego_pose": ("translation", "rotation"),
+    "calibrated_sensor": ("sensor_token", "translation", "rotation", "camera_intrinsic"),
+    "sensor": ("channel", "modality"),
+    "category": ("name",),
+    "attribute": ("name",),
+    "instance": ("category_token",),
+    "sample_annotation": ("sample_token", "instance_token", "translation", "size", "rotation"),
+}
+OPTIONAL = {"sample_data": ("width", "height"), "sample_annotation": ("attribute_tokens", "visibility_token")}
+NUMBERS = {"translation": 3, "size": 3, "rotation": 4}  # columns of so many numbers
+FARTHEST = 1e9
+BLANKS = " \t\n\r"
+
+
+def keep_all(_row: Row) -> bool:
+    """Return True."""
+    return True
+
+
+def read_table(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all) -> dict[str, Row]:
+    """Return token -> row of a table, the rows that are `kept`; raises `InputError` as `stream_table`."""
+    return {row["token"]: row for row in stream_table(folder, name, kept)}
+
+
+def stream_table(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all) -> Iterator[Row]:
+    """Yield the rows of the table `name` in `folder` that are `kept`, with token, COLUMNS and the OPTIONAL they have.
+
+    Raises `InputError` where the file is missing or no table, or a row lacks one of COLUMNS.
+    """
+    path, wanted, also = folder / f"{name}.json", sorted({"token", *COLUMNS[name]}), OPTIONAL.get(name, ())
+    for number, row in enumerate(_stream_list(path)):
+        if not isinstance(row, dict) or not row.keys() >= set(wanted):
+            lost = next(column for column in wanted if column not in row) if isinstance(row, dict) else "token"
+            raise InputError(f"{path}: row {number} has no '{lost}'")
+        own = {column: row[column] for column in (*wanted, *also) if column in row}
+        if odd := [column for column, value in own.items() if not _fits(column, value)]:
+            raise InputError(f"{path}: row {number} has a '{odd[0]}' that is none: {shorten(own[odd[0]])}")
+        if kept(own):
+            yield {column: _share(value) if column.endswith("token") else value for column, value in own.items()}
+
+
+def _share(token: object) -> object:
+    """Return the one string that is equal to a token: it is in many rows, and once in memory."""
+    return sys.intern(token) if isinstance(token, str) else token
+
+
+def _stream_list(path: Path) -> Iterator[object]:
+    """Yield the elements of the JSON list in a file, one at a time; raises `InputError` where there is none."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            yield from _decode_list(file, path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except JSONDecodeError as error:
+        raise InputError(f"{path}: not JSON ({error.msg})") from None
+    except InputError:
+        raise
+    except (IsADirectoryError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not JSON ({error})") from None
+
+
+def _decode_list(file: TextIO, path: Path) -> Iterator[object]:
+    """Yield the elements of a JSON list; an element is taken once what follows it has been read, too."""
+    decoder, text, more = JSONDecoder(), "", CHUNK
+    while (read := file.read(CHUNK)) and not (text := read.lstrip(BLANKS)):
+        pass
+    if not text.startswith("["):
+        read_json(path)
+        raise InputError(f"{path}: not a table of nuScenes; a list of rows is wanted")
+    begin, at = True, 1
+    while True:
+        try:
+            end = _skip(text, at)
+            if not begin or text[end : end + 1] != "]":  # an empty list
+                element, end = decoder.raw_decode(text, end)
+                end = _skip(text, end)
+                if text[end : end + 1] not in (",", "]"):
+                    raise JSONDecodeError("Expecting ',' delimiter", text, end)
+                yield element
+        except JSONDecodeError:  # the element may go on in what is not read yet
+            if not (read := file.read(more)):
+                raise
+            text, at, more = text[at:] + read, 0, 2 * more
+            continue
+        if text[end] == "]":
+            break
+        begin, at, more = False, end + 1, CHUNK
+    rest = text[end + 1 :]
+    while not rest.strip(BLANKS) and (rest := file.read(CHUNK)):
+        pass
+    if rest:
+        raise JSONDecodeError("Extra data", rest, 0)
+
+
+def _skip(text: str, at: int) -> int:
+    """Return the place of the next character that is no white space."""
+    while at < len(text) and text[at] in BLANKS:
+        at += 1
+    return at
+
+
+def _fits(column: str, value: object) -> bool:
+    """Return whether a value can be one of a column of COLUMNS or OPTIONAL."""
+    if column in NUMBERS:
+        return _are_numbers(value, NUMBERS[column]) and (column != "rotation" or any(value))  # type: ignore[arg-type]
+    if column == "camera_intrinsic":
+        return value == [] or (isinstance(value, list) and len(value) == 3 and all(_are_numbers(r, 3) for r in value))
+    if column == "timestamp":
+        return isinstance(value, int)
+    if column in ("width", "height"):
+        return value is None or isinstance(value, int)
+    if column == "attribute_tokens":
+        return isinstance(value, list) and all(isinstance(token, str) for token in value)
+    return isinstance(value, bool if column == "is_key_frame" else str)
+
+
+def _are_numbers(values: object, count: int) -> bool:
+    return (
+        isinstance(values, list)
+        and len(values) == count
+        and all(isinstance(value, int | float) and abs(value) < FARTHEST for value in values)
+    )
