@@ -187,9 +187,11 @@ class Dataset:
     def town(self) -> Town | None:
         """Return the town of the dataset, from the dataset or from flcav; None where neither has it."""
         name = str(self.manifest.recipe.get("town", ""))
+        if not name:  # imported
+            return None
         kept = self.folder / town_path(name)
         try:
-            return load_town(kept if name and kept.is_dir() else name)
+            return load_town(kept if kept.is_dir() else name)
         except InputError:
             return None
 

@@ -61,8 +61,7 @@ def label_sample(
     own = detections[~_contradicted(detections, told, cells, looked)]
     above = points[:, 2] + height
     if relief is not None:
-        world = transform_points(world_from_lidar, points[:, :3].astype(np.float64))
-        above = world[:, 2] - relief.heights(*world[:, :2].T)
+        above = relief.above(transform_points(world_from_lidar, points[:, :3].astype(np.float64)))
     known = _free_ground(points, above, cells) | looked
     boxes = concatenate([road[targets], own])
     exact = np.arange(len(boxes)) < targets.sum() if views else None

@@ -71,18 +71,20 @@ def label_ideally(frame: Frame) -> Boxes:
     return frame.annotations.boxes[frame.annotations.returns >= MIN_RETURNS]
 
 
-def build_road_view(frame: Frame, boxes: Boxes, lidar: str = "lidar", relief: Relief | None = None) -> RoadView:
+def build_road_view(
+    frame: Frame, boxes: Boxes, lidar: str = "lidar", relief: Relief | None = None, ground_m: float = 0.0
+) -> RoadView:
     """Return the view of the roadside sensor that recorded `frame`: its LiDAR `lidar`, and what its detector found.
 
     `boxes`: world frame, label = actor category. The grids cover the returns of the sweep; `relief` are the heights of
-    the ground, None where it is level.
+    the ground; None where it is level, at `ground_m` [m] in the world.
     """
     points = transform_points(frame.world_from_sensor(lidar), frame.lidar[lidar][:, :3].astype(np.float64))
     origin = np.floor(points[:, :2].min(axis=0) / CELL_M) * CELL_M
     shape = tuple(np.floor((points[:, :2].max(axis=0) - origin) / CELL_M).astype(int) + 1)
     ground, occupied = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
     x, y = np.floor((points[:, :2] - origin) / CELL_M).astype(np.int64).T
-    above = points[:, 2] if relief is None else points[:, 2] - relief.heights(*points[:, :2].T)
+    above = points[:, 2] - ground_m if relief is None else relief.above(points)
     low = (above > GROUND_M[0]) & (above < GROUND_M[1])
     high = (above >= GROUND_M[1]) & (above < TOP_M)
     ground[x[low], y[low]] = True

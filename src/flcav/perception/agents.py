@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from flcav.config import InputError
+from flcav.dataset.ground import POLE
 from flcav.dataset.store import Dataset
 from flcav.files import Json
 from flcav.perception.task import KnownLidar, KnowsRig, RigBound, Task
-
-POLE = "pole"  # prefix of the names of roadside agents; all other agents are vehicles
 
 
 @dataclass(frozen=True)

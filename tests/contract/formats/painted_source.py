@@ -48,6 +48,8 @@ LOCAL = np.array(  # x, y, z, length, width, height, yaw against the agent, whos
 IN_BOX = np.array([60, 50, 0, 30, 20, 10, 15, 5, 0])  # points of the LiDAR; the truck ahead shows and has none
 RETURNS = IN_BOX + 3 * (IN_BOX > 0)  # as recorded: of the actor itself, mirrors and all
 ECHOES = {0: 2, 5: 1}  # row -> echoes of the radar that lie in its box
+SLOPE = {"z": 7.0, "pitch": -0.08, "roll": 0.05}  # of the agents, where they are tilted
+TILT = np.stack((np.linspace(-0.1, 0.1, len(LOCAL)), np.linspace(0.06, -0.03, len(LOCAL))), axis=1)
 WEATHER = Weather(rain_mm_h=3.0)
 SIGNS = (("stop", "", 5), ("speed_60", "", 9), ("signal", "red", 6), ("signal", "green", 4), ("signal", "off", 7))
 
@@ -69,6 +71,7 @@ class PaintedSource:
     cameras: bool = True
     lidar: bool = True
     town: str = "painted"
+    tilted: bool = False  # the agents stand on a slope, and each actor on one of its own
 
     def describe(self) -> dict[str, Any]:
         return {"town": self.town, "seed": 0, "split": self.split}
@@ -90,8 +93,11 @@ class PaintedSource:
     def frame(self, scene: str, index: int, agent: str) -> Frame:
         rng = stream(0, scene, index, agent)
         x, y = rng.uniform(-50, 50, 2)
-        world_from_agent = pose(float(x), float(y), yaw=float(rng.uniform(-3, 3)))
-        boxes = Boxes.from_array(LOCAL, CATEGORIES).transform(world_from_agent)[: 0 if self.deserted else None]
+        slope = SLOPE if self.tilted else {}
+        world_from_agent = pose(float(x), float(y), yaw=float(rng.uniform(-3, 3)), **slope)
+        local = Boxes.from_array(LOCAL, CATEGORIES)
+        local = replace(local, tilt=TILT) if self.tilted else local
+        boxes = local.transform(world_from_agent)[: 0 if self.deserted else None]
         cameras = ["front", "back"] if self.cameras and agent == "cav0" else []
         optical = [*cameras, *(["thermal"] if cameras else [])]
         then = world_from_agent @ pose(0.4, 0.03, yaw=0.02)
@@ -194,7 +200,7 @@ def _points(boxes: Boxes, world_from_lidar: NDArray[np.float64], rng: np.random.
     inside = []
     for i, count in enumerate(IN_BOX[: len(boxes)]):
         spread = rng.uniform(-0.45, 0.45, (count, 3)) * boxes.size[i]
-        turned = spread @ pose(0, 0, yaw=boxes.yaw[i])[:3, :3].T
+        turned = spread @ boxes.rotations()[i].T
         inside.append(turned + boxes.center[i])
     angle = rng.uniform(0, 2 * np.pi, 200)
     ground = world_from_lidar @ np.stack((60 * np.cos(angle), 60 * np.sin(angle), 0 * angle - 1.8, 0 * angle + 1))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from painted_source import CATEGORIES, PaintedSource
+from scipy.spatial.transform import Rotation
 
 from flcav.cli.main import run
 from flcav.dataset.recording.recorder import record
@@ -85,6 +86,25 @@ def test_a_recording_holds_the_map_of_its_town(dataset: Dataset, tmp_path: Path)
         assert len(found[f"/world/map/{name}"][-1]["strips"]) == len(getattr(layers, name))
     x_min, y_min, *_ = np.array(found["/world/map/roads"][-1]["strips"][0]).min(axis=0)
     np.testing.assert_allclose((x_min, y_min), layers.roads[0].min(axis=0), rtol=1e-5)
+
+
+@needs_rerun
+def test_on_slopes_the_map_lies_on_the_ground_and_boxes_are_tilted(tmp_path: Path):
+    record(PaintedSource(1, spins=SPINS, town="hilly_ring", tilted=True, cameras=False), tmp_path / "hills")
+    hills, town = Dataset.open(tmp_path / "hills"), load_town("hilly_ring")
+    assert _view(hills, "--save", str(tmp_path / "a.rrd")) == 0
+    found = _read(tmp_path / "a.rrd")
+    for name in ("roads", "sidewalks", "crossings", "lanes", "markings"):
+        drawn = np.concatenate([np.array(strip) for strip in found[f"/world/map/{name}"][-1]["strips"]])
+        assert np.ptp(drawn[:, 2]) > 1
+        np.testing.assert_allclose(drawn[:, 2], town.grounds(*drawn[:, :2].T), atol=1e-3)
+    boxes = hills.frame(len(hills) - 1).annotations.boxes
+    assert boxes.tilt is not None
+    turned = Rotation.from_quat(found["/world/actors"][SPINS - 1]["quaternions"]).as_matrix()
+    np.testing.assert_allclose(turned, [boxes.pose(i)[:3, :3] for i in range(len(boxes))], atol=1e-6)
+    for i, line in enumerate(found["/world/tracks"][SPINS - 1]["strips"]):
+        foot = boxes.pose(i) @ (0, 0, -boxes.size[i, 2] / 2, 1)
+        np.testing.assert_allclose(line[-1], foot[:3], atol=1e-4)
 
 
 @needs_rerun

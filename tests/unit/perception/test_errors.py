@@ -33,6 +33,7 @@ from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.samples import samples_of
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.world.map.town import load_town
 from flcav.world.static import list_signs_and_signals
 
 CAMERA = {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 480, "height": 288, "fov_deg": 90.0}}
@@ -124,6 +125,12 @@ def test_a_path_that_ends_elsewhere_is_registered_at_the_present(drive, monkeypa
     trace = drive.trace(error.scene)
     assert trace is not None
     assert error.track == trace.actor[samples.columns.actor[0]]
+    assert error.z == 0
+    hills = load_town("hilly_grid")
+    monkeypatch.setattr(Dataset, "town", lambda _: hills)
+    (raised,) = path_errors.register_errors(TrajectoryNetwork(config), drive, samples).errors
+    assert (raised.x, raised.y, raised.z) == (error.x, error.y, hills.ground(error.x, error.y))
+    assert abs(raised.z) > 0.1
 
 
 def made(kind: str, track: str, x: float = 0.0, scene: str = "a") -> PerceptionError:

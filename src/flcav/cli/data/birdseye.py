@@ -25,27 +25,32 @@ def birdseye(
     """Draw a frame of a dataset from above: its points by height, its boxes, its agent."""
     import numpy as np
 
+    from flcav.dataset.ground import Ground
     from flcav.dataset.store import Dataset
     from flcav.files import write_bytes
     from flcav.geometry import inverse, transform_points
+    from flcav.perception.agents import POLE, kind_of
     from flcav.report import style
     from flcav.report.pictures.birdseye import View, birdseye
     from flcav.world.shapes import SHAPES
 
     sedan = next(shape for shape in SHAPES["car"] if shape.name == "sedan")
     dataset = Dataset.open(folder)
-    seen = dataset.frame(0 if frame is None else dataset.number(frame))
-    agent_from_world = inverse(seen.world_from_agent)
-    points = [transform_points(seen.agent_from_sensor[name], cloud[:, :3]) for name, cloud in seen.lidar.items()]
-    pole = seen.agent.startswith("pole")  # whose origin is at its sensors, that of a vehicle is on the ground
-    ground_m = -seen.world_from_agent[2, 3] if pole else 0.0
+    number = 0 if frame is None else dataset.number(frame)
+    seen = dataset.frame(number)
+    clouds = [transform_points(seen.agent_from_sensor[name], cloud[:, :3]) for name, cloud in seen.lidar.items()]
+    points, ground = np.concatenate(clouds).astype(np.float64), Ground(dataset)
+    if ground.relief is None:
+        points[:, 2] += ground.height_of(number)
+    else:
+        points[:, 2] = ground.relief.above(transform_points(seen.world_from_agent, points))
     view = View(
-        points=np.concatenate(points) - (0.0, 0.0, ground_m),
-        truth=seen.annotations.boxes.transform(agent_from_world),
+        points=points,
+        truth=seen.annotations.boxes.transform(inverse(seen.world_from_agent)),
         returns=seen.annotations.returns,
         title=f"{seen.key} · {seen.time_s:.1f} s",
         range_m=range_m,
-        agent_size=None if pole else (sedan.length, sedan.width),
+        agent_size=None if kind_of(seen.agent) == POLE else (sedan.length, sedan.width),
     )
     write_bytes(out, style.png(birdseye(view)))
-    typer.echo(f"{out}: {seen.key}, {sum(map(len, points))} points, {len(seen.annotations)} annotated actors")
+    typer.echo(f"{out}: {seen.key}, {len(points)} points, {len(seen.annotations)} annotated actors")

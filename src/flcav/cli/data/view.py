@@ -24,7 +24,6 @@ def view(
     from flcav.dataset.store import Dataset
     from flcav.extras import format_install_command
     from flcav.files import atomic_path
-    from flcav.world.map.lanes import map_layers
 
     if find_spec("rerun") is None:
         raise InputError(f"flcav view needs Rerun, which is not installed: {format_install_command('view')}")
@@ -42,15 +41,13 @@ def view(
         raise InputError(f"{folder}: no scene '{scene}'; it has {', '.join(scenes)}")
     shown = scene or scenes[0]
     selected = dataset.select(scenes=[shown])
-    town = dataset.town()
-    layers = None if town is None else map_layers(town)
     first = [i for i in selected if dataset.keys[i].index == dataset.keys[selected[0]].index]
     layout = blueprint([dataset.frame(i) for i in first])
     recording = rerun.RecordingStream("flcav", recording_id=shown)
 
     def log() -> None:
         with progress.show_progress(f"view {shown}") as report:
-            log_scene(recording, dataset, selected, layers, report)
+            log_scene(recording, dataset, selected, dataset.town(), report)
         recording.flush()
 
     if save is None:

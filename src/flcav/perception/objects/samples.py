@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
+from flcav.dataset.ground import Ground
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.agents import POLE, kind_of
@@ -115,18 +116,18 @@ class RecordedSweeps(Sequence[Sample]):
 def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
     """Return the numbers of the frames whose first LiDAR is mounted within `HEIGHT_SLACK_M` of the height expected.
 
-    The height is that of the calibration above the agent's origin, the expected one is -config.ground_z_m. A vehicle's
-    origin is on the ground, a pole's at its sensors, at their height in the world. All frames are returned where none
-    has a LiDAR; reading them as samples then raises.
+    The height is that above the ground (`flcav.dataset.ground`), the expected one is -config.ground_z_m. A vehicle's
+    origin is on the ground, a pole's at its sensors. All frames are returned where none has a LiDAR; reading them as
+    samples then raises.
 
     Raises `InputError` where there are LiDARs but none fits.
     """
     height_m: dict[int, float] = {}
+    ground = Ground(data)
     for number, key in enumerate(data.keys):
         if lidars := data.lidars(number):
             mounts = data.calibrations[key.agent].true.agent_from_sensor
-            origin_m = data.world_from_agent(number)[2, 3] if kind_of(key.agent) == POLE else 0.0
-            height_m[number] = float(mounts[lidars[0]][2, 3] + origin_m)
+            height_m[number] = float(mounts[lidars[0]][2, 3] + ground.height_of(number))
     expected_m = -config.ground_z_m
     fitting = [number for number, height in height_m.items() if abs(height - expected_m) <= HEIGHT_SLACK_M]
     if height_m and not fitting:

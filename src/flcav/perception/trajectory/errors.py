@@ -17,12 +17,13 @@ def register_errors(
 ) -> Registry:
     """Return the first miss of each road user and scene: a single path with a final error above `MISS_M`.
 
-    Its position is that of the road user at the present, on the ground (z = 0).
+    Its position is that of the road user at the present, on the ground of the town.
     """
     columns = samples.columns
     paths, probabilities = predict(network, samples, progress)
     said = paths[np.arange(len(paths)), find_medoid(paths, probabilities), -1]
     wrong = np.linalg.norm(said - columns.future[:, -1], axis=1) > MISS_M
+    town = data.town()
     traces: dict[str, Trace | None] = {scene: data.trace(scene) for scene in np.unique(columns.scene).tolist()}
     found: dict[int, list[PerceptionError]] = {}
     for row in np.flatnonzero(wrong):
@@ -34,7 +35,7 @@ def register_errors(
             PerceptionError(
                 x=float(x),
                 y=float(y),
-                z=0.0,
+                z=0.0 if town is None else town.ground(float(x), float(y)),
                 weight=1.0,
                 kind=FINAL_ERROR,
                 label=str(trace.category[actor]),

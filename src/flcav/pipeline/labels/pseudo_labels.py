@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from flcav.dataset.ground import Ground
 from flcav.fusion.detector import road_detector
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView, build_road_view, label_ideally
@@ -20,7 +21,6 @@ from flcav.perception.task import Task
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import EDGE
 from flcav.progress import Report
-from flcav.world.map.relief import Relief
 
 PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
 
@@ -66,7 +66,7 @@ def pseudo_label_samples(
     the package's road detector if `trained`, else by an ideal one, as their messages have them, which enter `book` as
     downlinks; stage III passes none, since its labels are those of stage II.
     """
-    data, relief = split.data, relief_of(split)
+    data, relief = split.data, Ground(split.data).relief
     views = road_views(split, poles, trained)
     samples: dict[str, list[Sample]] = {}
     for done, i in enumerate(frames):
@@ -84,22 +84,16 @@ def pseudo_label_samples(
 
 def road_views(split: Frames, poles: Sequence[int], trained: bool) -> dict[tuple[str, int], list[RoadView]]:
     """Return what sensors on `poles` see in each spin, by scene and number of the spin: see `pseudo_label_samples`."""
-    relief = relief_of(split)
+    ground = Ground(split.data)
     views: dict[tuple[str, int], list[RoadView]] = {}
     find = road_detector(split.data) if trained and poles else None
     for pole in poles:
         for i in split.poles.get(pole, ()):
             key, frame = split.data.keys[i], split.data.frame(i)
             boxes = label_ideally(frame) if find is None else find(i)
-            view = build_road_view(frame, boxes, choose_lidar(frame), relief)
+            view = build_road_view(frame, boxes, choose_lidar(frame), ground.relief, ground.below(i))
             views.setdefault((key.scene, key.index), []).append(view)
     return views
-
-
-def relief_of(split: Frames) -> Relief | None:
-    """Return the heights of the split's town; None where the recording has no town, or a flat one."""
-    town = split.data.town()
-    return None if town is None else town.relief
 
 
 def select_frames_near(split: Frames, sites: np.ndarray, range_m: float) -> tuple[int, ...]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from flcav.dataset.ground import Ground
 from flcav.dataset.store import Dataset
 from flcav.files import write_bytes
 from flcav.geometry import Boxes
@@ -241,10 +242,9 @@ def _sweep(work: Path, names: Names, run: Run) -> clouds.Sweep:
     region = run.recipe.with_role("federate")[0]
     data: Dataset = Frames.open(work / names.recording(region, "test", OBJECTS)).data
     frame = data.frame(looked.frame)
-    lidar = choose_lidar(frame)
-    ground_m = -float(frame.world_from_sensor(lidar)[2, 3])
+    points, ground_m = clouds.read_sweep(frame, choose_lidar(frame), Ground(data).relief)
     before, after = _detections("pretrained", looked.before), _detections("after the last stage", looked.after)
-    return clouds.Sweep(frame.lidar[lidar], ground_m, _boxes(looked.targets), before, after)
+    return clouds.Sweep(points, ground_m, _boxes(looked.targets), before, after)
 
 
 def _detections(title: str, seen: SweepDetections) -> clouds.Detections:

@@ -10,10 +10,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from flcav.geometry import Boxes, heading_vectors
+from flcav.geometry import Boxes, heading_vectors, transform_points
 from flcav.perception.images import CameraView
 from flcav.report import style
 from flcav.report.pictures.camera import boxes_on_picture, show_view
+from flcav.sensors.frame import Frame
+from flcav.world.map.relief import Relief
 
 GROUND_M = 0.25  # returns less than this above the ground are drawn as ground
 Extent = tuple[float, float, float]  # shown behind (negative), ahead, aside [m]
@@ -34,11 +36,20 @@ class Detections:
 class Sweep:
     """A sweep with detections of two networks, all in one frame: x forward, y left, at the sensor or its vehicle."""
 
-    points: NDArray[np.float32]  # (P, >=3) x, y, z [m]
+    points: NDArray[np.float32]  # (P, >=3) x, y, z [m]; on slopes z is the height above the ground
     ground_m: float  # z of the ground in that frame
     targets: Boxes  # (M,)
     before: Detections
     after: Detections
+
+
+def read_sweep(frame: Frame, lidar: str, relief: Relief | None) -> tuple[NDArray[np.float32], float]:
+    """Return the points of a vehicle's sweep and the z of the ground among them, as `Sweep` has them."""
+    points = frame.lidar[lidar]
+    if relief is None:
+        return points, -float(frame.agent_from_sensor[lidar][2, 3])
+    world = transform_points(frame.world_from_sensor(lidar), points[:, :3].astype(np.float64))
+    return np.column_stack((points[:, :2], relief.above(world))).astype(np.float32), 0.0
 
 
 def on_page(xy: NDArray) -> NDArray:

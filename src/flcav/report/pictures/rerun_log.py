@@ -12,6 +12,7 @@ from itertools import groupby
 import numpy as np
 import rerun as rr  # pyright: ignore[reportMissingImports] # of the extra `view`
 import rerun.blueprint as rrb  # pyright: ignore[reportMissingImports]
+import shapely
 from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image
@@ -19,17 +20,21 @@ from scipy.spatial.transform import Rotation
 
 from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
 from flcav.dataset.store import Dataset
-from flcav.geometry import inverse
+from flcav.geometry import Boxes, concatenate, inverse
 from flcav.progress import Report, ignore_progress
 from flcav.sensors.frame import Frame
 from flcav.sensors.radar.radar import compute_echo_directions
+from flcav.world.map.lanes import map_layers
 from flcav.world.map.layers import MapLayers
+from flcav.world.map.relief import Relief
+from flcav.world.map.town import Town
 
 Array = NDArray[np.float64]
 
 LIDAR_COLOURS = colormaps["turbo"]
 RADAR_COLOURS = colormaps["coolwarm"]
 RADAR_M_S = 15.0  # radial speed at the ends of the colour scale
+STEP_M = 2.0  # along a line of the map on slopes
 BEHIND_M = (-28.0, 0.0, 16.0)  # initial viewpoint, agent's frame
 AGENTS = "world/agents"
 
@@ -38,15 +43,15 @@ def log_scene(
     recording: rr.RecordingStream,
     dataset: Dataset,
     selected: Sequence[int],
-    layers: MapLayers | None,
+    town: Town | None,
     progress: Report = ignore_progress,
 ) -> None:
-    """Log the frames `selected` of one scene into a `rerun.RecordingStream`; `layers` is the map of its town."""
+    """Log the frames `selected` of one scene into a `rerun.RecordingStream`, with the map of its town, if known."""
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    if layers is not None:
-        _log_map(recording, layers)
+    if town is not None:
+        _log_map(recording, map_layers(town), town.relief)
     tracks: dict[str, list[Array]] = defaultdict(list)
     done = 0
     for spin, numbers in groupby(selected, key=lambda i: dataset.keys[i].index):
@@ -77,22 +82,26 @@ def blueprint(spin: Sequence[Frame]) -> rrb.Blueprint:
     return rrb.Blueprint(views, rrb.TimePanel(state="collapsed", timeline="spin"), collapse_panels=True)
 
 
-def _log_map(recording: rr.RecordingStream, layers: MapLayers) -> None:
+def _log_map(recording: rr.RecordingStream, layers: MapLayers, relief: Relief | None) -> None:
     outlines = {
         "roads": (layers.roads, (110, 110, 115)),
         "sidewalks": (layers.sidewalks, (150, 140, 120)),
         "crossings": ([crossing.outline for crossing in layers.crossings], (220, 220, 220)),
     }
-    for name, (polygons, colour) in outlines.items():
-        _log_lines(recording, f"world/map/{name}", [np.vstack((line, line[:1])) for line in polygons], colour)
-    lanes = [lane.centre_line for lane in layers.lanes if lane.kind != "walkingarea"]
-    _log_lines(recording, "world/map/lanes", lanes, (35, 60, 80))
-    _log_lines(recording, "world/map/markings", [marking.line for marking in layers.markings], (235, 235, 235))
+    lines = {name: ([np.vstack((ring, ring[:1])) for ring in rings], hue) for name, (rings, hue) in outlines.items()}
+    lines["lanes"] = [lane.centre_line for lane in layers.lanes if lane.kind != "walkingarea"], (35, 60, 80)
+    lines["markings"] = [marking.line for marking in layers.markings], (235, 235, 235)
+    for name, (own, colour) in lines.items():
+        strips = [_lay_on_ground(line, relief) for line in own]
+        recording.log(f"world/map/{name}", rr.LineStrips3D(strips, colors=colour, radii=0.05), static=True)
 
 
-def _log_lines(recording: rr.RecordingStream, path: str, lines: Sequence[Array], colour: tuple[int, int, int]) -> None:
-    strips = [np.column_stack((line, np.zeros(len(line)))) for line in lines]
-    recording.log(path, rr.LineStrips3D(strips, colors=colour, radii=0.05), static=True)
+def _lay_on_ground(line: Array, relief: Relief | None) -> Array:
+    """Return a line (K, 2) [m] on the ground, (K', 3): on a relief with a corner every `STEP_M` or less."""
+    if relief is None:
+        return np.column_stack((line, np.zeros(len(line))))
+    dense = shapely.get_coordinates(shapely.segmentize(shapely.linestrings(line), STEP_M))
+    return np.column_stack((dense, relief.heights(*dense.T)))
 
 
 def _log_agent(recording: rr.RecordingStream, frame: Frame) -> None:
@@ -169,23 +178,24 @@ def _log_boxes(recording: rr.RecordingStream, path: str, boxes: Array, labels: l
 
 def _log_actors(recording: rr.RecordingStream, spin: list[Frame], tracks: dict[str, list[Array]]) -> None:
     """Log the actors that any agent's annotations hold, and the track of each up to this spin."""
-    actors = {}
+    actors: dict[str, Boxes] = {}
     for frame in spin:
-        boxes = frame.annotations.boxes
         for i, track in enumerate(frame.annotations.track.tolist()):
-            actors[track] = (boxes.center[i], boxes.size[i], boxes.yaw[i], str(boxes.label[i]))
-    for track, (center, size, _, _) in actors.items():
-        tracks[track].append(center - (0, 0, size[2] / 2))
-    colours = [COLOURS.get(label, OTHER) for *_, label in actors.values()]
-    yaw = np.array([yaw for _, _, yaw, _ in actors.values()])
-    boxes = rr.Boxes3D(
-        centers=np.array([center for center, *_ in actors.values()]).reshape(-1, 3),
-        sizes=np.array([size for _, size, *_ in actors.values()]).reshape(-1, 3),
-        quaternions=Rotation.from_euler("z", yaw[:, None]).as_quat(),
+            actors[track] = frame.annotations.boxes[i : i + 1]
+    boxes = concatenate(list(actors.values()))
+    feet = boxes.center - boxes.rotations()[:, :, 2] * boxes.size[:, 2:] / 2
+    for track, foot in zip(actors, feet):
+        tracks[track].append(foot)
+    colours = [COLOURS.get(label, OTHER) for label in boxes.label.tolist()]
+    tilt = np.zeros((len(boxes), 2)) if boxes.tilt is None else boxes.tilt
+    shown = rr.Boxes3D(
+        centers=boxes.center,
+        sizes=boxes.size,
+        quaternions=Rotation.from_euler("ZYX", np.column_stack((boxes.yaw, tilt))).as_quat(),
         colors=colours,
-        labels=[f"{label} {track}" for track, (*_, label) in actors.items()],
+        labels=[f"{label} {track}" for track, label in zip(actors, boxes.label.tolist())],
         show_labels=False,
     )
-    recording.log("world/actors", boxes)
+    recording.log("world/actors", shown)
     lines = [np.array(tracks[track]) for track in actors]
     recording.log("world/tracks", rr.LineStrips3D(lines, colors=colours, radii=0.08))

@@ -60,6 +60,10 @@ class Relief:
         found = _interpolate(at.reshape(-1, 2), self.points, self._tin.simplices, self._tin.neighbors)
         return found.reshape(at.shape[:-1])
 
+    def above(self, points: Array) -> Array:
+        """Return how high (N,) [m] points (N, 3), world frame [m], are above the ground."""
+        return points[:, 2] - self.heights(*points[:, :2].T)
+
     def tilts(self, x: Array, y: Array, yaw: Array, size: Array) -> tuple[Array, Array, Array]:
         """Return height [m], pitch and roll [rad] of bodies (...) that stand on four wheels at these places.
 
