@@ -28,13 +28,13 @@ def placed(rotation: Rotation, places: np.ndarray) -> dict[str, Any]:
     return dict[str, Any](zip(columns, (w, x, y, z, *places.T.tolist()), strict=True))
 
 
-def write_log(folder: Path, *, annotated: bool = True) -> None:
+def write_log(folder: Path, *, annotated: bool = True, attitude: Rotation = NORTH) -> None:
     """Write two sweeps with a car 20 m ahead on the first, and a picture 20 ms after each."""
     sweeps = [START, START + STEP]
     times = [*sweeps, *(sweep + 20_000_000 for sweep in sweeps)]
     north = np.array([(time - START) / 1e9 * SPEED for time in times])
     places = np.column_stack((np.full(4, 100.0), 200 + north, np.full(4, 60.0)))
-    write_feather(folder / "city_SE3_egovehicle.feather", timestamp_ns=times, **placed(NORTH, places))
+    write_feather(folder / "city_SE3_egovehicle.feather", timestamp_ns=times, **placed(attitude, places))
     optical = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     mounts = [placed(Rotation.identity(), np.array([UP_LIDAR])), placed(optical, np.array([[1.6, 0.0, 1.4]]))]
     both = {name: [*mounts[0][name], *mounts[1][name]] for name in mounts[0]}

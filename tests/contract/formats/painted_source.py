@@ -71,7 +71,7 @@ class PaintedSource:
     cameras: bool = True
     lidar: bool = True
     town: str = "painted"
-    tilted: bool = False  # the agents stand on a slope, and each actor on one of its own
+    tilted: tuple[int, ...] = ()  # scenes where the agents stand on a slope, and each actor on one of its own
 
     def describe(self) -> dict[str, Any]:
         return {"town": self.town, "seed": 0, "split": self.split}
@@ -93,10 +93,11 @@ class PaintedSource:
     def frame(self, scene: str, index: int, agent: str) -> Frame:
         rng = stream(0, scene, index, agent)
         x, y = rng.uniform(-50, 50, 2)
-        slope = SLOPE if self.tilted else {}
+        tilted = int(scene.rpartition("-")[2]) in self.tilted
+        slope = SLOPE if tilted else {}
         world_from_agent = pose(float(x), float(y), yaw=float(rng.uniform(-3, 3)), **slope)
         local = Boxes.from_array(LOCAL, CATEGORIES)
-        local = replace(local, tilt=TILT) if self.tilted else local
+        local = replace(local, tilt=TILT) if tilted else local
         boxes = local.transform(world_from_agent)[: 0 if self.deserted else None]
         cameras = ["front", "back"] if self.cameras and agent == "cav0" else []
         optical = [*cameras, *(["thermal"] if cameras else [])]

@@ -90,7 +90,7 @@ def test_a_recording_holds_the_map_of_its_town(dataset: Dataset, tmp_path: Path)
 
 @needs_rerun
 def test_on_slopes_the_map_lies_on_the_ground_and_boxes_are_tilted(tmp_path: Path):
-    record(PaintedSource(1, spins=SPINS, town="hilly_ring", tilted=True, cameras=False), tmp_path / "hills")
+    record(PaintedSource(1, spins=SPINS, town="hilly_ring", tilted=(0,), cameras=False), tmp_path / "hills")
     hills, town = Dataset.open(tmp_path / "hills"), load_town("hilly_ring")
     assert _view(hills, "--save", str(tmp_path / "a.rrd")) == 0
     found = _read(tmp_path / "a.rrd")

@@ -18,7 +18,7 @@ from flcav.config import InputError
 from flcav.dataset.payloads import read_image
 from flcav.dataset.store import LazyMapping
 from flcav.files import Json
-from flcav.geometry import Boxes, count_points_in_boxes, inverse, transform_points
+from flcav.geometry import Boxes, angles_of, count_points_in_boxes, inverse, transform_points
 from flcav.sensors.camera.lens import Lens, project
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, LinkedFrame, SignViews, Views
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front, compute_truncation
@@ -26,6 +26,7 @@ from flcav.sensors.labels.outlines import NEAR_M, clip_in_front, compute_truncat
 Array = NDArray[np.float64]
 
 LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track whose difference is a velocity, as nuscenes-devkit's
+LEVEL_RAD = 1e-6  # pitch and roll of a box that is upright
 EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 
 
@@ -80,6 +81,13 @@ class Picture:
     path: Path
     lens: Lens
     world_from_camera: Array  # (4, 4), optical frame
+
+
+def turned_boxes(center: Array, size: Array, rotation: Array, label: NDArray[np.str_]) -> Boxes:
+    """Return boxes with (M, 3, 3) rotations of their own frames: upright where none leans by more than `LEVEL_RAD`."""
+    yaw, *tilts = angles_of(rotation)
+    tilt = np.stack(tilts, axis=1)
+    return Boxes(center, size, yaw, label, tilt=tilt if (np.abs(tilt) > LEVEL_RAD).any() else None)
 
 
 def annotate(

@@ -26,9 +26,10 @@ from flcav.dataset.formats.reading import (
     difference_tracks,
     pinhole,
     read_pictures,
+    turned_boxes,
     view_boxes,
 )
-from flcav.geometry import Boxes, pose, transform_points, wrap_angle, yaw_of
+from flcav.geometry import Boxes, pose, transform_points
 from flcav.sensors.camera.lens import Lens
 from flcav.sensors.frame import Calibration, LinkedFrame
 
@@ -238,13 +239,13 @@ def _read_labels(folder: Path, poses: Poses) -> Labels:
     table = _read_feather(folder / "annotations.feather", ("timestamp_ns", "track_uuid", "category", *size, *PLACED))
     sweep, track = table["timestamp_ns"].to_numpy(), np.array(table["track_uuid"].to_pylist(), np.str_)
     in_ego = _transforms(table)
-    center, yaw = np.zeros((len(table), 3)), np.zeros(len(table))
+    center, rotation = np.zeros((len(table), 3)), np.zeros((len(table), 3, 3))
     for time in np.unique(sweep).tolist():
         city_from_ego, own = poses.at(time), np.flatnonzero(sweep == time)
         center[own] = transform_points(city_from_ego, in_ego[own, :3, 3])
-        yaw[own] = [yaw_of(city_from_ego @ in_ego[row]) for row in own]
+        rotation[own] = city_from_ego[:3, :3] @ in_ego[own, :3, :3]
     label = np.array([CATEGORIES.get(name, name) for name in table["category"].to_pylist()], np.str_)
-    boxes = Boxes(center, np.column_stack([table[name].to_numpy() for name in size]), wrap_angle(yaw), label)
+    boxes = turned_boxes(center, np.column_stack([table[name].to_numpy() for name in size]), rotation, label)
     return Labels(sweep, track, boxes, difference_tracks(track, (sweep - sweep.min(initial=sweep[0])) / 1e9, center))
 
 

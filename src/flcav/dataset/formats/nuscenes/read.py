@@ -29,9 +29,10 @@ from flcav.dataset.formats.reading import (
     difference_tracks,
     pinhole,
     read_pictures,
+    turned_boxes,
     view_boxes,
 )
-from flcav.geometry import Boxes, inverse
+from flcav.geometry import inverse
 from flcav.sensors.frame import Calibration, LinkedFrame
 
 Array = NDArray[np.float64]
@@ -194,10 +195,9 @@ class NuscenesSource(LogSource):
             occlusion.append(OCCLUSION.get(row.get("visibility_token", ""), np.nan))
         center, size, quaternion = np.split(np.reshape(numbers, (-1, 10)), (3, 6), axis=1)
         turned = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix()
-        yaw = np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
         self._track, self._occlusion = np.array(track, np.str_), np.array(occlusion)
         self._velocity = difference_tracks(self._track, np.array(time_s), center)
-        self._boxes = Boxes(center, size[:, [1, 0, 2]], yaw, np.array(label, np.str_))
+        self._boxes = turned_boxes(center, size[:, [1, 0, 2]], turned, np.array(label, np.str_))
 
     def frame_count(self, scene: str) -> int:
         """Return the number of key frames of a scene."""

@@ -25,9 +25,10 @@ from flcav.dataset.formats.reading import (
     measure_picture,
     pinhole,
     read_pictures,
+    turned_boxes,
     view_boxes,
 )
-from flcav.geometry import Boxes, heading_vectors, inverse, yaw_of
+from flcav.geometry import Boxes, heading_vectors, inverse
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Calibration, LinkedFrame
 
@@ -80,7 +81,7 @@ class Opv2vSource(LogSource):
                 kind = "pole" if path.name.startswith("-") else "cav"
                 vehicle = known.get(path.name, f"{kind}{path.name.lstrip('-')}")
                 calibration = _calibrate(path / own[0])
-                lidar, cameras = calibration.agent_from_sensor[LIDAR], calibration.intrinsics
+                lidar, cameras = calibration.agent_from_sensor[LIDAR] + 0.0, calibration.intrinsics  # no -0.0
                 agent = names.of(vehicle, (lidar.tobytes(), *((name, cameras[name].tobytes()) for name in cameras)))
                 self._calibration.setdefault(agent, calibration)
                 shots += [Shot(path / stamp, agent, int(stamp), rank[stamp] * PERIOD_S) for stamp in own]
@@ -160,12 +161,13 @@ def _read_vehicles(about: About) -> tuple[Boxes, Array]:
     """Return the boxes of a frame's vehicles, world frame, and their (M, 3) velocities."""
     rows = list(about["vehicles"].values())
     placed = [from_carla([*np.add(row["location"], row["center"]), *row["angle"]]) for row in rows]
-    yaw = np.array([yaw_of(matrix) for matrix in placed])
-    center = np.array([matrix[:3, 3] for matrix in placed]).reshape(-1, 3)
+    poses = np.array(placed).reshape(-1, 4, 4)
     size = 2 * np.array([row["extent"] for row in rows], np.float64).reshape(-1, 3)
     speed = np.array([row.get("speed", np.nan) for row in rows]) / KMH
-    velocity = np.column_stack((heading_vectors(yaw) * speed[:, None], np.where(np.isnan(speed), np.nan, 0.0)))
-    return Boxes(center, size, yaw, np.full(len(rows), CATEGORY)), velocity
+    boxes = turned_boxes(poses[:, :3, 3], size, poses[:, :3, :3], np.full(len(rows), CATEGORY))
+    climb = np.zeros(len(rows)) if boxes.tilt is None else -boxes.tilt[:, 0]
+    ahead = np.column_stack((heading_vectors(boxes.yaw) * np.cos(climb)[:, None], np.sin(climb)))
+    return boxes, ahead * speed[:, None]
 
 
 def _read_about(stem: Path) -> About:

@@ -184,7 +184,7 @@ def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[in
     for i in np.flatnonzero(np.isin(boxes.label, VEHICLES) & enough):
         tall = boxes.size[i, 2]
         placed = boxes.pose(int(i))
-        placed[:3, 3] -= tall / 2 * placed[:3, 2]
+        placed[2, 3] -= tall / 2  # below the centre, upright too where the box leans: OpenCOOD adds the two unturned
         x, y, z, *rotation = carla_pose(placed)
         vehicles[numbers[str(truth.track[i])]] = {
             "angle": rotation,
