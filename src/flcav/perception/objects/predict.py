@@ -108,7 +108,10 @@ def detect_all(
     for turns in range(QUARTERS):
         found = _detect_ahead(network, [_turn(cloud, -turns) for cloud in clouds], score_threshold, batch)
         looks.append([boxes.transform(pose(0, 0, yaw=turns * math.pi / 2)) for boxes in found])
-    return [_suppress(concatenate(parts), network.config.classes) for parts in zip(*looks, strict=True)]
+    return [
+        _suppress(concatenate(parts), network.config.classes) if any(map(len, parts)) else parts[0]
+        for parts in zip(*looks, strict=True)
+    ]
 
 
 def look_around(network: Second) -> Second:
