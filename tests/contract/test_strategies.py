@@ -225,7 +225,7 @@ def test_another_strategy_leaves_what_comes_before_it_as_it_is():
             found[step.name] = step.fingerprint(found)
         return found
 
-    one, other = prints("fedavg"), prints("my_package.own:Last")
+    one, other = prints("fedavg"), prints("fedadam")
     changed = {name for name in one if one[name] != other[name]}
     federated = {"grid-edge-fl-objects", "grid-edge-fl-objects-densest", "ring-edge-fl-objects", "cloud-fl-objects"}
     assert federated | {"test-cloud-fl-objects-grid"} <= changed

@@ -33,7 +33,6 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels import quality, road_average
 from flcav.pipeline.labels.quality import measure_labels, read_history
 from flcav.pipeline.labels.road_average import RoadAverageLabels
-from flcav.pipeline.work.edge import edge_step
 from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.world.map.layers import MapLane, MapLayers
 
@@ -324,11 +323,3 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     assert as_told["grid/cav0"][0].boxes.yaw == pytest.approx(0, abs=0.05)
     with pytest.raises(BudgetExceeded, match="wireless uplink budget exceeded: grid/cav1"):
         RoadAverageLabels(*about, "grid", Ledger(Budget(1e-4, 0.0))).renew(3, weights)
-
-
-def test_labels_that_are_renewed_need_one_process() -> None:
-    nothing: Any = None
-    settings = cast(Any, SimpleNamespace(distillation=Distillation()))
-    for where in ({"processes": 2}, {"runtime": "ray"}):
-        with pytest.raises(InputError, match="renewed between rounds"):
-            edge_step(nothing, settings, **where)  # pyright: ignore[reportArgumentType]

@@ -15,13 +15,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.dataset.ground import Ground
 from flcav.fusion.labels import label_sample
 from flcav.perception.errors import MISS, PerceptionError
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels.pseudo_labels import relief_of, road_views
+from flcav.pipeline.labels.pseudo_labels import road_views
 from flcav.world.line_of_sight import find_visible
 from flcav.world.map.town import Town
 from flcav.world.trace import Trace
@@ -57,7 +58,7 @@ def count_added_labels(
     The network's detections that score `threshold` or more are the vehicles' own. poles: places (3,) of those whose
     sweeps are in the split, world [m].
     """
-    keys, relief = split.data.keys, relief_of(split)
+    keys, relief = split.data.keys, Ground(split.data).relief
     own = {i: detect_in(network, [split.data.frame(i)], score_threshold=threshold)[0] for i in frames}
     added = {}
     for pole, place in poles.items():
