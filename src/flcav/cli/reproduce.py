@@ -31,16 +31,6 @@ def _use_demo_size(recipe: "RunRecipe") -> "RunRecipe":
     return recipe.model_copy(update={"size": "demo"})
 
 
-def _use_toy_size(recipe: "RunRecipe") -> "RunRecipe":
-    """Return a recipe that shows that it runs, with plans that its few frames suffice for."""
-    few = {"samples": 16, "edge_rounds": 1}
-    tasks = {
-        name: task.model_copy(update={"plan": task.plan.model_copy(update=few)}) if task.plan else task
-        for name, task in recipe.tasks.items()
-    }
-    return recipe.model_copy(update={"size": "toy", "splits": None, "training": None, "tasks": tasks})
-
-
 class Target(StrEnum):
     """Targets other than the tasks' studies."""
 
@@ -275,7 +265,8 @@ def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, 
 def _federation_exchange(
     target: Target, out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale
 ) -> None:
-    from flcav.experiments.exchanges.run import compare_exchanges, draw_results, shrink_recipe
+    from flcav.experiments.exchanges.run import compare_exchanges, draw_results
+    from flcav.pipeline.recipe import shrink_recipe
 
     recipe, runs = _run_seeds(target, EXCHANGES[target], out, seeds, scale, jobs, engine, stale, shrink_recipe)
     results = compare_exchanges(recipe, runs, [out / f"seed{run.recipe.seed}" for run in runs])
@@ -285,17 +276,18 @@ def _federation_exchange(
 def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps
     from flcav.experiments.placement.run import draw_proof, list_regions, prove_placement
+    from flcav.pipeline.recipe import shrink_recipe
     from flcav.pipeline.running import WORK
     from flcav.sources.recipe import recipe_path
     from flcav.world.opendrive.importing import import_town
 
-    asked = _load_sized("placement", scale, _use_toy_size)
+    asked = _load_sized("placement", scale, shrink_recipe)
     if not (out / IMPORTED).exists():
         import_town(recipe_path("runs/placement").parents[1] / "maps" / f"{IMPORTED}.xodr", out / IMPORTED)
     overlaps = {region: list_overlaps(asked, region, out) for region in list_regions(asked)}
     for sentence in describe_overlaps(overlaps, asked.placement.range_m):
         typer.echo(sentence)
-    how: Any = (seeds, scale, jobs, engine, stale, _use_toy_size, out)
+    how: Any = (seeds, scale, jobs, engine, stale, shrink_recipe, out)
     recipe, runs = _run_seeds(Target.placement, "placement", out, *how)
     results = prove_placement(recipe, runs, [out / f"seed{run.recipe.seed}" / WORK for run in runs], out)
     _write_figures(out, results.as_json(), draw_proof(results), results.sentences())

@@ -19,7 +19,6 @@ from flcav.experiments.exchanges.run import (
     draw_results,
     judge_differences,
     measure_places,
-    shrink_recipe,
     summarise,
 )
 from flcav.experiments.exchanges.tables import tables
@@ -32,7 +31,7 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, resolve_settings
-from flcav.pipeline.recipe import CLOUD, MAIN, PRETRAIN, Federation, load_run_recipe
+from flcav.pipeline.recipe import CLOUD, MAIN, PRETRAIN, Federation, load_run_recipe, shrink_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
 

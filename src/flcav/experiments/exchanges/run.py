@@ -61,7 +61,6 @@ ARMS: Mapping[str, Mapping[str, str]] = {  # by what they are about: name in the
 NAMES: Mapping[str, str] = {name: arm for arms in ARMS.values() for name, arm in arms.items()}
 OWN, OTHERS, UNSEEN = "own region", "other regions", "unseen region"
 PLACES = (OWN, OTHERS, UNSEEN)
-QUICK_SAMPLES = 20  # of stage I at the scale `quick`
 
 
 @dataclass(frozen=True)
@@ -117,15 +116,6 @@ class ExchangeResult(Record):
                 words += f", difference {found}, {judged[name].describe()}"
             told.append(words)
         return told
-
-
-def shrink_recipe(recipe: RunRecipe) -> RunRecipe:
-    """Return the recipe at the scale `quick`: toy splits and trainings, and as few samples as they hold."""
-    tasks = {
-        name: own.model_copy(update={"plan": own.plan and own.plan.model_copy(update={"samples": QUICK_SAMPLES})})
-        for name, own in recipe.tasks.items()
-    }
-    return recipe.model_copy(update={"size": "toy", "splits": None, "training": None, "tasks": tasks})
 
 
 def compare_exchanges(recipe: RunRecipe, runs: Sequence[Run], folders: Sequence[Path]) -> ExchangeResult:
