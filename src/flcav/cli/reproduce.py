@@ -27,10 +27,6 @@ COMMON_SEEDS = 3
 IMPORTED = "quarter"  # map of the package, imported into the folder of the proof of placement
 
 
-def _use_demo_size(recipe: "RunRecipe") -> "RunRecipe":
-    return recipe.model_copy(update={"size": "demo"})
-
-
 class Target(StrEnum):
     """Targets other than the tasks' studies."""
 
@@ -266,7 +262,7 @@ def _federation_exchange(
     target: Target, out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale
 ) -> None:
     from flcav.experiments.exchanges.run import compare_exchanges, draw_results
-    from flcav.pipeline.recipe import shrink_recipe
+    from flcav.experiments.scales import shrink_recipe
 
     recipe, runs = _run_seeds(target, EXCHANGES[target], out, seeds, scale, jobs, engine, stale, shrink_recipe)
     results = compare_exchanges(recipe, runs, [out / f"seed{run.recipe.seed}" for run in runs])
@@ -276,7 +272,7 @@ def _federation_exchange(
 def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps
     from flcav.experiments.placement.run import draw_proof, list_regions, prove_placement
-    from flcav.pipeline.recipe import shrink_recipe
+    from flcav.experiments.scales import shrink_recipe
     from flcav.pipeline.running import WORK
     from flcav.sources.recipe import recipe_path
     from flcav.world.opendrive.importing import import_town
@@ -312,10 +308,10 @@ def _run_seeds(
     jobs: int,
     engine: Engine,
     stale: Stale,
-    shrink: "Callable[[RunRecipe], RunRecipe]" = _use_demo_size,
+    shrink: "Callable[[RunRecipe], RunRecipe] | None" = None,
     beside: Path | None = None,
 ) -> "tuple[RunRecipe, tuple[Run, ...]]":
-    """Run or finish the package's recipe `runs/<name>` with several seeds, with `shrink` applied if scale is quick.
+    """Run or finish the package's recipe `runs/<name>` with several seeds, as `_load_sized` returns it.
 
     Imported towns are looked for in `beside`.
     """
@@ -329,13 +325,14 @@ def _run_seeds(
     return recipe, runs
 
 
-def _load_sized(name: str, scale: str, shrink: "Callable[[RunRecipe], RunRecipe]" = _use_demo_size) -> "RunRecipe":
-    """Return the package's recipe `runs/<name>`, with `shrink` applied unless scale is paper."""
+def _load_sized(name: str, scale: str, shrink: "Callable[[RunRecipe], RunRecipe] | None" = None) -> "RunRecipe":
+    """Return the package's recipe `runs/<name>`; unless scale is paper, `shrink` of it (None: at the demo's size)."""
+    from flcav.experiments.scales import use_demo_size
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.sources.recipe import recipe_path
 
     recipe = load_run_recipe(recipe_path(f"runs/{name}"))
-    return recipe if scale == "paper" else shrink(recipe)
+    return recipe if scale == "paper" else (shrink or use_demo_size)(recipe)
 
 
 @when_interrupted()

@@ -172,7 +172,7 @@ class RigBound(Protocol):
 
 @dataclass(frozen=True)
 class KnownLidar:
-    """What a recording says of the vehicles' first LiDAR."""
+    """Beams and range of the vehicles' first LiDAR, as far as a recording names them."""
 
     beams: int | None = None  # None: not known
     range_m: float | None = None  # largest range; None: not known

@@ -22,6 +22,7 @@ from flcav.experiments.exchanges.run import (
     summarise,
 )
 from flcav.experiments.exchanges.tables import tables
+from flcav.experiments.scales import shrink_recipe
 from flcav.federation.upload import name_like
 from flcav.network.ledger import LedgerEntry
 from flcav.network.radio.budget import Radio
@@ -31,7 +32,7 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, resolve_settings
-from flcav.pipeline.recipe import CLOUD, MAIN, PRETRAIN, Federation, load_run_recipe, shrink_recipe
+from flcav.pipeline.recipe import CLOUD, MAIN, PRETRAIN, Federation, load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
 

@@ -1,4 +1,4 @@
-"""What a sensor on a pole may add to vehicles' labels: as expected before it stands, and as its sweeps show.
+"""Labels that a sensor on a pole adds to those of vehicles: expected before it stands, and found in its sweeps.
 
 Coverage counts registered errors within a radius. Vehicles learn from what the road detector labels, in frames in which
 they have returns of the object themselves:
