@@ -1,5 +1,7 @@
 """Markdown tables of a run's results."""
 
+from collections import Counter
+
 import numpy as np
 
 from flcav.experiments.cloud_rounds import cloud_tables
@@ -8,7 +10,7 @@ from flcav.network.ledger import LINKS
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.collecting.findings import findings, name_stage
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
-from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.plans import RoundPlan
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Finding
@@ -17,7 +19,7 @@ from flcav.pipeline.results.training import StageResult
 
 def tables(run: Run) -> dict[str, str]:
     """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, what cloud rounds do,
-    spread of retraining.
+    rounds of vehicles on a network, spread of retraining.
 
     Findings are judged anew, so that results of before a change of the judging are judged as others are.
     """
@@ -31,6 +33,7 @@ def tables(run: Run) -> dict[str, str]:
         "sensors": _sensors(run),
         **cloud_tables(run),
     }
+    own |= {} if run.recipe.federation.network is None else {"rounds": _rounds(run)}
     return own | {"spread": _spread(run)} if run.recipe.retrainings else own
 
 
@@ -116,6 +119,31 @@ def _budgets(run: Run) -> str:
         whole = (f"{mb:.1f}" for mb in (use.budget_mb, use.planned_mb, use.used_mb))
         rows.append([link, *whole, *(f"{main.sent_mb(task, link):.1f}" for task in main.plan.tasks)])
     return format_table(("uplink", "budget MB", "planned MB", "used MB", *main.plan.tasks), rows)
+
+
+def _rounds(run: Run) -> str:
+    """Return what became of the rounds of each vehicle on the network: planned, combined, lost and why, their time."""
+    main, rows = run.arms[MAIN], []
+    for task, plan in main.plan.tasks.items():
+        stages = [stage for stage in main.stages if stage.task == task]
+        rounds = [each for stage in stages for each in stage.records or () if each.server != CLOUD]
+        asked = {*(plan.joins or ()), *(name for each in rounds for name in (*each.clients, *each.failed))}
+        for name in sorted(asked):
+            region, _, vehicle = name.partition("/")
+            own = [each for each in rounds if each.server == region]
+            joined = [each for each in own if name in each.clients or name in each.failed]
+            lost = Counter(each.failed[name] for each in joined if name in each.failed)
+            rows.append(
+                [
+                    *(task, name, f"{run.recipe.regions[region].speed.get(vehicle, 1.0):g}"),
+                    len(own) if plan.joins is None else len(plan.joins[name]),
+                    sum(name in each.clients for each in joined),
+                    ", ".join(f"{times} {reason}" for reason, times in lost.items()),
+                    f"{sum(each.seconds or 0.0 for each in joined):.1f}",
+                ]
+            )
+    header = ("task", "vehicle", "speed", "rounds planned", "combined", "lost", "time of its rounds, s")
+    return format_table(header, rows)
 
 
 def _sensors(run: Run) -> str:

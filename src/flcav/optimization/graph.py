@@ -21,6 +21,7 @@ from pydantic import Field, model_validator
 from flcav.config import InputError, parse_config, read_yaml
 from flcav.optimization.curves.curves import NonNegative, OwnCurve, Positive
 from flcav.optimization.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
+from flcav.records import LEFT_OUT
 
 KINDS = ("task", "network", "modality", "vehicle")  # of nodes; each layer joins two neighbours of this list
 
@@ -34,9 +35,11 @@ class TaskNode(Quantities):
 
 
 class NetworkNode(Quantities):
-    """A network: its size, its modalities, limits, and the learning curve of tasks that have none of their own."""
+    """A network: its messages, its modalities, limits, and the learning curve of tasks that have none of their own."""
 
     model_mb: Positive  # one model update
+    exchange_mb: Annotated[Positive | None, LEFT_OUT] = None  # as of `AllocationTask`
+    labels_mb: Annotated[NonNegative | None, LEFT_OUT] = None  # as of `AllocationTask`
     modalities: Annotated[tuple[str, ...], Field(min_length=1)]
     limits: Limits
     curve: OwnCurve | None = None
@@ -152,6 +155,7 @@ def extract_layers(graph: nx.Graph) -> Layers:
         networks = {
             key[1]: {
                 **{name: graph.nodes[key][name] for name in ("model_mb", "limits", "curve")},
+                **{name: graph.nodes[key].get(name) for name in ("exchange_mb", "labels_mb")},
                 "train_s": graph.nodes[key].get("train_s", 0.0),
                 "modalities": [other[1] for other in graph[key] if other[0] == "modality"],
             }
@@ -239,6 +243,8 @@ def to_problem(graph: nx.Graph) -> Problem:
                 "weight": sum(tasks_of.values()),
                 "sample_mb": sum(layers.modalities[modality].sample_mb for modality in network.modalities),
                 "model_mb": network.model_mb,
+                "exchange_mb": network.exchange_mb,
+                "labels_mb": network.labels_mb,
                 "edge_groups": [sum(each.edge == edge for each in ordered.values()) for edge in edges],
                 **_named(ordered, held, network.train_s),
                 "limits": network.limits.model_dump(),

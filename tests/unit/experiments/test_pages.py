@@ -7,12 +7,13 @@ from reproduction_pages import TABLES, fill, fill_folder, tables_of
 from flcav.config import InputError, read_json
 from flcav.experiments.arms.run import ARMS, ArmsResult, order_arms
 from flcav.markdown import format_table
+from flcav.pipeline.running import RESULTS
 
 REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"
 RUNS = sorted((REPRODUCTIONS / "runs").glob("*"))
 FEDERATIONS = sorted((REPRODUCTIONS / "federation").glob("*"))
 PAGES = [*(folder for folder in (*REPRODUCTIONS.iterdir(), *FEDERATIONS) if folder.name in TABLES), *RUNS]
-MADE = [*(folder for folder in PAGES if (folder / "result.json").exists()), *RUNS]
+MADE = [folder for folder in PAGES if (folder / "result.json").exists() or (folder / RESULTS).exists()]
 
 
 @pytest.mark.parametrize("folder", MADE, ids=lambda folder: folder.name)

@@ -108,6 +108,13 @@ def test_a_vehicle_of_twice_the_speed_trains_half_as_long() -> None:
     assert (unknown.vehicles, unknown.train_s) == ((), 60.0)
 
 
+def test_a_round_takes_as_long_as_what_its_network_exchanges() -> None:
+    changed = values()
+    changed["networks"]["lidar detector"] |= {"exchange_mb": 6.0, "labels_mb": 3.0}
+    objects = to_problem(build_graph(parse_config(Layers, changed, "test"))).tasks[2]
+    assert objects.round_s("car 2") == pytest.approx(8 * (6 + 3) / 9)
+
+
 def test_the_vehicles_of_a_graph_carry_its_plan() -> None:
     problem = load_problem(RECIPE)
     plan = allocate(problem)
@@ -125,6 +132,8 @@ def test_the_vehicles_of_a_graph_carry_its_plan() -> None:
         (("vehicles", "car 1", "holds"), {"radar": {}}, "vehicles.car 1.holds = 'radar'"),
         (("modalities", "camera", "sample_mb"), float("nan"), "finite"),
         (("modalities", "camera", "sample_mb"), -1, "greater than 0"),
+        (("networks", "classifier", "exchange_mb"), -0.1, "classifier.exchange_mb' = -0.1: .* greater than 0"),
+        (("networks", "classifier", "labels_mb"), -0.1, "classifier.labels_mb' = -0.1: .* greater than or equal"),
         (("networks", "idle"), {**values()["networks"]["classifier"]}, "networks.idle serves no task"),
         (("vehicles",), {"car 1": values()["vehicles"]["car 1"] | {"holds": {"camera": {}}}}, "no vehicle holds"),
         (("networks", "classifier", "curve"), None, "tasks.weather.curve is missing"),

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import networkx as nx
 import numpy as np
 import pytest
 from flwr.app import Array, ArrayRecord, MetricRecord, RecordDict
@@ -16,10 +17,12 @@ from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.plan import MessageSizes, Price, price
+from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.curves.curves import Additive, Federated
 from flcav.optimization.curves.fitting import CurveFit, fit
 from flcav.optimization.curves.held_out import hold_out_runs
 from flcav.optimization.curves.history import History
+from flcav.optimization.graph import load_graph, load_problem
 from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
@@ -101,6 +104,37 @@ def test_tasks_share_both_budgets_and_fixed_plans_are_paid_first() -> None:
         make_plan((asked("signs", fixed=FixedPlan(samples=300, edge_rounds=2, cloud_rounds=1)),), frame(), "joint")
     with pytest.raises(InputError, match="the pools hold 20"):
         make_plan((asked("signs", pool=20, fixed=fixed),), frame(), "joint")
+
+
+def test_a_graph_prices_exchanges_and_labels_as_a_run_does(tmp_path: Path) -> None:
+    sizes = MessageSizes(sample_mb=0.4, model_mb=1.4, exchange_mb=0.2, labels_mb=0.3)
+    plan, problem = make_plan((replace(asked(), sizes=sizes),), frame(), "joint")
+    assert problem is not None
+    (task,), own = problem.tasks, plan.tasks["objects"]
+    values = {
+        "budgets_mb": problem.budgets_mb.model_dump(),
+        "tasks": {"objects": {"network": "detector"}},
+        "networks": {
+            "detector": {
+                **{"model_mb": 1.4, "exchange_mb": 0.2, "labels_mb": 0.3, "modalities": ["lidar"]},
+                "limits": task.limits.model_dump(mode="json"),
+                "curve": task.curve.model_dump(mode="json"),
+            }
+        },
+        "modalities": {"lidar": {"sample_mb": 0.4}},
+        "vehicles": {f"car {i}": {"edge": "grid" if i < 4 else "ring", "holds": {"lidar": {}}} for i in range(7)},
+    }
+    (tmp_path / "layers.yaml").write_text(json.dumps(values))
+    joined = json.dumps(nx.node_link_data(load_graph(tmp_path / "layers.yaml"), edges="links"))
+    (tmp_path / "graph.json").write_text(joined)
+    vehicles, edge_rounds, cloud_rounds = 4 + 3, own.edge_rounds, own.cloud_rounds
+    wireless = own.samples * 0.4 + vehicles * ((edge_rounds + cloud_rounds) * 0.2 + (edge_rounds + 1) * 0.3)
+    wireline = own.samples * 0.4 + 2 * cloud_rounds * 1.4
+    for name in ("layers.yaml", "graph.json"):
+        (same,) = allocate(load_problem(tmp_path / name)).tasks
+        assert (same.samples, same.edge_rounds, same.cloud_rounds) == (own.samples, edge_rounds, cloud_rounds)
+        assert (same.wireless_mb, same.wireline_mb) == (own.wireless_mb, own.wireline_mb)
+        assert (same.wireless_mb, same.wireline_mb) == pytest.approx((wireless, wireline))
 
 
 def test_the_curve_predicts_every_stage() -> None:

@@ -1,5 +1,7 @@
 """The timeline of rounds and the coverage map show what the records say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
@@ -28,6 +30,12 @@ def test_bars_are_as_long_as_the_times_and_begin_where_they_did():
     wire = [np.asarray(path.get_extents().intervalx) for path in axes.collections[0].get_paths()]
     np.testing.assert_allclose(wire, [[0, 0.5], [6.5, 7.0]], atol=1e-9)
     assert [label.get_text() for label in axes.get_yticklabels()] == ["cav0", "cav1", "wireline"]
+
+
+def test_rows_are_in_the_order_of_the_clients_numbers_whoever_comes_first():
+    timings = [replace(DONE, client=f"cav{number}") for number in (10, 2, 1)]
+    axes = timeline_of_rounds([replace(ROUND, clients=tuple(timings))]).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["cav1", "cav2", "cav10", "wireline"]
 
 
 def test_who_dropped_out_is_said_with_the_reason():

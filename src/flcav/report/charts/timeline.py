@@ -21,7 +21,8 @@ def timeline_of_rounds(records: Sequence[RoundRecord], width_in: float = 7.2) ->
     """Return the rounds as bars over time, a row per client and one for the wireline; raises ValueError for none."""
     if not records:
         raise ValueError("a timeline needs at least one round")
-    rows = list(dict.fromkeys(client.client for record in records for client in record.clients))
+    seen = {client.client for record in records for client in record.clients}
+    rows = sorted(seen, key=lambda name: (len(name), name))
     if any(record.wireline_down_s or record.wireline_up_s for record in records):
         rows.append(WIRELINE)
     figure = style.canvas(width_in, 1.3 + 0.42 * len(rows))
