@@ -6,9 +6,9 @@ from pathlib import Path
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
 from flcav.files import Json
-from flcav.perception.agents import POLE, kind_of
+from flcav.perception.agents import choose_frames
 from flcav.perception.card import read_lidar
-from flcav.perception.task import KnownLidar, KnowsRig, find_configuration
+from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.pipeline.frames import make_recording_recipe
 from flcav.pipeline.graph.outline import Outline
@@ -44,12 +44,10 @@ def compare_rigs(outline: Outline) -> tuple[str, ...]:
 def _compare(outline: Outline, folder: Path, name: str) -> str:
     """Return how the vehicles' rig in a dataset differs from the one that a task's network is trained with."""
     task = task_named(name)
-    if not isinstance(task, KnowsRig):
-        return ""
-    data, config = Dataset.open(folder), find_configuration(task, outline.recipe.tasks[name].network)
-    vehicles = [number for number, key in enumerate(data.keys) if kind_of(key.agent) != POLE]
     trained = {read_lidar(recipe) for recipe in _list_pools(outline, name)}
-    return task.compare_rig(data, config, vehicles, trained.pop() if len(trained) == 1 else KnownLidar())
+    known = trained.pop() if len(trained) == 1 else None
+    config = find_configuration(task, outline.recipe.tasks[name].network)
+    return choose_frames(task, config, Dataset.open(folder), "vehicles", trained=known).rig
 
 
 def _list_pools(outline: Outline, task: str) -> Iterator[Mapping[str, Json]]:
