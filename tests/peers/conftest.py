@@ -97,9 +97,14 @@ def _environment(name: str) -> Path:
     return python
 
 
+def build_peer(name: str) -> Peer:
+    """Return the peer of that name, its environment built where it has to be."""
+    return Peer(name, _environment(name))
+
+
 @pytest.fixture(scope="session")
 def peer() -> Callable[[str], Peer]:
-    return lambda name: Peer(name, _environment(name))
+    return build_peer
 
 
 @pytest.fixture(scope="session")

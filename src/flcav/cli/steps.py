@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from flcav.pipeline.rigs import RIG
 from flcav.pipeline.steps import FINISHED, Notify
 
 EPSILON = "epsilon"  # in the notes of rounds with differential privacy
@@ -28,6 +29,9 @@ def live_steps(title: str) -> Iterator[Notify]:
 
         def notify(step: str, done: int, total: int, note: str) -> None:
             nonlocal finished
+            if step == RIG:  # not of a step: what the run takes otherwise than it was recorded stays on the terminal
+                console.print(f"{title}: {note}", highlight=False)
+                return
             if step not in rows:
                 rows[step] = bars.add_task(f"  {step}", total=None, note="")
             bars.update(rows[step], completed=done, total=max(total, 1), note=note)

@@ -3,13 +3,12 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from flcav.config import InputError
 from flcav.dataset.ground import POLE
 from flcav.dataset.store import Dataset
 from flcav.files import Json
-from flcav.perception.task import KnownLidar, KnowsRig, RigBound, Task
+from flcav.perception.task import ConfigT, KnownLidar, KnowsRig, NetworkT, RigBound, SampleT, Task
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,12 @@ class FrameSelection:
 
 
 def choose_frames(
-    task: Task, config: Any, data: Dataset, wanted: str | None = None, *, trained: KnownLidar | None = None
+    task: Task[ConfigT, NetworkT, SampleT],
+    config: ConfigT | None,
+    data: Dataset,
+    wanted: str | None = None,
+    *,
+    trained: KnownLidar | None = None,
 ) -> FrameSelection:
     """Select the frames of the agents `wanted`: "all", "vehicles", "poles" or names, separated by commas.
 

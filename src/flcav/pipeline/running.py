@@ -12,6 +12,7 @@ from flcav.pipeline.federations.records import save_rounds
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import RunRecipe
 from flcav.pipeline.results.run import Run, Summary
+from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.seeds.spread import list_spreads
 from flcav.pipeline.seeds.summary import summarise
 from flcav.pipeline.steps import Notify, Stale, ignore_steps, run_side_by_side, run_steps, stopwatch
@@ -59,6 +60,7 @@ def run(
         Run.load(out, RESULTS)  # raises for results of another version
     graph, clock = Graph(recipe, Path(beside or ".")), stopwatch(out / WORK)
     check_federations(recipe, graph.settings.values())
+    tell_rigs([graph], notify)
 
     def timed(step: str, done: int, total: int, note: str) -> None:
         if note == "done":
@@ -111,6 +113,7 @@ def run_several(
     graphs = {out / name: Graph(recipe, Path(beside or ".")) for name, recipe in recipes.items()}
     for graph in graphs.values():
         check_federations(graph.recipe, graph.settings.values())
+    tell_rigs(graphs.values(), notify)
     steps = {folder / WORK: graph.steps for folder, graph in graphs.items()}
     names = {folder / WORK: folder.name for folder in graphs}
     run_side_by_side(steps, jobs=jobs, notify=notify, stale=stale, engine=engine, names=names)

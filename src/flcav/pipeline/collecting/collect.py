@@ -20,6 +20,7 @@ from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.run import ArmResult, LinkUse, Run, Spent
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import Pretrained, StageResult, Watched
+from flcav.pipeline.rigs import compare_rigs
 
 
 def collect_results(graph: Graph, work: Path) -> Run:
@@ -49,7 +50,7 @@ def collect_results(graph: Graph, work: Path) -> Run:
         findings=findings(differences, tests, arms, settings, roles, rests),
         gap_closed=gaps_closed(tests, recipe),
         provenance=provenance(recipe.seed),
-        caveats=list_caveats(recipe, main.labels.values(), settings.values()),
+        caveats=(*list_caveats(recipe, main.labels.values(), settings.values()), *compare_rigs(graph)),
     )
 
 

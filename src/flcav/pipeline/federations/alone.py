@@ -24,6 +24,7 @@ from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
 from flcav.pipeline.results.saved import WEIGHTS, Saved
 from flcav.pipeline.results.training import Round, StageResult, Watched
+from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.steps import Notify, Stale, Step, ignore_steps, run_steps
 from flcav.pipeline.work.edge import EdgeSettings, edge_step
 from flcav.pipeline.work.settings import make_step
@@ -77,6 +78,7 @@ def federate_regions(
     check_federations(recipe, graph.settings.values())
     if runtime != "embedded" and any(LABEL_SOURCES[kind].averaged for kind in graph.settings[arm].labels.values()):
         raise InputError("labels 'road-average' are renewed between rounds, and Ray's actors get them once; not on Ray")
+    tell_rigs([graph], notify)
     asked = list_federations(graph, arm)
     means = {"processes": jobs, "runtime": runtime, "timed": 1}
     alone = {name: _federation_step(graph, *about, means) for name, about in asked.items()}

@@ -77,7 +77,7 @@ class Run(Saved):
     differences: tuple[Difference, ...]
     findings: tuple[Finding, ...]
     gap_closed: Mapping[str, float]  # fraction closed of the gap to centralised training
-    caveats: tuple[str, ...]  # of the kinds of labels
+    caveats: tuple[str, ...]  # of the kinds of labels, and of rigs unlike those of the training
     provenance: Provenance
     elapsed_s: float = 0.0  # wall time of all starts together
 
