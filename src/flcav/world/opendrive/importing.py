@@ -80,6 +80,8 @@ def split_map(root: ElementTree.Element, prefix: Path, origin: Path, *, left_han
     options = {
         "opendrive-files": str(xodr),
         "opendrive.import-all-lanes": "true",
+        "opendrive.internal-shapes": "true",  # lanes inside junctions are the connecting roads
+        "opendrive.curve-resolution": "1",  # [m] between the points of a curve
         "flatten": "true",
         "offset.disable-normalization": "true",
         "plain-output-prefix": str(prefix),

@@ -47,8 +47,8 @@ def mirror_map(root: ElementTree.Element) -> None:
 
 
 def mirror_parts(prefix: Path) -> None:
-    """Mirror netconvert's plain nodes and edges beside `prefix` in place, y to -y."""
-    for part in ("nod", "edg"):
+    """Mirror netconvert's plain nodes, edges and connections beside `prefix` in place, y to -y."""
+    for part in ("nod", "edg", "con"):
         tree = ElementTree.parse(f"{prefix}.{part}.xml")
         for row in tree.getroot().iter():
             if "y" in row.attrib:

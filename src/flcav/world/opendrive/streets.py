@@ -77,7 +77,7 @@ def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChange
     lengths = {row.attrib["id"]: _length(row, places) for row in edges.getroot().findall("edge")}
     _open_short_lanes(connections.getroot(), lengths)
     _rule(nodes.getroot(), edges.getroot().findall("edge"), document)
-    offset = _move(nodes.getroot(), edges.getroot())
+    offset = _move(nodes.getroot(), edges.getroot(), connections.getroot())
     for part, tree in (("nod", nodes), ("edg", edges), ("con", connections)):
         tree.write(f"{prefix}.{part}.xml")
     return MapChanges(offset, added)
@@ -184,8 +184,9 @@ def _connect(root: ElementTree.Element, kept: dict[str, dict[int, int]]) -> None
             root.remove(row)
             continue
         ends = {"from": row.attrib["from"], "to": row.attrib["to"], "fromLane": str(here), "toLane": str(there)}
+        shape = {"shape": row.attrib["shape"]} if "shape" in row.attrib else {}
         row.clear()
-        row.attrib |= ends
+        row.attrib |= ends | shape
 
 
 def _open_short_lanes(root: ElementTree.Element, length: dict[str, float]) -> None:
@@ -231,7 +232,9 @@ def _rule(root: ElementTree.Element, edges: Iterable[ElementTree.Element], docum
         node.set("type", "traffic_light" if lights else "priority_stop" if name in document.stops else "priority")
 
 
-def _move(nodes: ElementTree.Element, edges: ElementTree.Element) -> tuple[float, float]:
+def _move(
+    nodes: ElementTree.Element, edges: ElementTree.Element, connections: ElementTree.Element
+) -> tuple[float, float]:
     """Move a map that reaches beyond `FAR_M` to the origin, in place; return the offset x, y [m]."""
     rows = nodes.findall("node")
     at = np.array([(float(row.attrib["x"]), float(row.attrib["y"])) for row in rows])
@@ -240,7 +243,7 @@ def _move(nodes: ElementTree.Element, edges: ElementTree.Element) -> tuple[float
     dx, dy = (float(v) for v in -np.round((at.min(axis=0) + at.max(axis=0)) / 2, -2))
     for row, (x, y) in zip(rows, at):
         row.attrib |= {"x": f"{x + dx:.2f}", "y": f"{y + dy:.2f}"}
-    for row in edges.findall("edge"):
+    for row in [*edges.findall("edge"), *connections.findall("connection")]:
         points = [tuple(float(v) for v in point.split(",")[:2]) for point in row.get("shape", "").split()]
         if points:
             row.set("shape", " ".join(f"{x + dx:.2f},{y + dy:.2f}" for x, y in points))

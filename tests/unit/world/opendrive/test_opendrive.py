@@ -20,6 +20,7 @@ from flcav.world.opendrive.document import read_map
 from flcav.world.opendrive.georeference import inverse_mercator, locate_origin
 from flcav.world.opendrive.importing import ImportedTown, import_town
 from flcav.world.opendrive.objects.crosswalks import find_crosswalks
+from flcav.world.opendrive.road_surface import Road
 from flcav.world.traffic.traffic import simulate
 
 CROSS = Path(__file__).parents[3] / "data" / "cross.xodr"
@@ -59,6 +60,20 @@ def test_the_cross_is_as_drawn(cross: ImportedTown) -> None:
     assert parameters.source is not None
     assert parameters.source.offset_m == (-CENTRE[0], -CENTRE[1])
     assert any("sidewalks" in note for note in cross.notes)
+
+
+def test_lanes_of_a_junction_are_its_connecting_roads(cross: ImportedTown) -> None:
+    lanes = [lane for edge in read_net(cross.town.net).edges.values() for lane in edge.lanes_of("driving")]
+    streets = shapely.STRtree([LineString(lane.shape) for lane in lanes if len(lane.shape) > 1])
+    connecting = [row for row in read_map(CROSS).iterfind("road") if row.get("junction", "-1") != "-1"]
+    assert len(connecting) == 12
+    for row in connecting:
+        road = Road(row)
+        s = np.linspace(0.0, road.length, 10)
+        (number,) = [int(lane.attrib["id"]) for lane in row.iter("lane") if lane.get("type") == "driving"]
+        centre = road.point(s, np.array([road.lane_centre(at, number) for at in s]))[:, :2] - CENTRE
+        away = streets.query_nearest(shapely.points(centre), return_distance=True, all_matches=False)[1]
+        assert away.max() < 0.05, road.id
 
 
 def test_the_origin_is_where_utm_says(cross: ImportedTown) -> None:

@@ -30,7 +30,7 @@ pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not inst
 
 
 def lines(net: RoadNet, sign: int, kind: str) -> list[LineString]:
-    return [LineString(lane.shape * (1, sign)) for edge in net.streets for lane in edge.lanes_of(kind)]
+    return [LineString(lane.shape * (1, sign)) for edge in net.edges.values() for lane in edge.lanes_of(kind)]
 
 
 def write(root: ElementTree.Element, path: Path) -> Path:
