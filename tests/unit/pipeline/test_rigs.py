@@ -1,5 +1,6 @@
 """Recorded datasets in a run whose rig is not that of the networks' training."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,14 @@ import pytest
 from flcav.cli.steps import live_steps
 from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
+from flcav.pipeline import running
+from flcav.pipeline.federations import alone
+from flcav.pipeline.federations.alone import federate_regions
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.rigs import compare_rigs, tell_rigs
+from flcav.pipeline.rigs import RIG, compare_rigs, tell_rigs
+from flcav.pipeline.running import run, run_several
+from flcav.pipeline.steps import Notify
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
@@ -49,6 +55,36 @@ def test_another_rig_is_told_once_for_each_region_and_task(otherwise: Path, caps
     with live_steps("run") as notify:
         tell_rigs([outline, outline], notify)
     assert capsys.readouterr().err.replace("\n", " ").split() == ["run:", *TOLD.split()]
+
+
+def begin_run(recipe: RunRecipe, out: Path, notify: Notify) -> None:
+    run(recipe, out, notify=notify)
+
+
+def begin_several(recipe: RunRecipe, out: Path, notify: Notify) -> None:
+    run_several({"one": recipe, "other": recipe.model_copy(update={"seed": 2})}, out, notify=notify)
+
+
+def begin_federation(recipe: RunRecipe, out: Path, notify: Notify) -> None:
+    federate_regions(recipe, out, notify=notify)
+
+
+@pytest.mark.parametrize("begin", [begin_run, begin_several, begin_federation])
+def test_runs_and_federations_tell_it_before_their_steps(
+    otherwise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begin: Callable[[RunRecipe, Path, Notify], None]
+) -> None:
+    class Begun(Exception):
+        pass
+
+    def begun(*_: object, **__: object) -> None:
+        raise Begun
+
+    for place, name in ((running, "run_steps"), (running, "run_side_by_side"), (alone, "run_steps")):
+        monkeypatch.setattr(place, name, begun)
+    told: list[tuple[str, str]] = []
+    with pytest.raises(Begun):
+        begin(outline_of(otherwise).recipe, tmp_path, lambda step, done, total, note: told.append((step, note)))
+    assert told == [(RIG, TOLD)]
 
 
 def test_the_rig_of_the_training_is_not_told(tmp_path: Path) -> None:
