@@ -30,9 +30,9 @@ def tables(run: Run) -> dict[str, str]:
         "differences": _differences(run),
         "plan": _plan(run),
         "budgets": _budgets(run),
-        "sensors": _sensors(run),
         **cloud_tables(run),
     }
+    own |= {"sensors": _sensors(run)} if any(each.chosen for each in run.arms[MAIN].placed) else {}
     own |= {} if run.recipe.federation.network is None else {"rounds": _rounds(run)}
     return own | {"spread": _spread(run)} if run.recipe.retrainings else own
 
