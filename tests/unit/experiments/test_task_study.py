@@ -70,7 +70,7 @@ RECORDED = {
     "weather": "e5217e3fd7183127",
     "signs": "af6031549073e2c9",
     "objects": "91e0a73860e306cc",
-    "objects-streets": "1f6dfe1a70482ba2",  # ten test scenes; the figures are of six, as their page says
+    "objects-streets": "8066dfcd7602c022",  # of the second training that the page announces
     "trajectory": "3b5f95cc2d111a7a",
     "trajectory-cameras": "9889f4d36a9b6fc9",
 }
