@@ -270,6 +270,7 @@ def _federation_exchange(
 
 
 def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+    from flcav.experiments.placement.claims import describe_claims
     from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps
     from flcav.experiments.placement.run import draw_proof, list_regions, prove_placement
     from flcav.experiments.scales import shrink_recipe
@@ -286,7 +287,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
     how: Any = (seeds, scale, jobs, engine, stale, shrink_recipe, out)
     recipe, runs = _run_seeds(Target.placement, "placement", out, *how)
     results = prove_placement(recipe, runs, [out / f"seed{run.recipe.seed}" / WORK for run in runs], out)
-    _write_figures(out, results.as_json(), draw_proof(results), results.sentences())
+    _write_figures(out, results.as_json(), draw_proof(results), [*results.sentences(), *describe_claims(results)])
 
 
 COMPARISONS: Mapping[str, Callable[[Path, int, str, int, Engine, Stale], None]] = {

@@ -13,6 +13,7 @@ from scipy.stats import spearmanr, t
 from shapely.geometry import Point
 
 from flcav.experiments.placement import predictors
+from flcav.experiments.placement.claims import describe_claims, judge_claims, list_claims
 from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps, overlap_of_circles
 from flcav.experiments.placement.predictors import RECALL, count_added_labels, expect_labels
 from flcav.experiments.placement.records import (
@@ -216,6 +217,32 @@ def test_regions_of_a_seed_are_pooled_before_seeds(beside: Path) -> None:
     assert [results.regions[region].town for region in BOTH] == list(BOTH)
     assert "| mean over regions | 1 | VRCSP | +0.055" in tables(results)["rules"]
     assert {f"{each} {region}" for each in ("poles", "seeds", "overlaps") for region in BOTH} < set(tables(results))
+
+
+def test_claims_are_of_means_over_regions_and_judged_together(beside: Path) -> None:
+    def of_seed(number: int, gains: Sequence[float], chosen: Sequence[float], **correlation: float) -> SeedGains:
+        told = {name: {TOWN: rho, NEAR: 0.5} for name, rho in correlation.items()}
+        found = seed(number, gains, chosen)
+        return replace(found, correlation={**found.correlation, COVERAGE: told["covered"], TRAFFIC: told["traffic"]})
+
+    poles = [0.06, 0.02, 0.0]
+    grid = [of_seed(i, poles, [0.06 + i / 1e3, 0.02, 0.03], covered=0.8 + i / 1e3, traffic=0.1) for i in range(3)]
+    quarter = [of_seed(i, poles, [0.04, 0.02 - i / 1e2, 0.03], covered=0.6, traffic=i / 10) for i in range(3)]
+    results = summarise_gains(RECIPE, {"grid": grid, "quarter": quarter}, beside)
+    claims = list_claims(results)
+    assert len(claims) == 2 * (1 + 1 + 2)  # for both kinds of test frames
+    beyond = claims[f"gain {TOWN}: rank correlation with errors covered - with traffic density"]
+    assert beyond.mean == pytest.approx(np.mean([(0.8 + i / 1e3 - 0.1 + 0.6 - i / 10) / 2 for i in range(3)]))
+    told = judge_claims(claims)
+    first = told[f"gain {TOWN}: rank correlation with errors covered"]
+    p = claims[f"gain {TOWN}: rank correlation with errors covered"].p_value(0.0)
+    assert p is not None
+    assert first.p is not None
+    assert (first.verdict, first.family) == ("held", 8)
+    assert first.p > p
+    assert f"gain {TOWN}, sensors 1: VRCSP - random" in claims
+    assert f"gain {TOWN}, sensors 1: VRCSP - random: +0.021" in " ".join(describe_claims(results))
+    assert "| held |" in tables(results)["claims"]
 
 
 def test_one_seed_has_no_interval(beside: Path) -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from flcav.experiments.placement.claims import judge_claims, list_claims
 from flcav.experiments.placement.records import (
     EXPECTED,
     FRAMES,
@@ -14,19 +15,42 @@ from flcav.experiments.placement.records import (
 )
 from flcav.intervals import MOST_SEEDS
 from flcav.markdown import format_table
+from flcav.verdicts import UNDECIDED, format_p
 
 POOLED = "mean over regions"
 
 
 def tables(results: PlacementProof) -> dict[str, str]:
-    """Return Markdown by name: correlation, rules, and of each region "poles REGION", seeds and overlaps."""
+    """Return Markdown by name: claims, correlation, rules, spread, and of each region poles, seeds and overlaps."""
     every = {name: own.means for name, own in results.regions.items()}
     if len(every) > 1:
         every[POOLED] = results.pooled
-    told = {"correlation": _correlation(every), "rules": _rules(every), "spread": _spread(results)}
+    told = {
+        "claims": _claims(results),
+        "correlation": _correlation(every),
+        "rules": _rules(every),
+        "spread": _spread(results),
+    }
     for name, own in results.regions.items():
         told |= {f"poles {name}": _poles(own), f"seeds {name}": _seeds(own), f"overlaps {name}": _overlaps(own)}
     return told
+
+
+def _claims(results: PlacementProof) -> str:
+    claims = list_claims(results)
+    rows = [
+        [
+            name,
+            claims[name].describe(sign=True),
+            "" if one.p is None else format_p(one.p),
+            one.verdict,
+            (one.seeds or f"more than {MOST_SEEDS}") if one.verdict == UNDECIDED and one.p is not None else "",
+        ]
+        for name, one in judge_claims(claims).items()
+    ]
+    return format_table(
+        ("claim, of the mean over regions", "mean over seeds", "p, corrected", "verdict", "if undecided: seeds"), rows
+    )
 
 
 def _correlation(every: dict[str, Means]) -> str:
