@@ -226,8 +226,8 @@ def test_claims_are_of_means_over_regions_and_judged_together(beside: Path) -> N
         return replace(found, correlation={**found.correlation, COVERAGE: told["covered"], TRAFFIC: told["traffic"]})
 
     poles = [0.06, 0.02, 0.0]
-    grid = [of_seed(i, poles, [0.06 + i / 1e3, 0.02, 0.03], covered=0.8 + i / 1e3, traffic=0.1) for i in range(3)]
-    quarter = [of_seed(i, poles, [0.04, 0.02 - i / 1e2, 0.03], covered=0.6, traffic=i / 10) for i in range(3)]
+    grid = tuple(of_seed(i, poles, [0.06 + i / 1e3, 0.02, 0.03], covered=0.8 + i / 1e3, traffic=0.1) for i in range(3))
+    quarter = tuple(of_seed(i, poles, [0.04, 0.02 - i / 1e2, 0.03], covered=0.6, traffic=i / 10) for i in range(3))
     results = summarise_gains(RECIPE, {"grid": grid, "quarter": quarter}, beside)
     claims = list_claims(results)
     assert len(claims) == 2 * (1 + 1 + 2)  # for both kinds of test frames
