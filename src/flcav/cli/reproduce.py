@@ -270,17 +270,15 @@ def _federation_exchange(
 
 
 def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+    from flcav.experiments.maps import import_map
     from flcav.experiments.placement.claims import describe_claims
     from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps
     from flcav.experiments.placement.run import draw_proof, list_regions, prove_placement
     from flcav.experiments.scales import shrink_recipe
     from flcav.pipeline.running import WORK
-    from flcav.sources.recipe import recipe_path
-    from flcav.world.opendrive.importing import import_town
 
     asked = _load_sized("placement", scale, shrink_recipe)
-    if not (out / IMPORTED).exists():
-        import_town(recipe_path("runs/placement").parents[1] / "maps" / f"{IMPORTED}.xodr", out / IMPORTED)
+    import_map(IMPORTED, out)
     overlaps = {region: list_overlaps(asked, region, out) for region in list_regions(asked)}
     for sentence in describe_overlaps(overlaps, asked.placement.range_m):
         typer.echo(sentence)

@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import spearmanr, t
 from shapely.geometry import Point
 
+from flcav.experiments.maps import import_map
 from flcav.experiments.placement import predictors
 from flcav.experiments.placement.claims import describe_claims, judge_claims, list_claims
 from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps, overlap_of_circles
@@ -42,7 +43,6 @@ from flcav.pipeline.recipe import load_run_recipe
 from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.sources.recipe import recipe_path
 from flcav.world.map.town import load_town
-from flcav.world.opendrive.importing import import_town
 
 RECIPE = load_run_recipe(recipe_path("runs/placement"))
 BOTH = ("grid", "quarter")
@@ -53,7 +53,7 @@ RANGES = Path(__file__).parents[3] / "reproductions/sensor-ranges/result.json"
 def beside(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the imported town of the recipe."""
     folder = tmp_path_factory.mktemp("towns")
-    import_town(recipe_path("runs/placement").parents[1] / "maps/quarter.xodr", folder / "quarter")
+    import_map("quarter", folder)
     return folder
 
 

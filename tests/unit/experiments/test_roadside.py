@@ -101,9 +101,10 @@ def test_zones_count_errors_around_poles_per_hectare_and_per_frame() -> None:
     assert zones[-1].per_frame is None
 
 
-def test_a_range_ends_where_too_few_cars_are_found_in_all() -> None:
-    cars = (10,) * (len(EDGES_M) - 1)
-    assert find_range(EDGES_M, cars, (10, 8, 6) + (0,) * (len(EDGES_M) - 4)) == EDGES_M[3]
+def test_a_range_ends_with_the_last_interval_in_which_enough_cars_are_found() -> None:
+    cars, none = (10,) * (len(EDGES_M) - 1), (0,) * (len(EDGES_M) - 4)
+    assert find_range(EDGES_M, cars, (10, 8, 7, *none)) == EDGES_M[2]  # though 25 of 30 are found up to the third
+    assert find_range(EDGES_M, cars, (2, 7, 8, *none)) == EDGES_M[3]  # few right below the sensor
     assert find_range(EDGES_M, cars, (0,) * (len(EDGES_M) - 1)) == 0.0
 
 
@@ -114,14 +115,14 @@ def test_the_sensors_of_a_range_are_read_by_the_placement(tmp_path: Path) -> Non
         Model("few", 16, (0,) * intervals, 0.0),
         Model("many", 64, all_to_20, find_range(SENSOR_EDGES_M, cars, all_to_20)),
     )
-    assert models[1].range_m == 25.0  # 40 of 50 cars
+    assert models[1].range_m == 20.0
     results = SensorRanges(8, cars, models)
     files = {name: tmp_path / f"{name}.csv" for name in ("errors", "poles", "sensors")}
     files["errors"].write_text("x,y,z\n1,2,0\n")
     files["poles"].write_text("id,x,y,z\n1,0,0,6\n")
     files["sensors"].write_bytes(results.sensors_csv())
     given = read_given(files["errors"], files["poles"], files["sensors"], None, [])
-    assert (given.names, given.ranges_m.tolist(), given.sensor_cost.tolist()) == (("many",), [25.0], [4.0])
+    assert (given.names, given.ranges_m.tolist(), given.sensor_cost.tolist()) == (("many",), [20.0], [4.0])
     assert SensorRanges.from_json(results.as_json(), "result.json") == results
 
 

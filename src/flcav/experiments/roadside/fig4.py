@@ -76,7 +76,7 @@ class Fig4(Record):
     suites: tuple[Suite, ...]  # the second and the third
     cars: tuple[int, ...]  # seen by any suite, in each interval of `EDGES_M`
     found: dict[str, tuple[int, ...]]  # of these, by arm
-    range_m: dict[str, float]  # within which an arm finds the share `REACHED` of the cars; 0 where nowhere
+    range_m: dict[str, float]  # to which an arm finds the share `REACHED` of the cars; 0 where nowhere
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
     def sentences(self) -> list[str]:
@@ -87,7 +87,7 @@ class Fig4(Record):
             f"{each.after.rotation_deg:.2f} degrees registered"
             for each in self.suites
         ]
-        return told + [f"{arm}: {REACHED:.0%} of the cars are found within {self.range_m[arm]:.0f} m" for arm in ARMS]
+        return told + [f"{arm}: {REACHED:.0%} of the cars are found up to {self.range_m[arm]:.0f} m" for arm in ARMS]
 
 
 def fig4(out: Path, progress: Report = ignore_progress) -> tuple[Fig4, dict[str, bytes]]:
@@ -185,10 +185,10 @@ def list_cars(data: Dataset, views: Sequence[tuple[int, str]]) -> Boxes:
 
 
 def find_range(edges_m: Sequence[float], cars: Sequence[int], found: Sequence[int]) -> float:
-    """Return the largest of the edges within which the share `REACHED` of the cars is found; 0 where nowhere.
+    """Return the far edge of the last interval in which the share `REACHED` of the cars is found; 0 where in none.
 
-    cars, found: in each interval between `edges_m`.
+    cars, found: in each interval between `edges_m`. What is nearer counts not: right below a sensor is a blind spot.
     """
-    every, own = np.cumsum(cars), np.cumsum(found)
+    every, own = np.array(cars), np.array(found)
     good = np.flatnonzero((own >= REACHED * every) & (every > 0))
     return float(edges_m[good[-1] + 1]) if len(good) else 0.0
