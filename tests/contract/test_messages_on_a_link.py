@@ -22,6 +22,7 @@ from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.strategies import FEDAVG, STRATEGIES, Strategy, of_servers, strategy_named
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes
@@ -95,9 +96,18 @@ class WiredGrid(Grid):
 
 
 class Walk:
-    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
-        drawn = np.random.default_rng(seed).normal(size=weights["w"].shape).astype(np.float32)
-        return LocalUpdate({"w": weights["w"] + drawn}, 3, 0.5)
+    """Walks at random, whatever corrects its steps; keeps where it went by itself."""
+
+    def train(
+        self, weights: Weights, *, steps: int, learning_rate: float, seed: int, own: Weights | None = None, **_: Any
+    ) -> LocalUpdate:
+        rng = np.random.default_rng(seed)
+        drawn = {name: rng.normal(size=array.shape).astype(np.float32) for name, array in weights.items()}
+        walked = {name: array + drawn[name] for name, array in weights.items()}
+        return LocalUpdate(walked, 3, 0.5, drawn, own={} if own is None else drawn)
+
+    def count_samples(self, steps: int) -> int:
+        return 3
 
 
 @pytest.fixture
@@ -146,6 +156,48 @@ def test_the_ledger_has_what_a_socket_carried_in_every_stage(wire: Wire, tmp_pat
     )
     kinds = {(entry.stage, entry.link, entry.direction) for entry in book.entries}
     assert len(kinds) == 2 + 3 + 4  # samples up; network, mistakes, views and rounds; edge and cloud rounds
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_the_ledger_has_what_a_socket_carried_for_every_strategy(wire: Wire, name: str) -> None:
+    book = federate_twice(strategy_named(name), Rules())
+    assert sorted(entry.bytes for entry in book.entries) == sorted(wire.arrived)
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [
+        {"upload": {"compression": "fp16"}},
+        {"upload": {"compression": "int8"}},
+        {"upload": {"compression": "top-k", "fraction": 0.1}},
+        {"upload": {"layers": ["v"]}},
+        {"selection": {"rule": "uniform", "clients": 2, "unbiased": True}},
+        {"selection": {"rule": "planned", "joins": {"grid/cav1": [2]}}},
+        {"privacy": {"where": "local", "clip": 1, "noise": 1}},
+        {"privacy": {"where": "central", "clip": 1, "noise": 1}},
+        {"secure": {}, "privacy": {"where": "local", "clip": 1, "noise": 1}},
+        {"personal": ["v"]},
+        {"personal": {"pull": 0.1}},
+    ],
+    ids=str,
+)
+def test_the_ledger_has_what_a_socket_carried_by_every_rule(wire: Wire, rules: dict[str, Any]) -> None:
+    book = federate_twice(FEDAVG, Rules.model_validate(rules))
+    assert sorted(entry.bytes for entry in book.entries) == sorted(wire.arrived)
+
+
+def federate_twice(strategy: Strategy, rules: Rules) -> Ledger:
+    """Return the ledger of two edge rounds of five vehicles, and of two cloud rounds with five regions."""
+    book, start = Ledger(Budget(100.0, 100.0)), {"w": np.zeros(300, np.float32), "v": np.zeros(30, np.float32)}
+    schedule, vehicles = Schedule(2, 1, 0.1, 0.1, 3), {f"grid/cav{i}": Walk() for i in range(5)}
+    how: Any = {"strategy": strategy, "rules": rules}
+    federate(vehicles, start, schedule, Account(book, "edge", "objects", "wireless"), **how)
+    air, line = (Account(book, "cloud", "objects", link) for link in ("wireless", "wireline"))
+    servers = {
+        region: EdgeServer(vehicles, 1, air, start, **how) for region in ("grid", "ring", "hills", "suburb", "mine")
+    }
+    federate(servers, start, schedule, line, strategy=of_servers(strategy), rules=rules.of_servers())
+    return book
 
 
 def test_an_update_over_the_budget_is_not_sent(wire: Wire) -> None:
