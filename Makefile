@@ -6,7 +6,7 @@ export OMP_NUM_THREADS := 1
 STAMP := .venv/.installed
 BIN := .venv/bin
 
-.PHONY: demo test test-peers lint docs check bench bench-peers format clean
+.PHONY: demo test test-peers test-ray lint docs check bench bench-peers format clean
 demo: $(STAMP)
 	$(BIN)/flcav demo --out out/demo
 
@@ -16,6 +16,12 @@ test: $(STAMP)
 # Exports read by other software, in environments of their own below out/peers: docs/formats.md.
 test-peers: $(STAMP)
 	$(BIN)/python -m pytest -n 0 -rs tests/peers
+
+# What runs on Ray beside what runs without it, in an environment of its own with the extra 'ray', below out/ray.
+test-ray:
+	test -x out/ray/bin/python || $(PYTHON) -m venv out/ray
+	out/ray/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,fusion,towns,ray]"
+	out/ray/bin/python -m pytest -n 0 -rs -k "on_ray or ray_cluster" tests/integration
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

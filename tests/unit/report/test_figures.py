@@ -93,6 +93,12 @@ def test_validation_and_test_frames_stand_on_axes_of_their_own() -> None:
     assert _dots(tested) == {0: {0.412, 0.381}, 1: {0.503, 0.447}, 2: {0.511, 0.468}}
 
 
+def test_towns_that_are_only_tested_are_named() -> None:
+    unseen = [{**row, "town": "unseen"} for row in TESTED if row["town"] == "ring"]
+    tested = figures.by_round(ROUNDS, [*TESTED, *unseen], "AP50").axes[1]
+    assert {text.get_text() for text in tested.texts} == {row["town"] for row in TESTED} | {"unseen"}
+
+
 def test_a_stage_that_was_not_tested_takes_no_place() -> None:
     rest = [row for row in TESTED if row["stage"] != "edge FL"]
     tested = figures.by_round(ROUNDS, rest, "AP50").axes[1]
@@ -101,11 +107,11 @@ def test_a_stage_that_was_not_tested_takes_no_place() -> None:
 
 
 def _dots(axes) -> dict[int, set[float]]:
-    """Return the values drawn as single dots by the place of their stage on the x axis."""
+    """Return the values drawn as single dots by their stage, the n-th of which spans [n, n + 1]."""
     out: dict[int, set[float]] = {}
     for line in axes.get_lines():
         if len(line.get_xdata()) == 1:
-            out.setdefault(round(float(line.get_xdata()[0])), set()).add(round(float(line.get_ydata()[0]), 3))
+            out.setdefault(int(line.get_xdata()[0]), set()).add(round(float(line.get_ydata()[0]), 3))
     return out
 
 

@@ -11,7 +11,7 @@ from flcav.report import style
 
 Row = Mapping[str, Any]
 
-LINE = 0.07  # height of a name, as a fraction of the axis
+LINE, TALL = 0.07, 0.13  # height of a name, as a fraction of the axis: of rounds, and of tests, which is lower
 STAGES = ("pretraining", "edge FL", "cloud FL")  # as rows name them, in their order
 
 
@@ -30,7 +30,7 @@ def draw_by_round(axes: Axes, rounds: Sequence[Row], measure: str) -> None:
     for town, line in lines.items():
         axes.plot(*zip(*line, strict=True), color=colours[town], linewidth=1.6, marker="o", markersize=2.5)
     axes.set_ylim(0, None)
-    _name_ends(axes, {town: line[-1] for town, line in lines.items()}, colours)
+    _name_ends(axes, {town: line[-1] for town, line in lines.items()}, colours, LINE)
     _mark_stages(axes, places)
     axes.set(xlabel="round of the stage, validation frames", ylabel=measure)
     axes.grid(axis="y")
@@ -42,28 +42,30 @@ def draw_tested(axes: Axes, tested: Sequence[Row], measure: str) -> None:
     `tested` has rows stage, town, score, low, high, stages named as in `STAGES`; low and high may be None.
     """
     stages = [stage for stage in STAGES if any(row["stage"] == stage for row in tested)]
-    towns = list(dict.fromkeys(row["town"] for row in tested))
+    towns, ends = list(dict.fromkeys(row["town"] for row in tested)), {}
+    colours = {town: _colour(town, towns) for town in towns}
     for number, town in enumerate(towns):
-        aside = 0.12 * (number - (len(towns) - 1) / 2)  # keeps intervals of towns apart
+        aside = 0.5 + 0.12 * (number - (len(towns) - 1) / 2)  # keeps intervals of towns apart
         own = sorted((stages.index(row["stage"]) + aside, row["score"]) for row in tested if row["town"] == town)
-        colour = _colour(town, towns)
-        axes.plot(*zip(*own, strict=True), color=colour, linewidth=0.8, linestyle=(0, (2, 2)))
+        axes.plot(*zip(*own, strict=True), color=colours[town], linewidth=0.8, linestyle=(0, (2, 2)))
         for row in tested:
             if row["town"] == town:
-                _draw_interval(axes, stages.index(row["stage"]) + aside, row, colour)
-    axes.set(xlim=(-0.5, max(len(stages), 1) - 0.5), xlabel="test frames", ylabel=measure)
+                _draw_interval(axes, stages.index(row["stage"]) + aside, row, colours[town])
+        ends[town] = own[-1]
+    axes.set(xlim=(0, max(len(stages), 1) + 0.12), xlabel="test frames", ylabel=measure)
     axes.set_ylim(0, None)
-    axes.set_xticks(range(len(stages)), stages)
+    _name_ends(axes, ends, colours, TALL)
+    axes.set_xticks([place + 0.5 for place in range(len(stages))], stages)
     axes.grid(axis="y")
 
 
-def _name_ends(axes: Axes, ends: Mapping[str, tuple[float, float]], colours: Mapping[str, str]) -> None:
+def _name_ends(axes: Axes, ends: Mapping[str, tuple[float, float]], colours: Mapping[str, str], height: float) -> None:
     """Write each town's name beside the end (x, y) of its line, without overlaps within a stage."""
     top = axes.get_ylim()[1]
     for stage in dict.fromkeys(int(x) for x, _ in ends.values()):
         own = {town: end for town, end in ends.items() if int(end[0]) == stage}
         right = max(x for x, _ in own.values())
-        places = style.keep_apart([y for _, y in own.values()], LINE * top, top)
+        places = style.keep_apart([y for _, y in own.values()], height * top, top)
         for town, place in zip(own, places, strict=True):
             axes.annotate(
                 town,
