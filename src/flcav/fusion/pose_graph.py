@@ -92,7 +92,7 @@ def _optimise(
 
     The objects of each instant are nodes of their own, so that nothing is assumed about their motion between spins.
     """
-    gtsam = _import_gtsam()
+    gtsam = import_gtsam()
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     robust = gtsam.noiseModel.mEstimator.Huber.Create(HUBER)
 
@@ -221,7 +221,8 @@ def set_clocks(sightings: Sequence[Sighting], at_s: float) -> list[Sighting]:
     return [replace(each, time_s=each.time_s + offset.get(each.agent, 0.0)) for each in sightings]
 
 
-def _import_gtsam() -> Any:
+def import_gtsam() -> Any:
+    """Return GTSAM; raises `InputError` where it is not installed."""
     try:
         import gtsam
     except ImportError:
