@@ -92,7 +92,7 @@ def _optimise(
 
     The objects of each instant are nodes of their own, so that nothing is assumed about their motion between spins.
     """
-    gtsam = import_gtsam()
+    gtsam = _import_gtsam()
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     robust = gtsam.noiseModel.mEstimator.Huber.Create(HUBER)
 
@@ -221,8 +221,12 @@ def set_clocks(sightings: Sequence[Sighting], at_s: float) -> list[Sighting]:
     return [replace(each, time_s=each.time_s + offset.get(each.agent, 0.0)) for each in sightings]
 
 
-def import_gtsam() -> Any:
-    """Return GTSAM; raises `InputError` where it is not installed."""
+def check_gtsam() -> None:
+    """Raise `InputError` where GTSAM is not installed."""
+    _import_gtsam()
+
+
+def _import_gtsam() -> Any:
     try:
         import gtsam
     except ImportError:

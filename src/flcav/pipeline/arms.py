@@ -11,7 +11,7 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects
 from flcav.federation.trainable import statistics_names
 from flcav.fusion.distillation import Distillation
-from flcav.fusion.pose_graph import import_gtsam
+from flcav.fusion.pose_graph import check_gtsam
 from flcav.perception.distillation import Imitates
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
@@ -157,7 +157,7 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
         if isinstance(edge, FedMD) and setting.central is None:
             _check_outputs(recipe, setting)
         if setting.distillation.pose_graph and setting.central is None:
-            import_gtsam()
+            check_gtsam()
         for region in setting.regions:
             if recipe.regions[region].data is None:
                 check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])
