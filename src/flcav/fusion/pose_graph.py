@@ -221,6 +221,11 @@ def set_clocks(sightings: Sequence[Sighting], at_s: float) -> list[Sighting]:
     return [replace(each, time_s=each.time_s + offset.get(each.agent, 0.0)) for each in sightings]
 
 
+def check_gtsam() -> None:
+    """Raise `InputError` where GTSAM is not installed."""
+    _import_gtsam()
+
+
 def _import_gtsam() -> Any:
     try:
         import gtsam

@@ -11,6 +11,7 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects
 from flcav.federation.trainable import statistics_names
 from flcav.fusion.distillation import Distillation
+from flcav.fusion.pose_graph import check_gtsam
 from flcav.perception.distillation import Imitates
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
@@ -139,7 +140,8 @@ def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
 def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
     """Raise `InputError` where an arm's strategies and rules do not go together, or not with so many vehicles.
 
-    The vehicles of regions of recorded data are not known before their frames are dealt.
+    Raises it also where a pose graph is asked for without GTSAM. The vehicles of regions of recorded data are not known
+    before their frames are dealt.
     """
     for setting in settings:
         edge, cloud = find_strategies(setting.federation)
@@ -154,6 +156,8 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
             )
         if isinstance(edge, FedMD) and setting.central is None:
             _check_outputs(recipe, setting)
+        if setting.distillation.pose_graph and setting.central is None:
+            check_gtsam()
         for region in setting.regions:
             if recipe.regions[region].data is None:
                 check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])

@@ -1,5 +1,6 @@
 """Federations of a recipe: refused before anything is computed, planned with what they send, ended by their budgets."""
 
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavgm import FedAvgM
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
+from flcav.fusion.distillation import Distillation
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
@@ -83,6 +85,16 @@ def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any
     for recipe, arms in (settings({}, **federation), settings({"other": federation})):
         with pytest.raises(InputError, match=said):
             check_federations(recipe, arms)
+
+
+def test_a_pose_graph_without_gtsam_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe, arms = settings({})
+    check_federations(recipe, arms)
+    graphs = [replace(each, distillation=Distillation(pose_graph=True)) for each in arms]
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    check_federations(recipe, arms)
+    with pytest.raises(InputError, match="a pose graph needs GTSAM, which is in"):
+        check_federations(recipe, graphs)
 
 
 def test_statistics_are_those_of_a_network_that_has_some() -> None:
