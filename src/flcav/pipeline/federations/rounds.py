@@ -54,7 +54,7 @@ class FederationCheckpoints:
         self.scores: list[Mapping[str, float]] = []
 
     def resume(self, weights: Weights) -> tuple[Weights, int]:
-        """Return the last round's weights and number, restoring ledger, losses and states.
+        """Return the last round's weights, in the order of `weights`, and number, restoring ledger, losses and states.
 
         Without a checkpoint, returns `weights` and 0; where one is damaged, the round before. Raises `InputError` for
         the checkpoint of another strategy, and where the last two are damaged.
@@ -78,7 +78,8 @@ class FederationCheckpoints:
             begins = f"{name}|"
             mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
             own.restore(mine, found.records[name])
-        return load_file(round_path(self._folder, number)), number
+        last = load_file(round_path(self._folder, number))
+        return {name: last[name] for name in weights}, number  # files order names otherwise, and noise follows them
 
     def keep_secrets(self, parties: Mapping[str, Sequence[str]]) -> None:
         """Restore the secrets of the parties of each state, by its name, or draw them; to be called before any round.
