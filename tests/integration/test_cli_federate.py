@@ -27,6 +27,10 @@ RECIPE = {
             {"privacy": {"clip": 1, "noise": 1, "epsilon": 0}},
             "'federation.privacy.epsilon' = 0: Input should be greater",
         ),
+        (
+            {"privacy": {"clip": 1, "noise": 1, "epsilon": 0.01}},
+            "privacy: a first round comes to epsilon = 4.729 at delta = 1e-05, above the budget of 0.01",
+        ),
         ({"privacy": {"clip": 1, "noise": 0}}, "'federation.privacy.noise' = 0: Input should be greater than 0"),
         ({"selection": {"rule": "uniform", "clients": 5}}, "5 clients are wanted in a round, and there are 4"),
         ({"least_clients": 5}, "least_clients: 5 are wanted in a round, and 4 take part"),

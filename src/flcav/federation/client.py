@@ -9,6 +9,7 @@ from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
 from flcav.federation.encoding import encode, flatten, is_local
+from flcav.federation.noise import Secret, derive_key
 from flcav.federation.privacy import change_norm
 from flcav.federation.records import (
     ARRAYS,
@@ -43,12 +44,15 @@ OWN, RESIDUAL = "own", "residual"  # records of a node's state: what strategy an
 KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
 
 
-def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> ClientApp:
+def client_app(
+    trainables: Mapping[str, Trainable], strategy: Strategy, rules: Rules, secrets: Mapping[str, Secret] = {}
+) -> ClientApp:
     """Return a Flower client app that trains the one of `trainables` (by client name) that its node stands for.
 
     A node stands for the client at the place `PARTITION` of its config. Its seed is derived from the round's seed and
-    the client's name. To a query it answers with its place and with what it keeps between rounds, after taking over
-    what the message brings of that.
+    the client's name. `secrets` are those of the clients, by name, that local noise is drawn by unless it is seeded;
+    they are in no message. To a query it answers with its place and with what it keeps between rounds, after taking
+    over what the message brings of that.
     """
     app, clients = ClientApp(), [*trainables]
 
@@ -60,6 +64,7 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
             return answer_secretly(message, context, name)
         work = LocalWork.from_record(message.content.config_records[CONFIG])
         seed = derive_seed(work.seed, name)
+        key = derive_key(secrets[name], "noise", work.round, work.seed) if name in secrets else None
         if asked == COUNT:
             return reply_norm(message, 0.0, count_samples(trainables[name], work.steps))
         if asked == SEND:
@@ -73,11 +78,11 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
             return reply_norm(message, change_norm(subtract(update.weights, start, names)), update.samples)
         if asked == MASKED and rules.secure is not None:
             peers = len(message.content.config_records[ASK][NAMES]) + 1  # type: ignore[arg-type]
-            integers = to_integers(flatten(update, start, rules, seed), rules.secure.largest, peers)
+            integers = to_integers(flatten(update, start, rules, seed, key), rules.secure.largest, peers)
             masked = {VECTOR: mask_update(message, context, integers)}
             about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
             return reply(message, LocalUpdate(masked, *about), {})
-        sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed)
+        sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)
         _record(context, RESIDUAL, left)
         return reply(message, sent, extra)
 

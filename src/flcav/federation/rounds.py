@@ -17,6 +17,7 @@ from flwr.serverapp.strategy import Strategy as FlowerStrategy
 from numpy.typing import NDArray
 
 from flcav.federation.encoding import count_coordinates, decode, unflatten
+from flcav.federation.noise import derive_key
 from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
 from flcav.federation.records import (
     ARRAYS,
@@ -39,7 +40,7 @@ from flcav.federation.records import (
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.secure.masks import to_values
 from flcav.federation.secure.messages import SecureSum
-from flcav.federation.state import FederationState, RoundRecord
+from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import RunningMean, average
 from flcav.federation.strategies.strategy import Averages, Exchanges, Stateful, find_weigher
@@ -137,7 +138,7 @@ class Rounds(FlowerStrategy):
         if self._centre is not None:
             records[CENTRE] = to_arrays({name: self._centre[name] for name in learned_names(self._centre)})
         selection, local = self._rules.selection, work.record()
-        self._chosen = selection.choose([*self._names.values()], work.round, work.seed)
+        self._chosen = selection.choose([*self._names.values()], work.round, self._draws_by(work))
         self._failed = {}
         if self._rules.secure is not None:
             return self._begin_securely(grid, {**records, CONFIG: local}, self._rules.secure)
@@ -150,6 +151,16 @@ class Rounds(FlowerStrategy):
         self._drawn = selection.draw(norms, work.seed)
         self._chosen = [*self._drawn]
         return self._address(self._chosen, {CONFIG: local, ASK: ConfigRecord({ASK: SEND})})
+
+    def _draws_by(self, work: LocalWork) -> int:
+        """Return the seed that the clients of a round are drawn by: that of the round, or one that nobody knows."""
+        privacy = self._rules.privacy
+        if privacy is None or not privacy.hides_draws(self._rules.selection):
+            return work.seed
+        return int.from_bytes(self._key("selection", work), "little")
+
+    def _key(self, purpose: str, work: LocalWork) -> bytes:
+        return derive_key(self._state.keep_secret(SERVER), purpose, work.round, work.seed)
 
     def _draw_unbiased(self, grid: Grid, local: ConfigRecord) -> None:
         """Ask all clients for their numbers of samples; note the shares, and the probabilities of those chosen."""
@@ -281,13 +292,15 @@ class Rounds(FlowerStrategy):
         privacy, start, updates, each = self._rules.privacy, self._start, received.updates, received.combinable
         if self._rules.secure is not None:
             each = [LocalUpdate(self._average_securely(updates, self._rules.secure), 1, 0.0)]
-        elif privacy is not None and privacy.where == "central":
+        elif privacy is not None and not privacy.local:
             sent = self._rules.upload.exchanged(start)
             names = [name for name in learned_names(start) if name in sent]
             expected = float(len(self._chosen))
             if self._rules.selection.rule == "poisson":  # by chance more or fewer come
                 expected = expected_clients(self._rules.selection, [*self._names.values()])
-            mean = average_privately(start, each, names, privacy, expected, self._work(number).seed)
+            work = self._work(number)
+            key = None if privacy.seeded else self._key("noise", work)
+            mean = average_privately(start, each, names, privacy, expected, work.seed, key)
             each = [LocalUpdate(mean, 1, 0.0)]
         elif self._rules.selection.weighs and updates:
             weights = {name: self._shares[name] / self._drawn[name] for name in updates}

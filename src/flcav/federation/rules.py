@@ -1,10 +1,13 @@
 """Rules of a federation: who takes part in a round, what is sent, what is kept private, and how many are needed."""
 
+from collections.abc import Sequence
+
 from pydantic import Field
 
 from flcav.config import Config, InputError
 from flcav.federation.privacy import Privacy
 from flcav.federation.selection import Selection
+from flcav.federation.state import SERVER
 from flcav.federation.trainable import Weights, learned_names
 from flcav.federation.upload import Patterns, Upload, name_like
 
@@ -42,6 +45,12 @@ class Rules(Config):
         All take part, and send in the same form; noise is the vehicles', and all that comes after it is as private.
         """
         return Rules(upload=self.upload.model_copy(update={"kept": self.personal_arrays}))
+
+    def secret_parties(self, clients: Sequence[str]) -> Sequence[str]:
+        """Return who draws noise by a secret: each of these clients, or `SERVER`; nobody where it is seeded."""
+        if self.privacy is None or self.privacy.seeded:
+            return ()
+        return clients if self.privacy.local else (SERVER,)
 
     @property
     def personal_arrays(self) -> Patterns:

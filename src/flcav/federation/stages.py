@@ -89,7 +89,8 @@ def federate(
     averaging (McMahan et al., AISTATS 2017, algorithm 1). `on_round` is called after each round with its number,
     weights and mean loss; `state` is then that of the round, with a record of it. Every message is entered in the
     ledger of `account`. To resume, pass the same strategy and rules, the weights and the number of the last round that
-    `on_round` was given, and the state after it.
+    `on_round` was given, and the state after it. Noise that is not seeded is drawn by secrets, which are kept in
+    `state`: without it no federation can be repeated, nor gone on with to the same weights.
 
     Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
     before this one, with the same clients and rules, which count against that budget. Clients train in this process, or
@@ -139,7 +140,8 @@ def federate(
         results.append(app.start(link, to_arrays(weights), rounds - done))
 
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"  # something on the clients
-    make_app = partial(client_app, strategy=strategy, rules=rules)
+    secrets = {party: state.keep_secret(party) for party in rules.secret_parties(names) if party in clients}
+    make_app = partial(client_app, strategy=strategy, rules=rules, secrets=secrets)
     if runtime is None or isinstance(runtime, ClientProcesses):
         trained, at_once = (clients, 1) if runtime is None else (RemoteClients(clients, runtime), runtime.count)
         with EmbeddedGrid(make_app(trained), names, state.clients, at_once) as grid:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from flcav.config import InputError
+from flcav.federation.privacy import affordable_rounds
 from flcav.federation.stages import check_rules
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
 from flcav.federation.strategies.fedmd import FedMD
@@ -145,14 +146,19 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
     """
     for setting in settings:
         edge, cloud = find_strategies(setting.federation)
-        selection = setting.federation.selection
+        selection, privacy = setting.federation.selection, setting.federation.privacy
         if setting.federation.network is not None and selection.rule == "importance":
             raise InputError("federation.network: importance selection draws the clients after they have trained")
         if setting.federation.network is not None and selection.unbiased:
             raise InputError("federation.network: unbiased weights need known probabilities, and the radio loses any")
-        if setting.federation.network is not None and selection.rule == "deadline" and setting.federation.privacy:
+        if setting.federation.network is not None and selection.rule == "deadline" and privacy is not None:
             raise InputError(
                 "federation.network: a deadline leaves other numbers of clients, and noise is for one number"
+            )
+        if setting.federation.network is not None and privacy is not None and privacy.hides_draws(selection):
+            raise InputError(
+                f"federation.network: rounds are timed before they are run, and {selection.rule} selection under "
+                "central noise draws in secret; 'privacy.seeded' simulates both"
             )
         if isinstance(edge, FedMD) and setting.central is None:
             _check_outputs(recipe, setting)
@@ -160,7 +166,10 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
             check_gtsam()
         for region in setting.regions:
             if recipe.regions[region].data is None:
-                check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])
+                names = [f"{region}/cav{i}" for i in range(recipe.vehicles(region))]
+                check_rules(edge, setting.federation, names)
+                if privacy is not None:
+                    affordable_rounds(privacy, selection, names, 1, 0)
         if CLOUD in setting.stages:
             check_rules(cloud, setting.federation.of_servers(), setting.regions)
         how = setting.federation

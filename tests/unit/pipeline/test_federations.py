@@ -141,6 +141,15 @@ def test_an_arm_s_rules_are_checked_with_the_recipe(federation: Any, said: str) 
         settings({"other": federation})
 
 
+def test_a_budget_below_one_round_is_refused_with_the_recipe() -> None:
+    small, large = ({"privacy": PRIVACY | {"epsilon": epsilon}} for epsilon in (0.5, 1.5))
+    check_federations(*settings({"other": large}))
+    with pytest.raises(InputError, match=r"privacy: a first round comes to epsilon = .*, above the budget of 0.5;"):
+        check_federations(*settings({"other": small}))
+    amplified = {"selection": {"rule": "poisson", "probability": 0.1}}
+    check_federations(*settings({"other": small | amplified}))
+
+
 def test_strategies_are_by_name_and_settings() -> None:
     how = Federation.model_validate({"strategy": {"fedavgm": {"momentum": 0.5}}})
     assert find_strategies(how) == (FedAvgM(momentum=0.5), FedAvgM(momentum=0.5))
