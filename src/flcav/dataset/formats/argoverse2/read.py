@@ -2,7 +2,8 @@
 
 Frames: `egovehicle` is at the centre of the rear axle, x ahead, y left, z up; `city` is the world; cameras are optical.
 A sweep's points are of both stacked LiDARs, in the ego frame at the sweep's time, their motion compensated; their times
-are those of the measurements, from the sweep's time on, at which the spin begins. Images have no distortion: av2-api's camera model has none, the coefficients in `intrinsics.feather` are of the raw images.
+are those of the measurements, from the sweep's time on, when the spin begins. Images have no distortion: av2-api's
+camera model has none, the coefficients in `intrinsics.feather` are of the raw images.
 """
 
 from collections.abc import Iterator

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from flcav.config import InputError
-from flcav.dataset.formats.kitti.files import Calibration as KittiCalibration
 from flcav.dataset.formats.kitti.files import (
     SUFFIXES,
     Objects,
@@ -25,6 +24,7 @@ from flcav.dataset.formats.kitti.files import (
     read_points,
     read_split,
 )
+from flcav.dataset.formats.kitti.files import Calibration as KittiCalibration
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import (
     AgentNames,
