@@ -105,11 +105,7 @@ class Argoverse2Source(LogSource):
         self.notes = (
             *((f"no annotations.feather in {len(bare)} of {len(self._logs)} logs, so no boxes",) if bare else ()),
             *((f"no sweep at {lost} annotated times, so no frames there",) if lost else ()),
-            *(
-                (f"no picture within {LATE_NS / 1e6:g} ms of a sweep of a camera that has others: {dark}",)
-                if dark
-                else ()
-            ),
+            *((f"no picture within {LATE_NS // 10**6} ms of a sweep, of cameras with others: {dark}",) if dark else ()),
         )
         self._labelled = not bare
         self._split_of = {scene: log.split for scene, log in self._logs.items()}
