@@ -232,6 +232,9 @@ def test_slow_vehicles_are_planned_into_the_rounds_that_they_have_time_for() -> 
         assert {each for name in names for each in own.joins[name]} == set(
             range(1, 1 + own.edge_rounds + own.cloud_rounds)
         )
+    sent_mb = own.samples * SIZES.sample_mb + sum(map(len, own.joins.values())) * SIZES.model_mb
+    all_join = price(settings.stage_plan(own.samples, own.edge_rounds, own.cloud_rounds), SIZES)
+    assert sent_mb < own.wireless_mb == pytest.approx(all_join.wireless_mb)  # priced as if all joined every round
     on_air, slower = make_plan((replace(asked(), train_s=2.0, air_s={"b": 1.0}),), settings, "joint")
     assert slower is not None
     for name, speed in speeds.items():
