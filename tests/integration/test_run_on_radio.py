@@ -87,7 +87,8 @@ def test_on_the_radio_megabytes_of_stragglers_buy_rounds_and_the_plan_says_who_u
     assert main.links["wireless"].used_mb <= main.links["wireless"].budget_mb
     uploads = first.uploads
     assert uploads is not None
-    sent = Counter(e.client for e in Ledger.load(folder / "ledgers/main.parquet").entries if e.stage == PRETRAIN)
+    book = Ledger.load(folder / "ledgers/main.parquet").entries
+    sent = Counter(e.client for e in book if (e.stage, e.link, e.direction) == (PRETRAIN, "wireless", "up"))
     assert {name: count for name, count in uploads.items() if count} == {
         name: sent[name] for name in sent if name.startswith("suburb/")
     }
