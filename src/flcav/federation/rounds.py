@@ -16,6 +16,7 @@ from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
 from numpy.typing import NDArray
 
+from flcav.config import InputError
 from flcav.federation.encoding import count_coordinates, decode, unflatten
 from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
 from flcav.federation.records import (
@@ -26,6 +27,7 @@ from flcav.federation.records import (
     COUNT,
     EXTRA,
     LOSS,
+    LOST_BY_NETWORK,
     NORM,
     SAMPLES,
     SEND,
@@ -38,11 +40,11 @@ from flcav.federation.records import (
 )
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.secure.masks import to_values
-from flcav.federation.secure.messages import SecureSum
+from flcav.federation.secure.messages import SecureSum, TooFewClients
 from flcav.federation.state import FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import RunningMean, average
-from flcav.federation.strategies.strategy import Averages, Exchanges, Stateful, find_weigher
+from flcav.federation.strategies.strategy import Averages, Exchanges, Robust, Stateful, find_weigher
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 
 OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
@@ -114,7 +116,10 @@ class Rounds(FlowerStrategy):
         self._nodes = {name: node for node, name in names.items()}
         self._start: Weights = {}
         self._chosen: list[str] = []  # who is to send an update in this round
+        self._asked: list[str] = []  # who was asked for anything in this round
         self._failed: dict[str, str] = {}  # by client what was wrong in this round
+        self._lost: set[str] = set()  # those of them whom the network lost
+        self._shortage: TooFewClients | None = None  # why no update was asked for in this round
         self._drawn: dict[str, float] = {}  # of unbiased selection: probability of the clients that were drawn
         self._secure: SecureSum | None = None  # of this round
         self._shares: dict[str, float] = {}  # of unbiased selection: of all samples, by client
@@ -138,7 +143,8 @@ class Rounds(FlowerStrategy):
             records[CENTRE] = to_arrays({name: self._centre[name] for name in learned_names(self._centre)})
         selection, local = self._rules.selection, work.record()
         self._chosen = selection.choose([*self._names.values()], work.round, work.seed)
-        self._failed = {}
+        self._asked = [*self._names.values()] if selection.unbiased else self._chosen
+        self._failed, self._lost, self._shortage = {}, set(), None
         if self._rules.secure is not None:
             return self._begin_securely(grid, {**records, CONFIG: local}, self._rules.secure)
         if selection.unbiased:
@@ -161,7 +167,10 @@ class Rounds(FlowerStrategy):
         self._drawn = dict.fromkeys(self._chosen, self._rules.selection.inclusion_probability(len(names)))
 
     def _begin_securely(self, grid: Grid, records: dict[str, Any], how: SecureAggregation) -> list[Message]:
-        """Exchange keys and shares among the chosen clients, and return the messages to those who are left."""
+        """Exchange keys and shares among the chosen clients, and return the messages to those who are left.
+
+        Nobody is sent a message where too few are left.
+        """
 
         def exchange(asks: Mapping[str, ConfigRecord]) -> dict[str, ConfigRecord]:
             asked = [each for name, ask in asks.items() for each in self._address([name], {CONFIG: local, ASK: ask})]
@@ -170,7 +179,10 @@ class Rounds(FlowerStrategy):
 
         local = records[CONFIG]
         self._secure = SecureSum(exchange, how.needed(len(self._chosen)))
-        asks = self._secure.agree(self._chosen)
+        try:
+            asks = self._secure.agree(self._chosen)
+        except TooFewClients as error:
+            self._shortage, asks = error, {}
         return [each for name, ask in asks.items() for each in self._address([name], {**records, ASK: ask})]
 
     def _address(self, clients: Iterable[str], records: dict[str, Any]) -> Iterator[Message]:
@@ -183,21 +195,24 @@ class Rounds(FlowerStrategy):
     ) -> tuple[ArrayRecord | None, MetricRecord | None]:
         """Return the aggregated weights, and as metrics the number of samples and the mean loss weighted by samples.
 
-        Raises `ClientFailed` where fewer clients than are wanted sent a usable update, ValueError where the strategy
-        returns arrays of other names, shapes or types.
+        Where the network lost clients, or fewer were chosen, than secure aggregation needs, the weights stay as they
+        were. Raises `ClientFailed` where fewer clients than are wanted sent a usable update, `TooFewClients` where too
+        few are left for secure aggregation and the network lost none, ValueError where the strategy returns arrays of
+        other names, shapes or types.
         """
         number = self._done + server_round
-        received = self._receive(replies)
-        least = self._rules.least_clients
-        wanted = len(self._chosen) if least is None else min(least, len(self._chosen))
-        if len(received.samples) < wanted or (self._failed and least is None):
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
-            raise ClientFailed(
-                f"round {number}: {len(received.samples)} of {len(self._chosen)} clients sent an update that can be "
-                f"used, {wanted} are wanted ({reasons})"
-            )
-        weights, loss = self._combine(received, number), received.mean_loss()
-        epsilon = None
+        received = Intake(None) if self._shortage else self._receive(replies)
+        self._check_enough(number)
+        try:
+            if self._shortage is not None:
+                raise self._shortage
+            weights = self._combine(received, number)
+        except TooFewClients as error:
+            if not self._lost and self._chose_enough():
+                raise
+            weights, received = self._start, Intake(None)
+            self._failed |= {name: str(error) for name in self._chosen if name not in self._failed}
+        loss, epsilon = received.mean_loss(), None
         if self._rules.privacy is not None:
             rounds, names = self._earlier + number, [*self._names.values()]
             epsilon = account_epsilon(self._rules.privacy, self._rules.selection, names, rounds)
@@ -205,6 +220,32 @@ class Rounds(FlowerStrategy):
         self._state.records.append(RoundRecord(*about, loss, sum(received.samples.values())))
         self._on_round(number, weights, loss)
         return to_arrays(weights), MetricRecord({SAMPLES: sum(received.samples.values()), LOSS: loss})
+
+    def _chose_enough(self) -> bool:
+        """Return whether as many clients were chosen as secure aggregation needs; by a plan they may be fewer."""
+        chosen = len(self._chosen)
+        return self._rules.secure is not None and self._rules.secure.needed(chosen) <= chosen
+
+    def _check_enough(self, number: int) -> None:
+        """Raise `ClientFailed` where fewer clients than are wanted sent what can be used, or than the strategy needs.
+
+        By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
+        a norm or a number of samples, and of those who were then to send an update.
+        """
+        least = self._rules.least_clients
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
+        for clients in [self._chosen] if isinstance(least, int) else [self._asked, self._chosen]:
+            asked = clients if least is not None else [name for name in clients if name not in self._lost]
+            bound = len(asked) if least == "all" else -(-len(asked) // 2) if least is None else least
+            wanted, usable = min(bound, len(asked)), sum(name not in self._failed for name in asked)
+            if usable < wanted:
+                told = f"{usable} of {len(asked)} clients sent an update that can be used, {wanted} are wanted"
+                raise ClientFailed(f"round {number}: {told} ({reasons})")
+        if isinstance(self._strategy, Robust) and self._failed.keys() - self._lost:
+            try:
+                self._strategy.check_clients(sum(name not in self._failed for name in self._chosen))
+            except InputError as error:
+                raise ClientFailed(f"round {number}: {error} ({reasons})") from None
 
     def _receive_norms(self, asked: Iterable[str], replies: Iterable[Message]) -> dict[str, float]:
         """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
@@ -236,6 +277,7 @@ class Rounds(FlowerStrategy):
                     self._failed.setdefault(name, "no answer")  # or what it failed by before
                 elif found.has_error():
                     self._failed[name] = str(found.error.reason)
+                    self._lost |= {name} if found.error.code == LOST_BY_NETWORK else set()
                 else:
                     yield name, found
 

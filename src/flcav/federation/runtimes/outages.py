@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from flwr.app import Error, Message
 from flwr.serverapp import Grid
 
-from flcav.federation.records import ARRAYS, CONFIG
-from flcav.federation.runtimes.embedded import CLIENT_APP_RAISED, wire_bytes
+from flcav.federation.records import ARRAYS, CONFIG, LOST_BY_NETWORK
+from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.wrapped import WrappedGrid
 
@@ -37,7 +37,7 @@ class LossyGrid(WrappedGrid):
     def _fail(self, message: Message) -> Message:
         outage, _, _ = self._find_outage(message)
         assert outage is not None
-        return Message(Error(code=CLIENT_APP_RAISED, reason=outage.reason), reply_to=message)
+        return Message(Error(code=LOST_BY_NETWORK, reason=outage.reason), reply_to=message)
 
     def _cut(self, reply: Message, message: Message) -> Message:
         """Return a reply as it arrives: an error where it is an update and breaks off."""
