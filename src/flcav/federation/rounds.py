@@ -6,7 +6,6 @@ round where one client fails.
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -17,7 +16,8 @@ from flwr.serverapp.strategy import Strategy as FlowerStrategy
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.federation.encoding import count_coordinates, decode, unflatten
+from flcav.federation.acceptance import UpdateRefused, read_update
+from flcav.federation.encoding import count_coordinates, unflatten
 from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
 from flcav.federation.records import (
     ARRAYS,
@@ -290,17 +290,16 @@ class Rounds(FlowerStrategy):
             try:
                 sent = to_update(message)
                 if self._secure is not None:
-                    received.add(name, self._check_masked(sent))
-                    continue
-                update = replace(sent, weights=decode(sent.weights, self._start, self._rules))
-            except (KeyError, IndexError, TypeError, ValueError) as error:
+                    update = self._check_masked(sent)
+                else:
+                    like = sent.extra if received.extra is None else received.extra
+                    update = read_update(sent, self._start, rules, like)
+            except UpdateRefused as error:
+                self._failed[name] = str(error)
+            except (KeyError, TypeError, ValueError) as error:
                 self._failed[name] = f"a message that is no update ({error})"
-                continue
-            fault = find_fault(update, self._start, update.extra if received.extra is None else received.extra)
-            if fault is None:
-                received.add(name, update)
             else:
-                self._failed[name] = fault
+                received.add(name, update)
         return received
 
     def _check_masked(self, sent: LocalUpdate) -> LocalUpdate:
@@ -355,25 +354,6 @@ class Rounds(FlowerStrategy):
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
         """Return None: clients do not evaluate."""
         return None
-
-
-def find_fault(update: LocalUpdate, start: Weights, extra: Weights) -> str | None:
-    """Return what makes an update unusable, None for a usable one.
-
-    `start` has the names, shapes and types that the weights must have, `extra` those of the arrays beside them.
-    """
-    for arrays, like in ((update.weights, start), (update.extra, extra)):
-        if set(arrays) != set(like):
-            odd = sorted(set(arrays) ^ set(like))
-            return f"an array '{odd[0]}' that is missing or unknown"
-        for name, array in arrays.items():
-            if (array.shape, array.dtype) != (like[name].shape, like[name].dtype):
-                return f"'{name}' is {array.dtype} {array.shape} instead of {like[name].dtype} {like[name].shape}"
-            if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-                return f"'{name}' has values that are not finite"
-    if update.samples < 0 or not np.isfinite(update.loss):
-        return f"{update.samples} samples and a loss of {update.loss}"
-    return None
 
 
 def average_inversely(start: Weights, updates: Mapping[str, LocalUpdate], weights: Mapping[str, float]) -> Weights:
