@@ -2,12 +2,14 @@
 
 import inspect
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
+from flcav.federation.acceptance import is_usable
 from flcav.federation.encoding import encode, flatten, is_local
 from flcav.federation.noise import Secret, derive_key
 from flcav.federation.privacy import change_norm
@@ -19,6 +21,7 @@ from flcav.federation.records import (
     COUNT,
     EXTRA,
     LOSS,
+    LOST,
     METRICS,
     NORM,
     SAMPLES,
@@ -53,6 +56,10 @@ def client_app(
     the client's name. `secrets` are those of the clients, by name, that local noise is drawn by unless it is seeded;
     they are in no message. To a query it answers with its place and with what it keeps between rounds, after taking
     over what the message brings of that.
+
+    What error feedback leaves out, and a strategy's own arrays, are taken over where the server gets the update and can
+    use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
+    arrives.
     """
     app, clients = ClientApp(), [*trainables]
 
@@ -67,11 +74,12 @@ def client_app(
         key = derive_key(secrets[name], "noise", work.round, work.seed) if name in secrets else None
         if asked == COUNT:
             return reply_norm(message, 0.0, count_samples(trainables[name], work.steps))
+        extra, own = {}, {}
         if asked == SEND:
-            start, update, extra = _recall(context)
+            start, update = _recall(context)
         else:
             start = read_arrays(message.content, ARRAYS)
-            update, extra = _train(trainables[name], message, context, start, work, seed)
+            update, extra, own = _train(trainables[name], message, context, start, work, seed)
         if asked == NORM:
             _keep(context, start, update)
             names = [each for each in learned_names(start) if each in rules.upload.exchanged(start)]
@@ -83,8 +91,11 @@ def client_app(
             about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
             return reply(message, LocalUpdate(masked, *about), {})
         sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)
-        _record(context, RESIDUAL, left)
-        return reply(message, sent, extra)
+        answer = reply(message, sent, extra)
+        if (left or own) and LOST not in message.content and is_usable(replace(sent, extra=extra), start, rules):
+            _record(context, RESIDUAL, left)
+            _record(context, OWN, own)
+        return answer
 
     @app.query()
     def query(message: Message, context: Context) -> Message:
@@ -96,8 +107,8 @@ def client_app(
 
     def _train(
         trainable: Trainable, message: Message, context: Context, start: Weights, work: LocalWork, seed: int
-    ) -> tuple[Update, Weights]:
-        """Return the result of local training, and a strategy's arrays beside it."""
+    ) -> tuple[Update, Weights, Weights]:
+        """Return the result of local training, a strategy's arrays beside it, and those to keep if they arrive."""
         sent, own = _optional(message.content, EXTRA), _recorded(context, OWN)
         correction = strategy.correct(sent, own) if isinstance(strategy, Corrects) else Correction()
         if isinstance(rules.personal, RegionalModels) and CENTRE in message.content:
@@ -110,11 +121,10 @@ def client_app(
         if isinstance(strategy, FedMD):
             _record(context, OWN, getattr(update, "own", {}))
         if not isinstance(strategy, Exchanges):
-            return update, {}
+            return update, {}, {}
         gradient = getattr(update, "gradient", {})  # asked for by the correction
-        extra, own = strategy.report(LocalUpdate(update.weights, update.samples, update.loss, gradient), sent, own)
-        _record(context, OWN, own)
-        return update, extra
+        found = LocalUpdate(update.weights, update.samples, update.loss, gradient)
+        return update, *strategy.report(found, sent, own)
 
     return app
 
@@ -138,11 +148,11 @@ def _keep(context: Context, start: Weights, update: Update) -> None:
     context.state[f"{KEPT}-{SAMPLES}"] = MetricRecord({SAMPLES: update.samples, LOSS: update.loss})
 
 
-def _recall(context: Context) -> tuple[Weights, Update, Weights]:
+def _recall(context: Context) -> tuple[Weights, Update]:
     metrics = context.state.metric_records[f"{KEPT}-{SAMPLES}"]
     samples, loss = metrics[SAMPLES], metrics[LOSS]
     update = LocalUpdate(_recorded(context, KEPT), int(samples), float(loss))  # type: ignore[arg-type]
-    return _recorded(context, KEPT_START), update, {}
+    return _recorded(context, KEPT_START), update
 
 
 def check_arguments(trainables: Mapping[str, Trainable], wanted: Iterable[str], why: str) -> None:

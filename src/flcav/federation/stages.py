@@ -99,9 +99,9 @@ def federate(
     for a client when it is to train; of updates no more are in memory than the strategy needs.
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
-    no update, and fewer are left than `rules` ask for (by default all), `InputError` where there are no clients, or
-    `rules` or `strategy` ask for what they cannot do, ValueError where `strategy` changes names, shapes or types of the
-    arrays.
+    no update, and fewer are left than `rules` ask for (by default half of those asked), `TooFewClients` where fewer are
+    left than secure aggregation needs, though `account` lost none, `InputError` where there are no clients, or `rules`
+    or `strategy` ask for what they cannot do, ValueError where `strategy` changes names, shapes or types of the arrays.
 
     >>> import numpy as np
     >>> from flcav import Ledger, federate
@@ -215,7 +215,7 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
     told, selection = type(strategy).__name__, rules.selection
     selection.check_clients(names)
     least, chosen = rules.least_clients, int(expected_clients(selection, names))
-    if least is not None and selection.rule not in ("poisson", "importance") and least > chosen:
+    if isinstance(least, int) and selection.rule not in ("poisson", "importance") and least > chosen:
         raise InputError(f"least_clients: {least} are wanted in a round, and {chosen} take part")
     single = isinstance(strategy, Robust | Exchanges)  # looks at each update
     if selection.weighs:

@@ -80,7 +80,7 @@ def federate_regions(
     asked = list_federations(graph, arm)
     means = {"processes": jobs, "runtime": runtime, "timed": 1}
     alone = {name: _federation_step(graph, *about, means) for name, about in asked.items()}
-    before = _needed(graph.steps, alone.values())
+    before = list_needed(graph.steps, alone.values())
     run_steps(before, out / WORK, jobs=jobs, notify=notify, stale=stale)
 
     def tell(step: str, done: int, total: int, note: str) -> None:
@@ -119,17 +119,7 @@ def list_federations(graph: Graph, arm: str) -> dict[str, tuple[str, str, str]]:
     return {name if arm == MAIN else f"{name}-{arm}": (arm, *about) for about, name in named.items()}
 
 
-def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapping[str, int | str]) -> Step:
-    """Return the step of stage II as a run has it, with validation after each round, and in several processes."""
-    edge = next(step for step in graph.steps if step.name == graph.names.edge(arm, region, task))
-    frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
-    name = next(name for name, about in list_federations(graph, arm).items() if about == (arm, region, task))
-    asked: EdgeSettings = edge.arguments["settings"]
-    scored = make_step(name, edge_step, asked.model_copy(update={"validation": frames}))
-    return replace(scored, means=means)
-
-
-def _needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
+def list_needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
     """Return those of `steps` that the steps `last` need, directly or not, in their order."""
     needs = {step.name: step.needs for step in steps}
     wanted, open_ = set(), [name for step in last for name in step.needs]
@@ -139,6 +129,16 @@ def _needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
             wanted.add(name)
             open_ += needs[name]
     return [step for step in steps if step.name in wanted]
+
+
+def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapping[str, int | str]) -> Step:
+    """Return the step of stage II as a run has it, with validation after each round, and in several processes."""
+    edge = next(step for step in graph.steps if step.name == graph.names.edge(arm, region, task))
+    frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
+    name = next(name for name, about in list_federations(graph, arm).items() if about == (arm, region, task))
+    asked: EdgeSettings = edge.arguments["settings"]
+    scored = make_step(name, edge_step, asked.model_copy(update={"validation": frames}))
+    return replace(scored, means=means)
 
 
 def _collect(graph: Graph, out: Path, step: str, region: str) -> Federation:
