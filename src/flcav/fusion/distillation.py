@@ -25,8 +25,9 @@ from flcav.config import Config
 from flcav.fusion.average import RoadAverage, average_boxes, variance_of
 from flcav.fusion.labels import cell_centers
 from flcav.fusion.map_context import MapContext, snap_to_map
-from flcav.fusion.pose_graph import Navigation, Sighting, add_pose_variance, correct_poses, tell
+from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.road import RoadView
+from flcav.fusion.sightings import Navigation, Sighting, add_pose_variance, tell
 from flcav.geometry import Boxes, inverse, points_in_boxes, pose, spread_over_footprints, transform_points
 from flcav.network.messages import from_names, pack, to_names, unpack
 from flcav.perception.objects.config import SecondConfig

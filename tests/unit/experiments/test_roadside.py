@@ -14,7 +14,7 @@ from flcav.experiments.roadside.errors import Errors, apply_errors
 from flcav.experiments.roadside.fig4 import EDGES_M, find_range
 from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
 from flcav.experiments.roadside.ranges import SHARED, Model, SensorRanges
-from flcav.fusion.pose_graph import Navigation, Sighting
+from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of
 from flcav.sensors.rig import RIGS, Rig
 from flcav.sources.recipe import Recipe

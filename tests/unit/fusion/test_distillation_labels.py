@@ -21,8 +21,8 @@ from flcav.fusion.distillation import (
     unpack_sighting,
 )
 from flcav.fusion.map_context import build_context
-from flcav.fusion.pose_graph import Navigation, Sighting
 from flcav.fusion.road import RoadView
+from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, concatenate, inverse, pose
 from flcav.network.ledger import Budget, BudgetExceeded, Ledger
 from flcav.perception.objects.model import second_tiny

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flcav.fusion.distillation import Distillation, Guidance, average_spin
-from flcav.fusion.pose_graph import Navigation, Sighting
 from flcav.fusion.road import RoadView
+from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, pose
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.objects.model import second_tiny

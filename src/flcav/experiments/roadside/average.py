@@ -18,8 +18,9 @@ from flcav.experiments.roadside.errors import Errors, apply_errors
 from flcav.experiments.roadside.sightings import Scene, read_scenes
 from flcav.fusion.average import RoadAverage, average_boxes
 from flcav.fusion.map_context import MapContext, build_context, snap_to_map
-from flcav.fusion.pose_graph import Sighting, correct_poses, tell
+from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.posts import posts_of
+from flcav.fusion.sightings import Sighting, tell
 from flcav.geometry import Boxes, inverse, wrap_angle, yaw_of
 from flcav.perception.metrics import average_precision, match
 from flcav.perception.metrics.matching import assign_targets

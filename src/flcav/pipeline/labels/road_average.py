@@ -23,9 +23,9 @@ from flcav.fusion.distillation import (
     unpack_sighting,
 )
 from flcav.fusion.map_context import build_context
-from flcav.fusion.pose_graph import Sighting
 from flcav.fusion.posts import posts_of
 from flcav.fusion.road import RoadView
+from flcav.fusion.sightings import Sighting
 from flcav.geometry import Boxes
 from flcav.network.ledger import Direction, Ledger
 from flcav.network.messages import send

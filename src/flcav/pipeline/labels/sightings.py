@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.fusion.distillation import TOLD, Distillation
-from flcav.fusion.pose_graph import Sighting
 from flcav.fusion.posts import find_posts
+from flcav.fusion.sightings import Sighting
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in

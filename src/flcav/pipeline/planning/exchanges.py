@@ -12,7 +12,7 @@ import numpy as np
 
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.fusion.distillation import Distillation, pack_sighting
-from flcav.fusion.pose_graph import Sighting
+from flcav.fusion.sightings import Sighting
 from flcav.network.ledger import BYTES_PER_MB
 from flcav.perception.client import as_shared
 from flcav.perception.distillation import SharedSamples
