@@ -255,6 +255,35 @@ def test_regional_models_are_beside_that_of_all(tmp_path: Path) -> None:
         assert found[None][name] == pytest.approx((found["a"][name] + found["b"][name]) / 2)
 
 
+class Powerless:
+    """A client that fails in every training."""
+
+    def train(self, weights: Weights, **how: Any) -> LocalUpdate:
+        raise OSError("no power")
+
+
+def test_the_note_of_a_round_names_who_failed_in_it(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
+    network, notes = learning.build_network(), []
+    clients: Any = make_clients(learning, Slope(), {f"a/cav{i}": [np.float32(i + 1)] for i in range(4)})
+    clients |= dict.fromkeys(("a/cav0", "a/cav2"), Powerless())
+
+    def report(done: int, total: int, note: str = "") -> None:
+        notes.append(note.partition(", ")[2])
+
+    for rounds in (2, 3):  # the third goes on from the checkpoint of the second
+        how = (FEDAVG, 0, Ledger(Budget(1.0, 1.0)), tmp_path / "edge", report)
+        schedule = learning.schedule(rounds, 1, "edge", "a")
+        federate_edge(EdgeFederation(learning, network, clients, schedule, *how), Rules())
+    names = [f"{name} (OSError('no power'))" for name in ("a/cav0", "a/cav2")]
+    assert notes == ["failed or lost: " + ", ".join(names)] * 3
+    notes.clear()
+    start = {"a": RegionStart(clients, to_arrays(network), earlier=0)}
+    where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), tmp_path / "cloud", report)
+    federate_cloud(CloudFederation(learning, network, start, 2, *where), 2, Rules())
+    assert notes == ["failed or lost: " + ", ".join(f"{name} in 2" for name in names)] * 2
+
+
 def test_both_stages_in_two_processes_end_with_the_bytes_of_one_also_where_labels_change(tmp_path: Path) -> None:
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2, average_rounds=1), 3)
     network, schedule = learning.build_network(), learning.schedule(3, 2, "edge", "a")

@@ -12,7 +12,7 @@ from safetensors.numpy import load_file, save
 from flcav.config import InputError
 from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.rounds import OnRound
-from flcav.federation.state import FederationState
+from flcav.federation.state import FederationState, describe_failures
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Weights
 from flcav.files import atomic_path, sha256, write_bytes, write_in_pieces
@@ -50,6 +50,7 @@ class FederationCheckpoints:
         self._task, self._folder, self._book, self._report = task, folder, book, report
         self._states, self._identity, self._score, self._privacy = states, identity, score, privacy
         self._hashes: dict[str, str] = {}  # of the files of weights, by name
+        self._told: dict[str, int] = {}  # of how many records failures were told, by state
         self.losses: list[float] = []
         self.scores: list[Mapping[str, float]] = []
 
@@ -78,6 +79,7 @@ class FederationCheckpoints:
             begins = f"{name}|"
             mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
             own.restore(mine, found.records[name])
+            self._told[name] = len(own.records)
         last = load_file(round_path(self._folder, number))
         return {name: last[name] for name in weights}, number  # files order names otherwise, and noise follows them
 
@@ -124,7 +126,7 @@ class FederationCheckpoints:
                 (self._folder / name).unlink(missing_ok=True)
             note = [f"{LOSS} {loss:.3f}", *self._tell_privacy()]
             note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self._score else {}).items()]
-            self._report(round_, rounds, ", ".join(note))
+            self._report(round_, rounds, ", ".join([*note, *self._tell_failures()]))
 
         return keep
 
@@ -136,6 +138,13 @@ class FederationCheckpoints:
             return []
         seeded = f" ({SEEDED})" if self._privacy.seeded else ""
         return [f"epsilon {max(private):.2f} at delta {self._privacy.delta:g}{seeded}"]
+
+    def _tell_failures(self) -> list[str]:
+        """Return who failed or was lost since the last note, in words; of stage III in all rounds of edge servers."""
+        records = [record for name, own in self._states.items() for record in own.records[self._told.get(name, 0) :]]
+        self._told = {name: len(own.records) for name, own in self._states.items()}
+        told = describe_failures([record.failed for record in records])
+        return [told] if told else []
 
     def _write(self, name: str, data: bytes, hashes: dict[str, str]) -> None:
         write_bytes(self._folder / name, data)
