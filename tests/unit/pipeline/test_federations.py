@@ -204,6 +204,16 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
     assert read_times(tmp_path / "plain") == {}
 
 
+def test_unbiased_federations_are_timed_too(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
+    clients = make_clients(learning, Slope(), {f"a/cav{i}": [np.float32(i + 1)] for i in range(3)})
+    how = (FEDAVG, 0, Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
+    schedule = learning.schedule(2, 1, "edge", "a")
+    rules = Rules.model_validate({"selection": {"rule": "uniform", "clients": 2, "unbiased": True}})
+    federate_edge(EdgeFederation(learning, learning.build_network(), clients, schedule, *how), rules, timed=True)
+    assert sum(map(len, read_times(tmp_path).values())) == 2 * 2
+
+
 def test_measured_speeds_are_those_of_a_recipe() -> None:
     measured = {
         "objects": {"a/cav0": [2.0, 2.0, 9.0], "a/cav1": [4.0, 4.0, 4.0], "b/cav0": [4.0, 5.0]},

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.federation.trainable import Trainable, Update, Weights
+from flcav.federation.trainable import Trainable, Update, Weights, count_samples
 from flcav.pipeline.results.saved import Saved
 
 TIMES = "train_s.csv"  # in the folder of a federation
@@ -43,6 +43,10 @@ class TimedClient:
         with contextlib.suppress(OSError), self.path.open("a") as file:  # a full disk is the checkpoint's to tell
             file.write(f"{self.name},{spent:.6f}\n")
         return update
+
+    def count_samples(self, steps: int) -> int:
+        """Return the client's number of samples; raises TypeError of a client that does not count them."""
+        return count_samples(self.client, steps)
 
 
 def time_clients(clients: Mapping[str, Trainable], folder: Path) -> dict[str, TimedClient]:
