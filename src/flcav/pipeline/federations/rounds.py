@@ -51,6 +51,7 @@ class FederationCheckpoints:
         self._states, self._identity, self._score, self._privacy = states, identity, score, privacy
         self._hashes: dict[str, str] = {}  # of the files of weights, by name
         self._told: dict[str, int] = {}  # of how many records failures were told, by state
+        self._goes_on = False  # after rounds that were carried out before, to an end that it has not reached
         self.losses: list[float] = []
         self.scores: list[Mapping[str, float]] = []
 
@@ -64,6 +65,7 @@ class FederationCheckpoints:
         number = 0 if found is None else found.round
         if damage:
             self._report(number, max(number, 1), damage)
+        self._goes_on = bool(damage) or (found is not None and not (self._folder / LEDGER).exists())
         if found is None:
             return weights, 0
         if found.by != self._identity:
@@ -84,10 +86,10 @@ class FederationCheckpoints:
         return {name: last[name] for name in weights}, number  # files order names otherwise, and noise follows them
 
     def keep_secrets(self, parties: Mapping[str, Sequence[str]]) -> None:
-        """Restore the secrets of the parties of each state, by its name, or draw them; to be called before any round.
+        """Restore the secrets of the parties of each state, by its name, or draw them before the first round.
 
-        They are in a file that only its owner may read, so that a round that is repeated has the same noise; `finish`
-        removes it. Raises `InputError` where it is damaged.
+        To be called after `resume`. They are in a file that only its owner may read, so that a round that is repeated
+        has the same noise; `finish` removes it. Raises `InputError` where it is damaged, or missing after a round.
         """
         path = self._folder / SECRETS
         try:
@@ -95,6 +97,9 @@ class FederationCheckpoints:
         except SafetensorError as error:
             raise InputError(f"{path} is damaged ({error}); remove the folder to begin anew") from None
         asked = {f"{name}|{party}": (name, party) for name, found in parties.items() for party in found}
+        if self._goes_on and asked.keys() - kept.keys():
+            told = "is missing or not complete: a round that is repeated would have other noise"
+            raise InputError(f"{path} {told}; remove the folder to begin anew")
         for key, (name, party) in asked.items():
             if key in kept:
                 self._states[name].secrets[party] = np.asarray(kept[key], np.uint8)
