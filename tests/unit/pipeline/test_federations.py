@@ -190,6 +190,9 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
     assert read_times(tmp_path / "busy") == {"a/cav0": pytest.approx([BUSY_S] * 3, rel=0.3)}
     (tmp_path / "busy" / TIMES).open("a").write("a/cav0,0.0")  # a kill
     assert len(read_times(tmp_path / "busy")["a/cav0"]) == 3
+    (resumed,) = time_clients({"a/cav0": Busy()}, tmp_path / "busy").values()
+    resumed.train({}, steps=1, learning_rate=0.1, seed=3)
+    assert {name: len(times) for name, times in read_times(tmp_path / "busy").items()} == {"a/cav0": 4}
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2), 3)
     network = learning.build_network()
     clients = make_clients(learning, Slope(), {f"a/cav{i}": [np.float32(i), np.float32(1)] for i in range(2)})

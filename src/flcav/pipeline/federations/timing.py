@@ -4,6 +4,7 @@ It is CPU time: that of a machine on which nothing else runs. No result depends 
 """
 
 import contextlib
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -50,9 +51,11 @@ class TimedClient:
 
 
 def time_clients(clients: Mapping[str, Trainable], folder: Path) -> dict[str, TimedClient]:
-    """Return clients whose times of training are kept in `folder`."""
+    """Return clients whose times of training are kept in `folder`; a line there that was cut off is removed."""
     folder.mkdir(parents=True, exist_ok=True)
     path = (folder / TIMES).resolve()  # actors may have another working directory
+    if path.exists():
+        os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
     return {name: TimedClient(name, client, path) for name, client in clients.items()}
 
 
