@@ -242,8 +242,8 @@ class Rounds(FlowerStrategy):
         """Raise `ClientFailed` where fewer clients than are wanted sent what can be used, or than the strategy needs.
 
         By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
-        a norm or a number of samples, and of those who were then to send an update. Where the network lost clients that
-        the strategy needs, the round has no update.
+        a norm or a number of samples, and of those who were then to send an update. `all` is of both, too, a number of
+        those who were to send. Where the network lost clients that the strategy needs, the round has no update.
         """
         least = self._rules.least_clients
         reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
