@@ -30,3 +30,13 @@ def test_a_killed_federation_ends_as_an_undisturbed_one(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         assert done.stdout.startswith("3 kills, ")
         assert ", 0 of them otherwise than an undisturbed one" in done.stdout
+
+
+def test_noise_by_secrets_is_refused_before_anything_is_done(tmp_path: Path) -> None:
+    path, out = tmp_path / "run.yaml", tmp_path / "out"
+    path.write_text(yaml.safe_dump(RECIPE | {"federation": {"privacy": {"clip": 1, "noise": 1}}}))
+    asked = [sys.executable, TOOL, str(path), "--out", str(out), "--kills", "1"]
+    done = subprocess.run(asked, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.endswith("'privacy.seeded' repeats it\n")
+    assert not out.exists()
