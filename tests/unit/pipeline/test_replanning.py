@@ -221,9 +221,29 @@ def test_regions_of_different_rounds_count_by_their_vehicles() -> None:
 
     both = (result("a", 7, 3, {"a/cav0": (1, 7)}), result("b", 3, 1, {"b/cav0": (2, 3)}))
     joins: dict[str, tuple[int, ...]] = {"a/cav0": (1, 2), "b/cav0": (1, 2)}
-    found = count_carried_out(replace(plan_of(4, 1), joins=joins), both)
+    found = count_carried_out(replace(plan_of(4, 1), joins=joins), both, 1)
     assert found.edge_rounds == 6  # (3 x 7 + 1 x 3) / 4
     assert found.joins == {"a/cav0": (0, 6), "b/cav0": (5, 6)}  # both end with the sixth
+
+
+def test_a_plan_that_is_not_made_anew_has_the_cloud_rounds_that_all_regions_have_vehicles_for() -> None:
+    first = replace(plan_of(4, 3), joins=dict.fromkeys(VEHICLES, tuple(range(1, 11))))
+    both = [ran_stage(region, rounds, replace(first, cloud_rounds=cloud), 2) for region, rounds, cloud in CARRIED]
+    ended = replace(both[0], rounds=4)  # a privacy budget ended the stage before its plan
+    for stages, many in ((both, 5), ([ended, both[1]], 4)):
+        ran = count_carried_out(first, stages, 2)
+        assert (ran.edge_rounds, ran.cloud_rounds) == (many, 2)
+        joins = ran.joins_after(0)
+        assert joins["a/cav0"] == joins["a/cav1"] == tuple(range(1, 1 + many + 2 * 2))
+        assert joins["b/cav0"] == tuple(range(max(many - 3, 1), 1 + many + 2 * 2))
+    short = {**problem().model_dump(), "budgets_mb": {"wireless": 10.0, "wireline": 99.0}}
+    none = remake_plan(
+        Plan("joint", {"t": first}), Problem.model_validate(short), "edge", {"t": 0.6}, Price(9.9, 0.0), {"t": ran}
+    )
+    assert none.tasks == {"t": ran}  # nothing is left for a cloud round
+
+
+CARRIED = (("a", 5, 2), ("b", 4, 3))  # region, its edge rounds, cloud rounds by its last plan
 
 
 def test_no_vehicle_joins_more_rounds_than_it_has_time_for_after_a_plan_is_made_anew() -> None:
@@ -269,7 +289,7 @@ def test_a_region_that_ran_more_rounds_than_the_mean_joins_the_cloud_rounds(
 ) -> None:
     asked = timed(problem(cloud=(cloud_rounds, cloud_rounds)), horizon_s, "t")
     first = replace(plan_of(6, cloud_rounds), joins=dict.fromkeys(VEHICLES, tuple(range(1, 7 + cloud_rounds))))
-    ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 7), ("b", 5))])
+    ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 7), ("b", 5))], 1)
     assert (ran.edge_rounds, (ran.joins or {})["a/cav0"][:7]) == (6, (0, 1, 2, 3, 4, 5, 6))
     made = remake_plan(Plan("joint", {"t": first}), asked, "edge", {"t": 0.6}, Price(0.0, 0.0), {"t": ran})
     own = made.tasks["t"]
@@ -288,7 +308,7 @@ def test_a_region_that_ran_more_rounds_than_the_mean_joins_the_cloud_rounds(
 
 def test_time_that_one_task_takes_beyond_its_plan_is_gone_for_the_others() -> None:
     first = replace(plan_of(6, 1), joins=dict.fromkeys(VEHICLES, tuple(range(1, 8))))
-    ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 7), ("b", 5))])
+    ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 7), ("b", 5))], 1)
     ran = replace(ran, joins={**(ran.joins or {}), "a/cav1": (1, 2, 3, 7)})
     plan, asked = Plan("joint", {"t": first, "u": first}), timed(problem(), 30.0, "t", "u")
     made = remake_plan(plan, asked, "edge", dict.fromkeys("tu", 0.6), Price(0.0, 0.0), dict.fromkeys("tu", ran))
@@ -306,9 +326,9 @@ def timed(asked: Problem, horizon_s: float | None, *names: str) -> Problem:
     return Problem.model_validate(asked.model_dump() | {"horizon_s": horizon_s, "tasks": tasks})
 
 
-def ran_stage(region: str, rounds: int, plan: TaskPlan) -> StageResult:
+def ran_stage(region: str, rounds: int, plan: TaskPlan, k: int = 1) -> StageResult:
     """Return a region's stage II whose last plan gave all its vehicles all its rounds, `rounds` of the edge."""
-    number = rounds + plan.cloud_rounds
+    number = rounds + k * plan.cloud_rounds
     own = {name: tuple(range(1, number + 1)) for name in VEHICLES if name.startswith(region)}
     last = replace(plan, edge_rounds=rounds, joins=own)
     made = RoundPlan(rounds, 0.5, Price(0, 0), Price(0, 0), last)

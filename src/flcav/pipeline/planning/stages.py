@@ -70,23 +70,27 @@ def remake_plan(
     return Plan(plan.rule, tasks, stage, dict(reached))
 
 
-def count_carried_out(plan: TaskPlan, stages: Sequence[StageResult]) -> TaskPlan:
+def count_carried_out(plan: TaskPlan, stages: Sequence[StageResult], k: int) -> TaskPlan:
     """Return the plan of a task with the edge rounds that its regions carried out, and who joined them.
 
-    `stages` are the results of stage II. Where regions ran different numbers of rounds, theirs is the mean by vehicles,
-    and the last round of each has that number: first ones of a region that ran more have numbers below 1.
+    `stages` are the results of stage II; a cloud round has `k` edge rounds. Where regions ran different numbers of
+    rounds, theirs is the mean by vehicles, and the last round of each has that number: first ones of a region that ran
+    more have numbers below 1. There are no more cloud rounds than the last plan of any region has, since no later one
+    says which of its vehicles have time for them.
     """
     rounds = round(float(np.average([each.rounds for each in stages], weights=[each.clients for each in stages])))
-    joins = plan.joins
-    if joins is not None:
-        last = {
-            name: tuple(number + rounds - each.rounds for number in own)
-            for each in stages
-            for made in (each.plans or ())[-1:]
-            for name, own in (made.plan.joins or {}).items()
-        }
-        joins = {name: last.get(name, own) for name, own in joins.items()}
-    return replace(plan, edge_rounds=rounds, joins=joins)
+    last = [each.plans[-1].plan if each.plans else plan for each in stages]
+    cloud = min(own.cloud_rounds for own in (plan, *last))
+    if plan.joins is None:
+        return replace(plan, edge_rounds=rounds, cloud_rounds=cloud)
+    joins: dict[str, tuple[int, ...]] = {}
+    for each, own in zip(stages, last, strict=True):
+        for name, joined in (own.joins or {}).items():
+            edge = [number - each.rounds for number in joined if number <= each.rounds]
+            later = [number - own.edge_rounds for number in joined if 0 < number - own.edge_rounds <= k * cloud]
+            if name.startswith(f"{each.region}/"):
+                joins[name] = tuple(rounds + number for number in edge + later)
+    return replace(plan, edge_rounds=rounds, cloud_rounds=cloud, joins={name: joins[name] for name in plan.joins})
 
 
 def find_spare(problem: Problem, shares: Shares) -> dict[str, float]:
