@@ -316,6 +316,17 @@ def test_time_that_one_task_takes_beyond_its_plan_is_gone_for_the_others() -> No
     assert [{name for name, own in each.items() if own} for each in joined] == [{*VEHICLES}, {"a/cav1", "b/cav0"}]
 
 
+def test_all_tasks_go_on_as_planned_where_one_of_them_has_too_little_time_left() -> None:
+    first = replace(plan_of(6, 1), joins=dict.fromkeys(VEHICLES, tuple(range(1, 8))))
+    ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 5), ("b", 7))], 1)
+    plan, sent = Plan("joint", {"t": first, "u": first}), Price(0.0, 0.0)
+    for horizon_s, anew in ((28.0, False), (30.0, True)):  # 14 rounds of 2 s, 13 of which b/cav0 has joined; 15
+        made = remake_plan(
+            plan, timed(problem(), horizon_s, "t", "u"), "edge", dict.fromkeys("tu", 0.6), sent, {"u": ran}
+        )
+        assert (made.tasks != {"t": first, "u": ran}) == anew
+
+
 VEHICLES = ("a/cav0", "a/cav1", "b/cav0")
 
 

@@ -33,9 +33,10 @@ def remake_plan(
     """Return the plan of the rest of a run after `stage`, which `plan` was carried out in; fixed plans stay.
 
     `problem` is that of the first plan, `reached` the score of each of its tasks now, `used_mb` what they have sent.
-    Counts are totals, including what is spent. Scores predicted of stages that are over are kept. Where what is left of
-    the budgets allows no other plan, the counts are those of `plan`. `done` are the plans of tasks whose stage came out
-    otherwise than planned, with the rounds that were carried out.
+    Counts are totals, including what is spent. Scores predicted of stages that are over are kept. `done` are the plans
+    of tasks whose stage came out otherwise than planned, with the rounds that were carried out. Where what is left of
+    the budgets allows no other plan, or in any task a region's vehicles have too little time left for its rounds, the
+    plans of all tasks are those of before: of `done`, or else of `plan`.
     """
     states, tasks = {}, {**plan.tasks, **done}
     for task in problem.tasks:
