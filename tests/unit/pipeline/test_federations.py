@@ -28,7 +28,7 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies, resolve_settings
 from flcav.pipeline.federations.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
-from flcav.pipeline.recipe import Federation, RunRecipe, Training
+from flcav.pipeline.recipe import Arm, Federation, RunRecipe, Training
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import StatisticsScore
 from flcav.pipeline.stages import statistics
@@ -85,6 +85,31 @@ def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any
     for recipe, arms in (settings({}, **federation), settings({"other": federation})):
         with pytest.raises(InputError, match=said):
             check_federations(recipe, arms)
+
+
+def test_secure_aggregation_is_refused_where_the_plan_says_who_joins() -> None:
+    def check(secure: dict[str, Any], *changes: dict[str, Any], **federation: Any) -> None:
+        recipe, _ = settings({"masked": secure}, **federation)
+        for more in changes:
+            recipe = recipe.model_copy(update=more)
+        check_federations(recipe, resolve_settings(recipe, {"objects": "ideal-road"}).values())
+
+    regions = settings({})[0].regions
+    slow = {"regions": {**regions, "grid": regions["grid"].model_copy(update={"speed": {"cav1": 0.5}})}}
+    soon, masked = {"horizon_s": 40.0}, {"secure": {}}
+    with pytest.raises(
+        InputError, match=r"federation.secure: a plan within horizon_s may leave a round to one vehicle"
+    ):
+        check(masked, slow, soon)
+    with pytest.raises(
+        InputError, match=r"federation.secure: a plan within horizon_s may leave a round to one vehicle"
+    ):
+        check(masked | {"network": {}}, soon, network={})
+    check(masked, slow)  # without a horizon all join every round
+    check(masked, soon)
+    check(masked | {"selection": {"rule": "uniform", "clients": 3}}, slow, soon)
+    arms = {"masked": Arm(plan="equal-stages", federation=masked)}
+    check({}, slow, soon, {"arms": arms})
 
 
 def test_a_pose_graph_without_gtsam_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
