@@ -247,7 +247,7 @@ def test_slow_vehicles_are_planned_into_the_rounds_that_they_have_time_for() -> 
     assert joins is not None
     for name, joined in own.joins.items():  # what is over stays
         assert [each for each in joins[name] if each <= own.edge_rounds] == [e for e in joined if e <= own.edge_rounds]
-    after = later.tasks["objects"].joins_after(own.edge_rounds)
+    after = later.tasks["objects"].joins_after_edge()
     assert {each for joined in after.values() for each in joined} == set(
         range(1, 1 + later.tasks["objects"].cloud_rounds)
     )

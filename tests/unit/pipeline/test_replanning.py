@@ -27,7 +27,8 @@ from flcav.pipeline.planning.course import Course, Replanning
 from flcav.pipeline.planning.rounds import Follower, Planner, restrict_problem
 from flcav.pipeline.planning.stages import continue_joins, count_carried_out, remake_plan
 from flcav.pipeline.planning.terms import Terms
-from flcav.pipeline.recipe import Training
+from flcav.pipeline.planning.updates import follow_plan
+from flcav.pipeline.recipe import Federation, Training
 from flcav.pipeline.results.plans import Plan, RoundPlan, TaskPlan
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import StageResult
@@ -223,7 +224,10 @@ def test_regions_of_different_rounds_count_by_their_vehicles() -> None:
     joins: dict[str, tuple[int, ...]] = {"a/cav0": (1, 2), "b/cav0": (1, 2)}
     found = count_carried_out(replace(plan_of(4, 1), joins=joins), both, 1)
     assert found.edge_rounds == 6  # (3 x 7 + 1 x 3) / 4
-    assert found.joins == {"a/cav0": (0, 6), "b/cav0": (5, 6)}  # both end with the sixth
+    assert found.joins == {"a/cav0": (1, 7), "b/cav0": (2, 3)}  # a region's rounds are counted from its first
+    assert found.ran == {"a": 7, "b": 3}
+    same = count_carried_out(replace(plan_of(4, 1), joins=joins), (both[0], replace(both[1], rounds=7)), 1)
+    assert (same.edge_rounds, same.ran) == (7, None)
 
 
 def test_a_plan_that_is_not_made_anew_has_the_cloud_rounds_that_all_regions_have_vehicles_for() -> None:
@@ -233,9 +237,9 @@ def test_a_plan_that_is_not_made_anew_has_the_cloud_rounds_that_all_regions_have
     for stages, many in ((both, 5), ([ended, both[1]], 4)):
         ran = count_carried_out(first, stages, 2)
         assert (ran.edge_rounds, ran.cloud_rounds) == (many, 2)
-        joins = ran.joins_after(0)
-        assert joins["a/cav0"] == joins["a/cav1"] == tuple(range(1, 1 + many + 2 * 2))
-        assert joins["b/cav0"] == tuple(range(max(many - 3, 1), 1 + many + 2 * 2))
+        assert ran.joins is not None
+        for name, joined in ran.joins.items():
+            assert joined == tuple(range(1, 1 + next(own.rounds for own in stages if own.region == name[0]) + 2 * 2))
     short = {**problem().model_dump(), "budgets_mb": {"wireless": 10.0, "wireline": 99.0}}
     none = remake_plan(
         Plan("joint", {"t": first}), Problem.model_validate(short), "edge", {"t": 0.6}, Price(9.9, 0.0), {"t": ran}
@@ -254,13 +258,13 @@ def test_no_vehicle_joins_more_rounds_than_it_has_time_for_after_a_plan_is_made_
         plans = [replace(plan_of(rounds, 0), joins=joins_of(most, rounds)) for rounds in (4, 4 + int(rng.integers(4)))]
         before, new = plans
         over = int(rng.integers(5))
-        ran = {region: over + int(rng.integers(-1, 2)) for region in "ab"}  # rounds of the region, numbered to `over`
+        ran = {region: over + int(rng.integers(-1, 2)) for region in "ab"}  # of the mean `over`
         assert before.joins is not None
         assert new.joins is not None
-        before = replace(
-            before, joins={name: tuple(e + over - ran[name[0]] for e in own) for name, own in before.joins.items()}
-        )
-        past = {name: [each for each in joined if each <= over] for name, joined in (before.joins or {}).items()}
+        before = replace(before, edge_rounds=over, ran=ran)
+        past = {
+            name: [each for each in joined if each <= ran[name[0]]] for name, joined in (before.joins or {}).items()
+        }
         time = {name: max(most[name], len(joined)) for name, joined in new.joins.items()}  # of so many rounds of 2 s
         spare_s = {name: 2.0 * (time[name] - len(joined)) for name, joined in new.joins.items()}
         task = problem(tasks=[{**problem().tasks[0].model_dump(), "train_s": 2.0}]).tasks[0]
@@ -274,11 +278,12 @@ def test_no_vehicle_joins_more_rounds_than_it_has_time_for_after_a_plan_is_made_
             continue
         assert joins is not None
         for name, joined in joins.items():
-            assert [each for each in joined if each <= over] == past[name]
+            assert [each for each in joined if each <= ran[name[0]]] == past[name]
             assert len({*joined}) == len(joined) <= max(time[name], len(past[name]))
         for region in "ab":
-            later = {each for name, joined in joins.items() if name[0] == region for each in joined if each > over}
-            assert later == {*range(over + 1, new.edge_rounds + 1)}
+            own = [each for name, joined in joins.items() if name[0] == region for each in joined]
+            later = {each - ran[region] for each in own if each > ran[region]}
+            assert later == {*range(1, new.edge_rounds - over + 1)}
     assert 0 < refused < 100
 
 
@@ -290,10 +295,10 @@ def test_a_region_that_ran_more_rounds_than_the_mean_joins_the_cloud_rounds(
     asked = timed(problem(cloud=(cloud_rounds, cloud_rounds)), horizon_s, "t")
     first = replace(plan_of(6, cloud_rounds), joins=dict.fromkeys(VEHICLES, tuple(range(1, 7 + cloud_rounds))))
     ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 7), ("b", 5))], 1)
-    assert (ran.edge_rounds, (ran.joins or {})["a/cav0"][:7]) == (6, (0, 1, 2, 3, 4, 5, 6))
+    assert (ran.edge_rounds, (ran.joins or {})["a/cav0"][:7]) == (6, (1, 2, 3, 4, 5, 6, 7))
     made = remake_plan(Plan("joint", {"t": first}), asked, "edge", {"t": 0.6}, Price(0.0, 0.0), {"t": ran})
     own = made.tasks["t"]
-    after = own.joins_after(6)
+    after = own.joins_after_edge()
     assert (own.cloud_rounds, own.predicted == ran.predicted) == (cloud_rounds, False)  # not the plan of before
     if horizon_s != 17.0:
         assert after == dict.fromkeys(VEHICLES, tuple(range(1, 1 + cloud_rounds)))
@@ -306,13 +311,27 @@ def test_a_region_that_ran_more_rounds_than_the_mean_joins_the_cloud_rounds(
         assert {*after["a/cav0"], *after["a/cav1"]} == {*range(1, 1 + cloud_rounds)}
 
 
+def test_the_cloud_s_plans_go_on_from_the_last_edge_round_of_each_region() -> None:
+    asked = timed(problem(cloud=(2, 2)), 99.0, "t")
+    first = replace(plan_of(6, 2), joins=dict.fromkeys(VEHICLES, tuple(range(1, 9))))
+    ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 7), ("b", 5))], 1)
+    begun = remake_plan(Plan("joint", {"t": first}), asked, "edge", {"t": 0.6}, Price(0.0, 0.0), {"t": ran})
+    terms = Terms("cloud", (2, 1), 1, Price(99.0, 99.0), Price(99.0, 99.0))
+    own = Planner(asked, begun, "t", terms).replan(begun.tasks["t"], 1, 0.6, Price(30.0, 9.0))
+    for plan in (begun.tasks["t"], own):
+        assert plan.ran == {"a": 7, "b": 5}
+        assert plan.joins == {name: tuple(range(1, {"a": 10, "b": 8}[name[0]])) for name in VEHICLES}
+        rules = [follow_plan(Federation(), plan, after_edge=after).selection.joins for after in (False, True)]
+        assert rules == [plan.joins, dict.fromkeys(VEHICLES, (1, 2))]
+
+
 def test_time_that_one_task_takes_beyond_its_plan_is_gone_for_the_others() -> None:
     first = replace(plan_of(6, 1), joins=dict.fromkeys(VEHICLES, tuple(range(1, 8))))
     ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 7), ("b", 5))], 1)
-    ran = replace(ran, joins={**(ran.joins or {}), "a/cav1": (1, 2, 3, 7)})
+    ran = replace(ran, joins={**(ran.joins or {}), "a/cav1": (1, 2, 3, 8)})
     plan, asked = Plan("joint", {"t": first, "u": first}), timed(problem(), 30.0, "t", "u")
     made = remake_plan(plan, asked, "edge", dict.fromkeys("tu", 0.6), Price(0.0, 0.0), dict.fromkeys("tu", ran))
-    joined = [own.joins_after(6) for own in made.tasks.values()]
+    joined = [own.joins_after_edge() for own in made.tasks.values()]
     assert [{name for name, own in each.items() if own} for each in joined] == [{*VEHICLES}, {"a/cav1", "b/cav0"}]
 
 

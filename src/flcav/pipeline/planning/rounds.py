@@ -93,7 +93,7 @@ class Planner:
             return terms.settle(terms.cut(before, done, sent_mb), done, sent_mb)
         past = (PRETRAIN,) if terms.stage == EDGE else (PRETRAIN, EDGE)
         predicted = {**(new.predicted or {}), **{each: (before.predicted or {})[each] for each in past}}
-        new = replace(new, predicted=predicted, joins=joins, uploads=before.uploads)
+        new = replace(new, predicted=predicted, joins=joins, uploads=before.uploads, ran=before.ran)
         return terms.settle(new, done, sent_mb)
 
 

@@ -67,7 +67,7 @@ def remake_plan(
         assert before.predicted is not None
         past = (PRETRAIN,) if stage == PRETRAIN else (PRETRAIN, EDGE)
         predicted = {**new.predicted, **{each: before.predicted[each] for each in past}}
-        tasks[name] = replace(new, predicted=predicted, joins=joins[name], uploads=before.uploads)
+        tasks[name] = replace(new, predicted=predicted, joins=joins[name], uploads=before.uploads, ran=before.ran)
     return Plan(plan.rule, tasks, stage, dict(reached))
 
 
@@ -75,23 +75,24 @@ def count_carried_out(plan: TaskPlan, stages: Sequence[StageResult], k: int) -> 
     """Return the plan of a task with the edge rounds that its regions carried out, and who joined them.
 
     `stages` are the results of stage II; a cloud round has `k` edge rounds. Where regions ran different numbers of
-    rounds, theirs is the mean by vehicles, and the last round of each has that number: first ones of a region that ran
-    more have numbers below 1. There are no more cloud rounds than the last plan of any region has, since no later one
-    says which of its vehicles have time for them.
+    rounds, the plan has their mean by vehicles. There are no more cloud rounds than the last plan of any region has,
+    since no later one says which of its vehicles have time for them.
     """
-    rounds = round(float(np.average([each.rounds for each in stages], weights=[each.clients for each in stages])))
+    ran = {each.region or "": each.rounds for each in stages}
+    rounds = round(float(np.average([*ran.values()], weights=[each.clients for each in stages])))
     last = [each.plans[-1].plan if each.plans else plan for each in stages]
     cloud = min(own.cloud_rounds for own in (plan, *last))
+    plan = replace(plan, edge_rounds=rounds, cloud_rounds=cloud, ran=ran if len({*ran.values()}) > 1 else None)
     if plan.joins is None:
-        return replace(plan, edge_rounds=rounds, cloud_rounds=cloud)
+        return plan
     joins: dict[str, tuple[int, ...]] = {}
     for each, own in zip(stages, last, strict=True):
         for name, joined in (own.joins or {}).items():
-            edge = [number - each.rounds for number in joined if number <= each.rounds]
+            edge = [number for number in joined if number <= each.rounds]
             later = [number - own.edge_rounds for number in joined if 0 < number - own.edge_rounds <= k * cloud]
             if name.startswith(f"{each.region}/"):
-                joins[name] = tuple(rounds + number for number in edge + later)
-    return replace(plan, edge_rounds=rounds, cloud_rounds=cloud, joins={name: joins[name] for name in plan.joins})
+                joins[name] = (*edge, *(each.rounds + number for number in later))
+    return replace(plan, joins={name: joins[name] for name in plan.joins})
 
 
 def find_spare(problem: Problem, shares: Shares) -> dict[str, float]:
@@ -105,15 +106,17 @@ def continue_joins(
 ) -> Joins | None:
     """Return the first `over` rounds that vehicles joined by the plan `before`, and the later ones by the `new` one.
 
-    spare_s: what the new plan leaves of each vehicle's time [s], as `find_spare` finds it; a round takes the `round_s`
-    of `task`. No vehicle joins more rounds in all than it has time for: where it would, the later rounds of its region
-    are dealt anew, round robin, to those that have rounds left. Raises `Infeasible` where these are too few for the
-    rounds.
+    Of `before`, and here, the rounds of a region are counted from its first; where regions ran different numbers of
+    edge rounds, `over` and `new` count their mean. spare_s: what the new plan leaves of each vehicle's time [s], as
+    `find_spare` finds it; a round takes the `round_s` of `task`. No vehicle joins more rounds in all than it has time
+    for: where it would, the later rounds of its region are dealt anew, round robin, to those that have rounds left.
+    Raises `Infeasible` where these are too few for the rounds.
     """
     if before.joins is None or new.joins is None:
         return new.joins
-    past = {name: tuple(each for each in before.joins[name] if each <= over) for name in new.joins}
-    later = {name: tuple(each for each in joined if each > over) for name, joined in new.joins.items()}
+    more = {name: before.edge_rounds_of(name) - before.edge_rounds for name in new.joins}  # than the mean
+    past = {name: tuple(each for each in before.joins[name] if each <= over + more[name]) for name in new.joins}
+    later = {name: tuple(each + more[name] for each in own if each > over) for name, own in new.joins.items()}
     most = {name: len(joined) + _further(spare_s[name], task.round_s(name)) for name, joined in new.joins.items()}
     for region in dict.fromkeys(name.rpartition("/")[0] for name in later):
         own = [name for name in later if name.rpartition("/")[0] == region]
