@@ -2,6 +2,7 @@
 
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -87,7 +88,7 @@ def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any
             check_federations(recipe, arms)
 
 
-def test_secure_aggregation_is_refused_where_the_plan_says_who_joins() -> None:
+def test_what_needs_a_known_number_is_refused_where_the_plan_says_who_joins() -> None:
     def check(secure: dict[str, Any], *changes: dict[str, Any], **federation: Any) -> None:
         recipe, _ = settings({"masked": secure}, **federation)
         for more in changes:
@@ -96,20 +97,54 @@ def test_secure_aggregation_is_refused_where_the_plan_says_who_joins() -> None:
 
     regions = settings({})[0].regions
     slow = {"regions": {**regions, "grid": regions["grid"].model_copy(update={"speed": {"cav1": 0.5}})}}
-    soon, masked = {"horizon_s": 40.0}, {"secure": {}}
-    with pytest.raises(
-        InputError, match=r"federation.secure: a plan within horizon_s may leave a round to one vehicle"
+    soon = {"horizon_s": 40.0}
+    planned: dict[str, dict[str, Any]] = {
+        "secure aggregation takes two or more": {"secure": {}},
+        "noise is for one number": {"privacy": PRIVACY},
+        "Krum needs a known one": {"strategy": {"krum": {"byzantine": 0}}, "cloud_strategy": "fedavg"},
+    }
+    for told, asked in planned.items():
+        said = rf"horizon_s: a plan by .* leaves other numbers to its rounds, .*{told}.*; choose another 'selection'"
+        with pytest.raises(InputError, match=said):
+            check(asked, slow, soon)
+        with pytest.raises(InputError, match=said):
+            check(asked | {"network": {}}, soon, network={})
+        check(asked, slow)  # without a horizon all join every round
+        check(asked, soon)
+        check(asked | {"selection": {"rule": "round-robin", "clients": 3}}, slow, soon)
+        arms = {"masked": Arm(plan="equal-stages", federation=asked)}
+        check({}, slow, soon, {"arms": arms})
+    check({"strategy": "median"}, slow, soon)  # of any number
+
+
+@pytest.mark.parametrize(
+    ("federation", "said"),
+    [
+        (
+            {"strategy": {"trimmed-mean": {"fraction": 0.3}}, "cloud_strategy": "fedavg"},
+            "and TrimmedMean needs a known one",
+        ),
+        ({"privacy": PRIVACY}, "and noise is for one number"),
+        ({"strategy": "median"}, None),
+        ({"secure": {}}, None),  # a round with too few has no update
+    ],
+)
+def test_a_predicted_deadline_is_refused_with_what_needs_a_known_number(federation: Any, said: str | None) -> None:
+    deadline, seconds = {"rule": "deadline", "deadline_s": 9}, {"grid/cav0": 1.0}
+
+    def check(selection: dict[str, Any], **network: Any) -> None:
+        check_federations(*settings({}, **federation, selection=selection, **network))
+
+    with (
+        nullcontext() if said is None else pytest.raises(InputError, match=f"federation.network: a predicted .* {said}")
     ):
-        check(masked, slow, soon)
+        check(deadline, network={})
+    check(deadline | {"seconds": seconds}, network={})
+    check(deadline | {"seconds": seconds})
     with pytest.raises(
-        InputError, match=r"federation.secure: a plan within horizon_s may leave a round to one vehicle"
+        InputError, match="selection: a deadline needs the predicted 'seconds' of a round by client, or"
     ):
-        check(masked | {"network": {}}, soon, network={})
-    check(masked, slow)  # without a horizon all join every round
-    check(masked, soon)
-    check(masked | {"selection": {"rule": "uniform", "clients": 3}}, slow, soon)
-    arms = {"masked": Arm(plan="equal-stages", federation=masked)}
-    check({}, slow, soon, {"arms": arms})
+        check(deadline)
 
 
 def test_a_pose_graph_without_gtsam_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
