@@ -1,12 +1,14 @@
 """The comparison of exchanges: whose accuracy counts where, seconds of rounds, means, verdicts, tables, the figure."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from flcav.experiments.exchanges import run as exchanges
 from flcav.experiments.exchanges.clock import mean_round_s
 from flcav.experiments.exchanges.run import (
     NAMES,
@@ -20,13 +22,14 @@ from flcav.experiments.exchanges.run import (
     draw_results,
     judge_differences,
     measure_places,
+    measure_seed,
     summarise,
 )
 from flcav.experiments.exchanges.tables import tables
 from flcav.experiments.scales import shrink_recipe
 from flcav.federation.divergence import Divergence, RoundDivergence
 from flcav.federation.upload import name_like
-from flcav.network.ledger import LedgerEntry
+from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.propagation import State
@@ -131,6 +134,34 @@ def test_scenes_go_on_in_stage_three_and_who_is_away_does_not_count() -> None:
     assert mean_round_s(sent, {"grid": scenes}, 2) == pytest.approx(1.5)  # in the third scene, the first again
     assert mean_round_s(sent, {"grid": scenes}, 1) == pytest.approx(1.0)  # in the second, with cav1 alone
     assert mean_round_s(sent[:1], {"grid": scenes}, 1) is None
+
+
+def test_edge_federation_alone_has_the_accuracy_the_messages_and_the_rounds_of_stage_two(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exchanges, "link_regions", lambda *_: {"grid": [links_of(True, True)]})
+    sent = [entry("grid/cav0", "up", 2_000_000), entry("grid/cav0", "up", 1_000_000, CLOUD)]
+    sent.append(LedgerEntry(PRETRAIN, "weather", "wireless", "up", 0, "suburb", 9_000_000))
+    Ledger(Budget(60, 30), sent).save(tmp_path / "ledgers" / "main.parquet")
+    clients = {EDGE: ("cav0", "cav1"), CLOUD: ("cav0",)}
+    stages = [
+        SimpleNamespace(stage=stage, records=[SimpleNamespace(server="grid", clients=names, epsilon=None)])
+        for stage, names in clients.items()
+    ]
+    plan = SimpleNamespace(tasks={"weather": SimpleNamespace(edge_rounds=1, cloud_rounds=1)})
+    reached = {PRETRAIN: 0.5, EDGE: 0.6, CLOUD: 0.7}
+    run = SimpleNamespace(
+        recipe=RECIPE,
+        arms={MAIN: SimpleNamespace(regional=None, stages=stages, plan=plan)},
+        test=lambda *, arm, stage, region, task: SimpleNamespace(estimate=SimpleNamespace(mean=reached[stage])),
+    )
+    found = measure_seed(cast(Any, run), tmp_path)
+    assert {*found} == {NONE, NO_CLOUD, WHOLE}
+    alone, whole = found[NO_CLOUD], found[WHOLE]
+    assert alone.accuracy == {OWN: 0.6}
+    assert whole.accuracy == pytest.approx({OWN: 0.7, OTHERS: 0.7, UNSEEN: 0.7})
+    assert (alone.wireless_up_mb, whole.wireless_up_mb) == (2.0, 3.0)
+    assert (alone.clients, whole.clients) == (2.0, 1.5)
 
 
 def arm(own: float, up_mb: float, epsilon: float | None = None) -> ExchangeArm:
