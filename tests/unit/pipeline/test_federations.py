@@ -22,6 +22,7 @@ from flcav.federation.strategies.fedavgm import FedAvgM
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 from flcav.fusion.distillation import Distillation
 from flcav.network.ledger import Budget, Ledger
+from flcav.perception.client import TaskClient
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
 from flcav.perception.weather.task import WEATHER
@@ -381,6 +382,32 @@ def test_both_stages_in_two_processes_end_with_the_bytes_of_one_also_where_label
 
     assert end(2) == end(1)
     assert end(1, renewed=False)[0] != end(1)[0]
+
+
+def test_cloud_rounds_begin_the_learning_rate_anew_where_that_is_asked_for_and_stage_two_stays_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, (main, anew) = settings({"anew": {"cloud_rate": 0.4, "personal": ["head.*"]}})
+    assert anew.federation.cloud_rate == 0.4
+    assert anew.edge_federation == main.edge_federation == main.federation
+
+    rates: list[float] = []
+    train = TaskClient.train
+
+    def telling(client: Any, weights: Any, *, learning_rate: float, **how: Any) -> Any:
+        rates.append(learning_rate / LineTask.practice.learning_rate)
+        return train(client, weights, learning_rate=learning_rate, **how)
+
+    monkeypatch.setattr(TaskClient, "train", telling)
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1, final_rate=0.1), 3)
+    network = learning.build_network()
+    clients = make_clients(learning, Slope(), {"a/cav0": [np.float32(1), np.float32(2)]})
+    starts = {"a": RegionStart(clients, to_arrays(network), earlier=2)}
+    for rate, expected in ((None, [0.1, 0.1]), (0.4, [0.4, 0.1])):
+        how = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), tmp_path / str(rate), ignore_progress)
+        federate_cloud(CloudFederation(learning, network, starts, 1, *how, rate=rate), 2, Rules())
+        assert rates == pytest.approx(expected)
+        rates.clear()
 
 
 def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
