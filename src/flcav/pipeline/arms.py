@@ -192,7 +192,7 @@ def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> N
     if predicted:
         why, instead = "federation.network: a predicted deadline leaves other numbers of vehicles to its rounds", ""
     elif how.selection.rule == "all" and _plans_joiners(recipe, setting):
-        why = "horizon_s: a plan by the vehicles' speeds or the time of messages leaves other numbers to its rounds"
+        why = "horizon_s: a plan by speeds or the time of messages leaves other numbers of vehicles to its rounds"
         instead = "; choose another 'selection' than all, or leave out horizon_s"
         if how.secure is not None:
             raise InputError(f"{why}, some of them one, and secure aggregation takes two or more{instead}")
