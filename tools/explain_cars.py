@@ -109,8 +109,8 @@ def main() -> None:
         missed.update(reason for reason in reasons if reason)
         false.update(explain_false(seen, every, neutral, others))
         row = np.searchsorted(RETURNS, inside, side="right") - 1
-        np.add.at(by_returns, (np.clip(row, 0, None), 0), 1)
-        np.add.at(by_returns, (np.clip(row, 0, None), 1), [not reason for reason in reasons])
+        for part, reason in zip(row.tolist(), reasons):
+            by_returns[max(part, 0)] += (1, not reason)
         for score, count in counts.items():
             own = seen[(seen.label == "Car") & (np.asarray(seen.score) >= score)]
             matched = assign_targets(own, every, OVERLAP, "bev")
