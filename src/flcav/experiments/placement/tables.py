@@ -118,9 +118,14 @@ def _spread(results: PlacementProof) -> str:
         several = len(own.seeds) > 1
         for frames in FRAMES:
             wanted = own.seeds_wanted[frames] or (f"more than {MOST_SEEDS}" if several else "")
-            rows.append([name, frames, f"{own.pair_sd[frames]:.3f}" if several else "", wanted])
-    spread = "standard deviation over seeds of the difference of two poles' gains"
-    return format_table(("region", "test frames", spread, f"seeds for a half-width of {HALF_WIDTH}"), rows)
+            spread, scenes = own.pair_sd[frames], "" if own.scene_sd is None else f"{own.scene_sd[frames]:.3f}"
+            rows.append([name, frames, *((f"{spread:.3f}", scenes) if several else ("", "")), wanted])
+    header = (
+        "standard deviation over seeds of the difference of two poles' gains",
+        "by the draw of the test scenes alone",
+        f"seeds for a half-width of {HALF_WIDTH}",
+    )
+    return format_table(("region", "test frames", *header), rows)
 
 
 def _overlaps(region: RegionProof) -> str:
