@@ -81,7 +81,7 @@ def draw_town(axes: Axes, town: Town) -> None:
 
 
 def draw_errors(axes: Axes, scene: ErrorMap) -> None:
-    """Draw the town, its errors, zones and poles: the chosen ones with their range, those of conventional rules square."""
+    """Draw the town, errors, zones and poles: the chosen ones with their range, those of conventional rules square."""
     draw_town(axes, scene.town)
     if scene.heat and len(scene.errors):
         draw_density(axes, scene)
