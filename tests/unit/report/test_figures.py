@@ -65,7 +65,7 @@ def test_a_chosen_pole_says_which_conventional_rules_choose_it_too() -> None:
     both = {DENSEST: ("2",), MOST_VISIBLE: ("2", "3")}
     axes = figures.town_map(replace(made_up_run.error_map(), conventional=both)).axes[0]
     notes = {text.get_text() for text in axes.texts}
-    assert {"placed, densest traffic and most visible objects", "most visible objects"} <= notes
+    assert {"placed, densest traffic\nand most visible objects", "most visible objects"} <= notes
 
 
 def test_zones_stand_on_the_map_with_their_density() -> None:

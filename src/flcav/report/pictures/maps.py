@@ -131,8 +131,10 @@ def draw_density(axes: Axes, scene: ErrorMap) -> None:
 
 
 def _join(words: Sequence[str]) -> str:
-    """Return "a", "a and b", or "a, b and c"; "" of none."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    """Return "a", "a and b", or on two lines "a, b and c"; "" of none."""
+    if len(words) < 3:
+        return " and ".join(words)
+    return f"{', '.join(words[:-1])}\nand {words[-1]}"
 
 
 def _write_beside(axes: Axes, note: str, at: Array, others: Array) -> Array:
