@@ -213,8 +213,7 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
     from flcav.experiments.arms.run import compare_arms, draw_arms, judge_differences
     from flcav.files import write_bytes, write_json
 
-    recipe, runs = _run_seeds(Target.demo_arms, "arms", out, seeds, scale, jobs, engine, stale)
-    results = compare_arms(recipe, runs, _list_works(out, runs))
+    results = compare_arms(*_run_seeds(Target.demo_arms, "arms", out, seeds, scale, jobs, engine, stale))
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "arms.png", draw_arms(results))
     for arm, closed in results.summary.gap_closed.items():
@@ -276,6 +275,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
     from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps
     from flcav.experiments.placement.run import draw_proof, list_regions, prove_placement
     from flcav.experiments.scales import shrink_recipe
+    from flcav.pipeline.running import WORK
 
     asked = _load_sized("placement", scale, shrink_recipe)
     import_map(IMPORTED, out)
@@ -284,7 +284,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
         typer.echo(sentence)
     how: Any = (seeds, scale, jobs, engine, stale, shrink_recipe, out)
     recipe, runs = _run_seeds(Target.placement, "placement", out, *how)
-    results = prove_placement(recipe, runs, _list_works(out, runs), out)
+    results = prove_placement(recipe, runs, [out / f"seed{run.recipe.seed}" / WORK for run in runs], out)
     _write_figures(out, results.as_json(), draw_proof(results), [*results.sentences(), *describe_claims(results)])
 
 
@@ -295,13 +295,6 @@ COMPARISONS: Mapping[str, Callable[[Path, int, str, int, Engine, Stale], None]] 
     Target.fig6a_allocation: _fig6a_allocation,
     Target.placement: _placement,
 }
-
-
-def _list_works(out: Path, runs: "Sequence[Run]") -> list[Path]:
-    """Return the folders of the steps of runs of several seeds in `out`."""
-    from flcav.pipeline.running import WORK
-
-    return [out / f"seed{run.recipe.seed}" / WORK for run in runs]
 
 
 @when_interrupted()

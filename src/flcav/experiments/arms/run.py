@@ -8,10 +8,8 @@ traffic too. The verdicts on all differences are corrected together.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-from flcav.experiments.arms.labels import RoadLabels, count_road_labels
 from flcav.files import Json
 from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds
 from flcav.pipeline.collecting.findings import name_stage
@@ -28,7 +26,6 @@ from flcav.verdicts import Claim, Judged, judge
 TASK = "objects"
 FURTHER = "edge FL, as many more rounds"  # instead of those of cloud FL
 IDEAL = "edge FL, VRCSP pole, ideal road detector"
-IDEAL_TOWN = "grid"  # where that arm is
 EFFECT = 0.02  # difference in AP50 that the comparison is to tell
 ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: name in the tables -> arm, stage
     "grid": {
@@ -113,7 +110,6 @@ class ArmsSeed:
     differences: Mapping[str, Estimate]  # "town: after - before", over test scenes
     gap_closed: Mapping[str, float]  # by arm
     used_mb: Mapping[str, Mapping[str, float]]  # by arm and link
-    labels: Annotated[RoadLabels | None, LEFT_OUT] = None  # of both road detectors in `IDEAL_TOWN`; None: older results
 
 
 @dataclass(frozen=True)
@@ -138,17 +134,17 @@ class ArmsResult(Record):
     note: Annotated[str | None, LEFT_OUT] = None  # of older results
 
 
-def compare_arms(recipe: RunRecipe, runs: Sequence[Run], works: Sequence[Path]) -> ArmsResult:
-    """Return the results of the arms of `recipe`, from a run of each seed; `works`: the folder of each run's steps.
+def compare_arms(recipe: RunRecipe, runs: Sequence[Run]) -> ArmsResult:
+    """Return the results of the arms of `recipe`, from a run of each seed.
 
     Raises `InputError` where no sensor was placed in a region.
     """
-    rows = tuple(one_seed(run, work) for run, work in zip(runs, works, strict=True))
+    rows = tuple(one_seed(run) for run in runs)
     return ArmsResult(rows, summarise(rows), recipe.model_dump(mode="json", exclude={"seed"}), provenance())
 
 
-def one_seed(run: Run, work: Path) -> ArmsSeed:
-    """Return the numbers of one seed's run, whose steps' folders are in `work`."""
+def one_seed(run: Run) -> ArmsSeed:
+    """Return the numbers of one seed's run."""
     main, pretrained = run.arms[MAIN], run.pretrained[0]
     own, plan = main.links, main.plan.tasks[TASK]
     ap = {town: {arm: _tested(run, town, *stage) for arm, stage in arms.items()} for town, arms in ARMS.items()}
@@ -177,7 +173,6 @@ def one_seed(run: Run, work: Path) -> ArmsSeed:
         differences=differences,
         gap_closed=closed,
         used_mb={"edge + cloud FL": {link: use.used_mb for link, use in own.items()}},
-        labels=count_road_labels(run, work, IDEAL_TOWN, TASK),
     )
 
 

@@ -9,13 +9,12 @@ from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, format_p, verdict
 
 
 def tables(results: ArmsResult) -> dict[str, str]:
-    """Return Markdown by name: grid, ring, differences, power, labels, seeds."""
+    """Return Markdown by name: grid, ring, differences, power, seeds."""
     return {
         "grid": _town(results, "grid"),
         "ring": _town(results, "ring"),
         "differences": _differences(results),
         "power": _power(results),
-        "labels": _labels(results),
         "seeds": _seeds(results),
     }
 
@@ -69,26 +68,6 @@ def _power(results: ArmsResult) -> str:
         "if undecided: seeds that tell a difference of the size found",
     )
     return format_table(header, rows)
-
-
-def _labels(results: ArmsResult) -> str:
-    """Return what becomes of the ideal road detector's labels with the trained one, over all seeds."""
-    each = [seed.labels for seed in results.seeds if seed.labels is not None]
-    ideal = sum(own.ideal for own in each)
-    parts = {
-        "beyond the field of the trained detector": [own.beyond for own in each],
-        "in its field, not found by it": [own.missed for own in each],
-        "found, 3D IoU below .7": [own.coarse for own in each],
-        "found, 3D IoU of .7 or more": [own.exact for own in each],
-        "all": [own.ideal for own in each],
-        "labels of the trained detector on none of these": [own.more for own in each],
-    }
-    frames = max(sum(own.frames for own in each), 1)
-    rows = [
-        [name, sum(counts), f"{sum(counts) / frames:.2f}", f"{sum(counts) / ideal:.0%}" if ideal else ""]
-        for name, counts in parts.items()
-    ]
-    return format_table(("labels of the ideal road detector on `grid`", "all seeds", "a sweep", "share"), rows)
 
 
 def _told(seeds: int | None, mean: MeanOverSeeds) -> str:

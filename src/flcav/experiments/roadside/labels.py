@@ -1,4 +1,4 @@
-"""Labels of the trained road detector beside those of an ideal one, on the frames that vehicles of stage II train on.
+"""Labels of the trained road detector beside those of an ideal one, on sweeps of vehicles near a pole.
 
 The ideal detector labels every object of which its LiDAR has ten returns or more, at any distance. What the trained one
 lacks of that is counted: objects beyond its field, objects that it misses, and boxes that are not exact.
@@ -7,27 +7,40 @@ lacks of that is counted: objects beyond its field, objects that it misses, and 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from flcav.config import parse_config
 from flcav.dataset.ground import Ground
+from flcav.dataset.recording.recorder import record
+from flcav.dataset.store import Dataset
 from flcav.fusion.detector import load_road_network
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes, inverse
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import CONFIGURATIONS
 from flcav.perception.objects.truth import choose_lidar, in_range
-from flcav.perception.task import find_configuration
-from flcav.perception.tasks import task_named
-from flcav.pipeline.arms import Names, resolve_settings
-from flcav.pipeline.frames import Frames
+from flcav.pipeline.frames import Frames, group_frames
 from flcav.pipeline.labels.pseudo_labels import Spin, road_views, select_frames_near
-from flcav.pipeline.labels.sources import choose_labels
-from flcav.pipeline.recipe import EDGE, MAIN
-from flcav.pipeline.results.run import Run
 from flcav.pipeline.stages.placement import find_sites
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
 
+RECIPE: Mapping[str, Any] = {
+    "town": "grid",
+    "seed": 7325,
+    "split": "test",
+    "scenes": 8,
+    "spins_per_scene": 2,
+    "every_s": 6.0,
+    "cavs": 4,
+    "poles": "all",
+}
+NETWORK = "tiny"  # of the vehicles, as in the demo
+NEAR_M = 60.0  # farthest vehicle from the pole, as in the demo
 FOUND, EXACT = 0.5, 0.7  # IoU of a found box, in bird's-eye view, and of an exact one, in 3D
 
 Views = Mapping[Spin, Mapping[int, RoadView]]
@@ -35,9 +48,9 @@ Views = Mapping[Spin, Mapping[int, RoadView]]
 
 @dataclass(frozen=True)
 class RoadLabels:
-    """Numbers of labels by road sensors in a region; the ideal detector's are the sum of the next four."""
+    """Numbers of labels by single poles; those of the ideal detector are `beyond`, `missed`, `coarse` and `exact`."""
 
-    frames: int  # of vehicles
+    sweeps: int  # of vehicles, counted for each pole that is near
     beyond: int  # labels of the ideal detector outside the field of the trained one
     missed: int  # inside, without a box of the trained one at the bird's-eye IoU `FOUND`
     coarse: int  # found, at a 3D IoU below `EXACT`
@@ -50,33 +63,32 @@ class RoadLabels:
         return self.beyond + self.missed + self.coarse + self.exact
 
 
-def count_road_labels(run: Run, work: Path, region: str, task: str) -> RoadLabels:
-    """Return the labels of both detectors at the run's own poles in a region, whose steps' folders are in `work`."""
-    recipe = run.recipe
-    names = Names(
-        resolve_settings(recipe, {each: choose_labels(each, own.labels) for each, own in recipe.tasks.items()})
-    )
-    split = Frames.open(work / names.recording(region, EDGE, task))
-    placed = {arm: each for arm, own in run.arms.items() for each in own.placed if each.region == region}
-    sites, near = find_sites(split, None), {pole for each in placed.values() for pole in each.chosen}
-    places = sites.position[np.isin(sites.number, list(near)), :2]
-    frames = select_frames_near(split, places, recipe.placement.group_range_m)
-    config = find_configuration(task_named(task), recipe.tasks[task].network)
-    return compare_road_labels(split, frames, placed[MAIN].chosen, config)
+def measure_road_labels(folder: Path) -> RoadLabels:
+    """Record vehicles and poles into `folder`; return the labels that each pole alone gives the vehicles near it."""
+    record(EmbeddedSource(parse_config(Recipe, dict(RECIPE), "labels")), folder)
+    data = Dataset.open(folder)
+    grouped = group_frames(data, folder.name)
+    split, config = Frames(data, grouped.vehicles, grouped.poles), CONFIGURATIONS[NETWORK]
+    sites = find_sites(split, None)
+    counts = np.zeros(6, dtype=np.int64)
+    for pole, place in zip(sites.number.tolist(), sites.position, strict=True):
+        counts += count_labels(split, select_frames_near(split, place[None, :2], NEAR_M), pole, config)
+    return RoadLabels(*counts.tolist())
 
 
-def compare_road_labels(split: Frames, frames: Sequence[int], poles: Sequence[int], config: SecondConfig) -> RoadLabels:
-    """Return the labels that sensors on `poles` give vehicles' frames of a split, for a network of `config`."""
+def count_labels(split: Frames, frames: Sequence[int], pole: int, config: SecondConfig) -> tuple[int, ...]:
+    """Return the fields of `RoadLabels` of the sensor on a pole, for vehicles' frames of a split and their network."""
     spins = {_spin(split, i) for i in frames}
-    trained, ideal = (road_views(split, poles, own, spins) for own in (True, False))
+    trained, ideal = (road_views(split, [pole], own, spins) for own in (True, False))
     field = _keep_field(split, ideal)
-    counts = np.zeros(5, dtype=np.int64)
+    beyond = missed = coarse = exact = more = 0
     for i in frames:
         every, inside, told = (_label(split, i, views, config) for views in (ideal, field, trained))
-        missed, coarse, exact = grade_labels(inside, told)
-        more = len(told) - int((assign_targets(_sure(told), every, FOUND, "bev") >= 0).sum())
-        counts += (len(every) - len(inside), missed, coarse, exact, more)
-    return RoadLabels(len(frames), *counts.tolist())
+        graded = grade_labels(inside, told)
+        beyond += len(every) - len(inside)
+        missed, coarse, exact = missed + graded[0], coarse + graded[1], exact + graded[2]
+        more += int((assign_targets(_sure(told), every, FOUND, "bev") < 0).sum())
+    return len(frames), beyond, missed, coarse, exact, more
 
 
 def grade_labels(ideal: Boxes, told: Boxes) -> tuple[int, int, int]:

@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from flcav.experiments.arms.labels import grade_labels
+from flcav.experiments.roadside.detector import RoadDetectorResult
+from flcav.experiments.roadside.labels import RoadLabels, grade_labels
+from flcav.experiments.roadside.tables import detector_tables
 from flcav.geometry import Boxes
 
 
@@ -21,3 +23,12 @@ def test_labels_are_missed_coarse_or_exact() -> None:
 
 def test_one_box_finds_one_label() -> None:
     assert grade_labels(cars((0, 0, 0), (0.5, 0, 0)), cars((0.2, 0, 0))) == (1, 0, 1)
+
+
+def test_the_table_of_labels_has_all_their_fates() -> None:
+    score = RoadDetectorResult(0.7, 0.7, (), RoadLabels(sweeps=10, beyond=5, missed=2, coarse=3, exact=10, more=1))
+    rows = detector_tables(score)["labels"].splitlines()
+    assert rows[2] == "| all | 20 | 2.00 | 100% |"
+    assert rows[3] == "| beyond the field of the trained detector | 5 | 0.50 | 25% |"
+    assert RoadDetectorResult.from_json(score.as_json(), "x") == score
+    assert "labels" not in detector_tables(RoadDetectorResult(0.7, 0.7, ()))
