@@ -26,7 +26,9 @@ def test_one_box_finds_one_label() -> None:
 
 
 def test_the_table_of_labels_has_all_their_fates() -> None:
-    score = RoadDetectorResult(0.7, 0.7, (), RoadLabels(sweeps=10, beyond=5, missed=2, coarse=3, exact=10, more=1))
+    score = RoadDetectorResult(
+        0.7, 0.7, (), RoadLabels(sweeps=10, beyond=5, missed=2, coarse=3, exact=10, other=3, false=1)
+    )
     rows = detector_tables(score)["labels"].splitlines()
     assert rows[2] == "| all | 20 | 2.00 | 100% |"
     assert rows[3] == "| beyond the field of the trained detector | 5 | 0.50 | 25% |"

@@ -22,7 +22,7 @@ from flcav.geometry import Boxes, inverse
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import CONFIGURATIONS
-from flcav.perception.objects.truth import choose_lidar, in_range
+from flcav.perception.objects.truth import choose_lidar, in_range, network_from_lidar
 from flcav.pipeline.frames import Frames, group_frames
 from flcav.pipeline.labels.pseudo_labels import Spin, road_views, select_frames_near
 from flcav.pipeline.stages.placement import find_sites
@@ -55,7 +55,8 @@ class RoadLabels:
     missed: int  # inside, without a box of the trained one at the bird's-eye IoU `FOUND`
     coarse: int  # found, at a 3D IoU below `EXACT`
     exact: int  # found, at a 3D IoU of `EXACT` or more
-    more: int  # labels of the trained detector on none of the ideal one's
+    other: int  # labels of the trained detector on objects that the ideal one does not label, at `FOUND`
+    false: int  # and on none
 
     @property
     def ideal(self) -> int:
@@ -70,7 +71,7 @@ def measure_road_labels(folder: Path) -> RoadLabels:
     grouped = group_frames(data, folder.name)
     split, config = Frames(data, grouped.vehicles, grouped.poles), CONFIGURATIONS[NETWORK]
     sites = find_sites(split, None)
-    counts = np.zeros(6, dtype=np.int64)
+    counts = np.zeros(7, dtype=np.int64)
     for pole, place in zip(sites.number.tolist(), sites.position, strict=True):
         counts += count_labels(split, select_frames_near(split, place[None, :2], NEAR_M), pole, config)
     return RoadLabels(*counts.tolist())
@@ -81,14 +82,16 @@ def count_labels(split: Frames, frames: Sequence[int], pole: int, config: Second
     spins = {_spin(split, i) for i in frames}
     trained, ideal = (road_views(split, [pole], own, spins) for own in (True, False))
     field = _keep_field(split, ideal)
-    beyond = missed = coarse = exact = more = 0
+    beyond = missed = coarse = exact = other = false = 0
     for i in frames:
         every, inside, told = (_label(split, i, views, config) for views in (ideal, field, trained))
         graded = grade_labels(inside, told)
         beyond += len(every) - len(inside)
         missed, coarse, exact = missed + graded[0], coarse + graded[1], exact + graded[2]
-        more += int((assign_targets(_sure(told), every, FOUND, "bev") < 0).sum())
-    return len(frames), beyond, missed, coarse, exact, more
+        rest = _find_others(told, every)
+        wrong = _find_others(rest, _list_objects(split, i, config))
+        other, false = other + len(rest) - len(wrong), false + len(wrong)
+    return len(frames), beyond, missed, coarse, exact, other, false
 
 
 def grade_labels(ideal: Boxes, told: Boxes) -> tuple[int, int, int]:
@@ -96,6 +99,19 @@ def grade_labels(ideal: Boxes, told: Boxes) -> tuple[int, int, int]:
     found = int((assign_targets(_sure(told), ideal, FOUND, "bev") >= 0).sum())
     exact = int((assign_targets(_sure(told), ideal, EXACT) >= 0).sum())
     return len(ideal) - found, found - exact, exact
+
+
+def _find_others(told: Boxes, known: Boxes) -> Boxes:
+    """Return the boxes that find none of the `known`."""
+    return told[assign_targets(_sure(told), known, FOUND, "bev") < 0]
+
+
+def _list_objects(split: Frames, i: int, config: SecondConfig) -> Boxes:
+    """Return all annotated objects of a vehicle's frame, in its network's frame."""
+    frame = split.data.frame(i)
+    boxes = frame.annotations.boxes.transform(inverse(frame.world_from_sensor(choose_lidar(frame))))
+    move = network_from_lidar(frame, config)
+    return boxes if move is None else boxes.transform(move)
 
 
 def _sure(boxes: Boxes) -> Boxes:
