@@ -56,7 +56,7 @@ class RoadLabels:
     coarse: int  # found, at a 3D IoU below `EXACT`
     exact: int  # found, at a 3D IoU of `EXACT` or more
     other: int  # labels of the trained detector on objects that the ideal one does not label, at `FOUND`
-    false: int  # and on none
+    false: int  # and on none, parts of trucks and buses included
 
     @property
     def ideal(self) -> int:

@@ -52,8 +52,8 @@ def _labels(labels: RoadLabels) -> str:
         "in its field, not found": labels.missed,
         f"found, at a 3D IoU below {EXACT}": labels.coarse,
         f"found, at a 3D IoU of {EXACT} or more": labels.exact,
-        "the trained detector's on other objects": labels.other,
-        "the trained detector's on none": labels.false,
+        "labels of the trained detector on other objects": labels.other,
+        "labels of the trained detector at a bird's-eye IoU below 0.5 with all objects": labels.false,
     }
     sweeps, ideal = max(labels.sweeps, 1), max(labels.ideal, 1)
     rows = [[name, count, f"{count / sweeps:.2f}", f"{count / ideal:.0%}"] for name, count in parts.items()]
