@@ -21,6 +21,7 @@ from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Update, Weights
+from flcav.machine.threads import use_threads
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.client import TaskClient
 from flcav.perception.objects.model import second_tiny
@@ -35,7 +36,6 @@ from flcav.perception.weights import to_arrays
 from flcav.seeds import derive_seed
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.threads import use_threads
 
 STEPS, REPEATS = 20, 5
 SCHEDULE = Schedule(rounds=1, steps=STEPS, learning_rate=1e-3, final_learning_rate=1e-3, seed=0)

@@ -4,7 +4,7 @@ from collections.abc import Generator
 
 import pytest
 
-from flcav.threads import use_threads
+from flcav.machine.threads import use_threads
 
 use_threads(1)  # of each of the two workers and its children: threads that wait for a core burn time
 

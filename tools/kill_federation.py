@@ -23,6 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from flcav.files import sha256
+from flcav.machine.threads import use_threads
 from flcav.pipeline.federations.alone import WORK, list_needed
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.provenance import provenance
@@ -33,7 +34,6 @@ from flcav.pipeline.steps.engines import perform
 from flcav.pipeline.steps.step import Record, read_record
 from flcav.progress import ignore_progress
 from flcav.seeds import stream
-from flcav.threads import use_threads
 
 FILES = (LEDGER, RESULT)  # beside the weights
 FORK = multiprocessing.get_context("fork")

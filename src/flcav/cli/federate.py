@@ -7,7 +7,7 @@ import typer
 
 from flcav.cli.options import STALE, Runtime, Stale
 from flcav.cli.terminal import print_json, when_interrupted
-from flcav.threads import use_threads
+from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
     from flcav.pipeline.results.training import StageResult

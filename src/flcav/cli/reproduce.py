@@ -12,7 +12,7 @@ import typer
 from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale, join_choices, refuse_unused
 from flcav.cli.terminal import when_interrupted
 from flcav.experiments.studies import STUDIES
-from flcav.threads import use_threads
+from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
     from flcav.files import Json

@@ -8,7 +8,7 @@ import typer
 
 from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
 from flcav.cli.terminal import print_json, when_interrupted
-from flcav.threads import use_threads
+from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
     from flcav.pipeline.results.run import Run, Summary

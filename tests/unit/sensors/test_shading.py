@@ -8,8 +8,8 @@ import shapely
 from scipy.ndimage import label
 from shapely.geometry import MultiPolygon, Point, Polygon
 
-from flcav import memory
 from flcav.geometry import pose
+from flcav.machine import memory
 from flcav.sensors.camera.camera import Camera, photograph
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays
 from flcav.sensors.camera.tone import develop, grain

@@ -3,16 +3,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-INNER = "from flcav.compiled import inlined\n@inlined\ndef inner(x):\n    return x + {}\n"
+INNER = "from flcav.machine.compiled import inlined\n@inlined\ndef inner(x):\n    return x + {}\n"
 MIDDLE = """
-from flcav.compiled import inlined
+from flcav.machine.compiled import inlined
 from inner import inner
 @inlined
 def middle(x):
     return inner(x)
 """
 OUTER = """
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 from middle import middle
 @compiled
 def outer(x):
@@ -44,7 +44,7 @@ def test_what_is_kept_is_made_anew_when_an_inlined_function_of_another_file_chan
 
 RECORD = """
 from typing import NamedTuple
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 class {0}(NamedTuple):
     x: int
 @compiled

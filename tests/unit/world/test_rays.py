@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flcav.compiled import compiled
 from flcav.geometry import inverse, pose, transform_points
+from flcav.machine.compiled import compiled
 from flcav.world.rays.embree import Assembly, Embree, Solid
 from flcav.world.rays.hits import MISS
 from flcav.world.rays.loader import embree_library

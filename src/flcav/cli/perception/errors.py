@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device, check_finite, refuse_unused
-from flcav.threads import use_threads
+from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
     from flcav.perception.errors import Registry

@@ -6,7 +6,7 @@ import typer
 
 from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device
 from flcav.cli.terminal import when_interrupted
-from flcav.threads import use_threads
+from flcav.machine.threads import use_threads
 
 
 def register(app: typer.Typer) -> None:

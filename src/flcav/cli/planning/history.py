@@ -7,7 +7,7 @@ import typer
 from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
 from flcav.cli.terminal import when_interrupted
 from flcav.config import InputError
-from flcav.threads import use_threads
+from flcav.machine.threads import use_threads
 
 
 def register(app: typer.Typer) -> None:

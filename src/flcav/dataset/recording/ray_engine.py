@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flcav.dataset.recording.jobs import Engine, Job, Part, perform
-from flcav.processes import ray_session
+from flcav.machine.processes import ray_session
 from flcav.sources.source import Source
 
 

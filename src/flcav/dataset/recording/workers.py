@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from flcav.dataset.recording.jobs import Engine, Job, perform
-from flcav.processes import exit_with_parent, start_server
+from flcav.machine.processes import exit_with_parent, start_server
+from flcav.machine.threads import use_threads
 from flcav.sources.source import Source
-from flcav.threads import use_threads
 
 POLL_S = 0.2
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 
 Array = NDArray[np.float64]
 States = NDArray[np.int64]

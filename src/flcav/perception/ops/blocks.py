@@ -8,7 +8,7 @@ threads.
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 
 Array = NDArray[np.floating]
 Int32s = NDArray[np.int32]

@@ -21,12 +21,12 @@ from queue import Queue, SimpleQueue
 from types import ModuleType
 from typing import IO, Any
 
+from flcav.machine.processes import ray_session
+from flcav.machine.threads import use_threads
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.steps.engines import KILLED, Engine, Workers, perform
 from flcav.pipeline.steps.source_hash import package_hash
 from flcav.pipeline.steps.step import Record, Step, read_value, remove, reserve_sibling
-from flcav.processes import ray_session
-from flcav.threads import use_threads
 
 PIECE_BYTES = 8_000_000
 SENDING = 1 / 20  # of a step's time, at most, for sending files back

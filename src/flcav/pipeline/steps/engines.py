@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flcav.config import Config
+from flcav.machine.processes import exit_with_parent, start_server
+from flcav.machine.threads import use_threads
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps.step import Record, Step, Work, read_value, write_done, write_started
-from flcav.processes import exit_with_parent, start_server
 from flcav.progress import Report
-from flcav.threads import use_threads
 
 KILLED = "a step's process was killed from outside, most often for want of memory"
 _queue: Any = None  # in a worker process: `Workers.reports`

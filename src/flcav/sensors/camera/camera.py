@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.camera.tone import GRAINS, develop, grain
 from flcav.sensors.frame import SEMANTICS

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 from flcav.seeds import stream
 
 STEPS = 4096  # entries of the look-up table

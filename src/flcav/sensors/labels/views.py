@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled
 from flcav.geometry import inverse
+from flcav.machine.compiled import compiled
 from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.frame import Array, Views
 from flcav.sensors.labels.outlines import clip_boxes, compute_amodal_boxes, compute_truncation

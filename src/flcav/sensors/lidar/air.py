@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.special import betaincinv
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 from flcav.world.weather import Weather
 
 Floats = NDArray[np.float32]

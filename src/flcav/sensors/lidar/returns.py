@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 from flcav.world.materials import Material
 from flcav.world.rays.hits import Hits
 

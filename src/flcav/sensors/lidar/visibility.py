@@ -6,7 +6,7 @@ Only rays that end before an actor's bounding box and pass through it are cast a
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.sensors.lidar.returns import cast_through_glass
 from flcav.world.rays.hits import Hits

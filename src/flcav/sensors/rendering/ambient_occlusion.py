@@ -6,7 +6,7 @@ Ray directions are cosine-weighted; each of the 16 blocks has another one.
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 from flcav.sensors.camera.lens import Lens
 from flcav.sensors.rendering.gbuffer import GBuffer
 from flcav.world.scene import Scene

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import inlined
 from flcav.geometry import heading_vectors
+from flcav.machine.compiled import inlined
 from flcav.seeds import stream
 from flcav.sensors.rendering.noise import fade, hash_pair, overlap, sample_noise
 from flcav.world.meshes.buildings import BAY_M, GABLED_BELOW_M, STOREY_M

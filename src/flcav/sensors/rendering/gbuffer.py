@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled, inlined
 from flcav.geometry import heading_vectors
+from flcav.machine.compiled import compiled, inlined
 from flcav.sensors.rendering.appearance import Appearance
 from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene

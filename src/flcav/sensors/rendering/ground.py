@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 from shapely.ops import substring
 
-from flcav.compiled import inlined
 from flcav.geometry import heading_vectors
+from flcav.machine.compiled import inlined
 from flcav.sensors.rendering.noise import fade, hash_pair, overlap, sample_noise
 from flcav.world.map.layers import Arrow, ArrowKind, MapLayers, Marking
 from flcav.world.map.paint import outline_arrow, outline_stripes

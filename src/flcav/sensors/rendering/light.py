@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 from flcav.sensors.rendering.gbuffer import GBuffer
 from flcav.sensors.rendering.state import Lamps, light_up
 from flcav.world.scene import Scene

@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import inlined
+from flcav.machine.compiled import inlined
 from flcav.seeds import stream
 
 SIDE = 256  # cells along each side of a table, a power of two

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 from flcav.sensors.rendering.noise import sample_noise
 from flcav.world.materials import Material
 

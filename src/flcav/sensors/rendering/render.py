@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.memory import keep_freed_memory
+from flcav.machine.memory import keep_freed_memory
 from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.rendering import rain, supersampling
 from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion

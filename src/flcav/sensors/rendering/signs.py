@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import inlined
+from flcav.machine.compiled import inlined
 from flcav.world.meshes.furniture import SIGN_RADIUS_M
 
 SIGN_KINDS = ("stop", "yield", "speed_30", "speed_60", "speed_90")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flcav.compiled import inlined
+from flcav.machine.compiled import inlined
 from flcav.sensors.rendering.noise import sample_noise
 
 SKYLINE = 0.16  # sine of the elevation up to which houses hide the sky, in reflections

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled, inlined
 from flcav.geometry import heading_vectors, transform_points
+from flcav.machine.compiled import compiled, inlined
 from flcav.world.materials import Material
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene

@@ -8,8 +8,8 @@ whether or not a pixel's centre hits it.
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.compiled import compiled
 from flcav.geometry import inverse, transform_points
+from flcav.machine.compiled import compiled
 from flcav.sensors.camera.lens import Lens, project
 from flcav.sensors.rendering.appearance import Appearance
 from flcav.sensors.rendering.gbuffer import GBuffer

@@ -6,7 +6,7 @@ approximation of the Fresnel term. The air blends radiance into its own by exp(-
 
 import numpy as np
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 from flcav.sensors.rendering.facade import shade_facade
 from flcav.sensors.rendering.ground import asphalt, find_paint, grass, paving
 from flcav.sensors.rendering.noise import fade, hash_pair, sample_noise

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import Delaunay, QhullError
 from shapely.geometry.base import BaseGeometry
 
-from flcav.compiled import compiled
 from flcav.config import InputError
+from flcav.machine.compiled import compiled
 from flcav.parquet import read_parquet
 
 Array = NDArray[np.float64]

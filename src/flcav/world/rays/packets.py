@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from flcav.compiled import compiled
+from flcav.machine.compiled import compiled
 
 # Rows of an RTCRayHit16, seen as a (32, 16) array of float32 or int32.
 ORIGIN, NEAR, DIRECTION, TIME, FAR, MASK, RAY_ID, FLAGS = 0, 3, 4, 7, 8, 9, 10, 11

@@ -15,7 +15,7 @@ from typing import Any
 
 from flcav.config import InputError
 from flcav.extras import format_install_command
-from flcav.threads import VARIABLES, threads_of_children
+from flcav.machine.threads import VARIABLES, threads_of_children
 
 _STARTING = threading.Lock()  # of the fork server: only one thread at a time changes the environment
 STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and pieces of files pass through it
