@@ -526,32 +526,24 @@ def killed_at(sign: Path, out: Path) -> None:
         process.wait()
 
 
-def test_a_run_killed_in_edge_fl_ends_the_same(finished: Path, tmp_path: Path) -> None:
-    first, redone = "grid-edge-fl-objects", ("grid-edge-fl-objects", "cloud-fl-objects")
-    ending = ("equal", "densest", "no_pole", "pole8", "ring")
+def test_a_run_killed_in_pretraining_and_in_edge_fl_ends_the_same(finished: Path, tmp_path: Path) -> None:
+    pretrained, first = "pretrain-objects", "grid-edge-fl-objects"
+    redone, ending = (first, "cloud-fl-objects"), ("equal", "densest", "no_pole", "pole8", "ring")
 
     def unwanted(name: str) -> bool:
-        return name == "look" or (any(step in name for step in redone) and not name.endswith(ending))
+        again = any(step in name for step in redone) and not name.endswith(ending)
+        return again or name in ("look", pretrained)
 
     work = without(finished, tmp_path, unwanted)
-    killed_at(work / first / "round1.safetensors", tmp_path)
-    assert not (work / first / "done.json").exists()
+    for step, sign in ((pretrained, "checkpoint.pt"), (first, "round1.safetensors")):
+        killed_at(work / step / sign, tmp_path)
+        assert not (work / step / "done.json").exists()
     run(RECIPE, tmp_path, beside=TOY.parent, jobs=2)  # alone, each stage has both workers
     assert timeless(tmp_path) == timeless(finished)
-    for path in (f"{step}/{name}" for step in redone for name in ("weights.safetensors", "ledger.parquet")):
+    same = [f"{step}/{name}" for step in (pretrained, *redone) for name in ("weights.safetensors", "ledger.parquet")]
+    for path in (*same, f"{pretrained}/result.json"):
         assert (work / path).read_bytes() == (finished / "work" / path).read_bytes(), path
-
-
-def test_a_run_killed_in_pretraining_goes_on_from_its_last_validation(finished: Path, tmp_path: Path) -> None:
-    work = without(finished, tmp_path, lambda name: name == "pretrain-objects")
-    killed_at(work / "pretrain-objects" / "checkpoint.pt", tmp_path)
-    assert not (work / "pretrain-objects" / "done.json").exists()
-    run(RECIPE, tmp_path, beside=TOY.parent)
-    for name in ("weights.safetensors", "ledger.parquet", "result.json"):
-        assert (work / "pretrain-objects" / name).read_bytes() == (
-            finished / "work/pretrain-objects" / name
-        ).read_bytes()
-    assert [each.step for each in Pretrained.load(work / "pretrain-objects").validated] == [5, 10]
+    assert [each.step for each in Pretrained.load(work / pretrained).validated] == [5, 10]
 
 
 def test_runs_are_compared_on_the_same_frames(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

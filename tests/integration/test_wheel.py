@@ -85,7 +85,7 @@ def started(site: Path, command: list[str | Path], cwd: Path, sign: Path) -> Non
 def test_the_demo_starts_without_a_checkout(installed: Path, tmp_path: Path):
     flcav = installed / "bin" / "flcav"
     started(
-        installed, [flcav, "demo", "--out", "own"], tmp_path, tmp_path / "own/work/suburb-pool-objects/data/.recording"
+        installed, [flcav, "demo", "--out", "own"], tmp_path, tmp_path / "own/work/suburb-pool-objects/started.json"
     )
     (tmp_path / "small.yaml").write_text(SMALL)
     planned = tmp_path / "small/work/plan/done.json"
