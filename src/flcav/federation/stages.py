@@ -195,6 +195,8 @@ def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules
     """Raise `InputError` where these clients cannot federate by this strategy and these rules."""
     if not clients:
         raise InputError("a federation of 0 clients: nobody trains")
+    if rules.selection.predicts:
+        raise InputError("selection: a deadline needs 'seconds', the predicted time of a round by client")
     check_rules(strategy, rules, [*clients])
     if isinstance(strategy, Corrects):
         check_arguments(clients, strategy.correct({}, {}).arguments(), type(strategy).__name__)
