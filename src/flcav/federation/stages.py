@@ -218,9 +218,9 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
     told, selection = type(strategy).__name__, rules.selection
     selection.check_clients(names)
     planned = selection.rule == "planned"  # any number, all at most: a round with too few has no update
-    least, chosen = rules.least_clients, len(names) if planned else int(expected_clients(selection, names))
-    if isinstance(least, int) and selection.rule not in ("poisson", "importance") and least > chosen:
-        raise InputError(f"least_clients: {least} are wanted in a round, and {chosen} take part")
+    chosen = len(names) if planned else int(expected_clients(selection, names))
+    if selection.rule not in ("poisson", "importance") and (short := rules.tell_shortage(chosen)):
+        raise InputError(short)
     single = isinstance(strategy, Robust | Exchanges)  # looks at each update
     if selection.weighs:
         if single:

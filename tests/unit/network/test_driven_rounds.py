@@ -181,15 +181,45 @@ def test_a_masked_round_that_the_network_leaves_too_few_for_has_no_update_and_th
     assert after[2][0] != after[1][0]
 
 
-@pytest.mark.parametrize("rules", [{"secure": {}}, {"secure": {"threshold": 2}}, {"least_clients": 2}], ids=str)
-def test_a_first_round_that_the_network_predicts_for_one_vehicle_does_not_end_the_run(rules: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("rules", "why"),
+    [
+        ({"secure": {}}, "secure aggregation: 1 clients sent keys, and 2 are needed"),
+        ({"secure": {"threshold": 2}}, "secure aggregation: 1 clients sent keys, and 2 are needed"),
+        ({"least_clients": 2}, "least_clients: 2 are wanted in a round, and 1 takes part"),
+        ({"least_clients": 3, "secure": {}}, "least_clients: 3 are wanted in a round, and 1 takes part"),
+    ],
+)
+def test_a_first_round_that_the_network_predicts_for_one_vehicle_has_no_update_and_the_run_goes_on(
+    rules: dict[str, Any], why: str
+) -> None:
     plan = {"rule": "planned", "joins": {name: (1, 2) if name == NAMES[0] else (2,) for name in NAMES}}
-    clients: dict[str, Trainable] = {name: Walk() for name in NAMES}
-    account, state = Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless"), FederationState()
-    how = Rules.model_validate(rules | {"selection": plan})
-    federate(clients, START, Schedule(2, 1, 0.1, 0.1, 3), account, rules=how, state=state)
-    alone = () if how.secure else NAMES[:1]
-    assert [record.clients for record in state.records] == [alone, NAMES]
+    clients = {name: Walk() for name in NAMES}
+    account, state, after = Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless"), FederationState(), []
+    federate(
+        {**clients},
+        START,
+        Schedule(2, 1, 0.1, 0.1, 3),
+        account,
+        rules=Rules.model_validate(rules | {"selection": plan}),
+        state=state,
+        on_round=lambda number, weights, loss: after.append((weights["w"][0], loss)),
+    )
+    assert [record.clients for record in state.records] == [(), NAMES]
+    assert state.records[0].failed == {NAMES[0]: why}
+    assert after[0] == (0.0, 0.0)
+    assert after[1][0] > 0
+    assert [client.trained for client in clients.values()] == [1, 1, 1]
+
+
+def test_a_round_with_fewer_than_were_to_take_part_by_chance_has_no_update() -> None:
+    names = [f"grid/cav{i}" for i in range(6)]
+    state, account = FederationState(), Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless")
+    rules = Rules.model_validate({"selection": {"rule": "poisson", "probability": 0.4}, "least_clients": 3})
+    federate({name: Walk() for name in names}, START, Schedule(8, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
+    chosen = [len(record.clients) or len(record.failed) for record in state.records]
+    assert [len(record.clients) for record in state.records] == [count if count >= 3 else 0 for count in chosen]
+    assert min(chosen) < 3 <= max(chosen)
 
 
 FIVE = tuple(f"grid/cav{i}" for i in range(5))
