@@ -1,7 +1,7 @@
 """The file of the secrets that noise is drawn by, in the folder of a federation while it is under way.
 
-Beside it lies its SHA-256, from before the first message on: by that a file that was lost or changed is told from one
-that there has not been yet. Of random bytes a hash gives nothing away.
+Before the first message its SHA-256 is written beside it. By that hash a file that was lost or changed is told from one
+that has not been written yet. A hash of random bytes does not reveal them.
 """
 
 import re
@@ -59,6 +59,6 @@ def write_secrets(folder: Path, secrets: Mapping[str, Secret]) -> None:
 
 
 def remove_secrets(folder: Path) -> None:
-    """Remove the secrets of a federation that has ended, the hash first: alone it would say that they were lost."""
+    """Remove the secrets of a federation that has ended, the hash first: a hash alone means that they were lost."""
     (folder / SECRETS_HASH).unlink(missing_ok=True)
     (folder / SECRETS).unlink(missing_ok=True)
