@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse, points_in_boxes
-from flcav.perception.metrics.found_cars import OVERLAP, SCORE, WITHIN_M
+from flcav.perception.metrics.found_cars import OVERLAP, SCORE, is_near
 from flcav.perception.metrics.matching import assign_targets, on_neutral
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.predict import detect_in, look_around
@@ -46,16 +46,16 @@ def overlaps(boxes: Boxes, others: Boxes) -> NDArray[np.float64]:
 
 
 def explain_missed(seen: Boxes, cars: Boxes) -> list[str]:
-    """Return what stands against each of the `cars` that none of the `seen` detections finds; "" for one found.
+    """Return what stands against each of the `cars` within 40 m that no detection finds; "" for one found.
 
-    `seen` have scores of `LOWEST` or more, of all classes.
+    `seen` are detections of all classes with scores of `LOWEST` or more. A car beyond 40 m may take a detection.
     """
     kept = seen[(seen.label == "Car") & (np.asarray(seen.score) >= SCORE)]
     taken = assign_targets(kept, cars, OVERLAP, "bev")
     same = overlaps(cars, cars) >= DOUBLE
     share, score, car = overlaps(seen, cars), np.asarray(seen.score)[:, None], (seen.label == "Car")[:, None]
     reasons = []
-    for row in range(len(cars)):
+    for row in np.flatnonzero(is_near(cars)):
         fits, near = share[:, row, None] >= OVERLAP, share[:, row, None] >= TOUCH
         if row in taken:
             reasons.append("")
@@ -76,8 +76,7 @@ def explain_false(seen: Boxes, cars: Boxes, neutral: Boxes, others: Boxes) -> li
     That is the most frequent class of the `others` that it touches, or else a car.
     """
     kept = seen[(seen.label == "Car") & (np.asarray(seen.score) >= SCORE)]
-    near = np.hypot(kept.center[:, 0], kept.center[:, 1]) < WITHIN_M
-    false = kept[(assign_targets(kept, cars, OVERLAP, "bev") < 0) & near & ~on_neutral(kept, neutral)]
+    false = kept[(assign_targets(kept, cars, OVERLAP, "bev") < 0) & is_near(kept) & ~on_neutral(kept, neutral)]
     out = []
     for on_cars, on_others in zip(overlaps(false, cars), overlaps(false, others)):
         below = Counter(others.label[on_others > 0].tolist()).most_common(1)
@@ -98,29 +97,27 @@ def main() -> None:
     by_returns = np.zeros((len(RETURNS) - 1, 2), np.int64)
     for frame, seen in zip(frames, found, strict=True):
         truth = asked_of(frame, network.config)
-        every = _of(truth.targets, "Car", True)
+        cars = _of(truth.targets, "Car", True)
         labelled = frame.annotations.boxes.transform(inverse(frame.world_from_sensor(choose_lidar(frame))))
         others = _of(labelled, "car", False)
-        cars = every[np.hypot(every.center[:, 0], every.center[:, 1]) < WITHIN_M]
-        neutral = _of(truth.neutral, "Car", True)
+        neutral, near = _of(truth.neutral, "Car", True), cars[is_near(cars)]
         points = frame.lidar[choose_lidar(frame)][:, :3].astype(np.float64)
-        inside = np.array([points_in_boxes(points, cars[[i]]).sum() for i in range(len(cars))])
+        inside = np.array([points_in_boxes(points, near[[i]]).sum() for i in range(len(near))])
         reasons = explain_missed(seen, cars)
         missed.update(reason for reason in reasons if reason)
-        false.update(explain_false(seen, every, neutral, others))
+        false.update(explain_false(seen, cars, neutral, others))
         row = np.searchsorted(RETURNS, inside, side="right") - 1
         for part, reason in zip(row.tolist(), reasons):
             by_returns[max(part, 0)] += (1, not reason)
         for score, count in counts.items():
             own = seen[(seen.label == "Car") & (np.asarray(seen.score) >= score)]
-            matched = assign_targets(own, every, OVERLAP, "bev")
-            near = [np.hypot(boxes.center[:, 0], boxes.center[:, 1]) < WITHIN_M for boxes in (every, own)]
-            count[0] += int(near[0][matched[matched >= 0]].sum())
-            count[1] += int(((matched < 0) & near[1] & ~on_neutral(own, neutral)).sum())
+            matched = assign_targets(own, cars, OVERLAP, "bev")
+            count[0] += int(is_near(cars)[matched[matched >= 0]].sum())
+            count[1] += int(((matched < 0) & is_near(own) & ~on_neutral(own, neutral)).sum())
     total = int(by_returns[:, 0].sum())
     print(f"{total} cars, {total - missed.total()} found")
-    for low, high, (cars, hit) in zip(RETURNS, RETURNS[1:], by_returns):
-        print(f"  of {low} returns or more, below {high}: {hit} of {cars}")
+    for low, high, (of, hit) in zip(RETURNS, RETURNS[1:], by_returns):
+        print(f"  of {low} returns or more, below {high}: {hit} of {of}")
     _tell("missed", missed)
     _tell("false", false)
     for score, (hit, wrong) in counts.items():

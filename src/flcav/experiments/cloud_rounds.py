@@ -72,7 +72,7 @@ def format_divergence(
 ) -> str:
     """Return a row per training, the means, and each column's rank correlation (Spearman's rho) with the mean gain.
 
-    names: of the trainings. gains: by what they are gained in, of each training.
+    names: of the trainings. gains: of each training, by the name of the comparison.
     """
     columns: dict[str, list[float]] = {}
     for when, own in (("after edge FL", "begun"), ("before averaging", "trained")):

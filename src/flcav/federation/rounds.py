@@ -134,7 +134,8 @@ class Rounds(FlowerStrategy):
         """Return one training message per chosen client: the round's weights and its local work.
 
         Under importance selection all clients train and report the norm of their update, and those that are drawn are
-        asked to send it. Under other unbiased selections all first report their number of samples.
+        asked to send it. Under other unbiased selections all first report their number of samples. Where fewer are
+        chosen than `least_clients`, nobody is sent a message.
         """
         self._start = to_weights(arrays)
         work, records = self._work(self._done + server_round), {ARRAYS: arrays}
@@ -146,17 +147,19 @@ class Rounds(FlowerStrategy):
         self._chosen = selection.choose([*self._names.values()], work.round, self._draws_by(work))
         self._asked = [*self._names.values()] if selection.unbiased else self._chosen
         self._failed, self._lost, self._shortage = {}, set(), None
-        if self._rules.secure is not None:
-            return self._begin_securely(grid, {**records, CONFIG: local}, self._rules.secure)
         if selection.unbiased:
             self._draw_unbiased(grid, local)
-        if selection.rule != "importance":
-            return self._address(self._chosen, {**records, CONFIG: local})
-        asked = self._address(self._chosen, {**records, CONFIG: local, ASK: ConfigRecord({ASK: NORM})})
-        norms = self._receive_norms(self._chosen, grid.send_and_receive(asked))
-        self._drawn = selection.draw(norms, work.seed)
-        self._chosen = [*self._drawn]
-        return self._address(self._chosen, {CONFIG: local, ASK: ConfigRecord({ASK: SEND})})
+        if selection.rule == "importance":
+            asked = self._address(self._chosen, {**records, CONFIG: local, ASK: ConfigRecord({ASK: NORM})})
+            norms = self._receive_norms(self._chosen, grid.send_and_receive(asked))
+            self._drawn = selection.draw(norms, work.seed)
+            self._chosen, records = [*self._drawn], {ASK: ConfigRecord({ASK: SEND})}
+        if short := self._rules.tell_shortage(len(self._chosen)):
+            self._shortage = ClientFailed(short)
+            return []
+        if self._rules.secure is not None:
+            return self._begin_securely(grid, {**records, CONFIG: local}, self._rules.secure)
+        return self._address(self._chosen, {**records, CONFIG: local})
 
     def _draws_by(self, work: LocalWork) -> int:
         """Return the seed that the clients of a round are drawn by: that of the round, or one that nobody knows."""
@@ -207,7 +210,8 @@ class Rounds(FlowerStrategy):
         """Return the aggregated weights, and as metrics the number of samples and the mean loss weighted by samples.
 
         Where the network lost clients, and fewer are left than secure aggregation or the strategy needs, or where fewer
-        were chosen than secure aggregation needs, the weights stay as they were. Raises `ClientFailed` where fewer
+        were chosen than secure aggregation or `least_clients` asks for, the weights stay as they were, and the record
+        names those who were chosen as failed, with the reason. Raises `ClientFailed` where fewer
         clients than are wanted sent a usable update, or than the strategy needs though the network lost none,
         `TooFewClients` where so few are left for secure aggregation, ValueError where the strategy returns arrays of
         other names, shapes or types.
@@ -234,23 +238,26 @@ class Rounds(FlowerStrategy):
         return to_arrays(weights), MetricRecord({SAMPLES: sum(received.samples.values()), LOSS: loss})
 
     def _chose_enough(self) -> bool:
-        """Return whether as many clients were chosen as secure aggregation needs; by a plan they may be fewer."""
-        chosen = len(self._chosen)
-        return self._rules.secure is not None and self._rules.secure.needed(chosen) <= chosen
+        """Return whether as many clients were chosen as the rules need; by a plan or by chance they may be fewer."""
+        chosen, secure = len(self._chosen), self._rules.secure
+        return not self._rules.tell_shortage(chosen) and (secure is None or secure.needed(chosen) <= chosen)
 
     def _check_enough(self, number: int) -> None:
         """Raise `ClientFailed` where fewer clients than are wanted sent what can be used, or than the strategy needs.
 
         By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
         a norm or a number of samples, and of those who were then to send an update. `all` is of both, too, a number of
-        those who were to send. Where the network lost clients that the strategy needs, the round has no update.
+        those who were to send. Where the network lost clients that the strategy needs, the round has no update, and so
+        where fewer were chosen than the rules need: that is no fault of a client.
         """
+        if not self._chose_enough():
+            return
         least = self._rules.least_clients
         reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
         for clients in [self._chosen] if isinstance(least, int) else [self._asked, self._chosen]:
             asked = clients if least is not None else [name for name in clients if name not in self._lost]
-            bound = len(asked) if least == "all" else -(-len(asked) // 2) if least is None else least
-            wanted, usable = min(bound, len(asked)), sum(name not in self._failed for name in asked)
+            wanted = len(asked) if least == "all" else -(-len(asked) // 2) if least is None else least
+            usable = sum(name not in self._failed for name in asked)
             if usable < wanted:
                 told = f"{usable} of {len(asked)} clients sent an update that can be used, {wanted} are wanted"
                 raise ClientFailed(f"round {number}: {told} ({reasons})")

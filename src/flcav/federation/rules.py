@@ -58,6 +58,13 @@ class Rules(Config):
         """
         return Rules(upload=self.upload.model_copy(update={"kept": self.personal_arrays}), least_clients="all")
 
+    def tell_shortage(self, clients: int) -> str:
+        """Return in words that fewer clients take part in a round than the number `least_clients`, or "" for enough."""
+        least = self.least_clients
+        if not isinstance(least, int) or clients >= least:
+            return ""
+        return f"least_clients: {least} are wanted in a round, and {clients} take{'s' if clients == 1 else ''} part"
+
     def secret_parties(self, clients: Sequence[str]) -> Sequence[str]:
         """Return who draws noise by a secret: each of these clients, or `SERVER`; nobody where it is seeded."""
         if self.privacy is None or self.privacy.seeded:

@@ -33,9 +33,9 @@ class Selection(Config):
     `probability`. round-robin: `clients` of them in turn. importance: `clients` of them in the mean, each by itself
     with a probability that grows with the norm of its update, which all train for and report (Chen et al., TMLR 2022).
     deadline: those whose predicted round time `seconds` is at most `deadline_s` (Nishio and Yonetani, ICC 2019, with
-    the bound on the time of a client instead of their sum); clients that `seconds` does not name are in time. planned:
-    those whose `joins` contain the round; clients that `joins` does not name join every round, and where none of those
-    that join is there, all do.
+    the bound on the time of a client instead of their sum); `seconds` name every client, or none where a network is to
+    predict them. planned: those whose `joins` contain the round; clients that `joins` does not name join every round,
+    and where none of those that join is there, all do.
 
     unbiased: of uniform and poisson, changes are weighted by share of all samples / probability of taking part, so that
     their sum is the Horvitz-Thompson estimate of the mean of all clients (Horvitz and Thompson, JASA 47, 1952; in
@@ -78,11 +78,17 @@ class Selection(Config):
         """Raise `InputError` where these clients cannot be selected so."""
         if self.clients is not None and self.clients > len(names):
             raise InputError(f"selection: {self.clients} clients are wanted in a round, and there are {len(names)}")
+        if self.seconds and (unknown := [name for name in names if name not in self.seconds]):
+            told = f"{len(unknown)} of {len(names)} clients, such as {unknown[0]}"
+            raise InputError(f"selection: 'seconds' has no time of a round for {told}")
         if self.rule == "deadline" and not self.choose(names, 1, 0):
             raise InputError(f"selection: no client is predicted to end a round within {self.deadline_s:g} s")
 
     def choose(self, names: Sequence[str], round_: int, seed: int) -> list[str]:
-        """Return the clients of round `round_` (from 1) in their order; of importance all, as each reports its norm."""
+        """Return the clients of round `round_` (from 1) in their order, for clients that `check_clients` takes.
+
+        Of importance selection these are all, as each reports its norm, and of a deadline that a network is to predict.
+        """
         count, rng = self.clients or 0, stream(seed, "selection")
         match self.rule:
             case "uniform":
@@ -94,7 +100,8 @@ class Selection(Config):
                 chosen = {((round_ - 1) * count + place) % len(names) for place in range(count)}
             case "deadline":
                 assert self.deadline_s is not None
-                chosen = {i for i, name in enumerate(names) if self.seconds.get(name, 0.0) <= self.deadline_s}
+                in_time = [self.predicts or self.seconds[name] <= self.deadline_s for name in names]
+                chosen = set(np.flatnonzero(in_time).tolist())
             case "planned":
                 chosen = {i for i, name in enumerate(names) if round_ in self.joins.get(name, (round_,))}
                 chosen = chosen or set(range(len(names)))

@@ -195,6 +195,8 @@ def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules
     """Raise `InputError` where these clients cannot federate by this strategy and these rules."""
     if not clients:
         raise InputError("a federation of 0 clients: nobody trains")
+    if rules.selection.predicts:
+        raise InputError("selection: a deadline needs 'seconds', the predicted time of a round by client")
     check_rules(strategy, rules, [*clients])
     if isinstance(strategy, Corrects):
         check_arguments(clients, strategy.correct({}, {}).arguments(), type(strategy).__name__)
@@ -216,9 +218,9 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
     told, selection = type(strategy).__name__, rules.selection
     selection.check_clients(names)
     planned = selection.rule == "planned"  # any number, all at most: a round with too few has no update
-    least, chosen = rules.least_clients, len(names) if planned else int(expected_clients(selection, names))
-    if isinstance(least, int) and selection.rule not in ("poisson", "importance") and least > chosen:
-        raise InputError(f"least_clients: {least} are wanted in a round, and {chosen} take part")
+    chosen = len(names) if planned else int(expected_clients(selection, names))
+    if selection.rule not in ("poisson", "importance") and (short := rules.tell_shortage(chosen)):
+        raise InputError(short)
     single = isinstance(strategy, Robust | Exchanges)  # looks at each update
     if selection.weighs:
         if single:

@@ -140,7 +140,7 @@ def read_lidar(recipe: Mapping[str, Json], agents: Iterable[str] | None = None) 
 
 
 def join_lidars(known: Sequence[KnownLidar]) -> KnownLidar:
-    """Return the LiDARs of several recordings as one: fewest and most beams, the range where it is the same."""
+    """Return what is known of several recordings' LiDARs: the fewest and most beams, and the range if all have one."""
     spans = [lidar.beams for lidar in known if lidar.beams is not None]
     beams = (min(low for low, _ in spans), max(high for _, high in spans)) if spans else None
     ranges = {lidar.range_m for lidar in known}

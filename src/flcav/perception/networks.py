@@ -19,7 +19,7 @@ from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card, join_lidars, read_lidar
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
-from flcav.perception.metrics.benchmark import evaluate_kitti, is_kitti
+from flcav.perception.metrics.benchmark import compare_kitti_rig, evaluate_kitti, is_kitti
 from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.objects.predict import look_around
 from flcav.perception.objects.task import ObjectsTask
@@ -155,8 +155,10 @@ def evaluate(
 
 
 def _evaluate_benchmark(task: ObjectsTask, folder: Path, network: Weights, device: str, progress: Report) -> Evaluation:
-    found = evaluate_kitti(resolve_network(task, network, device), folder, progress)
-    chosen = FrameSelection(tuple(range(found.frames)), ("ego",), {"vehicle": found.frames}, {})
+    tested = resolve_network(task, network, device)
+    found = evaluate_kitti(tested, folder, progress)
+    rig = compare_kitti_rig(folder, tested.config, find_trained_lidar(task, network))
+    chosen = FrameSelection(tuple(range(found.frames)), ("ego",), {"vehicle": found.frames}, {}, rig)
     return Evaluation(task.name, found.score, chosen, found.as_json(), tuple(found.lines()))
 
 

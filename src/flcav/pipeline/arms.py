@@ -180,9 +180,10 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
 
 
 def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
-    """Raise `InputError` where rounds are left with other numbers of vehicles than an arm's strategy or rules take.
+    """Raise `InputError` where an arm needs a known number of vehicles in a round, and its rounds may have any.
 
-    These numbers are known when a region's rounds are timed, which is after its recordings and pretraining.
+    The numbers are known only when a region's rounds are timed, after its recordings and pretraining. Raises it also
+    for a deadline that no network predicts round times for.
     """
     how, predicted = setting.federation, setting.federation.selection.predicts
     if predicted and how.network is None:

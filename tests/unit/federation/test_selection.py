@@ -27,7 +27,7 @@ from flcav.seeds import derive_seed
 
 SCHEDULE = Schedule(rounds=6, steps=5, learning_rate=0.05, final_learning_rate=0.02, seed=3)
 NAMES = [f"grid/cav{i}" for i in range(6)]
-SECONDS = {"grid/cav1": 9.0, "grid/cav2": 3.0, "grid/cav4": 3.1}
+SECONDS = dict(zip(NAMES, (0.5, 9.0, 3.0, 2.9, 3.1, 1.0), strict=True))
 RULES: dict[str, Any] = {
     "uniform": {"rule": "uniform", "clients": 2},
     "poisson": {"rule": "poisson", "probability": 0.4},
@@ -175,6 +175,12 @@ def test_what_makes_no_sense_is_one_sentence():
     for strategy, selection, said in (
         (FEDAVG, {"rule": "uniform", "clients": 7}, r"selection: 7 clients are wanted in a round, and there are 6"),
         (FEDAVG, {"rule": "deadline", "deadline_s": 1, "seconds": dict.fromkeys(NAMES, 2.0)}, r"no client is .* 1 s"),
+        (
+            FEDAVG,
+            {"rule": "deadline", "deadline_s": 1, "seconds": {"cav0": 0.5, **dict.fromkeys(NAMES[1:5], 0.5)}},
+            r"selection: 'seconds' has no time of a round for 2 of 6 clients, such as grid/cav0",
+        ),
+        (FEDAVG, {"rule": "deadline", "deadline_s": 1}, r"selection: a deadline needs 'seconds', the predicted time"),
         (
             Krum(),
             RULES["uniform"],

@@ -1,6 +1,5 @@
 """Rounds on a network: who takes part, who is lost, by name and in bytes, and how long a round takes."""
 
-from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -92,8 +91,12 @@ def test_deadline_selection_asks_those_whose_round_is_predicted_to_end_in_time()
     assert driven.rules.selection.rule == "planned"
     assert driven.rules.selection.joins == {"grid/cav0": (1,), "grid/cav1": (), "grid/cav2": (2,)}
     assert driven.seconds == pytest.approx([7.0, 10.0])  # alone, and so faster
-    given = {"selection": {"rule": "deadline", "deadline_s": 12.0, "seconds": {"grid/cav0": 13.0}}}
-    assert drive([scene], given).rules.selection.rule == "deadline"
+    seconds = dict(zip(NAMES, (13.0, 1.0, 1.0), strict=True))
+    given = drive([scene], {"selection": {"rule": "deadline", "deadline_s": 12.0, "seconds": seconds}})
+    assert given.rules.selection.rule == "deadline"
+    assert [client.client for client in given.records[0].clients] == ["cav2"]
+    with pytest.raises(InputError, match="'seconds' has no time of a round for 2 of 3 clients, such as grid/cav1"):
+        drive([scene], {"selection": {"rule": "deadline", "deadline_s": 12.0, "seconds": {"grid/cav0": 13.0}}})
 
 
 class Walk:
@@ -178,15 +181,45 @@ def test_a_masked_round_that_the_network_leaves_too_few_for_has_no_update_and_th
     assert after[2][0] != after[1][0]
 
 
-@pytest.mark.parametrize("rules", [{"secure": {}}, {"secure": {"threshold": 2}}, {"least_clients": 2}], ids=str)
-def test_a_first_round_that_the_network_predicts_for_one_vehicle_does_not_end_the_run(rules: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("rules", "why"),
+    [
+        ({"secure": {}}, "secure aggregation: 1 clients sent keys, and 2 are needed"),
+        ({"secure": {"threshold": 2}}, "secure aggregation: 1 clients sent keys, and 2 are needed"),
+        ({"least_clients": 2}, "least_clients: 2 are wanted in a round, and 1 takes part"),
+        ({"least_clients": 3, "secure": {}}, "least_clients: 3 are wanted in a round, and 1 takes part"),
+    ],
+)
+def test_a_first_round_that_the_network_predicts_for_one_vehicle_has_no_update_and_the_run_goes_on(
+    rules: dict[str, Any], why: str
+) -> None:
     plan = {"rule": "planned", "joins": {name: (1, 2) if name == NAMES[0] else (2,) for name in NAMES}}
-    clients: dict[str, Trainable] = {name: Walk() for name in NAMES}
-    account, state = Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless"), FederationState()
-    how = Rules.model_validate(rules | {"selection": plan})
-    federate(clients, START, Schedule(2, 1, 0.1, 0.1, 3), account, rules=how, state=state)
-    alone = () if how.secure else NAMES[:1]
-    assert [record.clients for record in state.records] == [alone, NAMES]
+    clients = {name: Walk() for name in NAMES}
+    account, state, after = Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless"), FederationState(), []
+    federate(
+        {**clients},
+        START,
+        Schedule(2, 1, 0.1, 0.1, 3),
+        account,
+        rules=Rules.model_validate(rules | {"selection": plan}),
+        state=state,
+        on_round=lambda number, weights, loss: after.append((weights["w"][0], loss)),
+    )
+    assert [record.clients for record in state.records] == [(), NAMES]
+    assert state.records[0].failed == {NAMES[0]: why}
+    assert after[0] == (0.0, 0.0)
+    assert after[1][0] > 0
+    assert [client.trained for client in clients.values()] == [1, 1, 1]
+
+
+def test_a_round_with_fewer_than_were_to_take_part_by_chance_has_no_update() -> None:
+    names = [f"grid/cav{i}" for i in range(6)]
+    state, account = FederationState(), Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless")
+    rules = Rules.model_validate({"selection": {"rule": "poisson", "probability": 0.4}, "least_clients": 3})
+    federate({name: Walk() for name in names}, START, Schedule(8, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
+    chosen = [len(record.clients) or len(record.failed) for record in state.records]
+    assert [len(record.clients) for record in state.records] == [count if count >= 3 else 0 for count in chosen]
+    assert min(chosen) < 3 <= max(chosen)
 
 
 FIVE = tuple(f"grid/cav{i}" for i in range(5))
@@ -262,32 +295,6 @@ def test_a_cloud_round_waits_for_the_slowest_region_and_the_wireline() -> None:
     assert both.seconds[CLOUD] == pytest.approx([2 * 2.5 + 7 + 13] * 2)
     assert both.seconds["grid"] == pytest.approx([7.0] * 4)
     assert set(both.outages) == set(grid.outages) | set(two.outages)
-
-
-def test_what_is_drawn_late_or_in_secret_cannot_be_driven() -> None:
-    from flcav.pipeline.arms import check_federations, resolve_settings
-    from flcav.pipeline.recipe import RunRecipe
-
-    poisson, privacy = {"rule": "poisson", "probability": 0.5}, {"clip": 1, "noise": 1}
-    for federation, said in (
-        ({"selection": {"rule": "importance", "clients": 1}}, "importance selection draws the clients after"),
-        ({"selection": {"rule": "deadline", "deadline_s": 9}, "privacy": privacy}, "noise is for one number"),
-        ({"selection": poisson, "privacy": privacy}, "poisson selection under central noise draws in secret"),
-        ({"selection": {"rule": "uniform", "clients": 2}, "privacy": privacy}, "uniform selection under central noise"),
-        ({"selection": poisson, "privacy": privacy | {"seeded": True}}, None),
-        ({"selection": poisson, "privacy": privacy | {"where": "local"}}, None),  # whose draws are no secret
-    ):
-        recipe = RunRecipe.model_validate(
-            {
-                "tasks": {"objects": {"history": "objects"}},
-                "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate", "vehicles": 3}},
-                "budgets_mb": {"wireless": 100, "wireline": 80},
-                "federation": {"network": {}, **federation},
-            }
-        )
-        refused = nullcontext() if said is None else pytest.raises(InputError, match=f"federation.network: .*{said}")
-        with refused:
-            check_federations(recipe, resolve_settings(recipe, {"objects": "ideal-road"}).values())
 
 
 def test_a_plan_s_time_on_the_air_is_the_mean_of_those_that_share_the_band():

@@ -4,6 +4,7 @@ import explain_cars as tool
 import numpy as np
 
 from flcav.geometry import Boxes, concatenate
+from flcav.perception.metrics import count_found_cars
 
 
 def box(x: float, label: str, score: float | None = None) -> Boxes:
@@ -28,3 +29,11 @@ def test_each_false_car_is_on_a_car_or_on_something_else():
     cars, trucks, others = box(0, "Car"), box(10, "Car"), box(20, "Pedestrian")
     seen = concatenate([box(x, "Car", 0.9) for x in (0, 2.5, 10, 20, 30, 45)] + [box(35, "Car", 0.2)])
     assert tool.explain_false(seen, cars, trucks, others) == [tool.SECOND, "Pedestrian", tool.NOTHING]
+
+
+def test_a_detection_of_a_car_out_of_range_does_not_find_the_car_before_it():
+    cars = concatenate([box(39.5, "Car"), box(40.4, "Car")])
+    seen = box(40.3, "Car", 0.9)
+    assert tool.explain_missed(seen, cars) == [tool.MISPLACED]
+    counted = count_found_cars([seen], [cars], [Boxes.empty()])
+    assert (counted.cars, counted.found) == (1, 0)

@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,7 +14,8 @@ import pytest
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import Calibration
 from flcav.geometry import Boxes
-from flcav.perception.metrics.benchmark import project_boxes
+from flcav.perception import networks
+from flcav.perception.metrics.benchmark import BenchmarkEvaluation, compare_kitti_rig, project_boxes
 from flcav.perception.metrics.kitti import (
     COUNTS,
     IGNORED,
@@ -26,6 +28,8 @@ from flcav.perception.metrics.kitti import (
     label_states,
 )
 from flcav.perception.networks import evaluate
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.task import KnownLidar
 
 SHARED = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
 PEER = SHARED / "peers/OpenPCDet/pcdet/datasets/kitti/kitti_object_eval_python/eval.py"
@@ -138,6 +142,24 @@ def test_the_benchmark_has_no_use_for_other_options(tmp_path: Path):
             evaluate("objects", tmp_path, **option)
     with pytest.raises(InputError, match="no frames to evaluate"):
         evaluate("objects", tmp_path)
+
+
+def test_a_lidar_unlike_that_of_the_training_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "training" / "velodyne").mkdir(parents=True)
+    found = BenchmarkEvaluation(frames=1, split=None, targets={}, benchmark=())
+    monkeypatch.setattr(networks, "evaluate_kitti", lambda *given: found)
+
+    def told(beams: int, range_m: float) -> str:
+        monkeypatch.setattr(networks, "find_trained_lidar", lambda *given: KnownLidar((beams, beams), range_m))
+        return evaluate("objects", tmp_path).chosen.sentence
+
+    unlike = "1 vehicle frame; unlike in the network's training the LiDAR"
+    assert told(16, 40.0) == f"{unlike} has 64 beams, not 16 and reaches 120 m, not 40 m"
+    assert told(64, 120.0) == "1 vehicle frame"
+    higher = compare_kitti_rig(tmp_path, replace(OBJECTS.configurations["tiny"], ground_z_m=-2.2), KnownLidar())
+    assert higher == "unlike in the network's training the LiDAR is 1.73 m above the ground, not 2.2 m (corrected)"
+    (tmp_path / "frames.csv").write_text("number,frame,agent,time_s\n")  # an export: its LiDAR may be any
+    assert told(16, 40.0) == "1 vehicle frame"
 
 
 @pytest.fixture(scope="module")

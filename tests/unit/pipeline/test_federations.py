@@ -1,8 +1,6 @@
-"""Federations of a recipe: refused before anything is computed, planned with what they send, ended by their budgets."""
+"""Federations of a recipe: planned with what they send, scored, timed, gone on with, ended by their budgets."""
 
-import sys
 import time
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,8 +8,8 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from federated_recipes import PRIVACY, settings
 from line_task import LineTask, Slope
-from pydantic import ValidationError
 
 from flcav.config import InputError
 from flcav.federation.privacy import account_epsilon
@@ -20,17 +18,16 @@ from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavgm import FedAvgM
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
-from flcav.fusion.distillation import Distillation
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.client import TaskClient
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.arms import check_federations, find_strategies, resolve_settings
+from flcav.pipeline.arms import check_federations, find_strategies
 from flcav.pipeline.federations.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
-from flcav.pipeline.recipe import Arm, Federation, RunRecipe, Training
+from flcav.pipeline.recipe import Federation, Training
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import StatisticsScore
 from flcav.pipeline.stages import statistics
@@ -41,121 +38,7 @@ from flcav.pipeline.stages.learning import Learning, load_stage_network
 from flcav.pipeline.stages.statistics import keep_statistics, score_statistics
 from flcav.progress import ignore_progress
 
-PRIVACY = {"clip": 1.0, "noise": 4.0}
 BUSY_S = 0.05  # CPU time of a training
-
-
-def settings(arms: dict[str, Any], **federation: Any) -> tuple[RunRecipe, Any]:
-    recipe = RunRecipe.model_validate(
-        {
-            "tasks": {"objects": {"history": "objects"}},
-            "regions": {
-                "suburb": {"role": "pretrain"},
-                "grid": {"role": "federate", "vehicles": 5},
-                "ring": {"role": "federate", "vehicles": 4},
-            },
-            "budgets_mb": {"wireless": 100, "wireline": 80},
-            "federation": federation,
-            "arms": {name: {"federation": own} for name, own in arms.items()},
-        }
-    )
-    return recipe, resolve_settings(recipe, {"objects": "ideal-road"}).values()
-
-
-@pytest.mark.parametrize(
-    ("federation", "said"),
-    [
-        ({"strategy": "fedprose"}, "strategy 'fedprose': choose one of fedavg, "),
-        ({"strategy": "krum"}, "krum: 5 clients or more are wanted .* and there are 4"),
-        ({"strategy": {"median": {}}, "cloud_strategy": "krum"}, "krum: .* and there are 2"),
-        ({"cloud_strategy": "fedprox"}, "cloud_strategy: FedProx corrects local steps, and edge servers take none"),
-        (
-            {"selection": {"rule": "uniform", "clients": 5}},
-            "selection: 5 clients are wanted in a round, and there are 4",
-        ),
-        ({"least_clients": 5}, "least_clients: 5 are wanted in a round, and 4 take part"),
-        ({"cloud_strategy": "fedmd"}, "cloud_strategy: FedMD shares frames among vehicles, and edge servers have no"),
-        ({"strategy": "fedmd"}, "strategy fedmd: 'objects' has no class probabilities .*; weather and signs have"),
-        ({"strategy": {"fedmd": {"frames": 0}}}, "strategy 'fedmd': frames = 0: "),
-        ({"personal": ["tail.*"]}, "personal: 'tail.\\*' matches none of [0-9]+ arrays, such as '"),
-        ({"personal": ["*"]}, "personal: \\* leave nothing for the regions to average"),
-        ({"personal": {"pull": 1}, "strategy": "fedprox"}, "FedProx corrects local steps, and so does the pull"),
-        ({"upload": {"layers": ["tail.*"]}}, "layers: 'tail.\\*' matches none of [0-9]+ arrays, such as '"),
-    ],
-)
-def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any, said: str) -> None:
-    for recipe, arms in (settings({}, **federation), settings({"other": federation})):
-        with pytest.raises(InputError, match=said):
-            check_federations(recipe, arms)
-
-
-def test_what_needs_a_known_number_is_refused_where_the_plan_says_who_joins() -> None:
-    def check(secure: dict[str, Any], *changes: dict[str, Any], **federation: Any) -> None:
-        recipe, _ = settings({"masked": secure}, **federation)
-        for more in changes:
-            recipe = recipe.model_copy(update=more)
-        check_federations(recipe, resolve_settings(recipe, {"objects": "ideal-road"}).values())
-
-    regions = settings({})[0].regions
-    slow = {"regions": {**regions, "grid": regions["grid"].model_copy(update={"speed": {"cav1": 0.5}})}}
-    soon = {"horizon_s": 40.0}
-    planned: dict[str, dict[str, Any]] = {
-        "secure aggregation takes two or more": {"secure": {}},
-        "noise is for one number": {"privacy": PRIVACY},
-        "Krum needs a known one": {"strategy": {"krum": {"byzantine": 0}}, "cloud_strategy": "fedavg"},
-    }
-    for told, asked in planned.items():
-        said = rf"horizon_s: a plan by .* leaves other numbers of vehicles .*{told}.*; choose another 'selection'"
-        with pytest.raises(InputError, match=said):
-            check(asked, slow, soon)
-        with pytest.raises(InputError, match=said):
-            check(asked | {"network": {}}, soon, network={})
-        check(asked, slow)  # without a horizon all join every round
-        check(asked, soon)
-        check(asked | {"selection": {"rule": "round-robin", "clients": 3}}, slow, soon)
-        arms = {"masked": Arm(plan="equal-stages", federation=asked)}
-        check({}, slow, soon, {"arms": arms})
-    check({"strategy": "median"}, slow, soon)  # of any number
-
-
-@pytest.mark.parametrize(
-    ("federation", "said"),
-    [
-        (
-            {"strategy": {"trimmed-mean": {"fraction": 0.3}}, "cloud_strategy": "fedavg"},
-            "and TrimmedMean needs a known one",
-        ),
-        ({"privacy": PRIVACY}, "and noise is for one number"),
-        ({"strategy": "median"}, None),
-        ({"secure": {}}, None),  # a round with too few has no update
-    ],
-)
-def test_a_predicted_deadline_is_refused_with_what_needs_a_known_number(federation: Any, said: str | None) -> None:
-    deadline, seconds = {"rule": "deadline", "deadline_s": 9}, {"grid/cav0": 1.0}
-
-    def check(selection: dict[str, Any], **network: Any) -> None:
-        check_federations(*settings({}, **federation, selection=selection, **network))
-
-    with (
-        nullcontext() if said is None else pytest.raises(InputError, match=f"federation.network: a predicted .* {said}")
-    ):
-        check(deadline, network={})
-    check(deadline | {"seconds": seconds}, network={})
-    check(deadline | {"seconds": seconds})
-    with pytest.raises(
-        InputError, match="selection: a deadline needs the predicted 'seconds' of a round by client, or"
-    ):
-        check(deadline)
-
-
-def test_a_pose_graph_without_gtsam_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    recipe, arms = settings({})
-    check_federations(recipe, arms)
-    graphs = [replace(each, distillation=Distillation(pose_graph=True)) for each in arms]
-    monkeypatch.setitem(sys.modules, "gtsam", None)
-    check_federations(recipe, arms)
-    with pytest.raises(InputError, match="a pose graph needs GTSAM, which is in"):
-        check_federations(recipe, graphs)
 
 
 def test_statistics_are_those_of_a_network_that_has_some() -> None:
@@ -187,28 +70,6 @@ def test_a_network_is_scored_with_each_region_s_own_statistics(tmp_path: Path, m
     for name, array in averaged.items():
         assert np.array_equal(seen[0][name], array)
         assert np.array_equal(seen[1][name], ring[name] if "running" in name else array)
-
-
-@pytest.mark.parametrize(
-    ("federation", "said"),
-    [
-        ({"privacy": {**PRIVACY, "epsilon": 0}}, "privacy.epsilon"),
-        ({"selection": {"rule": "uniform"}}, "the rule uniform needs 'clients'"),
-        ({"upload": {"compression": "zip"}}, "upload.compression"),
-    ],
-)
-def test_an_arm_s_rules_are_checked_with_the_recipe(federation: Any, said: str) -> None:
-    with pytest.raises(ValidationError, match=said):
-        settings({"other": federation})
-
-
-def test_a_budget_below_one_round_is_refused_with_the_recipe() -> None:
-    small, large = ({"privacy": PRIVACY | {"epsilon": epsilon}} for epsilon in (0.5, 1.5))
-    check_federations(*settings({"other": large}))
-    with pytest.raises(InputError, match=r"privacy: a first round comes to epsilon = .*, above the budget of 0.5;"):
-        check_federations(*settings({"other": small}))
-    amplified = {"selection": {"rule": "poisson", "probability": 0.1}}
-    check_federations(*settings({"other": small | amplified}))
 
 
 def test_strategies_are_by_name_and_settings() -> None:

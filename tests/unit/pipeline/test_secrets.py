@@ -150,11 +150,32 @@ def test_two_runs_of_one_seed_differ_unless_they_are_seeded(tmp_path: Path) -> N
 
 def test_damaged_secrets_are_one_sentence(tmp_path: Path) -> None:
     kill(edge, tmp_path, rules("local"), 5)
-    data = (tmp_path / SECRETS).read_bytes()
-    for damaged in (data[: len(data) // 2], data[:-1] + bytes([data[-1] ^ 1])):
+    data, known = (tmp_path / SECRETS).read_bytes(), (tmp_path / SECRETS_HASH).read_bytes()
+    for damaged in (b"", data[: len(data) // 2], data[:-1] + bytes([data[-1] ^ 1])):
         (tmp_path / SECRETS).write_bytes(damaged)
-        with pytest.raises(InputError, match=rf"{SECRETS} is damaged: .*; remove the folder to begin anew"):
+        told = rf"{SECRETS} is damaged, or {SECRETS_HASH} beside it: .*; remove the folder to begin anew"
+        with pytest.raises(InputError, match=told):
             edge(tmp_path, rules("local"))
+    (tmp_path / SECRETS).write_bytes(data)
+    for damaged in (b"", b"\xff\xfe", known[:-1], known + b"\n"):
+        (tmp_path / SECRETS_HASH).write_bytes(damaged)
+        with pytest.raises(InputError, match=rf"{SECRETS_HASH} is damaged: .*; remove the folder to begin anew"):
+            edge(tmp_path, rules("local"))
+    (tmp_path / SECRETS_HASH).unlink()
+    (tmp_path / SECRETS).write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match=rf"{SECRETS} is damaged: .*; remove the folder to begin anew"):
+        edge(tmp_path, rules("local"))
+
+
+def test_secrets_are_written_once(tmp_path: Path) -> None:
+    def written() -> list[tuple[int, int]]:
+        found = [(tmp_path / name).stat() for name in (SECRETS, SECRETS_HASH)]
+        return [(each.st_ino, each.st_mtime_ns) for each in found]
+
+    kill(edge, tmp_path, rules("local"), 2)
+    before = written()
+    kill(edge, tmp_path, rules("local"), 5)
+    assert written() == before
 
 
 def test_secrets_that_were_drawn_right_before_a_kill_are_kept(tmp_path: Path) -> None:

@@ -168,7 +168,7 @@ def _tell(given: "Given", placed: "Placement | None") -> "Json":
 def _draw(
     path: Path, town: "Town", given: "Given", placed: "Placement", conventional: "dict[str, Placement | None]"
 ) -> None:
-    """Write the map of the errors, the poles, and the placement beside the conventional ones that are known."""
+    """Write the map of the errors, the poles and the placement, with the poles of conventional rules that are known."""
     from flcav.files import write_bytes
     from flcav.report import style
     from flcav.report.charts.figures import town_map

@@ -113,9 +113,9 @@ def find_right(weights: Weights, pictures: Pictures) -> NDArray[np.bool_]:
 
 
 def spread_over_scenes(pictures: Pictures, values: Sequence[NDArray[np.float64]]) -> SharedScenes:
-    """Return how the mean over seeds of a number of each picture varies by the scenes, which all seeds have.
+    """Return the spread over draws of the test scenes, which all seeds share, of a mean over pictures and seeds.
 
-    values: (N,) of each seed. Of a single seed the spread is not told from that of the seeds.
+    values: of each seed, the number (N,) of each picture. A single seed has no scenes to share: `OWN_SCENES`.
     """
     if len(values) == 1:
         return OWN_SCENES

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import Calibration, KittiFolder, KittiFrame
+from flcav.dataset.formats.kitti.read import BEAMS, HEIGHT_M, RANGE_M
+from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import EDGES
 from flcav.geometry import Boxes, pose, transform_points
 from flcav.perception.metrics.kitti import (
@@ -22,11 +24,13 @@ from flcav.perception.metrics.kitti import (
     detection_states,
     label_states,
 )
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import LOWEST_SCORE, detect_moved
+from flcav.perception.objects.samples import describe_rig
 from flcav.perception.objects.truth import level_mount
 from flcav.perception.ops.rotated import iou
-from flcav.perception.task import Evaluated
+from flcav.perception.task import Evaluated, KnownLidar
 from flcav.progress import Report, ignore_progress
 from flcav.records import Class
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front
@@ -35,7 +39,7 @@ Array = NDArray[np.float64]
 BenchmarkKind = Literal["image", "bev", "3d"]  # rectangles in the image, footprints, boxes
 
 LIMITS = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}  # IoU above which a detection is of an object
-LIDAR_M = 1.73  # height of KITTI's LiDAR above the ground
+MOUNT = pose(0.0, 0.0, HEIGHT_M)  # of KITTI's LiDAR
 VALIDATION = "val"  # list of the frames that are evaluated, where there is one
 
 
@@ -93,6 +97,15 @@ def is_kitti(path: Path) -> bool:
     return (path / "training" / "velodyne").is_dir()
 
 
+def compare_kitti_rig(path: Path, config: SecondConfig, trained: KnownLidar) -> str:
+    """Return how the LiDAR of the KITTI folder `path` differs from the one of the network's training, in words.
+
+    The words are those of `describe_rig`. Of an export of flcav's neither beams nor range are known.
+    """
+    here = KnownLidar() if (path / FRAMES).is_file() else KnownLidar((BEAMS, BEAMS), RANGE_M)
+    return describe_rig([MOUNT], here, config, trained)
+
+
 def evaluate_kitti(network: Second, path: Path, progress: Report = ignore_progress) -> BenchmarkEvaluation:
     """Return the AP|R40 of each class on the frames of `ImageSets/val.txt`, or of all, of the KITTI folder `path`.
 
@@ -113,7 +126,7 @@ def evaluate_kitti(network: Second, path: Path, progress: Report = ignore_progre
 
 
 def _detect(network: Second, folder: KittiFolder, progress: Report) -> Iterator[_Found]:
-    move = level_mount(pose(0, 0, LIDAR_M), network.config)
+    move = level_mount(MOUNT, network.config)
     for number in range(len(folder)):
         frame = folder.frame(number)
         (boxes,) = detect_moved(network, [frame.points], [move], score_threshold=LOWEST_SCORE)

@@ -48,12 +48,13 @@ def count_found_cars(
         if seen.score is None and len(seen):
             raise ValueError("detections without scores cannot be counted")
         kept = seen if seen.score is None else seen[seen.score >= SCORE]
-        matched, near = assign_targets(kept, wanted, OVERLAP, "bev"), _is_near(wanted)
+        matched, near = assign_targets(kept, wanted, OVERLAP, "bev"), is_near(wanted)
         cars += int(near.sum())
         found += int(near[matched[matched >= 0]].sum())
-        false += int(((matched < 0) & _is_near(kept) & ~on_neutral(kept, others)).sum())
+        false += int(((matched < 0) & is_near(kept) & ~on_neutral(kept, others)).sum())
     return FoundCars(cars, found, round(false / (len(detections) * looks), 6))
 
 
-def _is_near(boxes: Boxes) -> NDArray[np.bool_]:
+def is_near(boxes: Boxes) -> NDArray[np.bool_]:
+    """Return (N,) whether the centre of each box is within `WITHIN_M` of the LiDAR, in whose frame the boxes are."""
     return np.hypot(boxes.center[:, 0], boxes.center[:, 1]) < WITHIN_M

@@ -141,22 +141,29 @@ def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
 
 
 def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], trained: KnownLidar) -> str:
-    """Return how the LiDAR of the frames' agents differs from the one of the network's training, in words.
-
-    That is by its number of beams, its range as far as the network looks, its height above the ground and its
-    direction, of which the last two are corrected (see `flcav.perception.objects.truth.network_from_lidar`). "" where
-    it does not differ, or does by nothing known.
-    """
+    """Return how the LiDAR of the frames' agents differs from the one of the network's training, as `describe_rig`."""
     agents = {data.keys[i].agent: data.lidars(i)[0] for i in frames if data.lidars(i)}
     mounts = [
         data.calibrations[agent].assumed.agent_from_sensor[lidar]
         for agent, lidar in agents.items()
         if kind_of(agent) != POLE
     ]
+    here = read_lidar(data.manifest.recipe, agents) if agents else KnownLidar()
+    return describe_rig(mounts, here, config, trained)
+
+
+def describe_rig(
+    mounts: Sequence[NDArray[np.float64]], here: KnownLidar, config: SecondConfig, trained: KnownLidar
+) -> str:
+    """Return how a LiDAR `here` differs from the one of the network's training, in words.
+
+    That is by its number of beams, its range as far as the network looks, its height above the ground and its
+    direction, of which the last two are corrected (see `flcav.perception.objects.truth.network_from_lidar`). "" where
+    it does not differ, or does by nothing known. mounts: (4, 4) vehicle from LiDAR, as each vehicle assumes it.
+    """
     moved = [mount for mount in mounts if level_mount(mount, config) is not None]
     heights = dict.fromkeys(f"{mount[2, 3]:.2f}" for mount in moved if abs(mount[2, 3] + config.ground_z_m) > LEVEL_M)
     turned = dict.fromkeys(f"{math.degrees(angle):.0f}" for mount in moved if (angle := turn_of(mount)) > LEVEL_RAD)
-    here = read_lidar(data.manifest.recipe, agents) if agents else KnownLidar()
     differences = []
     if trained.beams is not None and here.beams is not None and not _covers(trained.beams, here.beams):
         differences.append(f"has {_span(here.beams)} beams, not {_span(trained.beams)}")

@@ -84,8 +84,10 @@ def drive_rounds(
 
     seeds: of each round, which its clients are drawn by. Under deadline selection without given `seconds`
     those take part whose round is predicted to end in time, with all that are in the town at once. A round goes on
-    without the vehicles that it loses, however many they are, unless the rules say how many it needs.
+    without the vehicles that it loses, however many they are, unless the rules say how many it needs. Raises
+    `InputError` where the vehicles cannot be selected so.
     """
+    rules.selection.check_clients(fleet.clients)
     outages: dict[tuple[int, str], Outage] = {}
     records, joins, now = [], dict.fromkeys(fleet.clients, ()), 0.0
     for number, seed in enumerate(seeds, start=1):

@@ -1,9 +1,10 @@
 """The file of the secrets that noise is drawn by, in the folder of a federation while it is under way.
 
-Beside it lies its SHA-256, from before the first message on: by that a file that was lost or changed is told from one
-that there has not been yet. Of random bytes a hash gives nothing away.
+Before the first message its SHA-256 is written beside it. By that hash a file that was lost or changed is told from one
+that has not been written yet. A hash of random bytes does not reveal them.
 """
 
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -16,22 +17,26 @@ from flcav.federation.noise import Secret
 from flcav.files import atomic_path, sha256, write_bytes, write_in_pieces
 
 SECRETS, SECRETS_HASH = "secrets.safetensors", "secrets.sha256"
+HASH = re.compile(rb"[0-9a-f]{64}")
 
 
 def read_secrets(folder: Path, names: Collection[str], begun: bool) -> dict[str, Secret]:
     """Return the secrets of a federation, by name: none before they are drawn.
 
     `names` are those that it needs; `begun` says that it has sent messages, which the hash says, too. Raises
-    `InputError` where the file is not what was written, or lacks secrets although they were drawn.
+    `InputError` where the file or its hash is not what was written, or lacks secrets although they were drawn.
     """
     path, known = folder / SECRETS, folder / SECRETS_HASH
+    written = known.read_bytes() if known.exists() else None
+    if written is not None and not HASH.fullmatch(written):
+        raise _lost(known, "is damaged")
+    if written is not None and path.exists() and written != sha256(path).encode():
+        raise _lost(path, f"is damaged, or {SECRETS_HASH} beside it")
     try:
         kept = load_file(path) if path.exists() else {}
     except SafetensorError:
         raise _lost(path, "is damaged") from None
-    if path.exists() and known.exists() and known.read_text() != sha256(path):
-        raise _lost(path, "is damaged")
-    if (begun or known.exists()) and not kept.keys() >= {*names}:
+    if (begun or written is not None) and not kept.keys() >= {*names}:
         raise _lost(path, "is missing or not complete")
     return {name: np.asarray(array, np.uint8) for name, array in kept.items()}
 
@@ -41,7 +46,12 @@ def _lost(path: Path, why: str) -> InputError:
 
 
 def write_secrets(folder: Path, secrets: Mapping[str, Secret]) -> None:
-    """Write the secrets of a federation, by name, to a file that only its owner may read; then the file's hash."""
+    """Write the secrets of a federation, by name, to a file that only its owner may read; then the file's hash.
+
+    Where there is a hash, both were written before, and stay as they are: `read_secrets` has compared them.
+    """
+    if (folder / SECRETS_HASH).exists():
+        return
     with atomic_path(folder / SECRETS) as temporary:
         temporary.touch(mode=0o600)
         write_in_pieces(temporary, save(dict(secrets)))
@@ -49,6 +59,6 @@ def write_secrets(folder: Path, secrets: Mapping[str, Secret]) -> None:
 
 
 def remove_secrets(folder: Path) -> None:
-    """Remove the secrets of a federation that has ended, the hash first: alone it would say that they were lost."""
+    """Remove the secrets of a federation that has ended, the hash first: a hash alone means that they were lost."""
     (folder / SECRETS_HASH).unlink(missing_ok=True)
     (folder / SECRETS).unlink(missing_ok=True)

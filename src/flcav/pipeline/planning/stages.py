@@ -75,8 +75,8 @@ def count_carried_out(plan: TaskPlan, stages: Sequence[StageResult], k: int) -> 
     """Return the plan of a task with the edge rounds that its regions carried out, and who joined them.
 
     `stages` are the results of stage II; a cloud round has `k` edge rounds. Where regions ran different numbers of
-    rounds, the plan has their mean by vehicles. There are no more cloud rounds than the last plan of any region has,
-    since no later one says which of its vehicles have time for them.
+    rounds, the plan has their mean, weighted by numbers of vehicles. It has at most as many cloud rounds as the last
+    plan of the region with the fewest: for further ones no plan says which vehicles have time.
     """
     ran = {each.region or "": each.rounds for each in stages}
     rounds = round(float(np.average([*ran.values()], weights=[each.clients for each in stages])))

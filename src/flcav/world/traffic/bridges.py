@@ -1,7 +1,7 @@
-"""Actors on bridges and below them: which of two streets above each other an actor in plan is on.
+"""Actors on bridges and below them: which of two streets, one above the other, an actor is on.
 
-SUMO's net is plane. An actor above or below a deck is on it where a lane that leads over it is nearer, and points more
-in the actor's direction, than any lane that leads below.
+SUMO's net has no heights. An actor above or below a deck is on it where a lane that leads over it is nearer, and points
+more in the actor's direction, than any lane that leads below.
 """
 
 from collections.abc import Callable
