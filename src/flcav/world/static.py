@@ -2,6 +2,7 @@
 
 import pickle
 from collections.abc import Iterator
+from dataclasses import replace
 from enum import IntEnum
 from hashlib import sha256
 from itertools import chain
@@ -34,7 +35,8 @@ from flcav.world.meshes.mesh import Mesh, join_meshes, sheet, transform_mesh
 
 GROUND_M = -0.03  # height of open ground, a little below the road
 UNDER_M, ROUGH_M = 1.5, 1.0  # by which sloping ground reaches below roads and sidewalks, and how roughly it is cut
-DECK_M = 1.0  # thickness of a bridge's deck
+DECK_M = (0.2, 1.0)  # least and greatest thickness of a bridge's deck
+ROOM_M = 4.0  # a deck is thinner where less than this would be left below it
 LAND_M = 150.0  # width of open ground beyond the town's bounds
 TOWNS_KEPT = 4  # size of the cache of meshes
 
@@ -160,9 +162,16 @@ def _decks(town: Town) -> Iterator[Owned]:
     """Yield the decks of bridges, each as its road, its underside and its two sides."""
     for row, deck in enumerate(() if town.relief is None else town.relief.decks):
         yield Part.DECK, row, drape_area(deck.outline, deck.surface, 0.0, Material.ROAD)
-        yield Part.DECK, row, drape_area(deck.outline, deck.surface, -DECK_M, Material.WALL)
+        under = drape_area(deck.outline, deck.surface, 0.0, Material.WALL)
+        yield Part.DECK, row, replace(under, vertices=_lower(under.vertices, town))
         for side in deck.sides:
-            yield Part.DECK, row, sheet(np.stack((side - (0.0, 0.0, DECK_M), side)), Material.WALL)
+            yield Part.DECK, row, sheet(np.stack((_lower(side, town), side)), Material.WALL)
+
+
+def _lower(top: NDArray, town: Town) -> NDArray:
+    """Return the points (N, 3) of a deck's underside below those of its surface."""
+    thickness = np.clip(top[:, 2] - town.grounds(*top[:, :2].T) - ROOM_M, *DECK_M)
+    return np.column_stack((top[:, :2], top[:, 2] - thickness)).astype(top.dtype)
 
 
 def _sidewalks(town: Town) -> Iterator[Owned]:

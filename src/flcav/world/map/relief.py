@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 PLACE = ("deck", "section")  # columns of a town's heights with bridges
 AXLE_SHARE, TRACK_SHARE = 0.3, 0.4  # from the middle of a vehicle to its wheels, of its length and width
 FARTHEST_M = 1e8
+NOISE_M = 0.1  # a point so far below the surface of a deck still is on it
 
 
 class Relief:
@@ -67,8 +68,14 @@ class Relief:
         return found.reshape(at.shape[:-1])
 
     def above(self, points: Array) -> Array:
-        """Return how high (N,) [m] points (N, 3), world frame [m], are above the ground."""
-        return points[:, 2] - self.heights(*points[:, :2].T)
+        """Return how high (N,) [m] points (N, 3), world frame [m], are above the ground, or the deck below them."""
+        x, y, z = points.T
+        foot = self.heights(x, y)
+        for deck in self.decks:
+            inside = np.flatnonzero(shapely.contains_xy(deck.outline, x, y))
+            top = deck.surface.heights(x[inside], y[inside])
+            foot[inside] = np.where(top <= z[inside] + NOISE_M, np.maximum(top, foot[inside]), foot[inside])
+        return z - foot
 
     def table(self) -> pa.Table:
         """Return the points as a table with the columns x, y, z [m].
@@ -140,7 +147,9 @@ class Deck:
     def outline(self) -> BaseGeometry:
         """Return the area of the deck, seen from above."""
         right, left = self.sides
-        return shapely.make_valid(shapely.Polygon(np.concatenate((right, left[::-1]))[:, :2]))
+        area = shapely.make_valid(shapely.Polygon(np.concatenate((right, left[::-1]))[:, :2]))
+        shapely.prepare(area)
+        return area
 
 
 def find_tilts(

@@ -27,7 +27,7 @@ PACKAGED: tuple[str, ...] = (*TOWNS, *HILLY)  # all that come with flcav
 HEIGHTS = "heights.parquet"  # file of a town's relief, beside its net
 HILLS = "hills.parquet"  # that of a town of `HILLY`, beside the net of the level one
 KERB_M = 0.12  # height of a sidewalk above the road
-CLEAR_M = 3.0  # nothing stands nearer to a bridge
+BESIDE_BRIDGE_M = 3.0  # no pole, sign, signal, tree or furniture stands nearer to a bridge
 MARGIN_M = 5.0  # from the outermost surface or building to the bounds
 
 
@@ -170,7 +170,7 @@ def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
 def lift_town(town: Town, relief: Relief) -> Town:
     """Return a level town lifted onto a relief: poles, signs and signals by the ground at their feet.
 
-    Under and on bridges nothing stands: poles, signs, trees and furniture there are left out.
+    Poles, signs, signals, trees and furniture under and on bridges are left out.
     """
     town = _clear_bridges(town, relief)
 
@@ -189,20 +189,24 @@ def lift_town(town: Town, relief: Relief) -> Town:
 
 
 def _clear_bridges(town: Town, relief: Relief) -> Town:
-    """Return a town without what stands on or under bridges, or within `CLEAR_M` of them."""
+    """Return a town without what stands on or under bridges, or within `BESIDE_BRIDGE_M` of them, but buildings."""
     if not relief.decks:
         return town
-    taken = shapely.union_all([deck.outline for deck in relief.decks]).buffer(CLEAR_M)
+    taken = shapely.union_all([deck.outline for deck in relief.decks]).buffer(BESIDE_BRIDGE_M)
     shapely.prepare(taken)
 
     def is_free(feet: Array) -> NDArray[np.bool_]:
         return ~shapely.contains_xy(taken, *feet[:, :2].T)
 
-    poles, signs = is_free(town.poles.position), is_free(town.signs.position)
+    def is_clear(rows: Array) -> NDArray[np.bool_]:
+        return ~shapely.intersects(taken, [street_furniture.make_footprint(*row[:5]) for row in rows])
+
+    signals = town.signals
+    poles, signs, heads = is_free(town.poles.position), is_free(town.signs.position), is_free(signals.foot)
     return replace(
         town,
         trees=town.trees[is_free(town.trees)],
-        clutter=tuple((kind, rows[is_free(rows)]) for kind, rows in town.clutter),
+        clutter=tuple((kind, rows[is_clear(rows)]) for kind, rows in town.clutter),
         lamps=town.lamps[is_free(town.lamps)],
         posts=town.posts[is_free(town.posts)],
         poles=Poles(
@@ -215,6 +219,13 @@ def _clear_bridges(town: Town, relief: Relief) -> Town:
             town.signs.position[signs],
             town.signs.yaw[signs],
             tuple(kind for kind, kept in zip(town.signs.kind, signs) if kept),
+        ),
+        signals=Signals(
+            signals.position[heads],
+            signals.yaw[heads],
+            signals.foot[heads],
+            tuple(link for link, kept in zip(signals.link, heads) if kept),
+            int(heads[len(heads) - signals.walkers :].sum()),
         ),
     )
 

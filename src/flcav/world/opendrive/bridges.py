@@ -6,12 +6,15 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 BRIDGE_M = 2.5  # a road at least this far above another one passes over it
 CLEAR_M = 4.0  # from the end of a deck to the road below, seen from above
+JOINT_M = 0.5  # pieces of roads no farther apart than this go on as one bridge
 NEAR_M = 12.0  # the ground is sampled closely so far around a deck
 BATCH = 20_000  # pieces of roads that are compared with all others at a time
 
@@ -27,18 +30,17 @@ class Spans(NamedTuple):
     """The bridges of one road with K cross-sections."""
 
     decks: tuple[slice, ...]  # the cross-sections of each deck, those at both ends included
-    near: Mask  # (K,) cross-sections within `NEAR_M` of a deck of any road
+    near: Mask  # (K,) cross-sections that the ground keeps, since they are within `NEAR_M` of a deck of any road
 
 
 def find_bridges(roads: Sequence[Borders]) -> list[Spans]:
-    """Return the bridges of each road: where it lies `BRIDGE_M` or more above another road.
+    """Return the bridges of each road: where it lies `BRIDGE_M` or more above another road, or above itself.
 
-    A deck begins and ends `CLEAR_M` before the road below. A road that passes over itself has none.
+    A deck begins and ends `CLEAR_M` before the road below, and goes on over joints of roads.
     """
     counts = [max(len(road.right) - 1, 0) for road in roads]
-    owner = np.repeat(np.arange(len(roads)), counts)
-    over, near = np.zeros((2, len(owner)), np.bool_)
     pieces = _join_corners(roads)
+    over, near = np.zeros((2, len(pieces)), np.bool_)
     if len(pieces) and np.ptp(pieces[..., 2]) >= BRIDGE_M:
         corners = shapely.multipoints(pieces[..., :2].reshape(-1, 2), indices=np.repeat(np.arange(len(pieces)), 4))
         areas = np.asarray(shapely.convex_hull(corners))
@@ -46,12 +48,12 @@ def find_bridges(roads: Sequence[Borders]) -> list[Spans]:
         above, crossing = np.zeros((2, len(pieces)), np.bool_)
         low, high = pieces[..., 2].min(axis=1), pieces[..., 2].max(axis=1)
         for upper, lower in _batches(tree, areas, np.arange(len(areas)), CLEAR_M):
-            passing = (owner[upper] != owner[lower]) & (low[upper] - high[lower] >= BRIDGE_M)
+            passing = low[upper] - high[lower] >= BRIDGE_M
             upper, lower = upper[passing], lower[passing]
             above[upper] = True
             crossing[upper[shapely.intersects(areas[upper], areas[lower])]] = True
-        run = np.cumsum(np.diff(above, prepend=False) | (np.diff(owner, prepend=-1) != 0))
-        over = above & np.isin(run, run[crossing])
+        raised = np.flatnonzero(above)
+        over[raised] = _find_joined(areas[raised], low[raised], high[raised], crossing[raised])
         for _, close in _batches(tree, areas, np.flatnonzero(over), NEAR_M):
             near[close] = True
     splits = np.cumsum(counts)[:-1]
@@ -72,6 +74,23 @@ def _batches(
         some = rows[first : first + BATCH]
         one, other = tree.query(areas[some], predicate="dwithin", distance=within_m)
         yield some[one], other
+
+
+def _find_joined(areas: NDArray, low: Array, high: Array, crossing: Mask) -> Mask:
+    """Return which of N pieces of roads are `crossing`, or joined with such a piece, at once or by others of them.
+
+    `low` and `high` (N,) are their heights [m].
+    """
+    if not crossing.any():
+        return crossing
+    links = [np.zeros((2, 0), np.int64)]
+    for one, other in _batches(shapely.STRtree(areas), areas, np.arange(len(areas)), JOINT_M):
+        alike = np.maximum(low[one] - high[other], low[other] - high[one]) < BRIDGE_M
+        links.append(np.stack((one[alike], other[alike])))
+    rows = np.concatenate(links, axis=1)
+    graph = coo_array((np.ones(rows.shape[1]), tuple(rows)), shape=(len(areas), len(areas)))
+    group = connected_components(graph, directed=False)[1]
+    return np.isin(group, group[crossing])
 
 
 def _span(over: Mask, near: Mask) -> Spans:

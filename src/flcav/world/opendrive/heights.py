@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from flcav.config import InputError, shorten
+from flcav.world.map.relief import Relief
 from flcav.world.opendrive.bridges import CLEAR_M, Borders, Spans, find_bridges
 from flcav.world.opendrive.road_surface import Road
 from flcav.world.opendrive.standard import FARTHEST_M
+from flcav.world.opendrive.streets import SIDEWALK_M, WALKED
 
 Array = NDArray[np.float64]
 
@@ -21,8 +23,10 @@ HIGHEST_M = 10_000.0
 STEP_M = 1.0  # between two cross-sections, of which those are kept that are needed
 TOLERANCE_M = 0.003  # by which the surface may differ from a cross-section that is left out
 TWIST_M = 0.008  # and by which it may leave the plane between two of them
+NARROW_M = 0.1  # width of a road too narrow for a deck
+STRAY_M = 0.02  # in a map with bridges, by which the terrain may leave a cross-section
 BEND_SHARE = 0.1  # of an error in plan that counts as one of height
-ASIDE_M = (2.0, 6.0)  # beyond the outermost lanes the ground goes on at their height
+ASIDE_M = (SIDEWALK_M, 6.0)  # beyond the outermost lanes the ground goes on at their height
 FINE_M = 2.0  # between points across a road near a bridge: so that the ground beside it begins at its edge
 CELL_M = 0.5  # points of different roads in one cell are one
 FAR_M = 400.0  # from the outermost points to the edge of the terrain
@@ -52,14 +56,17 @@ def sample_heights(root: ElementTree.Element, origin: Path) -> Heights:
             raise InputError(f"{origin}: road {shorten(road.id)} reaches beyond {far}")
     edges = [Borders(*(np.concatenate([strip.inner[row] for strip in own]) for row in (0, -1))) for own in strips]
     spans = find_bridges(edges)
-    decks = [deck for own, span in zip(strips, spans) for deck in _list_decks(own, span)]
-    grounds = [_sample_ground(own, span) for own, span in zip(strips, spans)]
-    surface, aside = (np.concatenate([ground[i] for ground in grounds]) for i in (0, 1))
-    distance, _ = KDTree(surface[:, :2]).query(aside[:, :2])
-    room = np.minimum(np.array(ASIDE_M) - 0.1, CLEAR_M)
-    aside = aside[distance > np.tile(room, len(aside) // len(room))]
-    merged = _merge(np.concatenate((surface, aside)))
-    return Heights(np.concatenate((merged, surround(merged))).round(4), tuple(decks))
+    bare = not any(lane.get("type") in WALKED for lane in root.iter("lane"))
+    decks = [deck for own, span in zip(strips, spans) for deck in _list_decks(own, span, widened=bare)]
+    points = _sample_terrain(strips, spans)
+    while decks:
+        relief = Relief(points)  # its triangles may cut across a road where points beside it are few
+        strays = [_find_strays(own, span, relief) for own, span in zip(strips, spans)]
+        if not any(stray.any() for stray in strays):
+            break
+        spans = [span._replace(near=span.near | stray) for span, stray in zip(spans, strays)]
+        points = _sample_terrain(strips, spans)
+    return Heights(points, tuple(decks))
 
 
 class Strip(NamedTuple):
@@ -89,20 +96,57 @@ def _cross_sections(road: Road) -> list[Strip]:
     return out
 
 
-def _list_decks(strips: list[Strip], spans: Spans) -> list[tuple[Array, ...]]:
-    """Return the decks of a road, each as its cross-sections."""
-    sections = [strip.inner[:, i].round(4) for strip in strips for i in range(strip.inner.shape[1])]
-    return [tuple(sections[deck]) for deck in spans.decks]
+def _list_decks(strips: list[Strip], spans: Spans, *, widened: bool) -> list[tuple[Array, ...]]:
+    """Return the decks of a road, each as its cross-sections, `widened` by a sidewalk on both sides.
+
+    Those narrower than `NARROW_M` are left out.
+    """
+    sides = (slice(0, 1), slice(len(ASIDE_M), len(ASIDE_M) + 1)) if widened else (slice(0), slice(0))
+    whole = [np.concatenate((strip.outer[sides[0]], strip.inner, strip.outer[sides[1]])).round(4) for strip in strips]
+    sections = [points[:, i] for points in whole for i in range(points.shape[1])]
+    decks = [tuple(sections[deck]) for deck in spans.decks]
+    return [deck for deck in decks if any(np.ptp(section[:, :2], axis=0).max() > NARROW_M for section in deck)]
+
+
+def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> NDArray[np.bool_]:
+    """Return which of a road's K cross-sections a terrain leaves by more than `STRAY_M`.
+
+    Those on decks, and those that the ground keeps already, are left out.
+    """
+    errors = [
+        np.abs(relief.heights(*np.moveaxis(s.inner[..., :2], 2, 0)) - s.inner[..., 2]).max(axis=0) for s in strips
+    ]
+    return (np.concatenate(errors) > STRAY_M) & ~_find_raised(spans) & ~spans.near
+
+
+def _find_raised(spans: Spans) -> NDArray[np.bool_]:
+    """Return which of a road's K cross-sections are on decks alone.
+
+    Where a deck ends within the road, its last cross-section is the ground's, too.
+    """
+    raised = np.zeros(len(spans.near), np.bool_)
+    for deck in spans.decks:
+        raised[deck.start + (deck.start > 0) : deck.stop - (deck.stop < len(raised))] = True
+    return raised
+
+
+def _sample_terrain(strips: list[list[Strip]], spans: list[Spans]) -> Array:
+    """Return the points (N, 3) of the terrain of all roads."""
+    grounds = [_sample_ground(own, span) for own, span in zip(strips, spans)]
+    surface, aside = (np.concatenate([ground[i] for ground in grounds]) for i in (0, 1))
+    distance, _ = KDTree(surface[:, :2]).query(aside[:, :2])
+    room = np.minimum(np.array(ASIDE_M) - 0.1, CLEAR_M)
+    aside = aside[distance > np.tile(room, len(aside) // len(room))]
+    merged = _merge(np.concatenate((surface, aside)))
+    return np.concatenate((merged, surround(merged))).round(4)
 
 
 def _sample_ground(strips: list[Strip], spans: Spans) -> tuple[Array, Array]:
     """Return the points (N, 3) of a road's surface outside its bridges, and those (M, 3) beside it.
 
-    Where a deck ends within the road, its last cross-section is the ground's, too. The M are in the order of `ASIDE_M`.
+    The M are in the order of `ASIDE_M`.
     """
-    raised = np.zeros(len(spans.near), np.bool_)
-    for deck in spans.decks:
-        raised[deck.start + (deck.start > 0) : deck.stop - (deck.stop < len(raised))] = True
+    raised = _find_raised(spans)
     inner, outer, first = [np.zeros((0, 3))], [np.zeros((0, 3))], 0
     for strip in strips:
         rows = np.arange(first, first + strip.inner.shape[1])

@@ -1,7 +1,7 @@
 """Actors on bridges and below them: which of two streets, one above the other, an actor is on.
 
-SUMO's net has no heights. An actor above or below a deck is on it where a lane that leads over it is nearer, and points
-more in the actor's direction, than any lane that leads below.
+SUMO's net has no heights. An actor above or below a deck is on it where lanes that lead over it are nearer, and point more
+in the actor's direction, than those that lead below, all in all while it passes above or below.
 """
 
 from collections.abc import Callable
@@ -25,6 +25,7 @@ REACH_M = 15.0  # half a long vehicle, and the way of .3 s: so far beside a deck
 ALONG = np.cos(np.pi / 4)  # lanes that lead over a deck keep to its direction
 TURNED_M = 6.0  # distance that counts as much as a right angle between an actor and a lane
 BATCH = 1000  # actors that are compared with all lanes at a time
+BESIDE_SHARE = 1e-3  # of a moment beside a deck in what is decided by the moments above or below it
 EDGE_M = 0.05  # a point so far beside a deck still is on it
 
 
@@ -59,17 +60,23 @@ def find_footing(relief: Relief, net: Path, centre: Array, yaw: Array) -> Callab
 
 
 def _find_on(deck: Deck, net: RoadNet, centre: Array, yaw: Array) -> Mask:
-    """Return (T, A) whether an actor near a deck is on it, or about to be."""
+    """Return (T, A) whether an actor near a deck is on it, or about to be: the same while it stays near the deck."""
     zone = deck.outline.buffer(REACH_M)
     shapely.prepare(zone)
     out = shapely.contains_xy(zone, centre[..., 0], centre[..., 1])
     over, below = split_lanes(deck, net, zone)
+    if not len(over.start):
+        return np.zeros_like(out)
     place, ahead = centre[out], heading_vectors(yaw[out])
-    found = [
-        _misfit(over, place[rows], ahead[rows]) < _misfit(below, place[rows], ahead[rows])
+    worse = [
+        _misfit(over, place[rows], ahead[rows]) - _misfit(below, place[rows], ahead[rows])
         for rows in np.split(np.arange(len(place)), np.arange(BATCH, len(place), BATCH))
     ]
-    out[out] = np.concatenate(found)
+    weight = np.where(shapely.contains_xy(deck.outline, *place.T), 1.0, BESIDE_SHARE)
+    begins = np.ones(out.shape, np.bool_)
+    begins[1:] = ~out[:-1] | (np.linalg.norm(np.diff(centre, axis=0), axis=2) > REACH_M)
+    stay = np.cumsum((begins & out).T).reshape(out.T.shape).T[out]  # numbers of stays near the deck, one actor's each
+    out[out] = (np.bincount(stay, weight * np.concatenate(worse)) < 0)[stay]
     return out
 
 

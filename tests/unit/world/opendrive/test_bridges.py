@@ -1,6 +1,7 @@
 """Bridges of OpenDRIVE maps: decks, what drives on them and below them, and what they look like."""
 
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,19 +10,24 @@ from shapely import contains_xy
 
 from flcav.config import InputError
 from flcav.world.map.relief import Deck, Relief
-from flcav.world.map.town import Town
+from flcav.world.map.roads import read_net
+from flcav.world.map.signals import Signals
+from flcav.world.map.town import Poles, Signs, Town, lift_town
 from flcav.world.materials import Material
 from flcav.world.opendrive.bridges import BRIDGE_M, Borders, find_bridges
+from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.importing import import_town
+from flcav.world.opendrive.streets import SIDEWALK_M
 from flcav.world.scene import Scene
-from flcav.world.static import DECK_M, Part, build_static_world
+from flcav.world.static import DECK_M, ROOM_M, Part, build_static_world
 from flcav.world.trace import Trace
+from flcav.world.traffic.bridges import find_footing
 from flcav.world.traffic.traffic import simulate
 
 HALF_M, RISE = 80.0, 0.075  # of two streets: from where they cross to their ends, and the slope of the upper one
 
 
-def street(name: str, shape: str, length: float, links: str, profile: str = "") -> str:
+def street(name: str, shape: str, length: float, links: str = "||", profile: str = "") -> str:
     """Return a road with a lane in each direction; `links`: of the road, of lane 1, of lane -1."""
     own, *lanes = links.split("|")
     left, right = (
@@ -36,7 +42,10 @@ def street(name: str, shape: str, length: float, links: str, profile: str = "") 
 
 
 def crossing() -> ElementTree.Element:
-    """Return a street along x at height 0, one along y that passes 6 m above it, and a bow between their ends."""
+    """Return a street along x at height 0, one along y that passes 6 m above it, and a bow between their ends.
+
+    None has a sidewalk, which the import therefore adds to all of them.
+    """
     profile = (
         f'<elevationProfile><elevation s="0" a="0" b="{RISE}" c="0" d="0"/>'
         f'<elevation s="{HALF_M}" a="{RISE * HALF_M}" b="{-RISE}" c="0" d="0"/></elevationProfile>'
@@ -94,11 +103,47 @@ def test_actors_are_on_the_deck_or_below_it_by_their_street(town: Town, trace: T
     np.testing.assert_allclose(z[on], RISE * (HALF_M - np.abs(y[on])), atol=0.2)
     np.testing.assert_allclose(z[vehicle & ~crossing], 0.0, atol=0.05)
     np.testing.assert_allclose(np.abs(trace.tilt[..., 0][on & (np.abs(y) > 4)]), np.arctan(RISE), atol=0.02)
-    walkers = inside & (trace.category == "pedestrian")
-    known = np.minimum(np.abs(z), np.abs(z - RISE * (HALF_M - np.abs(y))))
-    assert known[walkers].max(initial=0.0) < 0.3
     way = np.abs(np.diff(z, axis=0)[trace.present[1:] & trace.present[:-1]])
     assert way.max() < 1.0  # in half a second: nobody jumps from one street to the other
+
+
+def test_pedestrians_on_added_sidewalks_are_on_the_deck_or_below_it(town: Town) -> None:
+    assert town.relief is not None
+    assert all(edge.lanes_of("sidewalk") for edge in read_net(town.net).streets)
+    along, beside = np.linspace(-20.0, 20.0, 81), np.full(81, 3.5 + SIDEWALK_M / 2)
+    walks = [(side * beside, along) for side in (1, -1)] + [(along, side * beside) for side in (1, -1)]
+    centre = np.stack([np.column_stack(walk) for walk in walks], axis=1)  # two above, two below
+    yaw = np.broadcast_to([np.pi / 2, -np.pi / 2, 0.0, np.pi], centre.shape[:2])
+    heights = find_footing(town.relief, town.net, centre, yaw)(*np.moveaxis(centre, 2, 0))
+    near = np.abs(along) < 7
+    top = RISE * (HALF_M - np.abs(along[near]))
+    np.testing.assert_allclose(heights[near, :2], np.stack((top, top), axis=1), atol=0.05)
+    np.testing.assert_allclose(heights[:, 2:], 0.0, atol=0.05)
+
+
+def test_who_turns_aside_below_a_deck_stays_below(town: Town) -> None:
+    assert town.relief is not None
+    centre = np.column_stack((np.linspace(-30.0, 30.0, 61), np.full(61, -1.75)))[:, None]
+    yaw = np.where(np.abs(centre[..., 0]) < 1.5, np.pi / 3, 0.0)  # for a moment along the lanes of the deck
+    heights = find_footing(town.relief, town.net, centre, yaw)(centre[..., 0], centre[..., 1])
+    np.testing.assert_allclose(heights, 0.0, atol=0.05)
+
+
+def test_who_waits_beside_a_deck_may_pass_over_it(town: Town) -> None:
+    assert town.relief is not None
+    passing = np.column_stack((np.full(17, -1.75), np.arange(8.0, -9.0, -1.0)))
+    centre = np.concatenate((np.full((100, 2), (-6.0, 8.5)), passing))[:, None]
+    yaw = np.repeat([0.0, -np.pi / 2], (100, 17))[:, None]
+    heights = find_footing(town.relief, town.net, centre, yaw)(centre[..., 0], centre[..., 1])
+    top = RISE * (HALF_M - np.abs(passing[1:-1, 1]))
+    np.testing.assert_allclose(heights[101:-1, 0], top, atol=0.05)
+
+
+def test_points_are_above_the_deck_or_above_the_ground_below_it(town: Town) -> None:
+    assert town.relief is not None
+    top = RISE * (HALF_M - 1.0)
+    points = np.array([(0.0, -1.0, top + z) for z in (1.5, -0.02, 0.0)] + [(0.0, -1.0, 2.0), (0.0, -1.0, 0.0)])
+    np.testing.assert_allclose(town.relief.above(points), (1.5, -0.02, 0.0, 2.0, 0.0), atol=0.01)
 
 
 def test_rays_meet_the_deck_from_above_and_from_below(town: Town, trace: Trace) -> None:
@@ -110,15 +155,51 @@ def test_rays_meet_the_deck_from_above_and_from_below(town: Town, trace: Trace) 
     (rise,) = scene.cast(pose, -down).distance
     top = RISE * (HALF_M - 2.0)
     assert 20.0 - fall == pytest.approx(top, abs=0.05) or fall < 20.0 - top  # or what drives there
-    assert 2.5 + rise == pytest.approx(top - DECK_M, abs=0.05)
+    assert 2.5 + rise == pytest.approx(top - DECK_M[1], abs=0.05)
     world = build_static_world(town)
     assert set(world.mesh.material[world.part == Part.DECK]) == {Material.ROAD, Material.WALL}
 
 
-def test_nothing_stands_on_or_under_a_deck(town: Town) -> None:
+def test_a_low_deck_is_thinner(town: Town) -> None:
+    assert town.relief is not None
+    for lowered, thickness in ((1.0, RISE * HALF_M - 1.0 - ROOM_M), (3.0, DECK_M[0])):
+        sections = [section - (0.0, 0.0, lowered) for section in deck_of(town).sections]
+        low = replace(town, relief=Relief(town.relief.points, [Deck(sections)]))
+        world = build_static_world(low)
+        under = world.mesh.vertices[
+            world.mesh.faces[(world.part == Part.DECK) & (world.mesh.material == Material.WALL)]
+        ]
+        middle = under[np.abs(under[..., 1]) < 0.3]
+        assert middle[:, 2].min() == pytest.approx(RISE * HALF_M - lowered - thickness, abs=0.05)
+
+
+def test_what_stands_on_or_under_a_deck_is_left_out(town: Town) -> None:
+    assert town.relief is not None
     area = deck_of(town).outline.buffer(1.0)
-    for feet in (town.lamps, town.trees, town.poles.position, town.signs.position, *(rows for _, rows in town.clutter)):
-        assert not contains_xy(area, *feet[:, :2].T).any()
+    assert not contains_xy(area, *town.lamps[:, :2].T).any()
+    near, far = (0.0, 5.0), (30.0, 30.0)
+    feet = np.array((near, far))
+    heads = np.column_stack((feet, (3.0, 3.0)))
+    hedge = np.array([(0.0, 16.0, np.pi / 2, 20.0, 0.8, 1.0), (30.0, 16.0, np.pi / 2, 20.0, 0.8, 1.0)])
+    filled = replace(
+        town,
+        relief=None,
+        trees=np.column_stack((feet, (5.0, 5.0), (1.0, 1.0))),
+        clutter=(("hedgerow", hedge),),
+        lamps=heads,
+        posts=heads,
+        poles=Poles(np.array((1, 2)), heads, np.zeros(2), ("straight", "straight")),
+        signs=Signs(heads, np.zeros(2), ("stop", "yield")),
+        signals=Signals(heads[[1, 0, 1]], np.zeros(3), feet[[1, 0, 1]], ("a:0", "b:0", "c:0"), walkers=2),
+    )
+    left = lift_town(filled, town.relief)
+    for rows in (left.trees, left.clutter[0][1], left.lamps, left.posts, left.poles.position, left.signs.position):
+        np.testing.assert_array_equal(rows[:, 0], [30.0])
+    assert left.poles.id.tolist() == [2]
+    assert left.signs.kind == ("yield",)
+    assert left.signals.link == ("a:0", "c:0")
+    assert left.signals.walkers == 1
+    np.testing.assert_array_equal(left.signals.foot, feet[[1, 1]])
 
 
 def test_the_heights_of_a_town_keep_their_decks(town: Town, tmp_path: Path) -> None:
@@ -148,3 +229,49 @@ def test_a_deck_is_where_a_road_is_high_above_another_and_crosses_it() -> None:
     assert (first, last) == (30 - 7 - 1, 30 + 7 + 2)  # 3 m of road and 4 m clear of it on each side, rounded up
     for other in (road(0.0, BRIDGE_M - 0.1, True), road(8.0, 9.0, False)):
         assert not any(span.decks for span in find_bridges([ground, other]))
+
+
+def test_a_deck_goes_on_over_a_joint_of_roads() -> None:
+    s, flat = np.arange(-30.0, 31.0), np.zeros(61)
+    ground = Borders(*(np.column_stack((s, flat + side, flat)) for side in (-3.0, 3.0)))
+    above = [np.column_stack((flat + side, s, flat + 6.0)) for side in (3.0, -3.0)]
+    before, after = Borders(*(end[:26] for end in above)), Borders(*(end[25:] for end in above))  # they meet at y = -5
+    _, first, second = find_bridges([ground, before, after])
+    assert [s[:26][deck].tolist() for deck in first.decks] == [[-8.0, -7.0, -6.0, -5.0]]
+    assert [(s[25:][deck][0], s[25:][deck][-1]) for deck in second.decks] == [(-5.0, 8.0)]
+
+
+def test_a_road_has_a_bridge_over_itself() -> None:
+    t = np.linspace(-1.6, 1.6, 200)
+    line = np.column_stack((30 * (t**2 - 1), 30 * (t**3 - t), 3 * (t + 1.6)))  # at 0, 0 with t = -1 and with t = 1
+    ahead = np.gradient(line[:, :2], axis=0)
+    aside = 3 * np.column_stack((-ahead[:, 1], ahead[:, 0])) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    aside = np.column_stack((aside, np.zeros(200)))
+    (span,) = find_bridges([Borders(line - aside, line + aside)])
+    (deck,) = span.decks
+    assert t[deck][0] < 1 < t[deck][-1]
+    assert t[deck][0] > 0.6
+
+
+def test_a_road_without_a_width_has_no_deck() -> None:
+    root = crossing()
+    for lane in root.iterfind("road[@id='1']//lane[@id='1']"):
+        lane.set("type", "sidewalk")  # so that none are added
+    for width in root.iterfind("road[@id='2']//width"):
+        width.set("a", "0")
+    found = sample_heights(root, Path("map"))
+    assert not found.decks
+    assert Relief(found.points).heights(0.0, 0.0) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("degrees", [90, 45, 25])
+def test_a_street_below_a_skewed_bridge_stays_level(degrees: int) -> None:
+    turn = np.radians(degrees)
+    level = '<elevationProfile><elevation s="0" a="6" b="0" c="0" d="0"/></elevationProfile>'
+    lower = street("1", 'x="-150" y="0" hdg="0"><line/>', 300.0)
+    start = f'x="{-100 * np.cos(turn)}" y="{-100 * np.sin(turn)}" hdg="{turn}"><line/>'
+    upper = street("2", start, 200.0, profile=level)
+    found = sample_heights(ElementTree.fromstring(f"<OpenDRIVE>{lower}{upper}</OpenDRIVE>"), Path("map"))
+    relief = Relief(found.points)
+    x, y = np.meshgrid(np.arange(-120.0, 120.5, 0.5), (-3.4, -1.7, 0.0, 1.7, 3.4))
+    np.testing.assert_allclose(relief.heights(x, y), 0.0, atol=0.02)
