@@ -1,7 +1,7 @@
 """Actors on bridges and below them: which of two streets, one above the other, an actor is on.
 
-SUMO's net has no heights. An actor above or below a deck is on it where lanes that lead over it are nearer, and point more
-in the actor's direction, than those that lead below, all in all while it passes above or below.
+SUMO's net has no heights. An actor above or below a deck is on it where lanes that lead over it are nearer, and point
+more in the actor's direction, than those that lead below, all in all while it passes above or below.
 """
 
 from collections.abc import Callable
