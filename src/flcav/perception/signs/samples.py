@@ -34,7 +34,7 @@ class RecordedPictures(Sequence[Sample]):
     """
 
     def __init__(self, data: Dataset, config: SignsConfig, frames: Sequence[int] | None = None) -> None:
-        data.check_labelled("signs")
+        data.check_labelled("signs" if config.labels == "signs" else "objects")
         self._data, self._config = data, config
         self._of = [(number, camera) for number in data.numbers(frames) for camera in data.frame(number).images]
         if not self._of:
@@ -65,12 +65,13 @@ class RecordedPictures(Sequence[Sample]):
 
 
 def sample_from_frame(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
-    """Return a camera's image with the boxes of its signs and lights.
+    """Return a camera's image with the boxes of its signs and lights, or of its actors, as `config.labels` says.
 
-    Boxes smaller than `config.smallest_px`, and boxes cut off by the image's edge, are ignored: a lamp may lie outside.
+    Boxes smaller than `config.smallest_px` are ignored, and so are signs cut off by the image's edge: a lamp may lie
+    outside.
     """
-    shown = select_rectangles(frame, camera, "signs", min_pixels=1)
-    names = [CLASSES["signs"][number] for number in shown.label]
+    shown = select_rectangles(frame, camera, config.labels, min_pixels=1)
+    names = [CLASSES[config.labels][number] for number in shown.label]
     known = np.array([name in config.classes for name in names], dtype=bool)
     label = np.array([config.classes.index(name) for name, ok in zip(names, known) if ok], dtype=np.int64)
     box = shown.box[known]
@@ -80,9 +81,12 @@ def sample_from_frame(frame: Frame, camera: str, picture: Picture, config: Signs
 
 
 def find_targets(box: NDArray[np.float64], size: tuple[int, int], config: SignsConfig) -> NDArray[np.bool_]:
-    """Return (N,) which boxes (N, 4) are targets in an image of `size` (width, height) [px]: whole and large enough."""
+    """Return (N,) which boxes (N, 4) are targets in an image of `size` (width, height) [px].
+
+    They are large enough, and those of signs are whole.
+    """
     whole = (box[:, :2] > 0).all(1) & (box[:, 2:] < size).all(1)
-    return whole & (size_px(box) >= config.smallest_px)
+    return (whole | (config.labels != "signs")) & (size_px(box) >= config.smallest_px)
 
 
 def size_px(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
