@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, linear_sum_assignment
 from scipy.spatial.transform import Rotation
@@ -22,7 +23,7 @@ from flcav.sensors.camera.lens import project_points
 
 Array = NDArray[np.float64]
 
-SIDE_PX, SIDE_SHARE = 2.0, 0.06  # standard deviation of a side: hypot of pixels and of a share of the box's own size
+SIDE_PX, SIDE_SHARE = 2.0, 0.08  # standard deviation of a side: hypot of pixels and of a share of the box's own size
 GATE = float(chi2.ppf(0.999, 4))  # largest squared distance of a pair, of four sides
 ROUNDS = 12  # most repetitions of association and fit
 NEAREST_M = 1.0  # least depth of all of a car before the camera
@@ -32,7 +33,7 @@ BORDER_PX = 1.5  # a side this near to the border of the picture may lie outside
 OUTLINE = np.array(
     [
         (x * a, y * b, z)
-        for a, b, z in ((0.85, 0.92, 0.0), (1.0, 0.8, 0.2), (0.96, 0.92, 0.55), (0.62, 0.76, 1.0))
+        for a, b, z in ((0.75, 0.88, 0.0), (1.0, 0.72, 0.25), (0.93, 0.92, 0.52), (0.52, 0.66, 0.98))
         for x in (-1, 1)
         for y in (-1, 1)
     ]
@@ -166,7 +167,7 @@ def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: Vi
 
 
 def project_cars(cars: Boxes, view: View) -> Array:
-    """Return the boxes (N, 4) x1 y1 x2 y2 [px] around the outlines of cars, LiDAR frame, clipped to the picture.
+    """Return the boxes (N, 4) x1 y1 x2 y2 [px] around what the picture shows of the outlines of cars, LiDAR frame.
 
     NaN for cars that are not wholly before the camera, or outside the picture.
     """
@@ -192,15 +193,14 @@ def sides_inside(boxes: Array, view: View) -> NDArray[np.bool_]:
 
 
 def _sides(points: Array, view: View) -> Array:
-    """Return the clipped boxes (N, 4) around outlines (N, K, 3), LiDAR frame; NaN as `project_cars`."""
+    """Return the boxes (N, 4) around what the picture shows of outlines (N, K, 3), LiDAR frame; NaN where nothing."""
     n, k, _ = points.shape
     seen = transform_points(view.camera_from_lidar, points.reshape(-1, 3))
-    before = (seen[:, 2].reshape(n, k) > NEAREST_M).all(axis=1)
+    before = np.all(seen[:, 2].reshape(n, k) > NEAREST_M, axis=1)
     pixels = project_points(view.intrinsics, view.distortion, seen).reshape(n, k, 2) + HALF_PX
-    low, high = pixels.min(axis=1), pixels.max(axis=1)
-    clipped = np.concatenate((low, high), axis=1).clip(0, np.array(view.size * 2, dtype=np.float64))
-    shown = before & (clipped[:, 2:] > clipped[:, :2]).all(axis=1)
-    return np.where(shown[:, None], clipped, np.nan)
+    hulls = shapely.convex_hull(shapely.multipoints(np.where(before[:, None, None], pixels, -1.0)))
+    shown = shapely.intersection(hulls, shapely.box(0, 0, *view.size))
+    return np.where((shapely.area(shown) > 0)[:, None], shapely.bounds(shown), np.nan)
 
 
 def _project_with_slope(cars: Boxes, view: View) -> tuple[Array, Array]:

@@ -111,7 +111,7 @@ def test_the_correction_brings_the_extrinsics_nearer_to_the_true_ones():
 
 def test_without_the_correction_cars_get_the_boxes_of_others():
     made, truth = shots()
-    off = replace(TRUE, camera_from_lidar=apply_error(EXACT, 3 * OFF), covariance=9 * SPREAD)
+    off = replace(TRUE, camera_from_lidar=apply_error(EXACT, 4 * OFF), covariance=16 * SPREAD)
     assert share_right([pair(shot, off) for shot in made], truth)[0] < 0.9
     assert share_right(correct_extrinsics(made, off).pairs, truth)[0] > 0.97
 
@@ -119,10 +119,10 @@ def test_without_the_correction_cars_get_the_boxes_of_others():
 def test_beyond_the_gate_nothing_is_paired(monkeypatch):
     cars = street(0)[:1]
     boxes = pinhole(cars, EXACT)
-    shot, sure = Shot(cars, boxes + (60, 0, 60, 0)), replace(TRUE, covariance=1e-4 * SPREAD)
+    shot, sure = Shot(cars, boxes + np.array((60, 0, 60, 0))), replace(TRUE, covariance=1e-4 * SPREAD)
     alone = pair(shot, sure)
     assert (len(alone), alone.lone_cars.tolist(), alone.lone_boxes.tolist()) == (0, [0], [0])
-    assert len(pair(Shot(cars, boxes + (2, 0, 2, 0)), sure)) == 1
+    assert len(pair(Shot(cars, boxes + np.array((2, 0, 2, 0))), sure)) == 1
     monkeypatch.setattr(association, "GATE", 100 * GATE)
     assert len(pair(shot, sure)) == 1
 

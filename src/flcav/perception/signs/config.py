@@ -40,6 +40,7 @@ class SignsConfig:
     labels: Literal["signs", "actors"] = "signs"  # what is to be found: a key of `flcav.dataset.rectangles.CLASSES`
     classes: Annotated[tuple[str, ...], Field(min_length=1)] = SIGNS  # of these labels, in the order of the scores
     anchors_px: tuple[Level, Level, Level] = ANCHORS_PX  # width, height of the anchors at each of STRIDES
+    background: bool = False  # whether its input is a picture beside the static background: see `signs.background`
     window_px: tuple[Window, Window] = (320, 192)  # width, height of a training sample
     smallest_px: Annotated[float, Field(ge=0, le=8192)] = 6.0  # least size, root of the area, of a target box
 
@@ -48,6 +49,12 @@ CONFIGURATIONS = {
     "n": SignsConfig(width=0.25, depth=0.33),
     "s": SignsConfig(width=0.5, depth=0.33),
     "road": SignsConfig(
-        width=0.125, depth=0.33, labels="actors", classes=("car", "van"), anchors_px=CAR_ANCHORS_PX, smallest_px=10.0
+        width=0.125,
+        depth=0.33,
+        labels="actors",
+        classes=("car", "van"),
+        anchors_px=CAR_ANCHORS_PX,
+        background=True,
+        smallest_px=10.0,
     ),
 }

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flcav.config import InputError
 from flcav.perception.images import read_pictures
 from flcav.perception.marks import PictureBoxes
 from flcav.perception.signs.model import SignDetector
@@ -17,8 +18,11 @@ def detect_signs(
 ) -> Iterator[Finding]:
     """Yield the detections of score `threshold` or more in each image at `path`, by falling score.
 
-    Raises `InputError` as `flcav.perception.images.read_pictures` does.
+    Raises `InputError` as `flcav.perception.images.read_pictures` does, and for a network of backgrounds, which sees
+    pictures of datasets alone: `flcav evaluate`.
     """
+    if network.config.background:
+        raise InputError(f"{path}: this network sees pictures beside their background; flcav evaluate signs learns it")
     for origin, rgb in read_pictures(path, frames):
         found = detect(network, rgb, threshold=threshold)
         names = np.array(network.config.classes)[found.label]

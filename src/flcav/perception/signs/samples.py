@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
-from flcav.perception.images import Picture, check_picture
+from flcav.perception.images import Picture
+from flcav.perception.signs.background import picture_reader
 from flcav.perception.signs.config import SignsConfig
 from flcav.sensors.frame import Frame
 
@@ -35,7 +36,7 @@ class RecordedPictures(Sequence[Sample]):
 
     def __init__(self, data: Dataset, config: SignsConfig, frames: Sequence[int] | None = None) -> None:
         data.check_labelled("signs" if config.labels == "signs" else "objects")
-        self._data, self._config = data, config
+        self._data, self._config, self._read = data, config, picture_reader(data, config.background)
         self._of = [(number, camera) for number in data.numbers(frames) for camera in data.frame(number).images]
         if not self._of:
             raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
@@ -49,11 +50,8 @@ class RecordedPictures(Sequence[Sample]):
         if index in self._kept:
             return self._kept[index]
         number, camera = self._of[index]
-        picture = self._data.plane(number, camera, "rgb")
-        frame = self._data.frame(number)
-        sample = sample_from_frame(
-            frame, camera, check_picture(picture, f"{self._data.folder} {frame.key}"), self._config
-        )
+        picture = self._read(number, camera)
+        sample = sample_from_frame(self._data.frame(number), camera, picture, self._config)
         if self._kept_bytes + picture.nbytes <= KEPT_BYTES:
             self._kept[index] = sample
             self._kept_bytes += picture.nbytes
