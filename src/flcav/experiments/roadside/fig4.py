@@ -91,7 +91,7 @@ class Fig4(Record):
     cars: tuple[int, ...]  # seen by any suite, in each interval of `EDGES_M`
     found: dict[str, tuple[int, ...]]  # of these, by arm
     range_m: dict[str, float]  # to which an arm finds the share `REACHED` of the cars; 0 where nowhere
-    cameras: tuple[CameraResult, ...]
+    cameras: tuple[CameraResult, ...] = ()
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
     def sentences(self) -> list[str]:
