@@ -58,8 +58,8 @@ class CameraResult:
 
 
 @dataclass(frozen=True)
-class _Known:
-    """The actors of one shot, as rows of the frame's annotations; -1: none."""
+class Known:
+    """Actors of the cars and of the boxes of one shot, as rows of the frame's annotations; -1: none."""
 
     cars: NDArray[np.int64]  # (N,) of the LiDAR's cars
     boxes: NDArray[np.int64]  # (M,) of the picture's boxes
@@ -78,7 +78,7 @@ def associate_camera(
     made = []
     for number in numbers:
         boxes = detect(network, read(number, camera), threshold=PICTURE_THRESHOLD).box
-        made.append(_name_actors(data.frame(number), lidar, camera, Shot(find(number), boxes)))
+        made.append(name_actors(data.frame(number), lidar, camera, Shot(find(number), boxes)))
     shots, known = [shot for shot, _ in made], [actors for _, actors in made]
     height, width = data.plane(numbers[0], camera, "rgb").shape[:2]
     both, size = data.calibrations[agent], (width, height)
@@ -118,7 +118,7 @@ def make_view(
     )
 
 
-def judge_pairs(pairs: Sequence[Pairs], known: Sequence[_Known], off: Offset) -> Associated:
+def judge_pairs(pairs: Sequence[Pairs], known: Sequence[Known], off: Offset) -> Associated:
     """Return the counts over all shots of one camera."""
     right = [
         (own.cars[each.car] >= 0) & (own.cars[each.car] == own.boxes[each.box])
@@ -137,12 +137,12 @@ def judge_pairs(pairs: Sequence[Pairs], known: Sequence[_Known], off: Offset) ->
     )
 
 
-def _name_actors(frame: Frame, lidar: str, camera: str, shot: Shot) -> tuple[Shot, _Known]:
+def name_actors(frame: Frame, lidar: str, camera: str, shot: Shot) -> tuple[Shot, Known]:
     """Return what LiDAR and camera found in a frame, and which actors that is."""
     truth, views = frame.annotations, frame.annotations.views[camera]
     rows = _actors_of_cars(shot.cars.transform(frame.world_from_sensor(lidar)), truth)
     visible = (rows >= 0) & (views.pixels[rows] >= VISIBLE_PX)
-    return shot, _Known(rows, _actors_of_boxes(shot.boxes, views), visible)
+    return shot, Known(rows, _actors_of_boxes(shot.boxes, views), visible)
 
 
 def _actors_of_cars(cars: Boxes, truth: Annotations) -> NDArray[np.int64]:
