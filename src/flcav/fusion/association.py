@@ -141,10 +141,10 @@ def pair(shot: Shot, view: View) -> Pairs:
 
 
 def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: View) -> View:
-    """Return the view whose extrinsics fit the pairs best, by least squares with a soft L1 loss, and their covariance.
+    """Return the view whose extrinsics fit the pairs best, and their covariance.
 
-    Residuals are the sides' offsets in standard deviations, and the error of `calibrated` in its own: translation and
-    rotation are corrected as far as the pairs show them.
+    By least squares of the sides' offsets in standard deviations, under a Cauchy loss, and of the error of `calibrated`
+    in its own: rotation and translation are corrected as far as the pairs show them.
     """
     cars = [shot.cars[own.car] for shot, own in zip(shots, pairs, strict=True)]
     boxes = np.concatenate([shot.boxes[own.box] for shot, own in zip(shots, pairs, strict=True)])
@@ -157,9 +157,10 @@ def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: Vi
         sides = _sides(points, moved)
         inside = sides_inside(sides, moved) & sides_inside(boxes, moved)
         off = np.where(inside & np.isfinite(sides), (boxes - sides) / sigma, 0.0)
-        return np.concatenate((off.ravel(), whiten @ error))
+        robust = np.sign(off) * np.sqrt(np.log1p(off**2))  # its square is the Cauchy loss; the prior stays Gaussian
+        return np.concatenate((robust.ravel(), whiten @ error))
 
-    found = least_squares(residuals, np.zeros(6), loss="soft_l1", x_scale=np.sqrt(np.diag(calibrated.covariance)))
+    found = least_squares(residuals, np.zeros(6), x_scale=np.sqrt(np.diag(calibrated.covariance)))
     covariance = np.linalg.inv(found.jac.T @ found.jac)
     return replace(
         calibrated, camera_from_lidar=apply_error(calibrated.camera_from_lidar, found.x), covariance=covariance
