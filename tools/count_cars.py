@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, pose
+from flcav.perception.metrics.found_cars import OVERLAP, SCORE, WITHIN_M
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect
@@ -32,7 +33,7 @@ from flcav.perception.objects.truth import (
 from flcav.perception.ops.rotated import iou
 from flcav.sensors.frame import Frame
 
-WITHIN_M, RETURNS, SCORE, OVERLAP, TOUCH = 40.0, 20, 0.3, 0.5, 0.1
+RETURNS, TOUCH = 20, 0.1
 
 
 @dataclass

@@ -47,7 +47,8 @@ def write_log(folder: Path, *, annotated: bool = True, attitude: Rotation = NORT
         xyz = np.array([[ahead, 0.0, 0.5], [ahead + 1, 0.5, 0.2], [0.0, 9.0, -0.3]]).astype(np.float16)
         columns = dict(zip("xyz", xyz.T))
         path = folder / "sensors" / "lidar" / f"{sweep}.feather"
-        write_feather(path, **columns, intensity=np.array([0, 51, 255], np.uint8))
+        offset_ns = np.array([0, 50_000_000, 99_000_000], np.int32)
+        write_feather(path, **columns, intensity=np.array([0, 51, 255], np.uint8), offset_ns=offset_ns)
         path = folder / "sensors" / "cameras" / "ring_front_center" / f"{sweep + 20_000_000}.jpg"
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (160, 96), (200, 30, 30)).save(path)

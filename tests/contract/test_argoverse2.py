@@ -10,6 +10,7 @@ import pytest
 from argoverse2_log import NORTH, START, UP_LIDAR, write_log
 from scipy.spatial.transform import Rotation
 
+from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.checks.validate import validate
 from flcav.dataset.formats.importing import import_dataset
@@ -71,30 +72,70 @@ def test_a_log_without_annotations_has_no_boxes_and_says_so(tmp_path: Path):
         Dataset.open(tmp_path / "out").check_labelled("objects")
 
 
-@pytest.mark.parametrize("how", ["missing", "truncated", "columns"])
+PICTURE = f"sensors/cameras/ring_front_center/{START + 20_000_000}.jpg"
+SWEEP = f"sensors/lidar/{START}.feather"
+TABLES = ("city_SE3_egovehicle", "calibration/intrinsics", "calibration/egovehicle_SE3_sensor")
+SENTENCES = {
+    "missing": "no such file",
+    "half": "not a Feather file, or a truncated one",
+    "empty": "not a Feather file, or a truncated one",
+    "columns": "no column",
+}
+
+
 @pytest.mark.parametrize(
-    "name",
-    ["city_SE3_egovehicle", "calibration/intrinsics", "calibration/egovehicle_SE3_sensor", f"sensors/lidar/{START}"],
+    ("name", "how", "sentence"),
+    [
+        *((f"{name}.feather", how, SENTENCES[how]) for name in TABLES for how in SENTENCES),
+        *((name, how, SENTENCES[how]) for name in ("annotations.feather", SWEEP) for how in list(SENTENCES)[1:]),
+        (PICTURE, "half", "a truncated image"),
+        (PICTURE, "empty", "not an image, or a truncated one"),
+        (PICTURE, "dangling", "no such file"),
+    ],
 )
-def test_a_file_of_a_log_names_itself(name: str, how: str, tmp_path: Path):
+def test_a_file_of_a_log_names_itself(
+    name: str, how: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     write_log(tmp_path / "log")
-    path = tmp_path / "log" / f"{name}.feather"
-    if how == "missing":
-        path.unlink()
-        if "lidar" in name:
-            return  # one sweep less
-    elif how == "truncated":
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    else:
+    path = tmp_path / "log" / name
+    whole = path.read_bytes()
+    path.unlink()
+    if how in ("half", "empty"):
+        path.write_bytes(whole[: len(whole) // 2] if how == "half" else b"")
+    elif how == "columns":
         feather.write_feather(pa.table({"other": [1]}), path)
-    sentence = {
-        "missing": "no such file",
-        "truncated": "not a Feather file, or a truncated one",
-        "columns": "no column",
-    }
-    with pytest.raises(InputError, match=sentence[how]) as error:
-        import_dataset("argoverse2", tmp_path / "log", tmp_path / "out")
-    assert str(error.value).startswith(str(path))
+    elif how == "dangling":
+        path.symlink_to(tmp_path / "nowhere.jpg")
+    with pytest.raises(SystemExit) as ended:
+        run(["import", "argoverse2", str(tmp_path / "log"), "--out", str(tmp_path / "out")])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[-1].removeprefix("flcav: ").startswith(f"{path}: ")
+    assert sentence in said[-1]
+    assert not (tmp_path / "out").exists()
+
+
+def test_sweeps_and_pictures_that_are_not_there_are_told(tmp_path: Path):
+    """Which files a log has, no file of it says: they are named by their times."""
+    write_log(tmp_path / "log")
+    (tmp_path / "log" / PICTURE).unlink()
+    notes = import_dataset("argoverse2", tmp_path / "log", tmp_path / "dark")
+    assert notes == ("no picture within 50 ms of a sweep, of cameras with others: 1",)
+    (tmp_path / "log" / SWEEP).unlink()
+    notes = import_dataset("argoverse2", tmp_path / "log", tmp_path / "out")
+    assert notes == ("no sweep at 1 annotated times, so no frames there",)
+
+
+def test_points_have_their_times(tmp_path: Path):
+    write_log(tmp_path / "log")
+    import_dataset("argoverse2", tmp_path / "log", tmp_path / "out")
+    times_s = Dataset.open(tmp_path / "out").frame(1).point_times["lidar"]
+    np.testing.assert_allclose(times_s, (0, 0.05, 0.099), atol=1e-7)
+    path = tmp_path / "log" / SWEEP
+    columns = feather.read_table(path).to_pydict() | {"offset_ns": [0, 1, 10**9]}
+    feather.write_feather(pa.table(columns), path)
+    with pytest.raises(InputError, match="a point's 'offset_ns' is no time within the spin"):
+        import_dataset("argoverse2", tmp_path / "log", tmp_path / "late")
 
 
 def test_velocities_are_differences_of_neighbours():
@@ -125,6 +166,8 @@ def test_points_of_a_real_log_lie_in_its_boxes(tmp_path: Path):
     rows = [np.flatnonzero(np.isin(frame.annotations.track, both)) for frame in near]
     order = [rows[i][np.argsort(near[i].annotations.track[rows[i]])] for i in range(2)]
     moved = near[1].annotations.boxes.center[order[1]] - near[0].annotations.boxes.center[order[0]]
+    assert all(0 < frame.point_times["lidar"].min() < 0.01 < 0.1 < frame.point_times["lidar"].max() for frame in near)
+    assert validate(tmp_path / "out") == []
     step = near[1].time_s - near[0].time_s
     np.testing.assert_allclose(moved / step, near[0].annotations.velocity[order[0]], atol=1.5)
     lidar = transform_points(inverse(near[0].world_from_agent), near[0].world_from_sensor("lidar")[None, :3, 3])

@@ -27,9 +27,15 @@ RECIPE = {
             {"privacy": {"clip": 1, "noise": 1, "epsilon": 0}},
             "'federation.privacy.epsilon' = 0: Input should be greater",
         ),
+        (
+            {"privacy": {"clip": 1, "noise": 1, "epsilon": 0.01}},
+            "privacy: a first round comes to epsilon = 4.729 at delta = 1e-05, above the budget of 0.01",
+        ),
         ({"privacy": {"clip": 1, "noise": 0}}, "'federation.privacy.noise' = 0: Input should be greater than 0"),
         ({"selection": {"rule": "uniform", "clients": 5}}, "5 clients are wanted in a round, and there are 4"),
         ({"least_clients": 5}, "least_clients: 5 are wanted in a round, and 4 take part"),
+        ({"least_clients": "half"}, "'federation.least_clients' = 'half': expected 'all' or a whole number from 1 to"),
+        ({"least_clients": 0}, "'federation.least_clients' = 0: expected 'all' or a whole number from 1 to 1000000"),
     ],
 )
 def test_a_federation_that_cannot_be_is_refused_in_a_sentence(

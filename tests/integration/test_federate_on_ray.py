@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from flcav.federation.privacy import Privacy
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.simulation import RaySimulation
@@ -50,8 +51,10 @@ CLIENTS = {f"cav{i}": Walker(stride) for i, stride in enumerate((3, 40, 1, 17, 8
         (FEDAVG, Rules(least_clients=4), 0),
         (Krum(), Rules(least_clients=5), 0),
         (Scaffold(), Rules(least_clients=4, upload=Upload(compression="none")), 1),
+        (FEDAVG, Rules(least_clients=4, privacy=Privacy(where="local", clip=1.0, noise=1.0, seeded=True)), 0),
+        (FEDAVG, Rules(least_clients=4, privacy=Privacy(where="local", clip=1.0, noise=1.0)), 0),
     ],
-    ids=["fedavg", "krum", "scaffold"],
+    ids=["fedavg", "krum", "scaffold", "seeded noise", "secret noise"],
 )
 def test_the_weights_on_ray_are_those_of_the_embedded_runtime(strategy: Strategy, rules: Rules, stopped: int):
     account, state = Account(Ledger(Budget(1.0, 1.0)), "edge", "walk", "wireless"), FederationState()
@@ -62,7 +65,7 @@ def test_the_weights_on_ray_are_those_of_the_embedded_runtime(strategy: Strategy
         kept[number][1].update({"": dict(state.server)})
 
     whole = federate(CLIENTS, START, SCHEDULE, account, strategy=strategy, rules=rules, state=state, on_round=keep)
-    start, again = START, FederationState()
+    start, again = START, FederationState(secrets=state.secrets)
     if stopped:
         start, clients, again.records = kept[stopped]
         again.server = clients.pop("")

@@ -11,8 +11,6 @@ from performed_steps import in_mb, perform, uplinks
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
-from flcav.experiments.run_tables import tables
-from flcav.network.clock.records import ClientTiming, load_rounds
 from flcav.network.ledger import Ledger
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
@@ -43,7 +41,7 @@ from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.running import RESULTS, run, run_several
 from flcav.pipeline.seeds.learning_history import ORIGIN, HistoryOrigin
 from flcav.pipeline.steps import Step, ignore_steps, run_side_by_side
-from flcav.report.pages.run_page import draw, page, write_report
+from flcav.report.pages.run_page import page, write_report
 from flcav.verdicts import UNDECIDED
 from flcav.world.opendrive.importing import import_town
 
@@ -193,41 +191,6 @@ def test_a_plan_within_a_horizon_counts_the_time_on_the_air(timed: tuple[Path, R
     assert known.earlier is not None
     fast = [len((plan.joins or {})["ring/cav0"]) for plan in (known.earlier[0].tasks["weather"], *plans)]
     assert 4 >= fast[0] >= fast[1] > fast[2] >= 1  # a round trains for 1 s, and narrow bands take as long again
-
-
-def test_on_the_radio_stragglers_join_what_the_plan_gives_them_and_are_cut_off_at_the_deadline(tmp_path: Path) -> None:
-    asked = load_run_recipe(RECIPES / "runs/radio.yaml").model_dump()
-    few = {"scenes": 1, "spins": 3, "cavs": 1}
-    asked["splits"] = {
-        **{"pool": few, "validation": few, "edge": few, "registry": few | {"cavs": 4, "every_s": 2.0}},
-        "test": {"scenes": 2, "spins": 1, "cavs": 1},
-    }
-    asked["regions"]["grid"]["speed"] = {"cav1": 0.5, "cav3": 0.3}  # cav3 trains for longer than the deadline
-    asked |= {"training": QUICK, "limits": {"samples": [3, 3], "edge_rounds": [2, 2], "cloud_rounds": [1, 1]}}
-    asked["horizon_s"], deadline_s = 24.0, asked["federation"]["network"]["rounds"]["deadline_s"]
-    result = run(RunRecipe.model_validate(asked), tmp_path)
-    joins = result.arms[MAIN].plan.tasks["weather"].joins
-    assert joins is not None
-    assert len(joins["grid/cav3"]) == 2 < len(joins["grid/cav0"]) == 3  # 24 s are no three rounds of 6.7 s and more
-    outcomes: dict[str, list[ClientTiming]] = {name: [] for name in joins}
-    lengths: dict[str, float] = dict.fromkeys(joins, 0.0)
-    for step in ("{}-edge-fl-weather", "cloud-fl-weather"):
-        for region in ("grid", "ring"):
-            for driven in load_rounds(tmp_path / "work" / step.format(region) / f"clock-{region}.parquet"):
-                assert driven.end_s - driven.start_s <= deadline_s + 1e-6
-                for timing in driven.clients:
-                    outcomes[f"{region}/{timing.client}"].append(timing)
-                    lengths[f"{region}/{timing.client}"] += driven.end_s - driven.start_s
-    assert {timing.dropped for timing in outcomes["grid/cav3"]} == {"past the deadline"}
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables(result)["rounds"].splitlines()[2:]]
-    assert {name: len(own) for name, own in outcomes.items()} == {name: len(own) for name, own in joins.items()}
-    for _, name, speed, planned, combined, lost, seconds in rows:
-        own = outcomes[name]
-        assert float(speed) == {"grid/cav1": 0.5, "grid/cav3": 0.3, "ring/cav0": 0.5}.get(name, 1.0)
-        assert (int(planned), int(combined)) == (len(joins[name]), sum(not timing.dropped for timing in own))
-        assert sum(int(each.split()[0]) for each in lost.split(", ") if each) == sum(bool(t.dropped) for t in own)
-        assert float(seconds) == pytest.approx(lengths[name], abs=0.06)
-    assert {"timeline_grid", "timeline_ring"} <= {*draw(result, tmp_path / "work")}
 
 
 def test_the_rest_of_a_stage_is_planned_after_each_round(timed: tuple[Path, RunRecipe, Run]) -> None:

@@ -262,7 +262,7 @@ def test_boxes_of_the_road_average_are_priced_and_booked_in_stages_two_and_three
     placement = RECIPE.placement.model_copy(update={"group_range_m": 1000.0})  # every frame is near a sensor
     changes = {"tasks": averaged, "regions": regions, "arms": {}, "placement": placement}
     asked = RunRecipe.model_validate(RECIPE.model_dump() | changes)
-    perform(asked, finished, tmp_path, ("plan", "grid-edge-fl-objects", "cloud-fl-objects"))
+    perform(asked, finished, tmp_path, ("plan", "grid-edge-objects", "grid-edge-fl-objects", "cloud-fl-objects"))
     plan, book = Plan.load(tmp_path / "plan").tasks["objects"], Ledger.load(tmp_path / "cloud-fl-objects" / LEDGER)
     sent = uplinks(book.entries, "wireless")
     rounds = [each for each in sent if each.round]
@@ -270,7 +270,8 @@ def test_boxes_of_the_road_average_are_priced_and_booked_in_stages_two_and_three
     boxes = [each for each in rounds if each not in updates]
     held = StageResult.load(tmp_path / "grid-edge-fl-objects").samples
     assert len(updates) == 2 * 2
-    assert [(each.stage, each.round) for each in boxes] == [(EDGE, 1)] * held + [(CLOUD, 1)] * held
+    told = 3 * held  # each frame, one before it and one after
+    assert [(each.stage, each.round) for each in boxes] == [(EDGE, 1)] * told + [(CLOUD, 1)] * told
     assert plan.labels_mb is not None
     assert 0.5 < 2 * 2 * plan.labels_mb / in_mb(boxes) < 2
     priced = plan.samples * plan.sample_mb + 2 * 2 * (plan.model_mb + plan.labels_mb)

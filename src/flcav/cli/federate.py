@@ -1,5 +1,6 @@
 """`flcav federate`: stage II of a run recipe alone, round by round."""
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ from flcav.cli.terminal import print_json, when_interrupted
 from flcav.threads import use_threads
 
 if TYPE_CHECKING:
+    from flcav.pipeline.results.training import StageResult
     from flcav.pipeline.steps import Notify
 
 
@@ -34,13 +36,14 @@ def federate(
 ) -> None:
     """Run stage II of a recipe alone, edge FL in every region; print each round with its scores on validation frames.
 
-    Writes federation.json, and the weights of each federation as safetensors. At the end it prints each task's train_s:
-    the CPU time that a vehicle trained in a round, in the median.
+    Speeds of vehicles, times and the network are the recipe's, as in a run. Writes federation.json, and the weights of
+    each federation as safetensors. At the end it prints each task's train_s, the CPU time that a vehicle trained in a
+    round, in the median; times.json has each vehicle's.
     """
     use_threads(1)
     from flcav.cli.steps import live_steps
     from flcav.files import check_writable
-    from flcav.pipeline.federations.alone import RESULTS, federate_regions, measure_train_s
+    from flcav.pipeline.federations.alone import RESULTS, TRAIN_TIMES, federate_regions, measure_times
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.sources.recipe import find_recipe
 
@@ -51,17 +54,28 @@ def federate(
         told = notify if as_json else _telling(notify)
         how = {"beside": found.parent, "jobs": jobs, "runtime": runtime.value, "stale": stale.value}
         results = federate_regions(asked, out, arm=arm, notify=told, **how)
-    train_s = measure_train_s(results, out)
+    times = measure_times(results, out)
     if as_json:
-        print_json(results.as_json() | {"train_s": train_s})
+        print_json(results.as_json() | times.as_json())
         return
     for each in results.federations:
-        result = each.result
-        told_rounds = f"{result.rounds} rounds, {result.clients} vehicles, {result.samples} samples"
-        typer.echo(f"{out / each.weights}: {result.task} in {result.region}, {told_rounds}")
-    for task, seconds in train_s.items():
+        typer.echo(f"{out / each.weights}: {_describe(each.result)}")
+    for task, seconds in times.train_s.items():
         typer.echo(f"{task}: train_s {seconds:.3g}, the median CPU time of a vehicle's training in a round [s]")
+    typer.echo(f"{out / TRAIN_TIMES}: times and speeds of each vehicle")
     typer.echo(f"{out / RESULTS}: all rounds")
+
+
+def _describe(result: "StageResult") -> str:
+    """Return a federation in words; on a network with its time and the vehicles that it lost."""
+    told = f"{result.task} in {result.region}, {result.rounds} rounds"
+    told += f", {result.clients} vehicles, {result.samples} samples"
+    seconds = [record.seconds for record in result.records or () if record.seconds is not None]
+    if not seconds:
+        return told
+    lost = Counter(f"{name} ({why})" for record in result.records or () for name, why in record.failed.items())
+    told += f", {sum(seconds):.1f} s on the network"
+    return ", lost: ".join([told, *([", ".join(f"{each} in {count}" for each, count in lost.items())] if lost else [])])
 
 
 def _telling(notify: "Notify") -> "Notify":

@@ -131,16 +131,19 @@ def read_image(path: Path, dtype: type[np.generic], channels: int = 1) -> NDArra
 
 
 def check_image(path: Path) -> None:
-    """Raise `InputError` where an image file is truncated or of no kind of PICTURES; it is not decoded.
+    """Raise `InputError` where an image file is missing, truncated or of no kind of PICTURES; it is not decoded.
 
     A PNG ends in its chunk IEND (ISO/IEC 15948, 11.2.5), a JPEG in the marker FFD9 (ITU-T T.81, B.1.1.3), after which
     some programs write more; the length of a WebP is in its header (RFC 9649, 2.3).
     """
-    with path.open("rb") as file:
-        head = file.read(12)
-        size = file.seek(0, io.SEEK_END)
-        file.seek(max(0, size - TAIL))
-        tail = file.read()
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+            size = file.seek(0, io.SEEK_END)
+            file.seek(max(0, size - TAIL))
+            tail = file.read()
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{path}: no such file") from None
     if head.startswith(b"\x89PNG"):
         whole = b"IEND" in tail
     elif head.startswith(b"\xff\xd8"):

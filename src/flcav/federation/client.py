@@ -2,13 +2,16 @@
 
 import inspect
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
+from flcav.federation.acceptance import is_usable
 from flcav.federation.encoding import encode, flatten, is_local
+from flcav.federation.noise import Secret, derive_key
 from flcav.federation.privacy import change_norm
 from flcav.federation.records import (
     ARRAYS,
@@ -18,6 +21,7 @@ from flcav.federation.records import (
     COUNT,
     EXTRA,
     LOSS,
+    LOST,
     METRICS,
     NORM,
     SAMPLES,
@@ -43,12 +47,19 @@ OWN, RESIDUAL = "own", "residual"  # records of a node's state: what strategy an
 KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
 
 
-def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> ClientApp:
+def client_app(
+    trainables: Mapping[str, Trainable], strategy: Strategy, rules: Rules, secrets: Mapping[str, Secret] = {}
+) -> ClientApp:
     """Return a Flower client app that trains the one of `trainables` (by client name) that its node stands for.
 
     A node stands for the client at the place `PARTITION` of its config. Its seed is derived from the round's seed and
-    the client's name. To a query it answers with its place and with what it keeps between rounds, after taking over
-    what the message brings of that.
+    the client's name. `secrets` are those of the clients, by name, that local noise is drawn by unless it is seeded;
+    they are in no message. To a query it answers with its place and with what it keeps between rounds, after taking
+    over what the message brings of that.
+
+    What error feedback leaves out, and a strategy's own arrays, are taken over where the server gets the update and can
+    use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
+    arrives.
     """
     app, clients = ClientApp(), [*trainables]
 
@@ -60,26 +71,31 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
             return answer_secretly(message, context, name)
         work = LocalWork.from_record(message.content.config_records[CONFIG])
         seed = derive_seed(work.seed, name)
+        key = derive_key(secrets[name], "noise", work.round, work.seed) if name in secrets else None
         if asked == COUNT:
             return reply_norm(message, 0.0, count_samples(trainables[name], work.steps))
+        extra, own = {}, {}
         if asked == SEND:
-            start, update, extra = _recall(context)
+            start, update = _recall(context)
         else:
             start = read_arrays(message.content, ARRAYS)
-            update, extra = _train(trainables[name], message, context, start, work, seed)
+            update, extra, own = _train(trainables[name], message, context, start, work, seed)
         if asked == NORM:
             _keep(context, start, update)
             names = [each for each in learned_names(start) if each in rules.upload.exchanged(start)]
             return reply_norm(message, change_norm(subtract(update.weights, start, names)), update.samples)
         if asked == MASKED and rules.secure is not None:
             peers = len(message.content.config_records[ASK][NAMES]) + 1  # type: ignore[arg-type]
-            integers = to_integers(flatten(update, start, rules, seed), rules.secure.largest, peers)
+            integers = to_integers(flatten(update, start, rules, seed, key), rules.secure.largest, peers)
             masked = {VECTOR: mask_update(message, context, integers)}
             about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
             return reply(message, LocalUpdate(masked, *about), {})
-        sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed)
-        _record(context, RESIDUAL, left)
-        return reply(message, sent, extra)
+        sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)
+        answer = reply(message, sent, extra)
+        if (left or own) and LOST not in message.content and is_usable(replace(sent, extra=extra), start, rules):
+            _record(context, RESIDUAL, left)
+            _record(context, OWN, own)
+        return answer
 
     @app.query()
     def query(message: Message, context: Context) -> Message:
@@ -91,8 +107,8 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
 
     def _train(
         trainable: Trainable, message: Message, context: Context, start: Weights, work: LocalWork, seed: int
-    ) -> tuple[Update, Weights]:
-        """Return the result of local training, and a strategy's arrays beside it."""
+    ) -> tuple[Update, Weights, Weights]:
+        """Return the result of local training, a strategy's arrays beside it, and those to keep if they arrive."""
         sent, own = _optional(message.content, EXTRA), _recorded(context, OWN)
         correction = strategy.correct(sent, own) if isinstance(strategy, Corrects) else Correction()
         if isinstance(rules.personal, RegionalModels) and CENTRE in message.content:
@@ -105,11 +121,10 @@ def client_app(trainables: Mapping[str, Trainable], strategy: Strategy, rules: R
         if isinstance(strategy, FedMD):
             _record(context, OWN, getattr(update, "own", {}))
         if not isinstance(strategy, Exchanges):
-            return update, {}
+            return update, {}, {}
         gradient = getattr(update, "gradient", {})  # asked for by the correction
-        extra, own = strategy.report(LocalUpdate(update.weights, update.samples, update.loss, gradient), sent, own)
-        _record(context, OWN, own)
-        return update, extra
+        found = LocalUpdate(update.weights, update.samples, update.loss, gradient)
+        return update, *strategy.report(found, sent, own)
 
     return app
 
@@ -133,11 +148,11 @@ def _keep(context: Context, start: Weights, update: Update) -> None:
     context.state[f"{KEPT}-{SAMPLES}"] = MetricRecord({SAMPLES: update.samples, LOSS: update.loss})
 
 
-def _recall(context: Context) -> tuple[Weights, Update, Weights]:
+def _recall(context: Context) -> tuple[Weights, Update]:
     metrics = context.state.metric_records[f"{KEPT}-{SAMPLES}"]
     samples, loss = metrics[SAMPLES], metrics[LOSS]
     update = LocalUpdate(_recorded(context, KEPT), int(samples), float(loss))  # type: ignore[arg-type]
-    return _recorded(context, KEPT_START), update, {}
+    return _recorded(context, KEPT_START), update
 
 
 def check_arguments(trainables: Mapping[str, Trainable], wanted: Iterable[str], why: str) -> None:

@@ -7,7 +7,7 @@ from flcav.federation.privacy import add_noise, clip_change
 from flcav.federation.rules import Rules
 from flcav.federation.trainable import LocalUpdate, Update, Weights, learned_names
 from flcav.federation.upload import VALUES, Arrays, add, compress, decompress, subtract
-from flcav.seeds import derive_seed, stream
+from flcav.seeds import derive_seed
 
 
 def is_changed(rules: Rules) -> bool:
@@ -15,17 +15,20 @@ def is_changed(rules: Rules) -> bool:
     return rules.upload.compression != "none" or is_local(rules)
 
 
-def encode(update: Update, start: Weights, rules: Rules, residual: Weights, seed: int) -> tuple[LocalUpdate, Arrays]:
+def encode(
+    update: Update, start: Weights, rules: Rules, residual: Weights, seed: int, key: bytes | None = None
+) -> tuple[LocalUpdate, Arrays]:
     """Return an update as it is sent, and what the client keeps for the next round.
 
-    `start` are the weights that the round began with, `residual` is what was kept in the last one, `seed` that of noise
-    and rounding. Under local privacy the number of samples, the loss and all that is not learned stay with the client.
+    `start` are the weights that the round began with, `residual` is what was kept in the last one, `seed` that of
+    rounding, and `seed` or `key` that of local noise, see `add_noise`. Under local privacy the number of samples, the
+    loss and all that is not learned stay with the client.
     """
     upload, weights = rules.upload, update.weights
     names, learned = upload.exchanged(start), set(learned_names(start))
     if not is_changed(rules):
         return LocalUpdate({name: weights[name] for name in names}, update.samples, update.loss), {}
-    change = _protect(subtract(weights, start, [name for name in names if name in learned]), rules, seed)
+    change = _protect(subtract(weights, start, [name for name in names if name in learned]), rules, seed, key)
     sent, kept = compress(upload, change, residual.get(VALUES), derive_seed(seed, "rounding"))
     if is_local(rules):
         return LocalUpdate(sent, 1, 0.0), kept
@@ -49,12 +52,12 @@ def decode(sent: Weights, start: Weights, rules: Rules) -> Weights:
     return weights | {name: sent[name] for name in rest}
 
 
-def flatten(update: Update, start: Weights, rules: Rules, seed: int) -> NDArray[np.float64]:
+def flatten(update: Update, start: Weights, rules: Rules, seed: int, key: bytes | None = None) -> NDArray[np.float64]:
     """Return the change of all floating arrays that are sent, one after another (coordinates,).
 
-    Under local privacy these are the learned ones, clipped and with noise; `seed` is that of the noise.
+    Under local privacy these are the learned ones, clipped and with noise; `seed` and `key` are as in `encode`.
     """
-    change = _protect(subtract(update.weights, start, _floating(start, rules)), rules, seed)
+    change = _protect(subtract(update.weights, start, _floating(start, rules)), rules, seed, key)
     return np.concatenate([np.ravel(array).astype(np.float64) for array in change.values()])
 
 
@@ -78,14 +81,14 @@ def _floating(start: Weights, rules: Rules) -> list[str]:
     return [name for name in names if np.issubdtype(start[name].dtype, np.floating)]
 
 
-def _protect(change: Arrays, rules: Rules, seed: int) -> Arrays:
+def _protect(change: Arrays, rules: Rules, seed: int, key: bytes | None) -> Arrays:
     """Return a change of learned arrays clipped and with noise, where noise is the clients'; else as it is."""
     privacy = rules.privacy
     if privacy is None or not is_local(rules):
         return change
-    return add_noise(clip_change(change, privacy.clip), privacy.noise * privacy.clip, stream(seed, "noise"))
+    return add_noise(clip_change(change, privacy.clip), privacy, seed, key)
 
 
 def is_local(rules: Rules) -> bool:
     """Return whether each client adds noise to its own update; all that is not learned then stays with it."""
-    return rules.privacy is not None and rules.privacy.where == "local"
+    return rules.privacy is not None and rules.privacy.local

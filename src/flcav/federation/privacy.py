@@ -2,7 +2,8 @@
 
 Central: a trusted server adds noise to the sum of the clipped changes of a round (McMahan et al., "Learning
 Differentially Private Recurrent Language Models", ICLR 2018, algorithm 1 with the fixed-denominator estimator). Local:
-every client adds noise to its own clipped change, and the server is not trusted.
+every client adds noise to its own clipped change, and the server is not trusted. Who adds noise draws it by a secret
+of its own, or, where the noise is `seeded`, by the seed of the round, which all know.
 """
 
 import bisect
@@ -16,12 +17,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flcav.config import Config, InputError
+from flcav.federation.noise import Normals, secret_noise
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import add, subtract
 from flcav.seeds import stream
 
 Arrays = dict[str, NDArray[np.number]]  # by name
+SEEDED = "seeded, no guarantee against who knows the seed"  # of epsilon whose noise can be drawn again
 
 
 class Privacy(Config):
@@ -32,6 +35,20 @@ class Privacy(Config):
     noise: float = Field(gt=0, le=1e6)  # standard deviation of the noise, as a multiple of `clip`
     delta: float = Field(default=1e-5, gt=0, lt=1)
     epsilon: float | None = Field(default=None, gt=0)  # budget: no round is begun that would exceed it
+    seeded: bool = False  # noise and draws from the run's seed, to be repeated: no guarantee against who knows the seed
+
+    @property
+    def local(self) -> bool:
+        """Return whether each client adds noise to its own update."""
+        return self.where == "local"
+
+    def hides_draws(self, selection: Selection) -> bool:
+        """Return whether epsilon is amplified by draws of clients that are to stay secret."""
+        return not self.seeded and self.amplified(selection)
+
+    def amplified(self, selection: Selection) -> bool:
+        """Return whether epsilon is smaller since nobody knows who takes part in a round."""
+        return not self.local and selection.rule in ("poisson", "uniform")
 
 
 def clip_change(change: Weights, norm: float) -> Arrays:
@@ -45,27 +62,42 @@ def change_norm(change: Weights) -> float:
     return float(np.sqrt(sum(float(np.sum(np.square(array, dtype=np.float64))) for array in change.values())))
 
 
-def add_noise(change: Weights, deviation: float, rng: np.random.Generator) -> Arrays:
-    """Return a change with independent Gaussian noise of this standard deviation on every coordinate."""
+def add_noise(change: Weights, privacy: Privacy, seed: int, key: bytes | None) -> Arrays:
+    """Return a change with independent Gaussian noise of the deviation `noise` x `clip` on every coordinate.
+
+    seed: of the round, which seeded noise is drawn by. key: of the round, which all other noise is drawn by. Raises
+    ValueError where it is missing.
+    """
+    if key is None and not privacy.seeded:
+        raise ValueError("noise without a secret to draw it by")
+    source: Normals = stream(seed, "noise") if privacy.seeded or key is None else secret_noise(key, change)
+    deviation = privacy.noise * privacy.clip
     return {
-        name: (array + rng.normal(scale=deviation, size=array.shape)).astype(array.dtype)
+        name: (array + source.normal(scale=deviation, size=array.shape)).astype(array.dtype)
         for name, array in change.items()
     }
 
 
 def average_privately(
-    start: Weights, updates: Sequence[LocalUpdate], names: Sequence[str], privacy: Privacy, expected: float, seed: int
+    start: Weights,
+    updates: Sequence[LocalUpdate],
+    names: Sequence[str],
+    privacy: Privacy,
+    expected: float,
+    seed: int,
+    key: bytes | None = None,
 ) -> Weights:
     """Return start + (sum of clipped changes + noise) / expected, of the arrays `names`; all others as in `start`.
 
     `expected` is the number of clients that are expected in a round, whether they came or not: the noise is
-    N(0, (noise clip)^2) per coordinate of the sum, and every client counts the same.
+    N(0, (noise clip)^2) per coordinate of the sum, and every client counts the same. `seed` and `key` are as in
+    `add_noise`.
     """
     total: Arrays = {name: np.zeros(start[name].shape) for name in names}
     for update in updates:
         for name, array in clip_change(subtract(update.weights, start, names), privacy.clip).items():
             total[name] += np.asarray(array, np.float64)
-    noisy = add_noise(total, privacy.noise * privacy.clip, stream(seed, "noise"))
+    noisy = add_noise(total, privacy, seed, key)
     return add(start, {name: array / expected for name, array in noisy.items()})
 
 
@@ -91,7 +123,7 @@ def account_epsilon(privacy: Privacy, selection: Selection, names: Sequence[str]
     logging.getLogger("absl").setLevel(logging.ERROR)  # warns of each order of Renyi divergence that it leaves out
     event: dp_accounting.DpEvent
     relation, times = NeighboringRelation.ADD_OR_REMOVE_ONE, rounds
-    if privacy.where == "local":
+    if privacy.local:
         event = dp_accounting.GaussianDpEvent(privacy.noise / 2)
         times = most_participations(selection, len(names), rounds)
     elif selection.rule == "poisson":

@@ -19,6 +19,8 @@ ASK = "ask"  # record and its entry: what is to be sent, where it is not the upd
 VECTOR = "#masked"  # the one array of an update under secure aggregation
 NORM, SEND = "norm", "send"  # ask for the norm of the update after training; for the update whose norm was sent
 COUNT = "count"  # ask for the number of samples before training
+LOST = "lost"  # record of a message whose answer will not arrive
+LOST_BY_NETWORK = 100  # error code in the place of an answer that does not arrive; Flower's own codes are below
 SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
 
 

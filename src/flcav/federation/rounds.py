@@ -6,7 +6,6 @@ round where one client fails.
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -16,7 +15,10 @@ from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
 from numpy.typing import NDArray
 
-from flcav.federation.encoding import count_coordinates, decode, unflatten
+from flcav.config import InputError
+from flcav.federation.acceptance import UpdateRefused, read_update
+from flcav.federation.encoding import count_coordinates, unflatten
+from flcav.federation.noise import derive_key
 from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
 from flcav.federation.records import (
     ARRAYS,
@@ -26,6 +28,7 @@ from flcav.federation.records import (
     COUNT,
     EXTRA,
     LOSS,
+    LOST_BY_NETWORK,
     NORM,
     SAMPLES,
     SEND,
@@ -38,11 +41,11 @@ from flcav.federation.records import (
 )
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.secure.masks import to_values
-from flcav.federation.secure.messages import SecureSum
-from flcav.federation.state import FederationState, RoundRecord
+from flcav.federation.secure.messages import SecureSum, TooFewClients
+from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import RunningMean, average
-from flcav.federation.strategies.strategy import Averages, Exchanges, Stateful, find_weigher
+from flcav.federation.strategies.strategy import Averages, Exchanges, Robust, Stateful, find_weigher
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 
 OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
@@ -114,7 +117,10 @@ class Rounds(FlowerStrategy):
         self._nodes = {name: node for node, name in names.items()}
         self._start: Weights = {}
         self._chosen: list[str] = []  # who is to send an update in this round
+        self._asked: list[str] = []  # who was asked for anything in this round
         self._failed: dict[str, str] = {}  # by client what was wrong in this round
+        self._lost: set[str] = set()  # those of them whom the network lost
+        self._shortage: TooFewClients | None = None  # why no update was asked for in this round
         self._drawn: dict[str, float] = {}  # of unbiased selection: probability of the clients that were drawn
         self._secure: SecureSum | None = None  # of this round
         self._shares: dict[str, float] = {}  # of unbiased selection: of all samples, by client
@@ -137,8 +143,9 @@ class Rounds(FlowerStrategy):
         if self._centre is not None:
             records[CENTRE] = to_arrays({name: self._centre[name] for name in learned_names(self._centre)})
         selection, local = self._rules.selection, work.record()
-        self._chosen = selection.choose([*self._names.values()], work.round, work.seed)
-        self._failed = {}
+        self._chosen = selection.choose([*self._names.values()], work.round, self._draws_by(work))
+        self._asked = [*self._names.values()] if selection.unbiased else self._chosen
+        self._failed, self._lost, self._shortage = {}, set(), None
         if self._rules.secure is not None:
             return self._begin_securely(grid, {**records, CONFIG: local}, self._rules.secure)
         if selection.unbiased:
@@ -151,6 +158,16 @@ class Rounds(FlowerStrategy):
         self._chosen = [*self._drawn]
         return self._address(self._chosen, {CONFIG: local, ASK: ConfigRecord({ASK: SEND})})
 
+    def _draws_by(self, work: LocalWork) -> int:
+        """Return the seed that the clients of a round are drawn by: that of the round, or one that nobody knows."""
+        privacy = self._rules.privacy
+        if privacy is None or not privacy.hides_draws(self._rules.selection):
+            return work.seed
+        return int.from_bytes(self._key("selection", work), "little")
+
+    def _key(self, purpose: str, work: LocalWork) -> bytes:
+        return derive_key(self._state.keep_secret(SERVER), purpose, work.round, work.seed)
+
     def _draw_unbiased(self, grid: Grid, local: ConfigRecord) -> None:
         """Ask all clients for their numbers of samples; note the shares, and the probabilities of those chosen."""
         names = [*self._names.values()]
@@ -161,7 +178,10 @@ class Rounds(FlowerStrategy):
         self._drawn = dict.fromkeys(self._chosen, self._rules.selection.inclusion_probability(len(names)))
 
     def _begin_securely(self, grid: Grid, records: dict[str, Any], how: SecureAggregation) -> list[Message]:
-        """Exchange keys and shares among the chosen clients, and return the messages to those who are left."""
+        """Exchange keys and shares among the chosen clients, and return the messages to those who are left.
+
+        Nobody is sent a message where too few are left.
+        """
 
         def exchange(asks: Mapping[str, ConfigRecord]) -> dict[str, ConfigRecord]:
             asked = [each for name, ask in asks.items() for each in self._address([name], {CONFIG: local, ASK: ask})]
@@ -170,7 +190,10 @@ class Rounds(FlowerStrategy):
 
         local = records[CONFIG]
         self._secure = SecureSum(exchange, how.needed(len(self._chosen)))
-        asks = self._secure.agree(self._chosen)
+        try:
+            asks = self._secure.agree(self._chosen)
+        except TooFewClients as error:
+            self._shortage, asks = error, {}
         return [each for name, ask in asks.items() for each in self._address([name], {**records, ASK: ask})]
 
     def _address(self, clients: Iterable[str], records: dict[str, Any]) -> Iterator[Message]:
@@ -183,21 +206,24 @@ class Rounds(FlowerStrategy):
     ) -> tuple[ArrayRecord | None, MetricRecord | None]:
         """Return the aggregated weights, and as metrics the number of samples and the mean loss weighted by samples.
 
-        Raises `ClientFailed` where fewer clients than are wanted sent a usable update, ValueError where the strategy
-        returns arrays of other names, shapes or types.
+        Where the network lost clients, or fewer were chosen, than secure aggregation needs, the weights stay as they
+        were. Raises `ClientFailed` where fewer clients than are wanted sent a usable update, `TooFewClients` where too
+        few are left for secure aggregation and the network lost none, ValueError where the strategy returns arrays of
+        other names, shapes or types.
         """
         number = self._done + server_round
-        received = self._receive(replies)
-        least = self._rules.least_clients
-        wanted = len(self._chosen) if least is None else min(least, len(self._chosen))
-        if len(received.samples) < wanted or (self._failed and least is None):
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
-            raise ClientFailed(
-                f"round {number}: {len(received.samples)} of {len(self._chosen)} clients sent an update that can be "
-                f"used, {wanted} are wanted ({reasons})"
-            )
-        weights, loss = self._combine(received, number), received.mean_loss()
-        epsilon = None
+        received = Intake(None) if self._shortage else self._receive(replies)
+        self._check_enough(number)
+        try:
+            if self._shortage is not None:
+                raise self._shortage
+            weights = self._combine(received, number)
+        except TooFewClients as error:
+            if not self._lost and self._chose_enough():
+                raise
+            weights, received = self._start, Intake(None)
+            self._failed |= {name: str(error) for name in self._chosen if name not in self._failed}
+        loss, epsilon = received.mean_loss(), None
         if self._rules.privacy is not None:
             rounds, names = self._earlier + number, [*self._names.values()]
             epsilon = account_epsilon(self._rules.privacy, self._rules.selection, names, rounds)
@@ -205,6 +231,32 @@ class Rounds(FlowerStrategy):
         self._state.records.append(RoundRecord(*about, loss, sum(received.samples.values())))
         self._on_round(number, weights, loss)
         return to_arrays(weights), MetricRecord({SAMPLES: sum(received.samples.values()), LOSS: loss})
+
+    def _chose_enough(self) -> bool:
+        """Return whether as many clients were chosen as secure aggregation needs; by a plan they may be fewer."""
+        chosen = len(self._chosen)
+        return self._rules.secure is not None and self._rules.secure.needed(chosen) <= chosen
+
+    def _check_enough(self, number: int) -> None:
+        """Raise `ClientFailed` where fewer clients than are wanted sent what can be used, or than the strategy needs.
+
+        By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
+        a norm or a number of samples, and of those who were then to send an update.
+        """
+        least = self._rules.least_clients
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
+        for clients in [self._chosen] if isinstance(least, int) else [self._asked, self._chosen]:
+            asked = clients if least is not None else [name for name in clients if name not in self._lost]
+            bound = len(asked) if least == "all" else -(-len(asked) // 2) if least is None else least
+            wanted, usable = min(bound, len(asked)), sum(name not in self._failed for name in asked)
+            if usable < wanted:
+                told = f"{usable} of {len(asked)} clients sent an update that can be used, {wanted} are wanted"
+                raise ClientFailed(f"round {number}: {told} ({reasons})")
+        if isinstance(self._strategy, Robust) and self._failed.keys() - self._lost:
+            try:
+                self._strategy.check_clients(sum(name not in self._failed for name in self._chosen))
+            except InputError as error:
+                raise ClientFailed(f"round {number}: {error} ({reasons})") from None
 
     def _receive_norms(self, asked: Iterable[str], replies: Iterable[Message]) -> dict[str, float]:
         """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
@@ -236,6 +288,7 @@ class Rounds(FlowerStrategy):
                     self._failed.setdefault(name, "no answer")  # or what it failed by before
                 elif found.has_error():
                     self._failed[name] = str(found.error.reason)
+                    self._lost |= {name} if found.error.code == LOST_BY_NETWORK else set()
                 else:
                     yield name, found
 
@@ -248,17 +301,16 @@ class Rounds(FlowerStrategy):
             try:
                 sent = to_update(message)
                 if self._secure is not None:
-                    received.add(name, self._check_masked(sent))
-                    continue
-                update = replace(sent, weights=decode(sent.weights, self._start, self._rules))
-            except (KeyError, IndexError, TypeError, ValueError) as error:
+                    update = self._check_masked(sent)
+                else:
+                    like = sent.extra if received.extra is None else received.extra
+                    update = read_update(sent, self._start, rules, like)
+            except UpdateRefused as error:
+                self._failed[name] = str(error)
+            except (KeyError, TypeError, ValueError) as error:
                 self._failed[name] = f"a message that is no update ({error})"
-                continue
-            fault = find_fault(update, self._start, update.extra if received.extra is None else received.extra)
-            if fault is None:
-                received.add(name, update)
             else:
-                self._failed[name] = fault
+                received.add(name, update)
         return received
 
     def _check_masked(self, sent: LocalUpdate) -> LocalUpdate:
@@ -281,13 +333,15 @@ class Rounds(FlowerStrategy):
         privacy, start, updates, each = self._rules.privacy, self._start, received.updates, received.combinable
         if self._rules.secure is not None:
             each = [LocalUpdate(self._average_securely(updates, self._rules.secure), 1, 0.0)]
-        elif privacy is not None and privacy.where == "central":
+        elif privacy is not None and not privacy.local:
             sent = self._rules.upload.exchanged(start)
             names = [name for name in learned_names(start) if name in sent]
             expected = float(len(self._chosen))
             if self._rules.selection.rule == "poisson":  # by chance more or fewer come
                 expected = expected_clients(self._rules.selection, [*self._names.values()])
-            mean = average_privately(start, each, names, privacy, expected, self._work(number).seed)
+            work = self._work(number)
+            key = None if privacy.seeded else self._key("noise", work)
+            mean = average_privately(start, each, names, privacy, expected, work.seed, key)
             each = [LocalUpdate(mean, 1, 0.0)]
         elif self._rules.selection.weighs and updates:
             weights = {name: self._shares[name] / self._drawn[name] for name in updates}
@@ -313,25 +367,6 @@ class Rounds(FlowerStrategy):
     def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
         """Return None: clients do not evaluate."""
         return None
-
-
-def find_fault(update: LocalUpdate, start: Weights, extra: Weights) -> str | None:
-    """Return what makes an update unusable, None for a usable one.
-
-    `start` has the names, shapes and types that the weights must have, `extra` those of the arrays beside them.
-    """
-    for arrays, like in ((update.weights, start), (update.extra, extra)):
-        if set(arrays) != set(like):
-            odd = sorted(set(arrays) ^ set(like))
-            return f"an array '{odd[0]}' that is missing or unknown"
-        for name, array in arrays.items():
-            if (array.shape, array.dtype) != (like[name].shape, like[name].dtype):
-                return f"'{name}' is {array.dtype} {array.shape} instead of {like[name].dtype} {like[name].shape}"
-            if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-                return f"'{name}' has values that are not finite"
-    if update.samples < 0 or not np.isfinite(update.loss):
-        return f"{update.samples} samples and a loss of {update.loss}"
-    return None
 
 
 def average_inversely(start: Weights, updates: Mapping[str, LocalUpdate], weights: Mapping[str, float]) -> Weights:

@@ -1,10 +1,14 @@
 """Rules of a federation: who takes part in a round, what is sent, what is kept private, and how many are needed."""
 
-from pydantic import Field
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field
 
 from flcav.config import Config, InputError
 from flcav.federation.privacy import Privacy
 from flcav.federation.selection import Selection
+from flcav.federation.state import SERVER
 from flcav.federation.trainable import Weights, learned_names
 from flcav.federation.upload import Patterns, Upload, name_like
 
@@ -26,6 +30,16 @@ class RegionalModels(Config):
     pull: float = Field(ge=0, le=1e6)  # lambda of the gradients g + lambda (v - w); 0: regions learn by themselves
 
 
+def _check_least(value: object) -> object:
+    counts = isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 10**6
+    if value is None or value == "all" or counts:
+        return value
+    raise ValueError("expected 'all' or a whole number from 1 to 1000000")
+
+
+LeastClients = Annotated[int | Literal["all"] | None, BeforeValidator(_check_least)]
+
+
 class Rules(Config):
     """Rules of the rounds of a federation; by default every client sends its whole update in every round."""
 
@@ -34,14 +48,21 @@ class Rules(Config):
     privacy: Privacy | None = None  # clipping and noise; default: none
     secure: SecureAggregation | None = None  # default: the server sees every update
     personal: Patterns | RegionalModels = ()  # what edge servers keep for their regions: arrays, as in `head.*`, or all
-    least_clients: int | None = Field(default=None, ge=1, le=10**6)  # whose updates a round needs; default: all chosen
+    least_clients: LeastClients = None  # whose updates a round needs; default: half of those asked whom no network lost
 
     def of_servers(self) -> "Rules":
         """Return the rules among edge servers, which federate with the cloud, where vehicles have these.
 
-        All take part, and send in the same form; noise is the vehicles', and all that comes after it is as private.
+        All take part, none may fail, and they send in the same form; noise is the vehicles', and what comes after it is
+        as private.
         """
-        return Rules(upload=self.upload.model_copy(update={"kept": self.personal_arrays}))
+        return Rules(upload=self.upload.model_copy(update={"kept": self.personal_arrays}), least_clients="all")
+
+    def secret_parties(self, clients: Sequence[str]) -> Sequence[str]:
+        """Return who draws noise by a secret: each of these clients, or `SERVER`; nobody where it is seeded."""
+        if self.privacy is None or self.privacy.seeded:
+            return ()
+        return clients if self.privacy.local else (SERVER,)
 
     @property
     def personal_arrays(self) -> Patterns:

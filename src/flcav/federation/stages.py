@@ -89,7 +89,8 @@ def federate(
     averaging (McMahan et al., AISTATS 2017, algorithm 1). `on_round` is called after each round with its number,
     weights and mean loss; `state` is then that of the round, with a record of it. Every message is entered in the
     ledger of `account`. To resume, pass the same strategy and rules, the weights and the number of the last round that
-    `on_round` was given, and the state after it.
+    `on_round` was given, and the state after it. Noise that is not seeded is drawn by secrets, which are kept in
+    `state`: without it no federation can be repeated, nor gone on with to the same weights.
 
     Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
     before this one, with the same clients and rules, which count against that budget. Clients train in this process, or
@@ -98,9 +99,9 @@ def federate(
     for a client when it is to train; of updates no more are in memory than the strategy needs.
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
-    no update, and fewer are left than `rules` ask for (by default all), `InputError` where there are no clients, or
-    `rules` or `strategy` ask for what they cannot do, ValueError where `strategy` changes names, shapes or types of the
-    arrays.
+    no update, and fewer are left than `rules` ask for (by default half of those asked), `TooFewClients` where fewer are
+    left than secure aggregation needs, though `account` lost none, `InputError` where there are no clients, or `rules`
+    or `strategy` ask for what they cannot do, ValueError where `strategy` changes names, shapes or types of the arrays.
 
     >>> import numpy as np
     >>> from flcav import Ledger, federate
@@ -139,7 +140,8 @@ def federate(
         results.append(app.start(link, to_arrays(weights), rounds - done))
 
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"  # something on the clients
-    make_app = partial(client_app, strategy=strategy, rules=rules)
+    secrets = {party: state.keep_secret(party) for party in rules.secret_parties(names) if party in clients}
+    make_app = partial(client_app, strategy=strategy, rules=rules, secrets=secrets)
     if runtime is None or isinstance(runtime, ClientProcesses):
         trained, at_once = (clients, 1) if runtime is None else (RemoteClients(clients, runtime), runtime.count)
         with EmbeddedGrid(make_app(trained), names, state.clients, at_once) as grid:
@@ -213,7 +215,7 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
     told, selection = type(strategy).__name__, rules.selection
     selection.check_clients(names)
     least, chosen = rules.least_clients, int(expected_clients(selection, names))
-    if least is not None and selection.rule not in ("poisson", "importance") and least > chosen:
+    if isinstance(least, int) and selection.rule not in ("poisson", "importance") and least > chosen:
         raise InputError(f"least_clients: {least} are wanted in a round, and {chosen} take part")
     single = isinstance(strategy, Robust | Exchanges)  # looks at each update
     if selection.weighs:

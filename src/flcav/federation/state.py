@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.federation.divergence import RoundDivergence
+from flcav.federation.noise import Secret, draw_secret
 from flcav.records import LEFT_OUT, Record
 
 Arrays = dict[str, NDArray[np.number]]  # by name
@@ -33,16 +34,22 @@ class RoundRecord(Record):
 class FederationState:
     """State of a federation after a round: what server and clients keep for the next one, and the rounds' records.
 
-    In a simulation it is in one place, so that a checkpoint holds all of it. Clients keep theirs to themselves.
+    In a simulation it is in one place, so that a checkpoint holds all of it. Clients keep theirs to themselves; secrets
+    of parties are in no message and no result, and a checkpoint keeps them apart.
     """
 
     server: Arrays = field(default_factory=dict)
     clients: ClientStates = field(default_factory=dict)
     records: list[RoundRecord] = field(default_factory=list)
     personal: Arrays = field(default_factory=dict)  # arrays of an edge server's region alone
+    secrets: dict[str, Secret] = field(default_factory=dict, repr=False)  # of clients by name, and of `SERVER`
+
+    def keep_secret(self, party: str) -> Secret:
+        """Return the secret of a client, or of `SERVER`, that private noise is drawn by; a new one the first time."""
+        return self.secrets.setdefault(party, draw_secret())
 
     def to_arrays(self) -> Arrays:
-        """Return server's and clients' arrays in one mapping, for a safetensors file."""
+        """Return server's and clients' arrays in one mapping, for a safetensors file; without `secrets`."""
         found = {f"{SERVER}|{name}": array for name, array in self.server.items()}
         found |= {f"{PERSONAL}|{name}": array for name, array in self.personal.items()}
         for client, kinds in self.clients.items():
@@ -51,7 +58,7 @@ class FederationState:
         return found
 
     def restore(self, arrays: Mapping[str, NDArray[np.number]], records: Sequence[RoundRecord]) -> None:
-        """Set the state, in place, to what `to_arrays` returned and to the records."""
+        """Set the state, in place, to what `to_arrays` returned and to the records; secrets stay as they are."""
         self.server, self.clients, self.personal = {}, {}, {}
         for key, array in arrays.items():
             owner, _, rest = key.partition("|")

@@ -81,7 +81,8 @@ def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | Non
             if residual is not None:
                 flat = flat + residual
             kept = max(1, round(upload.fraction * flat.size))
-            indices = np.sort(np.argsort(-np.abs(flat), kind="stable")[:kept])
+            size = np.where(np.isnan(flat), np.inf, np.abs(flat))  # what is no number is sent, and so refused
+            indices = np.sort(np.argsort(-size, kind="stable")[:kept])
             sent = {INDICES: indices.astype(np.uint32), VALUES: flat[indices]}
             flat[indices] = 0.0
             return sent, {VALUES: flat} if upload.error_feedback else {}

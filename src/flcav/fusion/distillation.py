@@ -1,12 +1,13 @@
 """Labels by federated distillation: what vehicles tell the edge server, and what they learn from the road average.
 
 Wang et al. (IEEE Network 37(3), 2023): road sensors and vehicles send boxes with their uncertainties to the edge
-server, which averages them (`flcav.fusion.average`); each vehicle learns from the average of the spin of its own frame.
-Nobody knows ground truth, and vehicles know their poses by their own navigation alone.
+server, which averages them over a window of spins (`flcav.fusion.average`); each vehicle learns from the average at
+the time of its own frame. The window is centred on the frame: labels are made after the drive. Nobody knows ground
+truth, and vehicles know poses and times by their own navigation alone.
 
-- A box of the average is a label where a road sensor has it, or where two vehicles do, each with a score that reaches
-  the threshold of pseudo-labels. Vehicles run one network and see one street: that two of them are half sure of a wall
-  is no evidence of a car.
+- A box of the average is a label where a road sensor has it in half of its spins or more, or where two vehicles do,
+  each with a score that reaches the threshold of pseudo-labels in the mean of its spins, 0 in those without the box.
+  Vehicles run one network and see one street: that two of them are half sure of a wall is no evidence of a car.
 - What one vehicle alone is sure of is ignored in the loss: it is not unlearned, nor does a network confirm itself.
 - What vehicles alone tell of is dropped where road sensors saw free ground, or have a box of their own.
 - An anchor is a negative only where a road sensor saw free ground.
@@ -21,11 +22,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flcav.config import Config
-from flcav.fusion.average import average_boxes, variance_of
+from flcav.fusion.average import RoadAverage, average_boxes, variance_of
 from flcav.fusion.labels import cell_centers
 from flcav.fusion.map_context import MapContext, snap_to_map
-from flcav.fusion.pose_graph import Navigation, Sighting, add_pose_variance, correct_poses, tell
+from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.road import RoadView
+from flcav.fusion.sightings import Navigation, Sighting, add_pose_variance, tell
 from flcav.geometry import Boxes, inverse, points_in_boxes, pose, spread_over_footprints, transform_points
 from flcav.network.messages import from_names, pack, to_names, unpack
 from flcav.perception.objects.config import SecondConfig
@@ -51,8 +53,10 @@ class Distillation(Config):
     temperature: float = Field(default=0.1, ge=0.01, le=10)  # of the contrastive term
     position_m: float = Field(default=0.2, ge=0, le=10)  # standard deviation of a vehicle's position, along x and y
     heading_deg: float = Field(default=0.3, ge=0, le=45)  # standard deviation of its heading
+    clock_s: float = Field(default=0.0, ge=0, le=1)  # standard deviation of its clock's offset, one in each scene
+    window_s: float = Field(default=0.5, ge=0, le=1)  # before and after a frame, of what is averaged; 0: its spin alone
     map_context: bool = True  # whether headings and classes of the average are snapped to the map, where there is one
-    pose_graph: bool = False  # whether a pose graph corrects vehicles' poses: needs the extra `fusion`
+    pose_graph: bool = False  # whether a pose graph corrects vehicles' poses and clocks: needs the extra `fusion`
 
     @property
     def navigation(self) -> Navigation:
@@ -120,27 +124,53 @@ def average_spin(
     threshold: float,
     posts: Array | None = None,
     context: MapContext | None = None,
+    around: Sequence[Sighting] = (),
 ) -> list[Guidance]:
     """Return what the edge server tells each vehicle of a spin, in the order of the vehicles among the sightings.
 
     sightings: of vehicles, and of road sensors with actor categories as labels; views: of the road sensors. posts:
-    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses; None: poses are as told. context: the
-    map that headings and classes are snapped to; None: they are as averaged. Of a single spin all speeds count as 0.
+    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses and clocks; None: they are as told.
+    context: the map that headings and classes are snapped to; None: they are as averaged. around: sightings of other
+    spins in the window, before and after, averaged with those of this one. Without any all speeds count as 0.
     """
-    told = [_classify(each, config) if each.navigation is None else each for each in sightings]
-    at_s = max((each.time_s for each in told), default=0.0)
+    told = [_classify(each, config) if each.navigation is None else each for each in (*sightings, *around)]
+    times_s = [each.time_s for each in sightings]
+    surveyed_s = [each.time_s for each in sightings if each.navigation is None]
+    at_s = float(np.median(surveyed_s or times_s or [0.0]))
     if posts is not None:
         told = correct_poses(told, posts, at_s)
     average = average_boxes([tell(each) for each in told], at_s)
     boxes = average.boxes if context is None else snap_to_map(average.boxes, average.velocity, context)
-    road, sure = np.zeros(len(boxes), dtype=bool), np.zeros(len(boxes), dtype=np.int64)
-    for each, member in zip(told, average.member, strict=True):
-        road[member] |= each.navigation is None
-        if each.navigation is not None and each.boxes.score is not None:
-            sure[member] += each.boxes.score >= threshold  # an object has at most one box of a sighting
+    road, sure = _count_votes(told, average, threshold)
     kept = select_labels(boxes, road, views, threshold)
     confirmed = (road | (sure > 1))[kept]
-    return [place_in(boxes[kept], confirmed, each) for each in told if each.navigation is not None]
+    asking = [each for each in told[: len(sightings)] if each.navigation is not None]
+    moved = [average.velocity[kept] * (each.time_s - at_s) for each in asking]
+    return [place_in(_shift(boxes[kept], by), confirmed, each) for each, by in zip(asking, moved, strict=True)]
+
+
+def _count_votes(
+    told: Sequence[Sighting], average: RoadAverage, threshold: float
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return (K,) whether a road sensor has each object, (K,) how many vehicles are sure of it, over a window."""
+    count = len(average.boxes)
+    road, sure = np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
+    for agent in {each.agent for each in told}:
+        own = [(each, member) for each, member in zip(told, average.member, strict=True) if each.agent == agent]
+        seen, score = np.zeros(count), np.zeros(count)
+        for each, member in own:  # an object has at most one box of a sighting
+            seen[member] += 1
+            score[member] += 1.0 if each.boxes.score is None else each.boxes.score
+        if own[0][0].navigation is None:
+            road |= (seen > 0) & (2 * seen >= len(own))
+        else:
+            sure += (seen > 0) & (score / len(own) >= threshold)
+    return road, sure
+
+
+def _shift(boxes: Boxes, xy_m: Array) -> Boxes:
+    """Return boxes (N,) moved by (N, 2) along x and y [m]."""
+    return replace(boxes, center=boxes.center + np.column_stack((xy_m, np.zeros(len(boxes)))))
 
 
 def _classify(seen: Sighting, config: SecondConfig) -> Sighting:

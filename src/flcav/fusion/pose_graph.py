@@ -3,12 +3,11 @@
 Nodes are the poses (x, y, yaw) of vehicles at each spin and those of the objects that agents told of. Factors are the
 vehicles' own navigation, boxes as poses of objects seen from vehicles and from road sensors, whose poses are surveyed,
 and posts segmented from LiDAR as points that the map knows (Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE ITS
-Magazine 2(4), 2010). The Huber kernel bounds the weight of wrong associations. A vehicle's clock is off where the
-objects that it tells of are displaced along their velocities: displacement = - offset * velocity.
+Magazine 2(4), 2010). The Huber kernel bounds the weight of wrong associations. Before, clocks are set (`clocks.py`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,59 +15,17 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.extras import format_install_command
-from flcav.fusion.average import YAW, RoadAverage, Told, average_boxes, variance_of
-from flcav.geometry import Boxes, pose, transform_points, wrap_angle, yaw_of
+from flcav.fusion.average import YAW, RoadAverage, average_boxes, variance_of
+from flcav.fusion.clocks import set_clocks
+from flcav.fusion.sightings import Navigation, Sighting, tell
+from flcav.geometry import pose, transform_points, wrap_angle, yaw_of
 
 Array = NDArray[np.float64]
 
 POST_M = 0.15  # standard deviation of a post's foot
 POST_GATE_M = 1.5  # farthest a post may lie from its place on the map, beside the error of the pose
 HUBER = 1.345  # where the kernel turns from quadratic to linear [standard deviations]
-LEAST_SPEED_MPS = 3.0  # slower objects say little about clocks
-ALIKE_MPS, ASIDE_M = 2.0, 1.5  # largest differences of two views of a moving object: of velocity, across its way
-LEAST_PAIRS = 2  # of moving objects that set a clock
-CLOCK_S = 0.3  # standard deviation of a clock's offset: farther ones than three are not looked for
 PASSES = 2  # of association and correction
-
-
-@dataclass(frozen=True)
-class Navigation:
-    """Standard deviations of a vehicle's own pose and clock, as its navigation states them."""
-
-    position_m: float
-    heading_rad: float
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """Observation of one agent in one spin: its pose by navigation, boxes and posts."""
-
-    agent: str
-    time_s: float  # by its clock
-    world_from_agent: Array  # (4, 4) by its navigation; of a road sensor as surveyed
-    boxes: Boxes  # agent's frame, its origin on the ground, with scores and variances
-    posts: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (L, 2) feet of posts, agent's frame [m]
-    navigation: Navigation | None = None  # None: surveyed, a road sensor
-
-
-def tell(sighting: Sighting) -> Told:
-    """Return what an agent tells of a spin: boxes in the world, with the uncertainty of its pose in their variances.
-
-    A heading error moves a box at distance r by r times the error, across the line of sight.
-    """
-    boxes = sighting.boxes.transform(sighting.world_from_agent)
-    return Told(sighting.agent, sighting.time_s, add_pose_variance(boxes, sighting))
-
-
-def add_pose_variance(boxes: Boxes, sighting: Sighting) -> Boxes:
-    """Return boxes, world frame, with the variance of an agent's pose added to theirs; of road sensors as they are."""
-    if sighting.navigation is None:
-        return boxes
-    known, variance = sighting.navigation, variance_of(boxes)
-    arm = boxes.center[:, :2] - sighting.world_from_agent[:2, 3]
-    variance[:, :2] += known.position_m**2 + (arm[:, ::-1] * known.heading_rad) ** 2
-    variance[:, YAW] += known.heading_rad**2
-    return replace(boxes, variance=variance)
 
 
 def correct_poses(sightings: Sequence[Sighting], posts: Array, at_s: float) -> list[Sighting]:
@@ -194,31 +151,9 @@ def _share_objects(sightings: Sequence[Sighting], found: RoadAverage) -> list[li
     return [each for each in seen.values() if len({sightings[one.sighting].agent for one in each}) > 1]
 
 
-def set_clocks(sightings: Sequence[Sighting], at_s: float) -> list[Sighting]:
-    """Return the sightings with the times of vehicles set to the clock of the road sensors, where these see the same.
-
-    Velocities of objects as one vehicle sees them do not depend on its clock. The offset is the median over pairs of
-    moving objects of displacement along velocity over speed; offsets within two standard errors of zero are left.
-    """
-    surveyed = average_boxes([tell(each) for each in sightings if each.navigation is None], at_s)
-    offset: dict[str, float] = {}
-    for agent in {each.agent for each in sightings if each.navigation is not None}:
-        own = average_boxes([tell(each) for each in sightings if each.agent == agent], at_s)
-        apart = own.boxes.center[:, None, :2] - surveyed.boxes.center[None, :, :2]
-        velocity = surveyed.velocity[None]
-        speed = np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), 1e-9)
-        behind = (apart * velocity).sum(axis=2) / speed**2  # [s]
-        aside = np.abs(apart[..., 0] * velocity[..., 1] - apart[..., 1] * velocity[..., 0]) / speed
-        alike = np.linalg.norm(own.velocity[:, None] - velocity, axis=2) <= ALIKE_MPS
-        pairs = (speed >= LEAST_SPEED_MPS) & alike & (aside <= ASIDE_M) & (np.abs(behind) <= 3 * CLOCK_S)
-        found = behind[pairs]
-        if len(found) < LEAST_PAIRS:
-            continue
-        spread = np.sqrt(variance_of(own.boxes)[:, :2].mean(axis=1))[:, None] / speed
-        late_s = float(np.median(found))
-        if abs(late_s) > 2 * float(np.median(spread[pairs])) / np.sqrt(len(found)):
-            offset[agent] = late_s
-    return [replace(each, time_s=each.time_s + offset.get(each.agent, 0.0)) for each in sightings]
+def check_gtsam() -> None:
+    """Raise `InputError` where GTSAM is not installed."""
+    _import_gtsam()
 
 
 def _import_gtsam() -> Any:

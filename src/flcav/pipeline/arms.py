@@ -5,12 +5,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 from flcav.config import InputError
+from flcav.federation.privacy import affordable_rounds
 from flcav.federation.stages import check_rules
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects
 from flcav.federation.trainable import statistics_names
 from flcav.fusion.distillation import Distillation
+from flcav.fusion.pose_graph import check_gtsam
 from flcav.perception.distillation import Imitates
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
@@ -139,24 +141,35 @@ def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
 def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
     """Raise `InputError` where an arm's strategies and rules do not go together, or not with so many vehicles.
 
-    The vehicles of regions of recorded data are not known before their frames are dealt.
+    Raises it also where a pose graph is asked for without GTSAM. The vehicles of regions of recorded data are not known
+    before their frames are dealt.
     """
     for setting in settings:
         edge, cloud = find_strategies(setting.federation)
-        selection = setting.federation.selection
+        selection, privacy = setting.federation.selection, setting.federation.privacy
         if setting.federation.network is not None and selection.rule == "importance":
             raise InputError("federation.network: importance selection draws the clients after they have trained")
         if setting.federation.network is not None and selection.unbiased:
             raise InputError("federation.network: unbiased weights need known probabilities, and the radio loses any")
-        if setting.federation.network is not None and selection.rule == "deadline" and setting.federation.privacy:
+        if setting.federation.network is not None and selection.rule == "deadline" and privacy is not None:
             raise InputError(
                 "federation.network: a deadline leaves other numbers of clients, and noise is for one number"
             )
+        if setting.federation.network is not None and privacy is not None and privacy.hides_draws(selection):
+            raise InputError(
+                f"federation.network: rounds are timed before they are run, and {selection.rule} selection under "
+                "central noise draws in secret; 'privacy.seeded' simulates both"
+            )
         if isinstance(edge, FedMD) and setting.central is None:
             _check_outputs(recipe, setting)
+        if setting.distillation.pose_graph and setting.central is None:
+            check_gtsam()
         for region in setting.regions:
             if recipe.regions[region].data is None:
-                check_rules(edge, setting.federation, [f"{region}/cav{i}" for i in range(recipe.vehicles(region))])
+                names = [f"{region}/cav{i}" for i in range(recipe.vehicles(region))]
+                check_rules(edge, setting.federation, names)
+                if privacy is not None:
+                    affordable_rounds(privacy, selection, names, 1, 0)
         if CLOUD in setting.stages:
             check_rules(cloud, setting.federation.of_servers(), setting.regions)
         how = setting.federation

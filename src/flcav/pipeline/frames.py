@@ -1,7 +1,7 @@
 """Data splits of a run: recorded in a town, or divided by scenes out of a recorded dataset."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from flcav.sources.recipe import Recipe
 from flcav.world.map.town import PACKAGED
 
 DATA = "data"
+SLACK_S = 1e-6  # of times that are compared with the ends of a window
 SHORTEST_S = 10.0  # shortest scene for tracks: it takes a past, a future, and several presents
 SHARES: Mapping[Role, Mapping[SplitName, float]] = {  # fractions of a dataset's scenes
     "pretrain": {"pool": 0.7, "validation": 0.15, "test": 0.15},
@@ -38,7 +39,7 @@ class Recorded(Saved):
     """A data split: the folder of its dataset, and its frames by who recorded them."""
 
     folder: str  # relative to the step's own, or absolute
-    vehicles: tuple[int, ...]  # numbers of the vehicles' frames
+    vehicles: tuple[int, ...]  # numbers of the vehicles' frames, without those of windows around them
     poles: Mapping[int, tuple[int, ...]]  # numbers of each roadside sensor's frames, by pole
     scenes: int
 
@@ -48,7 +49,7 @@ class Frames:
     """A data split, open for reading, with its frames by who recorded them."""
 
     data: Dataset
-    vehicles: tuple[int, ...]  # frame numbers of all vehicles
+    vehicles: tuple[int, ...]  # frame numbers of all vehicles, without those of windows around them
     poles: Mapping[int, tuple[int, ...]]  # frame numbers of each roadside sensor, by pole
 
     @classmethod
@@ -58,11 +59,13 @@ class Frames:
         return cls(Dataset.open(folder / recorded.folder), recorded.vehicles, recorded.poles)
 
 
-def make_recording_recipe(recipe: RunRecipe, region: str, split: SplitName, task: str, name: str) -> Recipe:
+def make_recording_recipe(
+    recipe: RunRecipe, region: str, split: SplitName, task: str, name: str, window_s: float = 0.0
+) -> Recipe:
     """Return the recording recipe of a split in a region's town, without poles.
 
-    Settings of the task, the run, the region, and the run's entry of the task override each other in this order. Raises
-    `InputError`, naming the recording by its `name`, where they do not go together.
+    Settings of the task, the run, the region, and the run's entry of the task override each other in this order.
+    window_s: as in `Recipe`. Raises `InputError`, naming the recording by its `name`, where they do not go together.
     """
     place, frames = recipe.regions[region], getattr(recipe.sized_splits, split)
     changes = [as_shared(task_named(task)).recording, recipe.recording.fields(), place.recording.fields()]
@@ -81,14 +84,28 @@ def make_recording_recipe(recipe: RunRecipe, region: str, split: SplitName, task
         "scenes": frames.scenes,
         "spins_per_scene": spins,
         "cavs": recipe.vehicles(region) if split == "edge" else frames.cavs,
+        "window_s": window_s,
     }
     return parse_config(Recipe, fields, name)
+
+
+def list_window(split: Frames, frames: Sequence[int], window_s: float) -> tuple[int, ...]:
+    """Return, ascending, `frames` of vehicles and what the same vehicle recorded within `window_s` of each [s]."""
+    middle: dict[tuple[str, str], list[float]] = {}
+    for i in frames:
+        middle.setdefault((split.data.keys[i].scene, split.data.keys[i].agent), []).append(split.data.keys[i].time_s)
+    keys = enumerate(split.data.keys)
+    return tuple(
+        i
+        for i, key in keys
+        if any(abs(key.time_s - time_s) <= window_s + SLACK_S for time_s in middle.get((key.scene, key.agent), ()))
+    )
 
 
 def record_frames(recipe: Recipe, beside: Path, folder: Path, report: Report) -> Recorded:
     """Record a split below `folder`; resumes an interrupted recording."""
     record(EmbeddedSource(recipe, beside), folder / DATA, progress=report)
-    return group_frames(Dataset.open(folder / DATA), DATA)
+    return group_frames(Dataset.open(folder / DATA), DATA, spins=recipe.middle_spins)
 
 
 def deal_frames(path: Path, split: SplitName, role: Role, seed: int, whole: bool) -> Recorded:
@@ -128,10 +145,16 @@ def _own_part(split: SplitName, role: Role, scenes: int) -> slice:
     return slice(start, start + counts[split])
 
 
-def group_frames(data: Dataset, folder: str, scenes: set[str] | None = None) -> Recorded:
-    """Group the frames of these scenes (None: all) by who recorded them; raises `InputError` for no vehicle's."""
+def group_frames(
+    data: Dataset, folder: str, scenes: set[str] | None = None, spins: Sequence[int] | None = None
+) -> Recorded:
+    """Group the frames of these scenes (None: all) by who recorded them; raises `InputError` for no vehicle's.
+
+    spins: numbers of those that the vehicles' frames are of (None: all); others are of windows around them.
+    """
     frames = data.select(scenes=scenes)
-    vehicles = tuple(i for i in frames if kind_of(data.keys[i].agent) != POLE)
+    middle = frames if spins is None else [i for i in frames if data.keys[i].index in set(spins)]
+    vehicles = tuple(i for i in middle if kind_of(data.keys[i].agent) != POLE)
     if not vehicles:
         raise InputError(f"{data.folder}: no frame of a vehicle")
     poles: dict[int, list[int]] = {}

@@ -149,7 +149,8 @@ class Frame:
     annotations: Annotations
     point_times: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     # LiDAR with a rolling spin -> (N,) time of each point [s] after `time_s`; a point is given in the sensor's frame at
-    # that time: see `flcav.sensors.lidar.rolling`
+    # that time: see `flcav.sensors.lidar.rolling`. Of an imported dataset it is in the sensor's frame at `time_s`, its
+    # motion compensated
     images: Mapping[str, CameraImage] = field(default_factory=dict)
     infrared: Mapping[str, NDArray[np.uint16]] = field(default_factory=dict)  # (H, W) apparent temperature [0.01 K]
     radar: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)

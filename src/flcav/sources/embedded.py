@@ -55,9 +55,9 @@ class EmbeddedSource:
             x, y, z = self.town.poles.position[known.index(pole)].tolist()
             mount_m = z - self.town.ground(x, y)
             _check_mounts("pole_rig", recipe.pole_rig, f"pole {pole}", mount_m)
-        self._per_scene = recipe.spins_per_scene * len(self.agents)
+        self._per_scene = recipe.spins * len(self.agents)
         self._frames = recipe.frames or recipe.scenes * self._per_scene
-        longest = max((format_key(self.scenes()[-1], recipe.spins_per_scene - 1, one) for one in self.agents), key=len)
+        longest = max((format_key(self.scenes()[-1], recipe.spins - 1, one) for one in self.agents), key=len)
         if len(longest) > LONGEST_NAME:
             raise InputError(
                 f"field 'town' = {shorten(recipe.town)}: a frame would be called {shorten(longest)}, {len(longest)} "
@@ -68,10 +68,9 @@ class EmbeddedSource:
 
     def describe(self) -> Mapping[str, Json]:
         """Return the recipe as JSON values, with names resolved: numbers of poles, rigs, hashes of the town's files."""
-        drawn = {} if self.recipe.randomise is None else {"randomise": self.recipe.randomise}
+        own, asked = self.recipe.model_dump(mode="json"), {"randomise", "window_s"}  # said where they are not left out
         return {
-            **self.recipe.model_dump(mode="json", exclude={"randomise"}),
-            **drawn,
+            **{name: value for name, value in own.items() if name not in asked or value},
             "town": self.town.name,
             "town_files": {name: hashlib.sha256(data).hexdigest() for name, data in self._files().items()},
             "scenes": len(self.scenes()),

@@ -77,6 +77,9 @@ class Recipe(Config):
     warmup_s: Warmup = 60.0  # traffic before the first spin; two numbers: drawn uniformly between them for each scene
     spins_per_scene: int = Field(default=10, ge=1, le=MOST)  # LiDAR spins; every agent records a frame at each
     every_s: Duration = 1.0  # time between two spins, a multiple of 0.1 s
+    window_s: Annotated[float, Field(ge=0, le=10), AfterValidator(_multiple_of_step)] = (
+        0.0  # above 0: a further spin so long before and after each of the others, a multiple of 0.1 s
+    )
     cavs: int = Field(default=1, ge=0, le=1000)  # connected vehicles that record: cav0, cav1, ...
     poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()  # numbers of the poles that record
     vehicle_rig: NamedRig = RIGS["lidar32"]  # every vehicle's sensors: the name of a rig, or a rig
@@ -88,10 +91,13 @@ class Recipe(Config):
 
     @model_validator(mode="after")
     def _ends(self) -> "Recipe":
-        last_s = self.warmup_steps[1] * STEP_S + (self.spins_per_scene - 1) * self.every_s
+        if round(self.window_s / STEP_S) >= self.warmup_steps[0]:
+            raise ValueError(f"window_s = {self.window_s:g} puts the first spin before the traffic: warmup_s is longer")
+        last_s = self.warmup_steps[1] * STEP_S + (self.spins_per_scene - 1) * self.every_s + self.window_s
         if last_s > LONGEST_S:
             raise ValueError(
-                f"warmup_s, spins_per_scene and every_s put the last spin at {last_s:g} s, after {LONGEST_S:g} s"
+                "warmup_s, spins_per_scene, every_s and window_s put the last spin at "
+                f"{last_s:g} s, after {LONGEST_S:g} s"
             )
         return self
 
@@ -110,10 +116,27 @@ class Recipe(Config):
         ends = self.warmup_s if isinstance(self.warmup_s, tuple) else (self.warmup_s, self.warmup_s)
         return round(ends[0] / STEP_S), round(ends[1] / STEP_S)
 
+    @property
+    def spins(self) -> int:
+        """Return the number of spins of a scene, those of the windows included."""
+        return len(self._steps())
+
+    @property
+    def middle_spins(self) -> tuple[int, ...]:
+        """Return the numbers of the `spins_per_scene` spins, among those of their windows."""
+        return tuple(np.flatnonzero(np.isin(self._steps(), self._middle_steps())).tolist())
+
     def times_s(self, warmup_steps: int) -> NDArray[np.float64]:
-        """Return (spins_per_scene,) the times of the spins [s] after a warm-up of `warmup_steps` steps of STEP_S."""
-        steps = warmup_steps + np.arange(self.spins_per_scene) * round(self.every_s / STEP_S)
-        return np.round(steps * np.float64(STEP_S), 1)
+        """Return (spins,) the times of the spins [s] after a warm-up of `warmup_steps` steps of STEP_S."""
+        return np.round((warmup_steps + self._steps()) * np.float64(STEP_S), 1)
+
+    def _middle_steps(self) -> NDArray[np.int64]:
+        return np.arange(self.spins_per_scene) * round(self.every_s / STEP_S)
+
+    def _steps(self) -> NDArray[np.int64]:
+        """Return the steps of all spins since the end of the warm-up, ascending."""
+        middle, aside = self._middle_steps(), round(self.window_s / STEP_S)
+        return np.unique(np.concatenate((middle - aside, middle, middle + aside)))
 
 
 def recipe_path(name: str) -> Path:

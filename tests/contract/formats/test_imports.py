@@ -1,6 +1,7 @@
 """Every format that is exported and imported keeps what both know; each damaged folder is one sentence."""
 
 import json
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,12 +10,14 @@ import numpy as np
 import pytest
 from painted_source import CATEGORIES, IN_BOX, PaintedSource
 
+from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.checks.validate import find_leaks, validate
 from flcav.dataset.formats.export import FORMATS, export
 from flcav.dataset.formats.exporter import ExportOptions, split_scenes
 from flcav.dataset.formats.importing import READABLE, import_dataset
 from flcav.dataset.formats.kitti.read import KittiSource
+from flcav.dataset.formats.nuscenes.rows import COLUMNS
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, wrap_angle
@@ -238,23 +241,27 @@ def _first(folder: Path, pattern: str) -> Path:
     return sorted(folder.glob(pattern))[0]
 
 
-DAMAGES = {  # format -> pattern of a file, and the sentence where it is missing, and where it is cut in half
+LOST, IMAGE = "no such file", "an image, or a truncated one"
+DAMAGES = {  # format -> pattern of a file, and the sentence where it is missing, cut in half, and empty
     "kitti": [
-        ("training/velodyne/*.bin", None, "truncated"),
-        ("training/calib/*.txt", "no such file", "needs 12 numbers|no such file|needs 9 numbers"),
-        ("training/image_2/*.png", "no such file", "a truncated image"),
-        ("training/label_2/*.txt", None, "is no KITTI label"),
+        ("training/velodyne/*.bin", LOST, "truncated", "empty; a point cloud holds"),
+        ("training/calib/*.txt", LOST, "needs 12 numbers|needs 9 numbers", "needs 12 numbers"),
+        ("training/image_2/*.png", LOST, "a truncated image", IMAGE),
+        ("training/label_2/*.txt", LOST, "is no KITTI label", None),
     ],
     "nuscenes": [
-        ("v1.0-flcav/ego_pose.json", "no such file", "not JSON"),
-        ("samples/LIDAR_TOP/*.bin", "no such file", "truncated"),
-        ("samples/RADAR_FRONT/*.pcd", "no such file", "truncated|not a binary PCD file"),
-        ("samples/CAM_FRONT/*.png", "no such file", "a truncated image"),
+        *((f"v1.0-flcav/{table}.json", LOST, "not JSON", "not JSON") for table in COLUMNS if table != "sample"),
+        ("v1.0-flcav/sample.json", None, "not JSON", "not JSON"),  # without it there are no tables
+        ("v1.0-flcav/splits.json", None, "not JSON", "not JSON"),
+        ("samples/LIDAR_TOP/*.bin", LOST, "truncated", "truncated"),
+        ("samples/RADAR_FRONT/*.pcd", LOST, "truncated|not a binary PCD file", "not a binary PCD file"),
+        ("samples/CAM_FRONT/*.png", LOST, "a truncated image", IMAGE),
     ],
     "opv2v": [
-        ("train/*/*/*.pcd", "no such file", "truncated"),
-        ("train/*/*/*_camera0.png", None, "a truncated image"),
-        ("train/*/*/000000.yaml", None, "not a YAML file|not a frame of OPV2V"),
+        ("train/*/*/*.pcd", LOST, "truncated", "not a binary PCD file"),
+        ("train/*/*/*_camera0.png", LOST, "a truncated image", IMAGE),
+        ("train/*/*/000000.yaml", LOST, "not a YAML file|not a frame of OPV2V", "not a frame of OPV2V"),
+        ("train/*/data_protocol.yaml", None, "not a YAML file", None),  # another's has no names
     ],
 }
 
@@ -265,12 +272,18 @@ DAMAGES = {  # format -> pattern of a file, and the sentence where it is missing
         (name, pattern, how, sentence)
         for name, damages in DAMAGES.items()
         for pattern, *sentences in damages
-        for how, sentence in zip(("missing", "half"), sentences)
+        for how, sentence in zip(("missing", "half", "empty"), sentences, strict=True)
         if sentence is not None
     ],
 )
 def test_a_missing_or_truncated_file_names_itself(
-    name: str, pattern: str, how: str, sentence: str, exported: dict[str, Path], tmp_path: Path
+    name: str,
+    pattern: str,
+    how: str,
+    sentence: str,
+    exported: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ):
     folder = tmp_path / "folder"
     shutil.copytree(exported[name], folder)
@@ -278,11 +291,36 @@ def test_a_missing_or_truncated_file_names_itself(
     if how == "missing":
         path.unlink()
     else:
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 - 1])
-    with pytest.raises(InputError, match=sentence) as error:
-        import_dataset(name, folder, tmp_path / "out")
-    assert str(path) in str(error.value)
-    assert not (tmp_path / "out" / "manifest.json").exists()
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 - 1] if how == "half" else b"")
+    with pytest.raises(SystemExit) as ended:
+        run(["import", name, str(folder), "--out", str(tmp_path / "out")])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.removeprefix("flcav: ").startswith(f"{path}: ")
+    assert re.search(sentence, said)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_listed_frame_of_kitti_without_any_file_names_itself(exported: dict[str, Path], tmp_path: Path):
+    folder = shutil.copytree(exported["kitti"], tmp_path / "folder")
+    with (folder / "ImageSets" / "train.txt").open("a") as file:
+        file.write("000099\n")
+    with pytest.raises(InputError, match=r"training/calib/000099\.txt: no such file; a frame of KITTI has one"):
+        import_dataset("kitti", folder, tmp_path / "out")
+
+
+def test_kitti_without_labels_and_opv2v_without_pictures_say_so(exported: dict[str, Path], tmp_path: Path):
+    folder = shutil.copytree(exported["kitti"], tmp_path / "kitti")
+    shutil.rmtree(folder / "training" / "label_2")
+    notes = import_dataset("kitti", folder, tmp_path / "bare")
+    assert notes == ("no label_2 of 4 of 4 frames, so no boxes there",)
+    folder = shutil.copytree(exported["opv2v"], tmp_path / "opv2v")
+    for path in folder.rglob("*_camera3.png"):
+        path.unlink()
+    assert import_dataset("opv2v", folder, tmp_path / "blind") == (
+        "no pictures of a camera of 1 of 2 agents, so no images of it",
+    )
+    assert set(Dataset.open(tmp_path / "blind").frame(0).images) == {"camera0"}
 
 
 def test_an_import_goes_on_once_a_file_is_replaced(

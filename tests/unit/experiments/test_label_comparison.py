@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import pytest
 
-from flcav.experiments.distillation.run import ARMS, BOTH, IDEAL, NO_ROAD, PLAIN, PRETRAINED, compare_labels
+from flcav.experiments.distillation.run import ARMS, BOTH, GRAPH, IDEAL, NO_ROAD, PLAIN, PRETRAINED, compare_labels
 from flcav.experiments.distillation.tables import tables
 from flcav.pipeline.recipe import EDGE, MAIN, load_run_recipe
 from flcav.pipeline.results.run import Spent
@@ -13,7 +13,16 @@ from flcav.pipeline.results.training import LabelQuality
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/distillation"))
-AP50 = {PRETRAINED: 0.5, NO_ROAD: 0.52, PLAIN: 0.58, "regression": 0.59, "contrast": 0.55, BOTH: 0.6, IDEAL: 0.6}
+AP50 = {
+    PRETRAINED: 0.5,
+    NO_ROAD: 0.52,
+    PLAIN: 0.58,
+    "regression": 0.59,
+    "contrast": 0.55,
+    BOTH: 0.6,
+    GRAPH: 0.61,
+    IDEAL: 0.6,
+}
 
 
 def run_of(seed: int, more: float) -> Any:
@@ -41,6 +50,7 @@ def test_means_differences_and_the_share_that_the_trained_detector_brings() -> N
     found = compare_labels(RECIPE, cast(Any, [run_of(1, 0.0), run_of(2, 0.02)]))
     assert found.ap50[BOTH].mean == pytest.approx(0.61)
     assert found.differences[f"{BOTH} - {PLAIN}"].mean == pytest.approx(0.02)
+    assert found.differences[f"{GRAPH} - {BOTH}"].mean == pytest.approx(0.01)
     assert found.closed.mean == pytest.approx(0.8)  # (.58 - .5) / (.6 - .5)
     assert found.seeds["1"][BOTH].up_mb == 32.5
     assert found.seeds["1"][PRETRAINED].labels == ()

@@ -154,10 +154,12 @@ def test_labels_really_added_are_road_boxes_with_returns_that_the_vehicle_lacks(
     split = Frames(cast(Any, data), (0, 1), {3: (2,), 7: (3,)})
     told = {3: cars(found, missed, unseen), 7: cars((210.0 + 10.0, 2.0), far)}
 
-    def views(split: Frames, poles: list[int], trained: bool) -> dict[tuple[str, int], list[RoadView]]:
+    def views(
+        split: Frames, poles: list[int], trained: bool, spins: set[tuple[str, int]]
+    ) -> dict[tuple[str, int], dict[int, RoadView]]:
         assert trained
         grid = np.zeros((1, 1), bool)
-        return {("s", 0): [RoadView(told[poles[0]], np.zeros(2), grid, grid)]} if split.poles[poles[0]] else {}
+        return {spin: {poles[0]: RoadView(told[poles[0]], np.zeros(2), grid, grid)} for spin in spins}
 
     own = replace(cars((10.5, 2.2), z=-1.0), label=np.array(["Car"]))  # of both vehicles, in the LiDAR's frame
     monkeypatch.setattr(predictors, "road_views", views)

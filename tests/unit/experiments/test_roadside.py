@@ -8,12 +8,13 @@ from flcav.cli.planning.place_inputs import read_given
 from flcav.config import parse_config
 from flcav.experiments.fig3b.cover import TownCover, cover_town, list_kinds
 from flcav.experiments.fig3b.run import ZONE_M, _count_zones
+from flcav.experiments.roadside.average import measure_residual
 from flcav.experiments.roadside.detector import _Frames, fit_threshold, score_town
 from flcav.experiments.roadside.errors import Errors, apply_errors
 from flcav.experiments.roadside.fig4 import EDGES_M, find_range
 from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
 from flcav.experiments.roadside.ranges import SHARED, Model, SensorRanges
-from flcav.fusion.pose_graph import Navigation, Sighting
+from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of
 from flcav.sensors.rig import RIGS, Rig
 from flcav.sources.recipe import Recipe
@@ -50,6 +51,22 @@ def test_white_errors_are_drawn_anew_and_constant_ones_once() -> None:
     assert np.abs(place[0]).min() > 0
     assert late.std() < 1e-9
     assert late[0] != 0
+
+
+def test_residuals_are_the_mean_errors_of_vehicles_alone() -> None:
+    true = sightings(2)
+    told = [
+        replace(each, world_from_agent=each.world_from_agent @ pose(0.3, -0.4, 0, -0.1), time_s=each.time_s - 0.2)
+        if each.agent == "cav0"
+        else each
+        for each in true
+    ]
+    found = measure_residual(true, told)  # cav0's, and cav1's, which has none
+    assert found.position_cm == pytest.approx(25)
+    assert found.heading_deg == pytest.approx(np.degrees(0.05))
+    assert found.clock_ms == pytest.approx(100)
+    moved = [replace(each, world_from_agent=pose(9, 9, 0, 1)) if each.navigation is None else each for each in told]
+    assert measure_residual(true, moved) == found
 
 
 def test_road_sensors_are_surveyed_and_messages_of_all_are_lost() -> None:

@@ -81,21 +81,22 @@ def test_clipping_bounds_the_norm_of_all_arrays_together():
     assert not clip_change({"a": np.zeros(3)}, 1.0)["a"].any()
 
 
+@pytest.mark.parametrize("seeded", [False, True])
 @pytest.mark.parametrize("where", ["central", "local"])
-def test_the_mean_has_the_noise_that_is_accounted_for(where: Any):
+def test_the_mean_has_the_noise_that_is_accounted_for(where: Any, seeded: bool):
     clip, noise, number = 0.2, 3.0, len(NAMES)
-    found, _ = run(Privacy(where=where, clip=clip, noise=noise))
+    found, _ = run(Privacy(where=where, clip=clip, noise=noise, seeded=seeded))
     rounds, size = SCHEDULE.rounds, math.sqrt(START["w"].size + START["b"].size)
     deviation = noise * clip * (1 / number if where == "central" else 1 / math.sqrt(number)) * math.sqrt(rounds)
     change = found["w"] - rounds * clip / size
-    assert np.std(change) == pytest.approx(deviation, rel=0.03)
-    assert np.mean(change) == pytest.approx(0, abs=4 * deviation / math.sqrt(change.size))
+    assert np.std(change) == pytest.approx(deviation, rel=0.05)
+    assert np.mean(change) == pytest.approx(0, abs=5 * deviation / math.sqrt(change.size))
     np.testing.assert_array_equal(found["norm.running_var"], START["norm.running_var"])  # no noise covers it
     assert found["n"] == 5
 
 
 def test_one_client_moves_the_sum_by_the_norm_at_most():
-    privacy, names = Privacy(clip=0.3, noise=1.0), ["w", "b"]
+    privacy, names = Privacy(clip=0.3, noise=1.0, seeded=True), ["w", "b"]  # the same noise on each sum
     each = [Stride(length).train(START, steps=1, learning_rate=0.1, seed=0) for length in (0.1, 4.0, 900.0)]
     sums = [average_privately(START, updates, names, privacy, 1.0, 7) for updates in (each, each[:2], [])]
     moved = {name: sums[0][name] - sums[1][name] for name in names}
@@ -103,8 +104,8 @@ def test_one_client_moves_the_sum_by_the_norm_at_most():
     assert change_norm({name: sums[1][name] - sums[2][name] for name in names}) == pytest.approx(0.4, rel=1e-3)
 
 
-def test_the_noise_is_its_own_and_resumes():
-    privacy, kept = Privacy(clip=1.0, noise=0.5), []
+def test_seeded_noise_is_its_own_and_resumes():
+    privacy, kept = Privacy(clip=1.0, noise=0.5, seeded=True), []
     for selection in (EVERY, POISSON):
         kept.clear()
         whole, state = run(privacy, selection, on_round=lambda number, weights, loss: kept.append(weights))

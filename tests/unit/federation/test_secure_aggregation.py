@@ -194,7 +194,7 @@ def test_a_vehicle_that_drops_out_is_named_and_the_sum_is_of_the_others():
 
 
 def test_local_noise_is_under_the_masks():
-    privacy = Privacy(where="local", clip=0.25, noise=2.0)
+    privacy = Privacy(where="local", clip=0.25, noise=2.0, seeded=True)
     noisy, masked = Rules(privacy=privacy), Rules(privacy=privacy, secure=SecureAggregation())
     expected, told, _ = run(walks(), noisy)
     found, state, _ = run(walks(), masked)

@@ -21,8 +21,8 @@ from flcav.fusion.distillation import (
     unpack_sighting,
 )
 from flcav.fusion.map_context import build_context
-from flcav.fusion.pose_graph import Navigation, Sighting
 from flcav.fusion.road import RoadView
+from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, concatenate, inverse, pose
 from flcav.network.ledger import Budget, BudgetExceeded, Ledger
 from flcav.perception.objects.model import second_tiny
@@ -280,13 +280,13 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     data = SimpleNamespace(keys=keys, frame=lambda i: spins[i], manifest=manifest, town=lambda: "town")
     monkeypatch.setattr(road_average, "map_layers", lambda town: lane_through(BOTH, np.pi))
     found = [boxes(BOTH, z=-1.0), boxes(BOTH, OUT_OF_SIGHT, z=-1.0)]
-    monkeypatch.setattr(road_average, "road_views", lambda *about, trained: {("s", 0): [seen]})
+    monkeypatch.setattr(road_average, "road_views", lambda *about: {("s", 0): {3: seen}})
     seen_cars = {len(each.lidar["lidar"]): told for each, told in zip(spins, found, strict=True)}
 
     def detections(network, frames, **how):
         return [seen_cars[len(frames[0].lidar["lidar"])]]
 
-    monkeypatch.setattr(road_average, "detect_in", detections)
+    monkeypatch.setattr("flcav.pipeline.labels.sightings.detect_in", detections)
     truth = FrameTruth("s", boxes(BOTH, z=-1.0), Boxes.empty(), Boxes.empty())
     monkeypatch.setattr(quality, "asked_of", lambda frame, config: truth)
     how = Distillation(position_m=0.05, heading_deg=0.1)

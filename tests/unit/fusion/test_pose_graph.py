@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from flcav.fusion.average import average_boxes
-from flcav.fusion.pose_graph import Navigation, Sighting, correct_poses, match_posts, tell
+from flcav.fusion.pose_graph import correct_poses, match_posts
 from flcav.fusion.posts import find_posts
+from flcav.fusion.sightings import Navigation, Sighting, tell
 from flcav.geometry import Boxes, inverse, pose, transform_points
 
 pytest.importorskip("gtsam")

@@ -1,5 +1,6 @@
 """Rounds on a network: who takes part, who is lost, by name and in bytes, and how long a round takes."""
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 from moving import made_links
 
 from flcav.config import InputError
+from flcav.federation.rounds import ClientFailed
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.stages import EdgeServer, Schedule, edge_seeds, federate
@@ -49,7 +51,7 @@ def test_a_round_takes_download_training_and_upload_of_all_that_share_the_band()
     # the rest shared until 10 s; cav2 has 2.5 MB by then and sends 7.5 MB alone, in 3 s
     assert driven.seconds == pytest.approx([13.0])
     assert [client.end_s for client in driven.records[0].clients] == pytest.approx([10.0, 13.0])
-    assert driven.rules == Rules().model_copy(update={"least_clients": 0})
+    assert driven.rules == Rules()
 
 
 def test_rounds_are_driven_in_the_scenes_in_turn_one_after_another() -> None:
@@ -102,14 +104,13 @@ class Walk:
 
 START = {"w": np.zeros(1000, np.float32)}
 OUTAGES = {(1, "grid/cav1"): Outage("out of coverage", 999), (2, "grid/cav2"): Outage("not in the town")}
-LEAST = Rules().model_copy(update={"least_clients": 0})
 
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_round_goes_on_without_those_that_the_network_loses(masked: bool) -> None:
     clients = {name: Walk() for name in NAMES}
     book, state = Ledger(Budget(1.0, 0.0)), FederationState()
-    rules = Rules.model_validate({"secure": {}}).model_copy(update={"least_clients": 0}) if masked else LEAST
+    rules = Rules.model_validate({"secure": {}} if masked else {})
     account = Account(book, "edge", "t", "wireless", OUTAGES)
     federate({**clients}, START, Schedule(2, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
     assert [record.clients for record in state.records] == [(NAMES[0], NAMES[2]), NAMES[:2]]
@@ -127,11 +128,70 @@ def test_a_round_that_loses_everybody_leaves_the_weights() -> None:
     book, state = Ledger(Budget(1.0, 1.0)), FederationState()
     lost = {(1, name): Outage("not in the town") for name in NAMES}
     clients: dict[str, Trainable] = {name: Walk() for name in NAMES}
-    server = EdgeServer(clients, 1, Account(book, CLOUD, "t", "wireless", lost), START, rules=LEAST, state=state)
+    server = EdgeServer(clients, 1, Account(book, CLOUD, "t", "wireless", lost), START, state=state)
     schedule = Schedule(1, 1, 0.1, 0.1, 3)
     end = federate({"grid": server}, START, schedule, Account(book, CLOUD, "t", "wireline"))
     assert np.array_equal(end.weights["w"], START["w"])
     assert (state.records[0].clients, state.records[0].loss, len(state.records[0].failed)) == ((), 0.0, 3)
+
+
+LATE, GONE = Outage("past the deadline", 7), Outage("not in the town")
+
+
+@pytest.mark.parametrize(
+    ("lost", "joins", "others"),
+    [
+        ({NAMES[0]: GONE, NAMES[1]: GONE}, NAMES, "1 clients sent keys"),
+        ({NAMES[0]: LATE, NAMES[1]: GONE}, NAMES, "1 clients sent an update"),
+        (dict.fromkeys(NAMES, LATE), NAMES, "0 clients sent an update"),
+        ({}, NAMES[2:], "1 clients sent keys"),
+    ],
+    ids=["not there", "late", "all late", "one by the plan"],
+)
+def test_a_masked_round_that_the_network_leaves_too_few_for_has_no_update_and_the_next_goes_on(
+    lost: dict[str, Outage], joins: tuple[str, ...], others: str
+) -> None:
+    clients: dict[str, Trainable] = {name: Walk() for name in NAMES}
+    plan = {name: (1, 2, 3) if name in joins else (1, 3) for name in NAMES}
+    rules = Rules.model_validate({"secure": {}, "selection": {"rule": "planned", "joins": plan}})
+    book, state, after = Ledger(Budget(1.0, 0.0)), FederationState(), []
+    account = Account(book, "edge", "t", "wireless", {(2, name): outage for name, outage in lost.items()})
+    federate(
+        clients,
+        START,
+        Schedule(3, 1, 0.1, 0.1, 3),
+        account,
+        rules=rules,
+        state=state,
+        on_round=lambda number, weights, loss: after.append((weights["w"][0], loss)),
+    )
+    assert [record.clients for record in state.records] == [NAMES, (), NAMES]
+    failed = state.records[1].failed
+    assert {name: failed[name] for name in lost} == {name: outage.reason for name, outage in lost.items()}
+    assert {*failed} == {*lost, *joins}
+    assert all(others in failed[name] and "2 are needed" in failed[name] for name in joins if name not in lost)
+    assert (state.records[1].samples, state.records[1].loss) == (0, 0.0)
+    assert after[1] == (after[0][0], 0.0)
+    assert after[2][0] != after[1][0]
+
+
+def test_half_of_those_whom_the_network_leaves_are_enough() -> None:
+    class Fails(Walk):
+        def train(self, weights: Weights, **how: Any) -> LocalUpdate:
+            raise OSError("no power")
+
+    def run(fails: tuple[str, ...], rules: Rules) -> FederationState:
+        clients: dict[str, Trainable] = {name: Fails() if name in fails else Walk() for name in NAMES}
+        state, account = FederationState(), Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless", OUTAGES)
+        federate(clients, START, Schedule(1, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
+        return state
+
+    assert run(NAMES[:1], Rules()).records[0].clients == NAMES[2:]  # one of the two whom the network did not lose
+    with pytest.raises(ClientFailed, match=r"0 of 2 clients sent an update that can be used, 1 are wanted"):
+        run((NAMES[0], NAMES[2]), Rules())
+    for rules, wanted in ((Rules(least_clients=2), 2), (Rules(least_clients="all"), 3)):
+        with pytest.raises(ClientFailed, match=f"1 of 3 clients .*, {wanted} are wanted"):
+            run(NAMES[:1], rules)
 
 
 def test_the_network_knows_whom_an_edge_server_will_draw() -> None:
@@ -158,16 +218,18 @@ def test_a_cloud_round_waits_for_the_slowest_region_and_the_wireline() -> None:
     assert set(both.outages) == set(grid.outages) | set(two.outages)
 
 
-def test_importance_cannot_be_driven() -> None:
+def test_what_is_drawn_late_or_in_secret_cannot_be_driven() -> None:
     from flcav.pipeline.arms import check_federations, resolve_settings
     from flcav.pipeline.recipe import RunRecipe
 
+    poisson, privacy = {"rule": "poisson", "probability": 0.5}, {"clip": 1, "noise": 1}
     for federation, said in (
         ({"selection": {"rule": "importance", "clients": 1}}, "importance selection draws the clients after"),
-        (
-            {"selection": {"rule": "deadline", "deadline_s": 9}, "privacy": {"clip": 1, "noise": 1}},
-            "noise is for one number",
-        ),
+        ({"selection": {"rule": "deadline", "deadline_s": 9}, "privacy": privacy}, "noise is for one number"),
+        ({"selection": poisson, "privacy": privacy}, "poisson selection under central noise draws in secret"),
+        ({"selection": {"rule": "uniform", "clients": 2}, "privacy": privacy}, "uniform selection under central noise"),
+        ({"selection": poisson, "privacy": privacy | {"seeded": True}}, None),
+        ({"selection": poisson, "privacy": privacy | {"where": "local"}}, None),  # whose draws are no secret
     ):
         recipe = RunRecipe.model_validate(
             {
@@ -177,7 +239,8 @@ def test_importance_cannot_be_driven() -> None:
                 "federation": {"network": {}, **federation},
             }
         )
-        with pytest.raises(InputError, match=f"federation.network: .*{said}"):
+        refused = nullcontext() if said is None else pytest.raises(InputError, match=f"federation.network: .*{said}")
+        with refused:
             check_federations(recipe, resolve_settings(recipe, {"objects": "ideal-road"}).values())
 
 

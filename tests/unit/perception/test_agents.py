@@ -264,6 +264,33 @@ def test_only_objects_lie_in_a_range(street, capsys):
     assert "--range: only objects" in capsys.readouterr().err
 
 
+def test_a_range_around_is_asked_for_to_all_four_sides(street, tmp_path, said, monkeypatch):
+    """The car 20 m ahead and 26 m to the left is 26 m away by 20 m to the right of who looks left."""
+    hits = detections((10, 3, 0.9), (20, 26, 0.8), (-10, 5, 0.7), (30, 30, 0.6), (50, 0, 0.5))
+    monkeypatch.setattr(prediction, "detect_all", lambda *_, **__: [hits])
+    weights = tmp_path / "weights.safetensors"
+    save_network(OBJECTS, second(small_config(("Car",))), weights)
+    options = ("evaluate", "objects", "--data", street.folder, "--weights", weights, "--range", "48,24", "--json")
+    ahead, around = json.loads(said(*options)), json.loads(said(*options, "--around"))
+    assert (ahead["rules"]["range_m"], around["rules"]["range_m"]) == ([0, -24, -3, 48, 24, 1],) * 2
+    assert ("around" in ahead["rules"], around["rules"]["around"]) == (False, True)
+    assert (ahead["scores"][0]["targets"], around["scores"][0]["targets"]) == (4, 8)
+    counts = {key: each["near"] for key, each in (("ahead", ahead), ("around", around))}
+    assert (counts["ahead"]["cars"], counts["ahead"]["found"]) == (4, 4)
+    assert (counts["around"]["cars"], counts["around"]["found"]) == (8, 8)
+    assert counts["ahead"]["false_per_quarter_turn"] == 0  # (-10, 5) and (30, 30) are in no range asked for
+    assert counts["around"]["false_per_quarter_turn"] == 0.25  # one in each of four looks
+    assert (counts["around"]["within_m"], counts["around"]["score"], counts["around"]["overlap"]) == (40, 0.3, 0.5)
+
+
+def test_infer_has_no_range(street, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        run(["infer", "objects", str(street.folder), "--around", "--range", "48,24"])
+    assert len(told := capsys.readouterr().err.splitlines()) == 1
+    assert "No such option" in told[0]
+    assert "--range" in told[0]
+
+
 def test_one_scene_has_no_interval(recorded, tmp_path, said, monkeypatch):
     hits = detections((10, 3, 0.8))
     monkeypatch.setattr(prediction, "detect_all", lambda *_, **__: [hits])

@@ -112,7 +112,9 @@ def test_a_sweep_of_a_report_is_divided_at_the_ground(data: Dataset) -> None:
 def test_a_road_sensor_sees_free_ground_where_it_is(data: Dataset) -> None:
     level = Place("").frame(POLE)
     wanted = build_road_view(level, Boxes.empty(), "top", ground_m=UP_M)
-    ((found,),) = road_views(Frames(data, (0,), {6: (1,)}), [6], trained=False).values()
+    split, spin = Frames(data, (0,), {6: (1,)}), (data.keys[1].scene, data.keys[1].index)
+    found = road_views(split, [6], trained=False, spins={spin})[spin][6]
+    assert not road_views(split, [6], trained=False, spins=())
     assert wanted.ground.any()
     assert wanted.occupied.any()
     np.testing.assert_array_equal(found.ground, wanted.ground)

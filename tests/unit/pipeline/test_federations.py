@@ -1,5 +1,6 @@
 """Federations of a recipe: refused before anything is computed, planned with what they send, ended by their budgets."""
 
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +19,14 @@ from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavgm import FedAvgM
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
+from flcav.fusion.distillation import Distillation
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies, resolve_settings
-from flcav.pipeline.federations.timing import TIMES, read_times, time_clients
+from flcav.pipeline.federations.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
 from flcav.pipeline.recipe import Federation, RunRecipe, Training
 from flcav.pipeline.results.saved import WEIGHTS
@@ -85,6 +87,16 @@ def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any
             check_federations(recipe, arms)
 
 
+def test_a_pose_graph_without_gtsam_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe, arms = settings({})
+    check_federations(recipe, arms)
+    graphs = [replace(each, distillation=Distillation(pose_graph=True)) for each in arms]
+    monkeypatch.setitem(sys.modules, "gtsam", None)
+    check_federations(recipe, arms)
+    with pytest.raises(InputError, match="a pose graph needs GTSAM, which is in"):
+        check_federations(recipe, graphs)
+
+
 def test_statistics_are_those_of_a_network_that_has_some() -> None:
     recipe, arms = settings({}, score_statistics=True)
     check_federations(recipe, arms)
@@ -129,6 +141,15 @@ def test_an_arm_s_rules_are_checked_with_the_recipe(federation: Any, said: str) 
         settings({"other": federation})
 
 
+def test_a_budget_below_one_round_is_refused_with_the_recipe() -> None:
+    small, large = ({"privacy": PRIVACY | {"epsilon": epsilon}} for epsilon in (0.5, 1.5))
+    check_federations(*settings({"other": large}))
+    with pytest.raises(InputError, match=r"privacy: a first round comes to epsilon = .*, above the budget of 0.5;"):
+        check_federations(*settings({"other": small}))
+    amplified = {"selection": {"rule": "poisson", "probability": 0.1}}
+    check_federations(*settings({"other": small | amplified}))
+
+
 def test_strategies_are_by_name_and_settings() -> None:
     how = Federation.model_validate({"strategy": {"fedavgm": {"momentum": 0.5}}})
     assert find_strategies(how) == (FedAvgM(momentum=0.5), FedAvgM(momentum=0.5))
@@ -166,9 +187,9 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
     (timed,) = time_clients({"a/cav0": Busy()}, tmp_path / "busy").values()
     for seed in range(3):
         timed.train({}, steps=1, learning_rate=0.1, seed=seed)
-    assert read_times(tmp_path / "busy") == pytest.approx([BUSY_S] * 3, rel=0.3)
+    assert read_times(tmp_path / "busy") == {"a/cav0": pytest.approx([BUSY_S] * 3, rel=0.3)}
     (tmp_path / "busy" / TIMES).open("a").write("a/cav0,0.0")  # a kill
-    assert len(read_times(tmp_path / "busy")) == 3
+    assert len(read_times(tmp_path / "busy")["a/cav0"]) == 3
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2), 3)
     network = learning.build_network()
     clients = make_clients(learning, Slope(), {f"a/cav{i}": [np.float32(i), np.float32(1)] for i in range(2)})
@@ -179,8 +200,24 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
         federate_edge(federation, Rules(), timed=folder.name == "timed")
         ends.append({path.name: path.read_bytes() for path in folder.iterdir() if path.name != TIMES})
     assert ends[0] == ends[1]
-    assert len(read_times(tmp_path / "timed")) == 3 * 2
-    assert read_times(tmp_path / "plain") == []
+    assert {name: len(times) for name, times in read_times(tmp_path / "timed").items()} == {"a/cav0": 3, "a/cav1": 3}
+    assert read_times(tmp_path / "plain") == {}
+
+
+def test_measured_speeds_are_those_of_a_recipe() -> None:
+    measured = {
+        "objects": {"a/cav0": [2.0, 2.0, 9.0], "a/cav1": [4.0, 4.0, 4.0], "b/cav0": [4.0, 5.0]},
+        "weather": {"a/cav1": [1.0], "a/cav0": [1.0]},
+        "signs": {},
+    }
+    assert summarise_times(measured) == TrainTimes(
+        train_s={"objects": 4.0, "weather": 1.0},
+        vehicle_train_s={
+            "objects": {"a/cav0": 2.0, "a/cav1": 4.0, "b/cav0": 4.5},
+            "weather": {"a/cav0": 1.0, "a/cav1": 1.0},
+        },
+        speed={"a": {"cav0": 5 / 3, "cav1": 1.0}, "b": {"cav0": 4 / 4.5}},
+    )
 
 
 def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:

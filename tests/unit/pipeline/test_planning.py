@@ -2,8 +2,9 @@
 
 import json
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import networkx as nx
 import numpy as np
@@ -12,6 +13,7 @@ from flwr.app import Array, ArrayRecord, MetricRecord, RecordDict
 from flwr.common.serde import recorddict_to_proto
 
 from flcav.config import InputError
+from flcav.experiments.fig6a.run import BUDGETS
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
@@ -27,15 +29,18 @@ from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import to_arrays
+from flcav.pipeline.arms import PlanRule
 from flcav.pipeline.planning import allocation
 from flcav.pipeline.planning.allocation import PlanRequest, PlanSettings, fit_curve, make_plan
 from flcav.pipeline.planning.histories import HistoryPoint, load_history, parse_history
 from flcav.pipeline.planning.stages import remake_plan
 from flcav.pipeline.planning.updates import model_mb
-from flcav.pipeline.recipe import FixedPlan, Limits
+from flcav.pipeline.recipe import FixedPlan, Limits, load_run_recipe
+from flcav.pipeline.results.plans import TaskPlan
 from flcav.pipeline.seeds.spread import read_spreads
 from flcav.pipeline.tables import append_records
 
+RECIPES = Path(__file__).parents[3] / "recipes/runs"
 FITTED: dict[tuple[bytes, ...], CurveFit] = {}
 
 
@@ -227,6 +232,9 @@ def test_slow_vehicles_are_planned_into_the_rounds_that_they_have_time_for() -> 
         assert {each for name in names for each in own.joins[name]} == set(
             range(1, 1 + own.edge_rounds + own.cloud_rounds)
         )
+    sent_mb = own.samples * SIZES.sample_mb + sum(map(len, own.joins.values())) * SIZES.model_mb
+    all_join = price(settings.stage_plan(own.samples, own.edge_rounds, own.cloud_rounds), SIZES)
+    assert sent_mb < own.wireless_mb == pytest.approx(all_join.wireless_mb)  # priced as if all joined every round
     on_air, slower = make_plan((replace(asked(), train_s=2.0, air_s={"b": 1.0}),), settings, "joint")
     assert slower is not None
     for name, speed in speeds.items():
@@ -245,18 +253,49 @@ def test_slow_vehicles_are_planned_into_the_rounds_that_they_have_time_for() -> 
     )
 
 
-def test_half_of_the_demo_s_budgets_costs_more_than_trainings_differ_and_twice_them_brings_less() -> None:
-    sizes, spreads = MessageSizes(0.451, 1.348), read_spreads("demo", Path())
-    least = max(spreads["objects", town, "main", "cloud", "", ""].sd for town in ("grid", "ring"))
-    own = PlanRequest("objects", 1.0, sizes, 320, load_history("objects"), None, 4.4)
-    predicted = []
-    for factor in (0.5, 1, 2):
-        settings = PlanSettings(Price(80 * factor, 44 * factor), 0.02, Limits(), (4, 3), 1, (320, 240), 40.0)
-        plan = make_plan((own,), settings, "joint")[0].tasks["objects"].predicted
-        assert plan is not None
-        predicted.append(plan["cloud"])
-    assert predicted[1] - predicted[0] > least
-    assert 0 < predicted[2] - predicted[1] < least  # docs/runs.md: where more megabytes cease to help
+def plan_recipe(name: str, wireless: float = 1, wireline: float = 1, rule: PlanRule = "joint") -> TaskPlan:
+    """Return the plan of objects in a recipe of the package, with so many times its budgets."""
+    recipe = load_run_recipe(RECIPES / f"{name}.yaml")
+    pool, edge, own = recipe.sized_splits.pool, recipe.sized_splits.edge, recipe.tasks["objects"]
+    groups = tuple(recipe.vehicles(region) for region in recipe.with_role("federate"))
+    sizes = MessageSizes(sample_mb=0.448, model_mb=model_mb(OBJECTS, own.network))  # a sweep: as in docs/runs.md
+    candidates = pool.scenes * pool.spins * pool.cavs
+    request = PlanRequest("objects", own.weight, sizes, candidates, load_history("objects"), None, own.train_s)
+    settings = PlanSettings(
+        budgets_mb=Price(wireless * recipe.budgets_mb.wireless, wireline * recipe.budgets_mb.wireline),
+        headroom=recipe.headroom,
+        limits=recipe.limits,
+        edge_groups=groups,
+        edge_rounds_per_cloud_round=recipe.federation.edge_rounds_per_cloud_round,
+        group_samples=tuple(vehicles * edge.scenes * edge.spins for vehicles in groups),
+        horizon_s=recipe.horizon_s,
+    )
+    return make_plan((request,), settings, rule)[0].tasks["objects"]
+
+
+@pytest.mark.parametrize("name", ["demo", "arms"])
+def test_doubling_up_to_a_recipe_s_budget_is_worth_more_than_trainings_differ_and_beyond_it_less(name: str) -> None:
+    spreads = read_spreads("demo", Path())
+    differ = max(spreads["objects", town, "main", "cloud", "", ""].sd for town in ("grid", "ring"))
+    half, own, twice, more = ((plan_recipe(name, factor).predicted or {})["cloud"] for factor in (0.5, 1, 2, 4))
+    print(f"{name}: half of the wireless budget {half:.3f}, all {own:.3f}, twice {twice:.3f}, four times {more:.3f}")
+    assert own - half > differ
+    assert 0 < twice - own < differ  # docs/runs.md: where more megabytes cease to help
+    assert more - twice < 0.001
+    assert plan_recipe(name, 1, 2).predicted == plan_recipe(name).predicted  # of wireline there is enough
+    with pytest.raises(Infeasible, match=r"the least that the limits allow costs 20\.6\d+ MB of wireline"):
+        plan_recipe(name, 1, 0.5)
+
+
+def test_plans_of_the_comparison_of_plans_stay_within_what_the_history_covers() -> None:
+    limits, covered = load_run_recipe(RECIPES / "allocation.yaml").limits, load_history("objects").resources.max(axis=0)
+    assert (limits.edge_rounds[1], limits.cloud_rounds[1]) == (None, None)  # rounds: the history's
+    assert limits.samples[1] == covered[0]
+    for factor, rule in product(BUDGETS, get_args(PlanRule)):
+        plan = plan_recipe("allocation", factor, factor, rule)
+        counts = (plan.samples, plan.edge_rounds, plan.cloud_rounds)
+        print(f"budgets x {factor:g}, {rule}: {counts} of {covered}, predicted {(plan.predicted or {})['cloud']:.3f}")
+        assert (np.array(counts) <= covered).all()
 
 
 @pytest.mark.parametrize(  # docs/runs.md, "Histories of the package"

@@ -19,12 +19,13 @@ from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.plan import Price
 from flcav.optimization.problem import Problem
+from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.network import DrivenRounds
 from flcav.pipeline.planning.course import Course, Replanning
 from flcav.pipeline.planning.rounds import Follower, Planner, restrict_problem
-from flcav.pipeline.planning.stages import count_carried_out
+from flcav.pipeline.planning.stages import continue_joins, count_carried_out
 from flcav.pipeline.planning.terms import Terms
 from flcav.pipeline.recipe import Training
 from flcav.pipeline.results.plans import Plan, RoundPlan, TaskPlan
@@ -222,4 +223,45 @@ def test_regions_of_different_rounds_count_by_their_vehicles() -> None:
     joins: dict[str, tuple[int, ...]] = {"a/cav0": (1, 2), "b/cav0": (1, 2)}
     found = count_carried_out(replace(plan_of(4, 1), joins=joins), both)
     assert found.edge_rounds == 6  # (3 x 7 + 1 x 3) / 4
-    assert found.joins == {"a/cav0": (1, 7), "b/cav0": (2, 3)}
+    assert found.joins == {"a/cav0": (0, 6), "b/cav0": (5, 6)}  # both end with the sixth
+
+
+def test_no_vehicle_joins_more_rounds_than_it_has_time_for_after_a_plan_is_made_anew() -> None:
+    rng = np.random.default_rng(3)
+    refused = 0
+    for _ in range(200):
+        most = {f"{region}/cav{number}": int(rng.integers(1, 7)) for region in "ab" for number in range(3)}
+        plans = [replace(plan_of(rounds, 0), joins=joins_of(most, rounds)) for rounds in (4, 4 + int(rng.integers(4)))]
+        before, new = plans
+        over = int(rng.integers(5))
+        assert before.joins is not None
+        assert new.joins is not None
+        past = {name: [each for each in joined if each <= over] for name, joined in before.joins.items()}
+        try:
+            joins = continue_joins(before, new, over)
+        except Infeasible:
+            left = {name: len(new.joins[name]) - len(past[name]) for name in past}
+            fewest = min(sum(max(many, 0) for name, many in left.items() if name[0] == region) for region in "ab")
+            assert fewest < new.edge_rounds - over
+            refused += 1
+            continue
+        assert joins is not None
+        for name, joined in joins.items():
+            assert [each for each in joined if each <= over] == past[name]
+            assert len({*joined}) == len(joined) <= max(len(new.joins[name]), len(past[name]))
+        for region in "ab":
+            later = {each for name, joined in joins.items() if name[0] == region for each in joined if each > over}
+            assert later == {*range(over + 1, new.edge_rounds + 1)}
+    assert 0 < refused < 100
+
+
+def joins_of(most: dict[str, int], rounds: int) -> dict[str, tuple[int, ...]]:
+    """Return the rounds of vehicles, each of so many at most, one vehicle after another."""
+    joins = {}
+    for region in "ab":
+        start = 0
+        for name in (each for each in most if each[0] == region):
+            count = min(max(most[name], -(-rounds // 3)), rounds)
+            joins[name] = tuple(sorted((start + number) % rounds + 1 for number in range(count)))
+            start += count
+    return joins

@@ -307,11 +307,43 @@ def test_arms_of_distillation_share_all_but_stage_two_and_have_their_labels_meas
     assert [several[f"grid-edge-fl-{task}"].scored for task in SEVERAL] == [True, False, False]
     before = {step.name: settings_of(step) for step in Graph(recipe_of(), Path()).steps}
     assert not any(getattr(own, name, False) for own in before.values() for name in ("scored", "distillation"))
-    same = {"grid-edge-fl-objects", "plan"}  # whose labels are measured now, and whose messages are priced
-    assert all(settings[name] == own for name, own in before.items() if name not in same)
+    changed = {
+        "grid-edge-fl-objects",
+        "plan",
+        "grid-edge-objects",
+    }  # labels are measured, messages priced, windows recorded
+    assert {name for name, own in before.items() if settings[name] != own} == changed
     assert [own.labels is None for own in (before["plan"].tasks["objects"], settings["plan"].tasks["objects"])] == [
         True,
         False,
     ]
     with pytest.raises(ValueError, match=r"arms\.odd\.distillation: .*terms"):
         recipe_of(arms={"odd": {"distillation": {"terms": ["outputs"]}}})
+
+
+def test_windows_of_the_road_average_are_recorded_where_vehicles_train_and_nowhere_else() -> None:
+    def averaged(*windows: float) -> dict[str, Any]:
+        """Return the settings of the steps of a run with an arm for each window."""
+        about = {"labels": {"objects": "road-average"}, "stages": ["edge"]}
+        arms = {f"arm{n}": {**about, "distillation": {"window_s": each}} for n, each in enumerate(windows)}
+        return {step.name: settings_of(step) for step in Graph(recipe_of(arms=arms), Path()).steps}
+
+    found = averaged(0.0, 0.5)
+    recorded = {name: own.recipe.window_s for name, own in found.items() if hasattr(own, "recipe")}
+    assert recorded.pop("grid-edge-objects") == 0.5
+    assert set(recorded.values()) == {0.0}
+    assert found["plan"].tasks["objects"].labels.distillation.window_s == 0.5  # the longer is priced
+    assert averaged(0.0)["grid-edge-objects"].recipe.window_s == 0
+    assert averaged()["grid-edge-objects"].recipe.window_s == 0
+    with pytest.raises(InputError, match=r"distillation.window_s: arms have 0.3 s and 0.5 s; in a town all have one"):
+        averaged(0.5, 0.3, 0.0)
+    with pytest.raises(InputError, match=r"grid-edge-objects: field 'window_s' = 0.25: must be a multiple of 0.1 s"):
+        averaged(0.25)
+
+
+def test_messages_of_labels_are_priced_with_posts_where_any_arm_has_a_pose_graph() -> None:
+    about = {"labels": {"objects": "road-average"}, "stages": ["edge"]}
+    arms = {"plain": about, "graph": {**about, "distillation": {"pose_graph": True}}}
+    for chosen, wanted in ((arms, True), ({"plain": about}, False)):
+        steps = {step.name: settings_of(step) for step in Graph(recipe_of(arms=chosen), Path()).steps}
+        assert steps["plan"].tasks["objects"].labels.distillation.pose_graph is wanted

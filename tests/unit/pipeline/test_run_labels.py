@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError
+from flcav.fusion.distillation import Distillation
 from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
 from flcav.pipeline.arms import resolve_settings
@@ -15,6 +16,8 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels import pseudo_labels
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold, select_frames_near
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
+from flcav.pipeline.planning import exchanges
+from flcav.pipeline.planning.exchanges import Held, Sensors, measure_labels
 from flcav.pipeline.recipe import RunRecipe
 
 
@@ -89,3 +92,22 @@ def test_the_road_detector_is_said_to_have_been_trained_where_it_labels() -> Non
     assert caveats("road-average", "hilly_suburb") == ("trained road detector", told)
     assert caveats("own-detections", "arterial") == ()
     assert caveats("own-detections", "arterial", arm="road") == (told,)
+
+
+def test_a_vehicle_s_messages_are_priced_for_all_spins_of_its_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    times_s = (0.0, 0.5, 1.0, 4.0)
+    keys = [SimpleNamespace(scene="s", agent="cav0", index=i, time_s=time_s) for i, time_s in enumerate(times_s)]
+    drive = Frames(cast(Any, SimpleNamespace(keys=keys)), (1, 3), {})
+    monkeypatch.setattr(exchanges, "_expect_sensors", lambda region, sensors: np.zeros((1, 2)))
+    monkeypatch.setattr(exchanges, "select_frames_near", lambda drive, sites, near_m: drive.vehicles)
+    monkeypatch.setattr(exchanges, "_sighting_bytes", lambda *about: 1000)
+
+    def priced_mb(recorded: bool, window_s: float) -> float:
+        region = Held(drive, recorded, training_frames=20, vehicles=2)
+        sensors = Sensors((), 1, 40.0, 60.0)
+        return measure_labels([region], sensors, Distillation(window_s=window_s), cast(Any, None))
+
+    assert priced_mb(recorded=False, window_s=0.0) == pytest.approx(20 * 1e-3 / 2)
+    assert priced_mb(recorded=False, window_s=0.5) == pytest.approx(3 * 20 * 1e-3 / 2)
+    assert priced_mb(recorded=True, window_s=0.0) == pytest.approx(20 * 1e-3 / 2)
+    assert priced_mb(recorded=True, window_s=0.5) == pytest.approx(2 * 20 * 1e-3 / 2)  # 4 frames told of for 2

@@ -8,6 +8,7 @@ import pytest
 from made_up_run import run as made_up_run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.state import RoundRecord
 from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
 from flcav.pipeline.federations.checkpoint import Checkpoint
@@ -83,6 +84,10 @@ def test_rounds_are_a_table_curves_and_rows_of_the_page(tmp_path: Path) -> None:
     text = html.render(page(run), {})
     for shown in ("<th>ε so far</th><th>seconds</th>", "<td>grid/cav1: no power</td><td>2.0</td>", "<td>3.500</td>"):
         assert shown in text
+    for seeded, head in ((False, "ε so far, at δ = 1e-05"), (True, f"ε so far, at δ = 1e-05, {SEEDED}")):
+        federation = run.recipe.federation.model_copy(update={"privacy": Privacy(clip=1.0, noise=1.0, seeded=seeded)})
+        recipe = run.recipe.model_copy(update={"federation": federation})
+        assert f"<th>{head}</th>" in html.render(page(replace(run, recipe=recipe)), {})
     plain = html.render(page(with_rounds(replace(first, epsilon=None, seconds=None))), {})
     assert "<td>grid/cav1: no power</td>" in plain
     assert "<th>ε so far</th>" not in plain

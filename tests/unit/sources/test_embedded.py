@@ -48,6 +48,15 @@ def test_frames_come_spin_by_spin_vehicles_before_poles():
     assert all(len(frame.lidar["lidar"]) > 100 for frame in frames)
 
 
+def test_a_window_is_recorded_and_said_where_there_is_one():
+    source = small(poles=[1], scenes=1, window_s=0.5, spins_per_scene=1)
+    frames = list(source.frames("suburb-3-000"))
+    assert len(frames) == source.frame_count("suburb-3-000") == 9
+    assert [(frame.index, frame.time_s) for frame in frames[::3]] == [(0, 34.5), (1, 35.0), (2, 35.5)]
+    assert source.describe()["window_s"] == 0.5
+    assert "window_s" not in small().describe()
+
+
 def test_a_scene_is_the_same_whatever_was_asked_before_and_in_a_copy():
     source = small()
     last = next(iter(source.frames("suburb-3-001")))

@@ -31,6 +31,17 @@ def test_times_are_exact_tenths_of_a_second():
     assert times.dtype == np.float64
 
 
+def test_a_window_is_a_spin_before_and_one_after_each():
+    recipe = parsed(every_s=4.0, spins_per_scene=2, window_s=0.5)
+    assert recipe.times_s(600).tolist() == [59.5, 60.0, 60.5, 63.5, 64.0, 64.5]
+    assert (recipe.spins, recipe.middle_spins) == (6, (1, 4))
+    dense = parsed(every_s=1.0, spins_per_scene=3, window_s=0.5)  # a spin between two is of both windows
+    assert dense.times_s(600).tolist() == [59.5, 60.0, 60.5, 61.0, 61.5, 62.0, 62.5]
+    assert dense.middle_spins == (1, 3, 5)
+    plain = parsed(every_s=1.0, spins_per_scene=3)
+    assert (plain.times_s(600).tolist(), plain.middle_spins) == ([60.0, 61.0, 62.0], (0, 1, 2))
+
+
 def test_a_range_of_warm_ups_is_one_of_the_recipes_settings():
     recipe = parsed(warmup_s=[60, 90.5])
     assert recipe.warmup_steps == (600, 905)
@@ -47,6 +58,9 @@ def test_a_range_of_warm_ups_is_one_of_the_recipes_settings():
         ({"frames": 0}, "field 'frames' = 0"),
         ({"every_s": 0}, "field 'every_s' = 0: .*greater than 0"),
         ({"every_s": 0.25}, "field 'every_s' = 0.25: must be a multiple of 0.1 s"),
+        ({"window_s": 0.25}, "field 'window_s' = 0.25: must be a multiple of 0.1 s"),
+        ({"window_s": -0.5}, "field 'window_s' = -0.5"),
+        ({"window_s": 0.5, "warmup_s": 0.5}, ".*window_s = 0.5 puts the first spin before the traffic"),
         ({"warmup_s": float("inf")}, "field 'warmup_s' = inf: must be seconds"),
         ({"warmup_s": 0}, "field 'warmup_s' = 0: must be seconds above 0"),
         ({"warmup_s": [90.0, 60.0]}, "field 'warmup_s' = .*the lower first"),

@@ -30,7 +30,8 @@ EXACT = 1e-6  # tolerance between values that are stored twice [s], [m], [rad], 
 def check_values(frame: Frame, *, imported: bool = False) -> Iterator[str]:
     """Check that numbers are finite and in range, the pose is rigid, classes are known and tracks unique.
 
-    In an imported dataset velocities and occlusions may be NaN, which is unknown, and classes are any.
+    In an imported dataset velocities and occlusions may be NaN, which is unknown, classes are any, and a spin may begin
+    or end at the frame's time.
     """
     truth = frame.annotations
     for name, points in frame.lidar.items():
@@ -39,7 +40,7 @@ def check_values(frame: Frame, *, imported: bool = False) -> Iterator[str]:
         elif ((points[:, 3] < 0) | (points[:, 3] > 1)).any():
             yield f"{frame.key}: '{name}' has an intensity outside 0 to 1"
     for name, times_s in frame.point_times.items():
-        if not (np.abs(times_s) <= LONGEST_SPIN_S / 2).all():
+        if not (np.abs(times_s) <= (LONGEST_SPIN_S if imported else LONGEST_SPIN_S / 2)).all():
             yield f"{frame.key}: '{name}' has a point that was measured in no spin around the frame's time"
     if not is_rigid(frame.world_from_agent):
         yield f"{frame.key}: the pose of {frame.agent} is not a rigid transform"
@@ -90,13 +91,14 @@ def check_measurements(frame: Frame) -> Iterator[str]:
             yield f"{frame.key}: '{name}' reports a motion that nothing survives"
 
 
-def check_points(frame: Frame, trace: Trace | None = None) -> Iterator[str]:
+def check_points(frame: Frame, trace: Trace | None = None, *, imported: bool = False) -> Iterator[str]:
     """Check that each actor's enlarged box contains as many points as the annotation counts returns.
 
-    Points of a rolling LiDAR are compensated for the motion of the carrier and the actor by `trace`. The check is
-    skipped without `trace` for such a LiDAR, and where a point or a box is not finite or beyond `FARTHEST`.
+    Points of a rolling LiDAR are compensated for the motion of the carrier and the actor by `trace`; those of an
+    imported dataset are as they are. The check is skipped without `trace` for a rolling LiDAR of a recording, and where
+    a point or a box is not finite or beyond `FARTHEST`.
     """
-    if not frame.lidar or (frame.point_times and trace is None):
+    if not frame.lidar or (frame.point_times and trace is None and not imported):
         return
     if not all(np.isfinite(points).all() for points in frame.lidar.values()):
         return

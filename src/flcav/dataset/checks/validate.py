@@ -72,7 +72,7 @@ def _frame_problems(frame: Frame, trace: Trace | None, *, imported: bool) -> Ite
     yield from check_values(frame, imported=imported)
     if not imported:  # KITTI has the camera's view alone of each spin
         yield from check_sweeps(frame)
-    yield from check_points(frame, trace)
+    yield from check_points(frame, trace, imported=imported)
     yield from check_measurements(frame)
     yield from check_images(frame, imported=imported)
     if trace is not None:

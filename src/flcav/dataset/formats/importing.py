@@ -49,7 +49,7 @@ def import_dataset(
     try:
         source = READABLE[name].read(folder, split)
         record(source, out, progress=progress)
-    except InputError:
+    except (InputError, OSError):
         drop_unbegun(out)
         raise
     except ValueError as error:  # of names that a dataset cannot hold, or numbers that no measurement has

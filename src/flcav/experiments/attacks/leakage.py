@@ -28,7 +28,7 @@ from flcav.experiments.attacks.inference import (
     membership_auc,
     name_nearest,
 )
-from flcav.federation.privacy import Privacy, account_epsilon
+from flcav.federation.privacy import SEEDED, Privacy, account_epsilon
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.reading import read_round
@@ -86,13 +86,13 @@ class LeakageResult(Record):
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
     def sentences(self) -> list[str]:
-        """Return a sentence per level."""
+        """Return a sentence per level, and one on what epsilon rests on."""
         told = []
         for level in (*self.levels, self.masked, self.summed):
             epsilon = "" if level.epsilon is None else f" (epsilon {level.epsilon:.3g})"
             numbers = ", ".join(f"{name} {mean.mean:.3f}" for name, mean in level.mean.items())
             told.append(f"{level.name}{epsilon}: {numbers}")
-        return told
+        return [*told, f"noise: {SEEDED}"]
 
 
 def repeat_leakage(out: Path, seeds: int, progress: Report = ignore_progress) -> tuple[LeakageResult, dict[str, bytes]]:
@@ -101,7 +101,7 @@ def repeat_leakage(out: Path, seeds: int, progress: Report = ignore_progress) ->
     known = np.concatenate([each.features for each in drives.vehicles.values()])
     names, levels, done = [*drives.vehicles], [], 0
     for noise in NOISES:
-        privacy = Privacy(where="local", clip=CLIP, noise=noise, delta=DELTA) if noise else None
+        privacy = Privacy(where="local", clip=CLIP, noise=noise, delta=DELTA, seeded=True) if noise else None
         found = []
         for seed in range(1, seeds + 1):
             found.append(attack(drives, known, Rules(privacy=privacy), seed)[0])

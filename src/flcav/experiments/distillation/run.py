@@ -1,8 +1,8 @@
 """Comparison of labels for stage II, the arms of recipes/runs/distillation.yaml: same frames, steps and budget.
 
-Arms differ in their labels and in the terms of the loss alone. Every arm has a ledger of its own with the boxes that
-its vehicles send. Over seeds, which have recordings of their own, intervals cover training and traffic. The verdicts on
-all differences are corrected together.
+Arms differ only in their labels, in the terms of the loss, and in whether a pose graph corrects vehicles' poses. Every
+arm has a ledger of its own with the boxes that its vehicles send. Over seeds, which have recordings of their own,
+intervals cover training and traffic. The verdicts on all differences are corrected together.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,12 +22,13 @@ from flcav.report.charts import figures
 from flcav.verdicts import Claim, Judged, judge
 
 TASK, TOWN = "objects", "grid"
-PRETRAINED, NO_ROAD, PLAIN, IDEAL, BOTH = (
+PRETRAINED, NO_ROAD, PLAIN, IDEAL, BOTH, GRAPH = (
     "pretrained",
     "no road sensor",
     "plain pseudo-labels",
     "ideal labels",
     "regression and contrast",
+    "both with a pose graph",
 )
 ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     PRETRAINED: (MAIN, PRETRAIN),
@@ -36,6 +37,7 @@ ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     "regression": ("regression", EDGE),
     "contrast": ("contrastive", EDGE),
     BOTH: (MAIN, EDGE),
+    GRAPH: ("pose_graph", EDGE),
     IDEAL: ("ideal", EDGE),
 }
 COMPARED = (  # (after, before): claims that the difference is positive
@@ -44,6 +46,7 @@ COMPARED = (  # (after, before): claims that the difference is positive
     (BOTH, PLAIN),
     (BOTH, "regression"),
     (BOTH, "contrast"),
+    (GRAPH, BOTH),
     (PLAIN, PRETRAINED),
     (IDEAL, PLAIN),
 )

@@ -2,7 +2,7 @@
 
 Vehicles drive through `grid` with the detector of the package. Its errors are counted in zones around the candidate
 poles; the pole that covers most errors is compared with conventional placements, by visible objects and by traffic.
-Fewer drives in every town of the package show how many sensors each takes.
+As many drives in other towns show how many sensors each takes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +37,7 @@ from flcav.world.map.town import Town
 
 RECIPE: Mapping[str, Any] = {
     "town": "grid",
-    "seed": 8301,
+    "seed": 8311,
     "split": "registry",
     "scenes": 8,
     "spins_per_scene": 4,
@@ -45,8 +45,7 @@ RECIPE: Mapping[str, Any] = {
     "cavs": 4,
     "vehicle_rig": "kitti_lidar",
 }
-OTHERS: Mapping[str, int] = {"ring": 8302, "suburb": 8303, "arterial": 8304}  # towns compared, and their seeds
-COMPARED = 2  # scenes of each town
+OTHERS: Mapping[str, int] = {"ring": 8312, "suburb": 8313, "arterial": 8314}  # towns compared, and their seeds
 RANGE_M = 40.0  # within which a sensor covers an error
 ZONE_M = 30.0  # radius of a scenario zone around a candidate pole
 COUNTS = (1, 2, 3)  # sensors
@@ -108,12 +107,9 @@ class Fig3b(Record):
 def fig3b(out: Path, progress: Report = ignore_progress) -> tuple[Fig3b, dict[str, bytes]]:
     """Record drives into `out`, register the detector's errors; return the numbers, and PNG files by name."""
     data, town, found = _drive(RECIPE, out / "data", progress)
-    scenes = sorted({key.scene for key in data.keys})[:COMPARED]
-    first = np.array([error.scene in scenes for error in found.errors], dtype=np.bool_)
-    towns = [cover_town(town, found.positions[first], RANGE_M)]
+    towns = [cover_town(town, found.positions, RANGE_M)]
     for name, seed in OTHERS.items():
-        asked = {**RECIPE, "town": name, "seed": seed, "scenes": COMPARED}
-        _, other, errors = _drive(asked, out / name, progress)
+        _, other, errors = _drive({**RECIPE, "town": name, "seed": seed}, out / name, progress)
         towns.append(cover_town(other, errors.positions, RANGE_M))
     traces = [trace for scene in sorted({key.scene for key in data.keys}) if (trace := data.trace(scene)) is not None]
     places = np.array([data.world_from_agent(number)[:2, 3] for number in range(len(data))])

@@ -1,8 +1,8 @@
 """Validation of MLGRA by training (Wang et al., IEEE Network 37(3), 2023, Fig. 6a): joint plan against equal stages.
 
 Both plans, the arms of recipes/runs/allocation.yaml, have the same budgets (a quarter of the recipe's, the recipe's, or
-four times as much), the same learning curve, and the same limits, so wide that only the budgets bind. Runs of a seed
-share their recorded frames; each places its sensors by the errors of its own pretrained network. The score that the
+four times as much), the same learning curve, and the same limits: what its history covers. Runs of a seed share their
+recorded frames; each places its sensors by the errors of its own pretrained network. The score that the
 curve predicts after each stage is compared with the score after training.
 """
 

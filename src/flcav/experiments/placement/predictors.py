@@ -10,7 +10,6 @@ they have returns of the object themselves:
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,11 +63,10 @@ def count_added_labels(
     for pole, place in poles.items():
         near = [i for i in frames if np.linalg.norm((split.data.world_from_agent(i)[:3, 3] - place)[:2]) <= REACH_M]
         spins = {(keys[i].scene, keys[i].index) for i in near}
-        sweeps = tuple(i for i in split.poles[pole] if (keys[i].scene, keys[i].index) in spins)
-        views = road_views(replace(split, poles={pole: sweeps}), [pole], trained=True)
+        views = road_views(split, [pole], True, spins)
         added[pole] = 0
         for i in near:
-            frame, told = split.data.frame(i), views.get((keys[i].scene, keys[i].index), [])
+            frame, told = split.data.frame(i), [*views.get((keys[i].scene, keys[i].index), {}).values()]
             lidar = choose_lidar(frame)
             alone, helped = (label_sample(frame, own[i], each, network.config, lidar, relief) for each in ([], told))
             if helped.exact is not None:

@@ -4,7 +4,7 @@ Labels are evaluated online: at a spin from the messages of the spins before tha
 all scenes and spins together.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -18,9 +18,10 @@ from flcav.experiments.roadside.errors import Errors, apply_errors
 from flcav.experiments.roadside.sightings import Scene, read_scenes
 from flcav.fusion.average import RoadAverage, average_boxes
 from flcav.fusion.map_context import MapContext, build_context, snap_to_map
-from flcav.fusion.pose_graph import Sighting, correct_poses, tell
+from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.posts import posts_of
-from flcav.geometry import Boxes, wrap_angle
+from flcav.fusion.sightings import Sighting, tell
+from flcav.geometry import Boxes, inverse, wrap_angle, yaw_of
 from flcav.perception.metrics import average_precision, match
 from flcav.perception.metrics.matching import assign_targets
 from flcav.pipeline.provenance import Provenance, provenance
@@ -59,6 +60,12 @@ KNOBS: Mapping[str, Mapping[float, Errors]] = {
     "clock offset [s]": {size: Errors(clock_s=size) for size in (0.0, 0.2, 0.4)},
 }
 JOINT = Errors(position_m=0.5, heading_deg=2.0)
+CORRECTED: Mapping[str, Errors] = {  # errors whose rest after the pose graph is measured
+    BOTH: JOINT,
+    "position .5 m, constant": Errors(constant_m=0.5),
+    "clock .2 s": Errors(clock_s=0.2),
+    "clock .4 s": Errors(clock_s=0.4),
+}
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,15 @@ class Snapped:
 
 
 @dataclass(frozen=True)
+class Residual:
+    """Mean absolute errors of vehicles over their sightings."""
+
+    position_cm: float
+    heading_deg: float
+    clock_ms: float
+
+
+@dataclass(frozen=True)
 class RoadAverageResult(Record):
     """AP50 of the road average against each error, by arm."""
 
@@ -93,6 +109,9 @@ class RoadAverageResult(Record):
     joint: Mapping[str, Point]  # at `JOINT`, by arm
     clean: Mapping[str, float]  # without errors, by arm
     snapped: Snapped
+    residuals: Annotated[Mapping[str, tuple[Residual, Residual]] | None, LEFT_OUT] = (
+        None  # of `CORRECTED` as stated and after the pose graph; None in older results
+    )
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
     @property
@@ -139,6 +158,7 @@ def evaluate_road_average(out: Path, progress: Report = ignore_progress) -> tupl
         joint={arm: _point(scenes, 0.5, JOINT, arm, posts, clean[arm]) for arm in ARMS},
         clean=clean,
         snapped=_snap(scenes, build_context(map_layers(town))),
+        residuals={name: _correct(scenes, errors, posts) for name, errors in CORRECTED.items()},
         provenance=provenance(),
     )
     return results, results.pictures()
@@ -174,6 +194,32 @@ def _precision(scenes: Mapping[str, Scene], errors: Errors, arm: str, posts: np.
             targets.append(scene.truth[spin].targets)
             neutral.append(scene.truth[spin].neutral)
     return average_precision(match(found, targets, neutral, 0.5, "bev"))
+
+
+def _correct(scenes: Mapping[str, Scene], errors: Errors, posts: np.ndarray) -> tuple[Residual, Residual]:
+    """Return the errors of vehicles, of which none is a loss, as stated and after the pose graph."""
+    true: list[Sighting] = []
+    stated: list[Sighting] = []
+    corrected: list[Sighting] = []
+    for seed in range(SEEDS):
+        for name, scene in scenes.items():
+            arrived = apply_errors(scene.sightings, errors, stream(seed, "road average", name))
+            for spin in SPINS:
+                at_s = scene.time_s[spin]
+                window = [n for n, s in enumerate(scene.sightings) if at_s - WINDOW_S - 1e-6 <= s.time_s <= at_s + 1e-6]
+                true += [scene.sightings[n] for n in window]
+                stated += [arrived[n] for n in window]
+                corrected += correct_poses([arrived[n] for n in window], posts, at_s)
+    return measure_residual(true, stated), measure_residual(true, corrected)
+
+
+def measure_residual(true: Sequence[Sighting], told: Sequence[Sighting]) -> Residual:
+    """Return the mean absolute errors of the poses and times of vehicles, in `told` as compared with `true`."""
+    pairs = [(a, b) for a, b in zip(true, told, strict=True) if a.navigation is not None]
+    off_m = [np.linalg.norm((b.world_from_agent - a.world_from_agent)[:2, 3]) for a, b in pairs]
+    turned = [abs(yaw_of(inverse(a.world_from_agent) @ b.world_from_agent)) for a, b in pairs]
+    late_s = [abs(b.time_s - a.time_s) for a, b in pairs]
+    return Residual(100 * float(np.mean(off_m)), float(np.degrees(np.mean(turned))), 1000 * float(np.mean(late_s)))
 
 
 def _snap(scenes: Mapping[str, Scene], context: MapContext) -> Snapped:

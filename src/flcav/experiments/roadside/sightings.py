@@ -7,8 +7,8 @@ import numpy as np
 
 from flcav.dataset.store import Dataset
 from flcav.fusion.detector import load_road_network, road_detector
-from flcav.fusion.pose_graph import Navigation, Sighting
 from flcav.fusion.posts import find_posts
+from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, concatenate, inverse, transform_points
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.networks import resolve_network

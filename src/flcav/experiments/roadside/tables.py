@@ -1,9 +1,9 @@
 """Markdown tables of the road detector, the road average, sensors' ranges, and Fig. 4."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
-from flcav.experiments.roadside.average import ARMS, BOTH, GRAPH, KNOBS, RoadAverageResult
+from flcav.experiments.roadside.average import ARMS, BOTH, GRAPH, KNOBS, Point, Residual, RoadAverageResult
 from flcav.experiments.roadside.cameras import CameraResult
 from flcav.experiments.roadside.detector import BINS_M, WITHIN_M, RoadDetectorResult
 from flcav.experiments.roadside.fig4 import ARMS as PLACED
@@ -11,6 +11,8 @@ from flcav.experiments.roadside.fig4 import EDGES_M, Fig4
 from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
 from flcav.experiments.roadside.ranges import SensorRanges
 from flcav.markdown import format_table
+
+WHEN = ("as stated", "after the pose graph")
 
 
 def detector_tables(results: RoadDetectorResult) -> dict[str, str]:
@@ -42,14 +44,10 @@ def detector_tables(results: RoadDetectorResult) -> dict[str, str]:
 
 
 def average_tables(results: RoadAverageResult) -> dict[str, str]:
-    """Return Markdown by name: joint, knobs, map."""
-    joint = [
-        [arm, f"{results.clean[arm]:.3f}", f"{point.mean:.3f} ({min(point.ap50):.3f} to {max(point.ap50):.3f})"]
-        for arm in ARMS
-        for point in (results.joint[arm],)
-    ]
+    """Return Markdown by name: joint, knobs, map, and residuals where they were measured."""
+    joint = [[arm, f"{results.clean[arm]:.3f}", _describe(results.joint[arm])] for arm in ARMS]
     rows = [
-        [knob, f"{point.size:g}", *(f"{results.knobs[knob][arm][row].mean:.3f}" for arm in ARMS)]
+        [knob, f"{point.size:g}", *(_describe(results.knobs[knob][arm][row]) for arm in ARMS)]
         for knob in KNOBS
         for row, point in enumerate(results.knobs[knob][GRAPH])
     ]
@@ -60,9 +58,30 @@ def average_tables(results: RoadAverageResult) -> dict[str, str]:
     ]
     return {
         "joint": format_table(("AP50", "no errors", f"{BOTH}: mean (range over seeds)"), joint),
-        "knobs": format_table(("error", "size", *ARMS), rows),
+        "knobs": format_table(("error: AP50, mean (range over seeds)", "size", *ARMS), rows),
         "map": format_table(("labels", "mean heading error [°]", f"reversed of {snapped.matched}", "AP50"), context),
+        **({"residuals": _residuals(results.residuals)} if results.residuals is not None else {}),
     }
+
+
+def _describe(point: Point) -> str:
+    """Return the mean over seeds, with their range where they differ."""
+    low, high = min(point.ap50), max(point.ap50)
+    return f"{point.mean:.3f}" + (f" ({low:.3f} to {high:.3f})" if high > low else "")
+
+
+def _residuals(residuals: Mapping[str, tuple[Residual, Residual]]) -> str:
+    rows = [
+        [
+            name,
+            *(f"{each.position_cm:.1f}" for each in pair),
+            *(f"{each.heading_deg:.2f}" for each in pair),
+            *(f"{each.clock_ms:.0f}" for each in pair),
+        ]
+        for name, pair in residuals.items()
+    ]
+    heads = [f"{measure}, {when}" for measure in ("position [cm]", "heading [°]", "clock [ms]") for when in WHEN]
+    return format_table(("errors", *heads), rows)
 
 
 def fig4_tables(results: Fig4) -> dict[str, str]:

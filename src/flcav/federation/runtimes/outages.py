@@ -2,11 +2,11 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from flwr.app import Error, Message
+from flwr.app import ConfigRecord, Error, Message, RecordDict
 from flwr.serverapp import Grid
 
-from flcav.federation.records import ARRAYS, CONFIG
-from flcav.federation.runtimes.embedded import CLIENT_APP_RAISED, wire_bytes
+from flcav.federation.records import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
+from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.wrapped import WrappedGrid
 
@@ -15,7 +15,8 @@ class LossyGrid(WrappedGrid):
     """Grid that answers for the nodes which `account.outages` has lost in a round, with the reason as an error.
 
     Nothing reaches a node that is not there. The bytes of an update that broke off are entered as far as they came;
-    what comes before training, such as keys, arrives.
+    what comes before training, such as keys, arrives. A node whose update will break off is told so with the message,
+    in the place of the acknowledgement that it would miss afterwards.
     """
 
     def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:
@@ -37,7 +38,13 @@ class LossyGrid(WrappedGrid):
     def _fail(self, message: Message) -> Message:
         outage, _, _ = self._find_outage(message)
         assert outage is not None
-        return Message(Error(code=CLIENT_APP_RAISED, reason=outage.reason), reply_to=message)
+        return Message(Error(code=LOST_BY_NETWORK, reason=outage.reason), reply_to=message)
+
+    def _tell(self, message: Message) -> Message:
+        """Return a message as its node gets it: with a note where the answer will not arrive."""
+        if self._find_outage(message)[0] is not None:
+            message.content = RecordDict({**message.content, LOST: ConfigRecord()})  # others share the content
+        return message
 
     def _cut(self, reply: Message, message: Message) -> Message:
         """Return a reply as it arrives: an error where it is an update and breaks off."""
@@ -56,7 +63,7 @@ class LossyGrid(WrappedGrid):
                 ids.append(f"away-{len(self._answers)}-{message.metadata.dst_node_id}")
                 self._answers[ids[-1]] = self._fail(message)
             else:
-                ids += self._grid.push_messages([message])
+                ids += self._grid.push_messages([self._tell(message)])
                 self._asked[ids[-1]] = message
         return ids
 
@@ -82,7 +89,7 @@ class LossyGrid(WrappedGrid):
                     away.append(message)
                 else:
                     asked[message.metadata.dst_node_id] = message
-                    yield message
+                    yield self._tell(message)
 
         for reply in self._grid.send_and_receive(reachable(), timeout=timeout):
             yield self._cut(reply, asked[reply.metadata.src_node_id])

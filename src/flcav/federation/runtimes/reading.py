@@ -8,6 +8,7 @@ from flwr.serverapp import Grid
 
 from flcav.federation.client import client_app
 from flcav.federation.encoding import decode, unflatten
+from flcav.federation.noise import draw_secret
 from flcav.federation.records import ARRAYS, VECTOR, to_arrays, to_update, to_weights
 from flcav.federation.rounds import Rounds
 from flcav.federation.rules import Rules
@@ -50,7 +51,8 @@ def read_round(
 
     Of a masked update it takes the integers for a change of the weights.
     """
-    with EmbeddedGrid(client_app(clients, FEDAVG, rules), [*clients]) as grid:
+    secrets = {party: draw_secret() for party in rules.secret_parties([*clients]) if party in clients}
+    with EmbeddedGrid(client_app(clients, FEDAVG, rules, secrets), [*clients]) as grid:
         reading = ReadGrid(grid, grid.names)
         app = Rounds(FEDAVG, rules, schedule.work, grid.names, FederationState(), 0, 0, lambda *_: None)
         after = to_weights(app.start(reading, to_arrays(start), 1).arrays)

@@ -10,13 +10,16 @@ from flcav.perception.metrics.average_precision import (
     weighted_precision,
 )
 from flcav.perception.metrics.calibration import calibration_error, fit_logistic
+from flcav.perception.metrics.found_cars import FoundCars, count_found_cars
 from flcav.perception.metrics.matching import Matches, match
 
 __all__ = [
+    "FoundCars",
     "Matches",
     "average_precision",
     "bootstrap_interval",
     "calibration_error",
+    "count_found_cars",
     "fit_logistic",
     "interval_words",
     "match",

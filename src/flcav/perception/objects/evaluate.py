@@ -1,6 +1,6 @@
 """Evaluation of an object detector: AP and AOS per class, broken down by distance, occlusion and weather; calibration.
 
-AP is that in 3D and in bird's-eye view, at IoU 0.5 and 0.7.
+AP is that in 3D and in bird's-eye view, at IoU 0.5 and 0.7. Beside it stands a count at one score, of cars near by.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.geometry import Boxes, concatenate
 from flcav.perception.metrics import (
+    FoundCars,
     average_precision,
     bootstrap_interval,
+    count_found_cars,
     interval_words,
     match,
     orientation_similarity,
@@ -22,7 +24,7 @@ from flcav.perception.metrics import (
     round_or_none,
 )
 from flcav.perception.objects.calibrate import OVERLAP, Reliability
-from flcav.perception.objects.truth import FrameTruth, TargetCriteria, select_class
+from flcav.perception.objects.truth import QUARTERS, FrameTruth, TargetCriteria, select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.perception.task import Evaluated
 from flcav.perception.tracking.evaluate import TracksEvaluation
@@ -67,12 +69,13 @@ class Score:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectsEvaluation(Evaluated):
-    """Evaluation of one network on one set of frames: AP and AOS, breakdown, calibration, tracking."""
+    """Evaluation of one network on one set of frames: AP and AOS, cars near by, breakdown, calibration, tracking."""
 
     frames: int
     scenes: int
     scores: tuple[Score, ...]  # class by class
     rules: Annotated[TargetCriteria | None, LEFT_OUT] = None  # target criteria; None in results of earlier versions
+    near: Annotated[FoundCars | None, LEFT_OUT] = None  # None of a network that knows no cars, and in earlier results
     slices: tuple[BreakdownRow, ...]  # breakdown of AP
     trust: tuple[Reliability, ...]  # calibration of scores and variances, one per class
     tracks: Annotated[TracksEvaluation | None, LEFT_OUT] = None  # None unless asked for
@@ -107,8 +110,8 @@ class ObjectsEvaluation(Evaluated):
     def lines(self) -> list[str]:
         """Return the evaluation in words.
 
-        Frames and target criteria; a line per class, kind of overlap and IoU; a line per class and part of the
-        breakdown; calibration errors; tracking.
+        Frames and target criteria; a line per class, kind of overlap and IoU; cars near by; a line per class and part
+        of the breakdown; calibration errors; tracking.
         """
         lines = [f"{self.frames} frames of {self.scenes} scenes", *(self.rules.lines() if self.rules else ())]
         for row in self.scores:
@@ -119,6 +122,7 @@ class ObjectsEvaluation(Evaluated):
                 found += f", {row.right_headings:.0%} of those found head the right way"
             counts = f"objects: {row.targets}, and {row.hidden} without a return"
             lines.append(f"{row.label:<12}{row.kind:>4} IoU {row.iou:.1f}  {found}  ({counts})")
+        lines += [] if self.near is None else [str(self.near)]
         lines += [f"at IoU {OVERLAP:g} by distance, occlusion and weather:", *format_breakdown(self.slices, OVERLAP)]
         for row in self.trust:
             if row.ece is not None:
@@ -150,6 +154,23 @@ def score_detections(
             numbers = map(round_or_none, (ap, low, high, aos, right))
             scores.append(Score(name, kind, overlap, *numbers, targets=sum(map(len, targets)), hidden=hidden))
     return tuple(scores)
+
+
+def count_cars(
+    detections: Sequence[Boxes], truths: Sequence[FrameTruth], classes: Sequence[str], *, around: bool
+) -> FoundCars | None:
+    """Return the cars near the LiDAR that were found and invented, see `count_found_cars`; None without class Car.
+
+    detections (LiDAR frame) and truths run over the same frames; around: whether the network looked to all four sides.
+    """
+    if "Car" not in classes:
+        return None
+    return count_found_cars(
+        [select_class(boxes, "Car") for boxes in detections],
+        [select_class(truth.targets, "Car") for truth in truths],
+        [select_class(truth.neutral, "Car") for truth in truths],
+        looks=QUARTERS if around else 1,
+    )
 
 
 class BreakdownPart(NamedTuple):

@@ -15,7 +15,7 @@ from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, 
 from flcav.perception.objects.calibrate import calibrate, measure_reliability
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.errors import find_errors
-from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, score_detections
+from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, count_cars, score_detections
 from flcav.perception.objects.infer import detect_objects
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.messages import pack_sweep, unpack_sweep
@@ -103,7 +103,7 @@ class ObjectsTask(ObjectsOutcomes):
         asked: SecondConfig | None = None,
         progress: Report = ignore_progress,
     ) -> ObjectsEvaluation:
-        """Return AP and AOS per class, kind of overlap and IoU, with intervals over scenes; breakdown; calibration.
+        """Return AP and AOS per class, kind of overlap and IoU, with intervals over scenes; cars near by; breakdown.
 
         frames: their numbers (None: all). asked: the network's configuration with a smaller range, see `narrow_range`
         in `flcav.perception.objects.truth`. Raises `InputError` where there are no frames, or one has no LiDAR.
@@ -122,6 +122,7 @@ class ObjectsTask(ObjectsOutcomes):
             scenes=len({truth.scene for truth in truths}),
             scores=score_detections(found, truths, classes),
             rules=target_criteria(asked or network.config),
+            near=count_cars(found, truths, classes, around=network.config.around),
             slices=break_down(found, truths, classes),
             trust=measure_reliability(found, truths, classes),
         )

@@ -9,14 +9,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from flcav.config import InputError
 from flcav.files import atomic_path
 from flcav.pipeline.arms import check_federations
 from flcav.pipeline.federations.checkpoint import DAMAGED, LAST, Checkpoint
 from flcav.pipeline.federations.rounds import LOSS
-from flcav.pipeline.federations.timing import read_times
+from flcav.pipeline.federations.timing import TrainTimes, read_times, summarise_times
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.labels.sources import LABEL_SOURCES
@@ -29,7 +27,7 @@ from flcav.pipeline.steps import Notify, Stale, Step, ignore_steps, run_steps
 from flcav.pipeline.work.edge import EdgeSettings, edge_step
 from flcav.pipeline.work.settings import make_step
 
-WORK, RESULTS = "work", "federation.json"
+WORK, RESULTS, TRAIN_TIMES = "work", "federation.json", "times.json"
 FEDERATE = "federate"  # in the names of the steps
 
 
@@ -82,7 +80,7 @@ def federate_regions(
     asked = list_federations(graph, arm)
     means = {"processes": jobs, "runtime": runtime, "timed": 1}
     alone = {name: _federation_step(graph, *about, means) for name, about in asked.items()}
-    before = _needed(graph.steps, alone.values())
+    before = list_needed(graph.steps, alone.values())
     run_steps(before, out / WORK, jobs=jobs, notify=notify, stale=stale)
 
     def tell(step: str, done: int, total: int, note: str) -> None:
@@ -96,15 +94,17 @@ def federate_regions(
     return results
 
 
-def measure_train_s(results: Federations, out: Path) -> dict[str, float]:
-    """Return the median CPU time that a vehicle trained in a round [s], by task: a recipe's `train_s`.
+def measure_times(results: Federations, out: Path) -> TrainTimes:
+    """Return how long vehicles trained, and their speeds, by the trainings in the folder `out`; times.json there.
 
-    `results` are those in the folder `out`. Tasks that were federated without a measurement are left out.
+    `results` are those in that folder. Tasks that were federated without a measurement are left out.
     """
-    times: dict[str, list[float]] = {}
+    measured: dict[str, dict[str, list[float]]] = {}
     for each in results.federations:
-        times.setdefault(each.result.task, []).extend(read_times(out / WORK / Path(each.weights).stem))
-    return {task: float(np.median(own)) for task, own in times.items() if own}
+        measured.setdefault(each.result.task, {}).update(read_times(out / WORK / Path(each.weights).stem))
+    times = summarise_times(measured)
+    times.save(out, TRAIN_TIMES)
+    return times
 
 
 def tells_of_round(step: str, note: str) -> bool:
@@ -119,17 +119,7 @@ def list_federations(graph: Graph, arm: str) -> dict[str, tuple[str, str, str]]:
     return {name if arm == MAIN else f"{name}-{arm}": (arm, *about) for about, name in named.items()}
 
 
-def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapping[str, int | str]) -> Step:
-    """Return the step of stage II as a run has it, with validation after each round, and in several processes."""
-    edge = next(step for step in graph.steps if step.name == graph.names.edge(arm, region, task))
-    frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
-    name = next(name for name, about in list_federations(graph, arm).items() if about == (arm, region, task))
-    asked: EdgeSettings = edge.arguments["settings"]
-    scored = make_step(name, edge_step, asked.model_copy(update={"validation": frames}))
-    return replace(scored, means=means)
-
-
-def _needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
+def list_needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
     """Return those of `steps` that the steps `last` need, directly or not, in their order."""
     needs = {step.name: step.needs for step in steps}
     wanted, open_ = set(), [name for step in last for name in step.needs]
@@ -139,6 +129,16 @@ def _needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
             wanted.add(name)
             open_ += needs[name]
     return [step for step in steps if step.name in wanted]
+
+
+def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapping[str, int | str]) -> Step:
+    """Return the step of stage II as a run has it, with validation after each round, and in several processes."""
+    edge = next(step for step in graph.steps if step.name == graph.names.edge(arm, region, task))
+    frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
+    name = next(name for name, about in list_federations(graph, arm).items() if about == (arm, region, task))
+    asked: EdgeSettings = edge.arguments["settings"]
+    scored = make_step(name, edge_step, asked.model_copy(update={"validation": frames}))
+    return replace(scored, means=means)
 
 
 def _collect(graph: Graph, out: Path, step: str, region: str) -> Federation:

@@ -109,10 +109,8 @@ def drive_rounds(
         ends = max((timing.end_s for timing in clients), default=now)
         records.append(RoundRecord(number, now, ends, 0.0, 0.0, clients))
         now = ends
-    least = 0 if rules.least_clients is None else rules.least_clients
     selection = Selection(rule="planned", joins=joins) if predicts else rules.selection
-    changed = rules.model_copy(update={"least_clients": least, "selection": selection})
-    return DrivenRounds(changed, outages, tuple(records))
+    return DrivenRounds(rules.model_copy(update={"selection": selection}), outages, tuple(records))
 
 
 def _time(

@@ -1,19 +1,21 @@
 """The files that a federation writes after each round, to go on from, and the network that it comes to."""
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
 from flcav.config import InputError
-from flcav.federation.privacy import Privacy
+from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.rounds import OnRound
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Weights
-from flcav.files import sha256, write_bytes
+from flcav.files import atomic_path, sha256, write_bytes, write_in_pieces
 from flcav.network.ledger import Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays, save_network, to_arrays
@@ -22,6 +24,7 @@ from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.progress import Report
 
 LOSS = "loss"  # begins the note of a round
+SECRETS = "secrets.safetensors"  # of who draws noise, while a federation is under way
 
 
 class FederationCheckpoints:
@@ -51,7 +54,7 @@ class FederationCheckpoints:
         self.scores: list[Mapping[str, float]] = []
 
     def resume(self, weights: Weights) -> tuple[Weights, int]:
-        """Return the last round's weights and number, restoring ledger, losses and states.
+        """Return the last round's weights, in the order of `weights`, and number, restoring ledger, losses and states.
 
         Without a checkpoint, returns `weights` and 0; where one is damaged, the round before. Raises `InputError` for
         the checkpoint of another strategy, and where the last two are damaged.
@@ -75,7 +78,29 @@ class FederationCheckpoints:
             begins = f"{name}|"
             mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
             own.restore(mine, found.records[name])
-        return load_file(round_path(self._folder, number)), number
+        last = load_file(round_path(self._folder, number))
+        return {name: last[name] for name in weights}, number  # files order names otherwise, and noise follows them
+
+    def keep_secrets(self, parties: Mapping[str, Sequence[str]]) -> None:
+        """Restore the secrets of the parties of each state, by its name, or draw them; to be called before any round.
+
+        They are in a file that only its owner may read, so that a round that is repeated has the same noise; `finish`
+        removes it. Raises `InputError` where it is damaged.
+        """
+        path = self._folder / SECRETS
+        try:
+            kept = load_file(path) if path.exists() else {}
+        except SafetensorError as error:
+            raise InputError(f"{path} is damaged ({error}); remove the folder to begin anew") from None
+        asked = {f"{name}|{party}": (name, party) for name, found in parties.items() for party in found}
+        for key, (name, party) in asked.items():
+            if key in kept:
+                self._states[name].secrets[party] = np.asarray(kept[key], np.uint8)
+        drawn = {key: self._states[name].keep_secret(party) for key, (name, party) in asked.items()}
+        if drawn.keys() - kept.keys():
+            with atomic_path(path) as temporary:
+                temporary.touch(mode=0o600)
+                write_in_pieces(temporary, save(drawn))
 
     def make_saver(self, rounds: int) -> OnRound:
         """Return the callback that saves a checkpoint after each of `rounds` rounds."""
@@ -104,24 +129,29 @@ class FederationCheckpoints:
         return keep
 
     def _tell_privacy(self) -> list[str]:
-        """Return the largest epsilon after the last round, with its delta, in words; none without noise."""
+        """Return the largest epsilon after the last round, in words, with its delta and limit; none without noise."""
         spent = [own.records[-1].epsilon for own in self._states.values() if own.records]
         private = [epsilon for epsilon in spent if epsilon is not None]
         if self._privacy is None or not private:
             return []
-        return [f"epsilon {max(private):.2f} at delta {self._privacy.delta:g}"]
+        seeded = f" ({SEEDED})" if self._privacy.seeded else ""
+        return [f"epsilon {max(private):.2f} at delta {self._privacy.delta:g}{seeded}"]
 
     def _write(self, name: str, data: bytes, hashes: dict[str, str]) -> None:
         write_bytes(self._folder / name, data)
         hashes[name] = hashlib.sha256(data).hexdigest()
 
     def finish(self, start: Any, rounds: int, averaged: int, start_share: float = 0.0) -> None:
-        """Write the ledger and the final weights, see `load_round_network`; without rounds those of `start`."""
+        """Write the ledger and the final weights, see `load_round_network`; without rounds those of `start`.
+
+        Secrets are removed.
+        """
         network = start
         if rounds:
             network = load_round_network(self._task, start, self._folder, rounds, averaged, start_share)
         save_network(self._task, network, self._folder / WEIGHTS)
         self._book.save(self._folder / LEDGER)
+        (self._folder / SECRETS).unlink(missing_ok=True)
 
 
 def _state_name(round_: int) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from flcav.config import InputError, shorten
 from flcav.federation.strategies import sends_outputs
+from flcav.fusion.distillation import Distillation
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import count_training_frames
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
@@ -77,6 +78,22 @@ class Outline:
     def helped(self, task: str) -> bool:
         """Return whether the labels of a task come from roadside sensors in any arm."""
         return any(LABEL_SOURCES[arm.labels[task]].from_poles for arm in self.settings.values())
+
+    def averaging(self, task: str) -> list[Distillation]:
+        """Return how the labels of a task are averaged, of each arm that federates with the road average."""
+        arms = [arm for arm in self.settings.values() if arm.central is None]
+        return [arm.distillation for arm in arms if LABEL_SOURCES[arm.labels[task]].averaged]
+
+    def window_s(self, task: str) -> float:
+        """Return how long before and after a task's training frames others are recorded for labels [s]; 0: none are.
+
+        Raises `InputError` where arms differ in it, other than by 0, and a region is recorded in a town.
+        """
+        windows = sorted({each.window_s for each in self.averaging(task)} - {0.0})
+        if len(windows) > 1 and len(self.recorded) < len(self.federating):
+            told = " and ".join(f"{each:g} s" for each in windows)
+            raise InputError(f"distillation.window_s: arms have {told}; in a town all have one window, or 0")
+        return max(windows, default=0.0)
 
     def pools(self, task: str) -> dict[str, str]:
         """Return the steps that record a task's candidates for upload, by region."""

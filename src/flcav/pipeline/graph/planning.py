@@ -3,7 +3,6 @@
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.graph.testing import list_validations
-from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.planning.histories import read_history
 from flcav.pipeline.planning.updates import update_forms
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
@@ -78,13 +77,14 @@ def _plan_task(outline: Outline, task: str) -> PlannedTask:
 def _label_task(outline: Outline, task: str) -> LabelSettings | None:
     """Return what the messages of labels are predicted from; None where no arm labels by the road average."""
     arms = [arm for arm in outline.settings.values() if arm.central is None]
-    averaging = [arm.distillation for arm in arms if LABEL_SOURCES[arm.labels[task]].averaged]
+    averaging = outline.averaging(task)
     if not averaging:
         return None
+    most = {"window_s": outline.window_s(task), "pose_graph": any(each.pose_graph for each in averaging)}
     placements, own = [arm.placement for arm in arms], outline.recipe.placement
     split = "registry" if task in (*own.tasks, outline.placing_task) else "validation"
     return LabelSettings(
-        distillation=averaging[0],
+        distillation=averaging[0].model_copy(update=most),  # the largest messages of any arm
         drives={region: outline.names.recording(region, split, task) for region in outline.federating},
         recorded=tuple(outline.recorded),
         poles=tuple(sorted({pole for each in placements for pole in each.poles})),

@@ -1,6 +1,6 @@
 """Pseudo-labels by the pretrained network and roadside sensors, and ground truth as labels."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ from flcav.perception.task import Task
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import EDGE
 from flcav.progress import Report
+
+Spin = tuple[str, int]  # scene, and number in the scene
 
 PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
 
@@ -67,13 +69,13 @@ def pseudo_label_samples(
     downlinks; stage III passes none, since its labels are those of stage II.
     """
     data, relief = split.data, Ground(split.data).relief
-    views = road_views(split, poles, trained)
+    views = road_views(split, poles, trained, {(data.keys[i].scene, data.keys[i].index) for i in frames})
     samples: dict[str, list[Sample]] = {}
     for done, i in enumerate(frames):
         key, frame = data.keys[i], data.frame(i)
         lidar = choose_lidar(frame)
         (detections,) = detect_in(network, [frame], score_threshold=threshold)
-        told, name = views.get((key.scene, key.index), []), f"{region}/{key.agent}"
+        told, name = [*views.get((key.scene, key.index), {}).values()], f"{region}/{key.agent}"
         if book is not None:
             about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
             told = [RoadView.from_message(send(book, view.message(), **about)) for view in told]
@@ -82,17 +84,22 @@ def pseudo_label_samples(
     return samples
 
 
-def road_views(split: Frames, poles: Sequence[int], trained: bool) -> dict[tuple[str, int], list[RoadView]]:
-    """Return what sensors on `poles` see in each spin, by scene and number of the spin: see `pseudo_label_samples`."""
+def road_views(
+    split: Frames, poles: Sequence[int], trained: bool, spins: Collection[Spin]
+) -> dict[Spin, dict[int, RoadView]]:
+    """Return what sensors see in `spins`, by spin and number of the pole, of `poles`: see `pseudo_label_samples`."""
     ground = Ground(split.data)
-    views: dict[tuple[str, int], list[RoadView]] = {}
+    views: dict[Spin, dict[int, RoadView]] = {}
     find = road_detector(split.data) if trained and poles else None
     for pole in poles:
         for i in split.poles.get(pole, ()):
-            key, frame = split.data.keys[i], split.data.frame(i)
+            key = split.data.keys[i]
+            if (key.scene, key.index) not in spins:
+                continue
+            frame = split.data.frame(i)
             boxes = label_ideally(frame) if find is None else find(i)
             view = build_road_view(frame, boxes, choose_lidar(frame), ground.relief, ground.below(i))
-            views.setdefault((key.scene, key.index), []).append(view)
+            views.setdefault((key.scene, key.index), {})[pole] = view
     return views
 
 

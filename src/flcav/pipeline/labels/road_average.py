@@ -1,8 +1,10 @@
 """Labels by the road average in a region's rounds: vehicles tell what they detect, the edge server averages.
 
-Before each round every vehicle detects with the weights that the round begins with, sends boxes and its own pose up,
-and receives the road average of its spin; its samples are then labelled anew. All messages are entered in the ledger.
-After stage II they are labelled once, before the first round.
+Before each round every vehicle detects with the weights that the round begins with, in its frames and in what it
+recorded around them, sends boxes and its own poses up, and receives the road average of its frames' windows; its
+samples are then labelled anew. A window is centred on its frame: labels are made after the drive, so that what came
+after the frame is known, too. All messages are entered in the ledger; what a vehicle tells of a spin is sent once, for
+all windows that the spin is in. After stage II samples are labelled once, before the first round.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +15,6 @@ import numpy as np
 
 from flcav.federation.trainable import Weights
 from flcav.fusion.distillation import (
-    TOLD,
     Distillation,
     Guidance,
     average_spin,
@@ -22,26 +23,25 @@ from flcav.fusion.distillation import (
     unpack_sighting,
 )
 from flcav.fusion.map_context import build_context
-from flcav.fusion.pose_graph import Sighting
-from flcav.fusion.posts import find_posts, posts_of
+from flcav.fusion.posts import posts_of
 from flcav.fusion.road import RoadView
-from flcav.geometry import Boxes, transform_points
+from flcav.fusion.sightings import Sighting
+from flcav.geometry import Boxes
 from flcav.network.ledger import Direction, Ledger
 from flcav.network.messages import send
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.model import Second, second
-from flcav.perception.objects.predict import detect_in
+from flcav.perception.objects.model import second
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar
 from flcav.perception.weights import from_arrays
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels.pseudo_labels import road_views
+from flcav.pipeline.frames import SLACK_S, Frames, list_window
+from flcav.pipeline.labels.pseudo_labels import Spin, road_views
 from flcav.pipeline.labels.quality import LABELS, measure_labels, read_history
+from flcav.pipeline.labels.sightings import make_sighting
 from flcav.pipeline.recipe import EDGE
 from flcav.pipeline.results.training import LabelHistory
 from flcav.progress import Report, ignore_progress
-from flcav.seeds import stream
 from flcav.world.map.lanes import map_layers
 
 SURVEYED = np.eye(4)  # road sensors tell of boxes in the world frame
@@ -71,10 +71,17 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
         """
         self._how, self._config, self._threshold, self._split, self._region = how, config, threshold, split, region
         self._frames, self._book, self._stage, self._folder, self._report = frames, book, stage, folder, report
-        self._views = road_views(split, poles, trained=True)
-        self._seen_by = {i: self._views.get(self._spin(i), []) for i in frames}  # as each frame's vehicle has them
+        self._told = list_window(split, frames, how.window_s)
+        seen = [i for pole in poles for i in split.poles.get(pole, ())]
+        self._time_s = {self._spin(i): split.data.keys[i].time_s for i in (*seen, *self._told)}
+        self._around = {spin: self._find_around(spin) for spin in dict.fromkeys(map(self._spin, frames))}
+        spins = {spin for around in self._around.values() for spin in around}
+        self._views = road_views(split, poles, True, spins)
+        self._seen_by = {i: self._list_views(self._spin(i)) for i in frames}  # as each frame's vehicle has them
         town = split.data.town() if how.pose_graph or how.map_context else None
-        self._posts = posts_of(town) if town is not None and how.pose_graph else None
+        self._posts = None
+        if how.pose_graph:
+            self._posts = np.zeros((0, 2)) if town is None else posts_of(town)
         self._context = build_context(map_layers(town)) if town is not None and how.map_context else None
         names = sorted({self._name(i) for i in frames})
         self._samples: dict[str, list[Sample]] = {
@@ -97,8 +104,17 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
     def _name(self, frame: int) -> str:
         return f"{self._region}/{self._split.data.keys[frame].agent}"
 
-    def _spin(self, frame: int) -> tuple[str, int]:
+    def _spin(self, frame: int) -> Spin:
         return self._split.data.keys[frame].scene, self._split.data.keys[frame].index
+
+    def _find_around(self, spin: Spin) -> tuple[Spin, ...]:
+        """Return the spins in the window of a spin, itself first."""
+        ends = self._time_s[spin] - self._how.window_s - SLACK_S, self._time_s[spin] + self._how.window_s + SLACK_S
+        near = (each for each, time_s in self._time_s.items() if each[0] == spin[0] and ends[0] <= time_s <= ends[1])
+        return spin, *(each for each in near if each != spin)
+
+    def _list_views(self, spin: Spin) -> list[RoadView]:
+        return [*self._views.get(spin, {}).values()]
 
     def send_views(self) -> None:
         """Send what the road sensors see to the vehicles, for the free ground; before the first round."""
@@ -112,21 +128,14 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
         from_arrays(network, weights)
         told: dict[int, Sighting] = {}
         own: dict[int, Boxes] = {}
-        for done, i in enumerate(self._frames, start=1):
-            sighting, own[i] = self._see(network, i)
+        for done, i in enumerate(self._told, start=1):
+            sighting, own[i] = make_sighting(network, self._split.data, i, self._how)
             told[i] = unpack_sighting(sighting.agent, self._send("up", i, round_, pack_sighting(sighting)))
-            self._report(done, len(self._frames), "labels")
-        spins: dict[tuple[str, int], list[int]] = {}
-        for i in self._frames:
-            spins.setdefault(self._spin(i), []).append(i)
-        given: dict[int, Guidance] = {}
-        for spin, frames in spins.items():
-            views = self._views.get(spin, [])
-            poles = [Sighting(f"pole {n}", told[frames[0]].time_s, SURVEYED, v.boxes) for n, v in enumerate(views)]
-            sightings = [*(told[i] for i in frames), *poles]
-            found = average_spin(sightings, views, self._config, self._threshold, self._posts, self._context)
-            for i, guidance in zip(frames, found, strict=True):
-                given[i] = Guidance.from_message(self._send("down", i, round_, guidance.message()))
+            self._report(done, len(self._told), "labels")
+        given = {
+            i: Guidance.from_message(self._send("down", i, round_, guidance.message()))
+            for i, guidance in self._average(told)
+        }
         place = dict.fromkeys(self._samples, 0)
         for i in self._frames:
             name, frame = self._name(i), self._split.data.frame(i)
@@ -138,20 +147,22 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
             quality = measure_labels(round_, self._split, self._frames, self._region, self, self._config)
             LabelHistory((*kept, quality)).save(self._folder, LABELS)
 
-    def _see(self, network: Second, i: int) -> tuple[Sighting, Boxes]:
-        """Return what the vehicle of a frame tells, by its navigation, and its detections in the LiDAR's frame."""
-        data, how = self._split.data, self._how
-        key, frame = data.keys[i], data.frame(i)
-        (found,) = detect_in(network, [frame], score_threshold=TOLD)
-        lidar = choose_lidar(frame)
-        mount = frame.assumed.agent_from_sensor[lidar]
-        posts = np.zeros((0, 2))
-        if self._posts is not None:
-            posts = find_posts(transform_points(mount, frame.lidar[lidar][:, :3]), 0.0)
-        recorded = str(data.manifest.recipe.get("seed"))
-        rng = stream(0, "navigation", recorded, key.scene, key.index, key.agent)
-        known = how.navigate(frame.world_from_agent, rng)
-        return Sighting(key.agent, key.time_s, known, found.transform(mount), posts, how.navigation), found
+    def _average(self, told: Mapping[int, Sighting]) -> Iterator[tuple[int, Guidance]]:
+        """Yield the number of each frame to be labelled, and what its vehicle is told of it."""
+        spins: dict[Spin, dict[int, Sighting]] = {}
+        for i, sighting in told.items():
+            spins.setdefault(self._spin(i), {})[i] = sighting
+        seen = {
+            spin: [Sighting(f"pole {n}", self._time_s[spin], SURVEYED, view.boxes) for n, view in views.items()]
+            for spin, views in self._views.items()
+        }
+        asked = set(self._frames)
+        for spin, (_, *others) in self._around.items():
+            around = [one for each in others for one in (*spins.get(each, {}).values(), *seen.get(each, ()))]
+            middle = [*spins[spin].values(), *seen.get(spin, ())]
+            how = (self._config, self._threshold, self._posts, self._context, around)
+            found = average_spin(middle, self._list_views(spin), *how)
+            yield from (each for each in zip(spins[spin], found, strict=True) if each[0] in asked)
 
     def _send(self, direction: Direction, i: int, round_: int, message: bytes) -> bytes:
         about: Any = {"stage": self._stage, "task": OBJECTS.name, "link": "wireless", "client": self._name(i)}

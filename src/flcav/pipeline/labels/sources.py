@@ -15,7 +15,7 @@ class LabelSource:
     from_detections: bool = False  # pseudo-labels of the frozen stage I network
     from_poles: bool = False  # boxes of roadside sensors
     trained: bool = False  # these boxes are a trained detector's, not an ideal one's
-    averaged: bool = False  # the road average of a spin's poles and vehicles, renewed before each round of stage II
+    averaged: bool = False  # the road average of a window's poles and vehicles, renewed before each round of stage II
     caveat: str = ""  # stated with every result that depends on them
 
 

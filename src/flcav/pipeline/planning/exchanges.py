@@ -12,7 +12,7 @@ import numpy as np
 
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.fusion.distillation import Distillation, pack_sighting
-from flcav.fusion.pose_graph import Sighting
+from flcav.fusion.sightings import Sighting
 from flcav.network.ledger import BYTES_PER_MB
 from flcav.perception.client import as_shared
 from flcav.perception.distillation import SharedSamples
@@ -20,8 +20,9 @@ from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.truth import asked_of
 from flcav.perception.task import Task, build_network
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.frames import Frames
+from flcav.pipeline.frames import Frames, list_window
 from flcav.pipeline.labels.pseudo_labels import select_frames_near
+from flcav.pipeline.labels.sightings import find_told_posts
 from flcav.pipeline.planning.updates import UpdateForm
 from flcav.pipeline.stages.placement import find_sites, read_traces
 from flcav.seeds import stream
@@ -72,13 +73,19 @@ class Sensors:
 
 
 def measure_labels(regions: Sequence[Held], sensors: Sensors, how: Distillation, config: SecondConfig) -> float:
-    """Return what a vehicle sends to have its samples labelled once by the road average [MB], in the mean."""
+    """Return what a vehicle sends to have its samples labelled once by the road average [MB], in the mean.
+
+    A recorded region has in its windows what it has. In a town one more spin is recorded before each frame and after;
+    where a spin lies between two frames it is sent once, and this is more than is sent.
+    """
     sent, vehicles = 0.0, 0
     for region in regions:
         drive = region.drive
         near = select_frames_near(drive, _expect_sensors(region, sensors), sensors.near_m)
-        each = sum(_sighting_bytes(drive, i, how, config) for i in near) / len(drive.vehicles)
-        sent += region.training_frames * each
+        told = list_window(drive, near, how.window_s) if region.recorded else near
+        spins = 3 if how.window_s and not region.recorded else 1
+        each = sum(_sighting_bytes(drive, i, how, config) for i in told) / len(drive.vehicles)
+        sent += region.training_frames * spins * each
         vehicles += region.vehicles
     return sent / vehicles / BYTES_PER_MB
 
@@ -97,4 +104,5 @@ def _sighting_bytes(drive: Frames, i: int, how: Distillation, config: SecondConf
     """Return the size of a vehicle's message on a frame, with its annotated boxes for detections [bytes]."""
     frame, key = drive.data.frame(i), drive.data.keys[i]
     boxes = asked_of(frame, config).targets
-    return len(pack_sighting(Sighting(key.agent, key.time_s, frame.world_from_agent, boxes, navigation=how.navigation)))
+    posts = find_told_posts(frame, how)
+    return len(pack_sighting(Sighting(key.agent, key.time_s, frame.world_from_agent, boxes, posts, how.navigation)))

@@ -83,16 +83,16 @@ class Planner:
             }
         )
         asked = condition_problem(asked, PlanState(tasks={self.task: state}))
+        over = done if terms.stage == EDGE else before.edge_rounds + k * done
         try:
             allotted, shares = allocate_tasks(asked)
+            own = next(each for each in allotted if each.name == self.task)
+            new = make_task_plan(before.sizes, own, asked, shares)
+            joins = continue_joins(before, new, over)
         except Infeasible:
             return terms.settle(terms.cut(before, done, sent_mb), done, sent_mb)
-        own = next(each for each in allotted if each.name == self.task)
-        new = make_task_plan(before.sizes, own, asked, shares)
-        over = done if terms.stage == EDGE else before.edge_rounds + k * done
         past = (PRETRAIN,) if terms.stage == EDGE else (PRETRAIN, EDGE)
         predicted = {**(new.predicted or {}), **{each: (before.predicted or {})[each] for each in past}}
-        joins = continue_joins(before, new, over)
         new = replace(new, predicted=predicted, joins=joins, uploads=before.uploads)
         return terms.settle(new, done, sent_mb)
 

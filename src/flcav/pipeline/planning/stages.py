@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -44,30 +45,32 @@ def remake_plan(
     rest = condition_problem(problem, PlanState(tasks=states, used_mb=sent))
     try:
         allotted, shares = allocate_tasks(rest)
+        made = {own.name: make_task_plan(tasks[own.name].sizes, own, rest, shares) for own in allotted}
+        over = {name: tasks[name].edge_rounds if stage == EDGE else 0 for name in made}
+        joins = {name: continue_joins(tasks[name], new, over[name]) for name, new in made.items()}
     except Infeasible:
-        allotted, shares = (), {}
-    for own in allotted:
-        before = tasks[own.name]
-        new = make_task_plan(before.sizes, own, rest, shares)
+        made, joins = {}, {}
+    for name, new in made.items():
+        before = tasks[name]
         assert new.predicted is not None
         assert before.predicted is not None
         past = (PRETRAIN,) if stage == PRETRAIN else (PRETRAIN, EDGE)
-        joins = continue_joins(before, new, before.edge_rounds) if stage == EDGE else new.joins
         predicted = {**new.predicted, **{each: before.predicted[each] for each in past}}
-        tasks[own.name] = replace(new, predicted=predicted, joins=joins, uploads=before.uploads)
+        tasks[name] = replace(new, predicted=predicted, joins=joins[name], uploads=before.uploads)
     return Plan(plan.rule, tasks, stage, dict(reached))
 
 
 def count_carried_out(plan: TaskPlan, stages: Sequence[StageResult]) -> TaskPlan:
     """Return the plan of a task with the edge rounds that its regions carried out, and who joined them.
 
-    `stages` are the results of stage II. Where regions ran different numbers of rounds, theirs is the mean by vehicles.
+    `stages` are the results of stage II. Where regions ran different numbers of rounds, theirs is the mean by vehicles,
+    and the last round of each has that number: first ones of a region that ran more have numbers below 1.
     """
     rounds = round(float(np.average([each.rounds for each in stages], weights=[each.clients for each in stages])))
     joins = plan.joins
     if joins is not None:
         last = {
-            name: own
+            name: tuple(number + rounds - each.rounds for number in own)
             for each in stages
             for made in (each.plans or ())[-1:]
             for name, own in (made.plan.joins or {}).items()
@@ -77,10 +80,31 @@ def count_carried_out(plan: TaskPlan, stages: Sequence[StageResult]) -> TaskPlan
 
 
 def continue_joins(before: TaskPlan, new: TaskPlan, over: int) -> Mapping[str, tuple[int, ...]] | None:
-    """Return the first `over` rounds that vehicles joined by the plan `before`, and the later ones by the `new` one."""
+    """Return the first `over` rounds that vehicles joined by the plan `before`, and the later ones by the `new` one.
+
+    No vehicle joins more rounds than the new plan gives it in all: where it would, the later rounds of its region are
+    dealt anew, round robin, to those that have rounds left. Raises `Infeasible` where these are too few for the rounds.
+    """
     if before.joins is None or new.joins is None:
         return new.joins
-    return {
-        name: tuple(each for each in before.joins[name] if each <= over) + tuple(each for each in joined if each > over)
-        for name, joined in new.joins.items()
-    }
+    past = {name: tuple(each for each in before.joins[name] if each <= over) for name in new.joins}
+    later = {name: tuple(each for each in joined if each > over) for name, joined in new.joins.items()}
+    most = {name: len(joined) for name, joined in new.joins.items()}
+    for region in dict.fromkeys(name.rpartition("/")[0] for name in later):
+        own = [name for name in later if name.rpartition("/")[0] == region]
+        if any(len(past[name]) + len(later[name]) > most[name] for name in own):
+            rounds = sorted({*chain.from_iterable(later[name] for name in own)})
+            later |= _deal({name: most[name] - len(past[name]) for name in own}, rounds)
+    return {name: past[name] + later[name] for name in later}
+
+
+def _deal(left: Mapping[str, int], rounds: Sequence[int]) -> dict[str, tuple[int, ...]]:
+    """Return which of `rounds` each vehicle joins, of which it has so many `left`: each starts where the last ended."""
+    dealt, start = {}, 0
+    for name, many in left.items():
+        count = min(max(many, 0), len(rounds))
+        dealt[name] = tuple(sorted(rounds[(start + number) % len(rounds)] for number in range(count)))
+        start += count
+    if start < len(rounds):
+        raise Infeasible(f"{start} rounds are left to the vehicles of a region, which has {len(rounds)} to go")
+    return dealt

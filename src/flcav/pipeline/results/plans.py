@@ -22,7 +22,8 @@ class TaskPlan:
     model_mb: float  # of one model update
     predicted: Mapping[str, float] | None  # score after each stage, by the learning curve; None: a fixed plan
     joins: Annotated[Mapping[str, tuple[int, ...]] | None, LEFT_OUT] = (
-        None  # by vehicle the rounds it joins, of 1 … edge rounds + k · cloud rounds; None: every vehicle joins all
+        None  # by vehicle the rounds it joins, of 1 … edge rounds + k · cloud rounds; None: every vehicle joins all.
+        # Where regions ran different numbers of edge rounds, the last of each has the number of their mean
     )
 
     uploads: Annotated[Mapping[str, int] | None, LEFT_OUT] = (

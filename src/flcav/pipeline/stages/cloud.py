@@ -126,6 +126,8 @@ def federate_cloud(
     kept: Any = (learning.task, own.folder, own.book, own.report, states, identity, scored, rules.privacy)
     checkpoints = FederationCheckpoints(*kept)
     rules.check_personal(to_arrays(own.network))
+    parties = {region: rules.secret_parties([*each.clients]) for region, each in own.regions.items()}
+    checkpoints.keep_secrets({f"{EDGE}/{region}": found for region, found in parties.items()})
     start, done = checkpoints.resume(to_arrays(own.network))
     wireless = Account(own.book, CLOUD, learning.task.name, "wireless", outages)
     wireline = Account(own.book, CLOUD, learning.task.name, "wireline")

@@ -32,7 +32,7 @@ def draw_recall(
     axes.axvline(within_m, color=style.RULE, linewidth=1)
     axes.set(xlim=(0, within_m + 1), ylim=(0, 1.02), xlabel="distance from the pole [m]", ylabel="recall")
     axes.grid(axis="y")
-    style.key(figure, axes.get_lines()[: len(lines)])
+    style.key(figure, axes.get_lines()[: len(lines)], ncols=min(len(lines), 3))
     return figure
 
 

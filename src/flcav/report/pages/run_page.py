@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from flcav.dataset.ground import Ground
 from flcav.dataset.store import Dataset
+from flcav.federation.privacy import SEEDED
 from flcav.files import write_bytes
 from flcav.geometry import Boxes
 from flcav.network.clock.records import load_rounds
@@ -107,6 +108,7 @@ def page(run: Run) -> dict[str, Any]:
         ],
         "delta": f"{recipe.federation.privacy.delta:g}" if recipe.federation.privacy else None,
         "divergences": [row for row in rounds if row["divergence"] is not None],
+        "seeded": SEEDED if recipe.federation.privacy and recipe.federation.privacy.seeded else None,
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,

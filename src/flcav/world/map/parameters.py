@@ -211,6 +211,7 @@ class TownParameters(Config):
     streets: dict[str, StreetParameters]  # parameters of the streets, by the net's edge type
     poles: tuple[PoleParameters, ...] = ()  # candidate sites of roadside sensors
     signs: tuple[SignParameters, ...] = ()  # signs of the map; signs of the same sort are not placed by rule then
+    limits_known: bool = False  # the map says where speed-limit signs are: none is placed by rule
     posts: tuple[PostParameters, ...] = ()  # poles of the map
     objects: tuple[ObjectParameters, ...] = ()  # further objects of the map; with buildings or trees it has no others
     signals: tuple[SignalParameters, ...] = ()  # signal heads of the map; approaches with one have no others

@@ -210,11 +210,12 @@ def place_poles(
 
 
 def place_signs(
-    net: RoadNet, known: tuple[SignParameters, ...] = ()
+    net: RoadNet, known: tuple[SignParameters, ...] = (), *, limits_known: bool = False
 ) -> list[tuple[tuple[float, float, float], float, str]]:
     """Return position, yaw and kind of each traffic sign: give way and stop before junctions, the limit after them.
 
-    Where some are `known`, these stand instead: signs of right of way, or speed limits.
+    Where some are `known`, these stand instead: signs of right of way, or speed limits. With `limits_known` there is no
+    speed limit but these, even where there are none.
     """
     out = [((sign.x, sign.y, sign.height_m), float(np.radians(sign.yaw_deg)), str(sign.kind)) for sign in known]
     sorts = {kind.partition("_")[0] == "speed" for _, _, kind in out}
@@ -229,7 +230,8 @@ def place_signs(
             limit = 3.6 * edge.lanes_of("driving")[0].speed
             wanted.append((SPEED_SIGNS[min(SPEED_SIGNS, key=lambda shown: abs(shown - limit))], length - 12.0))
         for name, before_end in wanted:
-            if (name.partition("_")[0] == "speed") in sorts:
+            speed = name.startswith("speed")
+            if speed in sorts or (speed and limits_known):
                 continue
             x, y, heading = _kerb_side(edge, before_end, net.side)
             out.append(((x, y, SIGN_HEIGHT_M), float(heading + np.pi), name))

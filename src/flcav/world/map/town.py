@@ -214,7 +214,7 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
         trees = street_furniture.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
     poles = street_furniture.place_poles(net, parameters.poles)
     mounts = np.array([row[1] for row in poles], dtype=np.float64).reshape(-1, 3)
-    signs = street_furniture.place_signs(net, parameters.signs)
+    signs = street_furniture.place_signs(net, parameters.signs, limits_known=parameters.limits_known)
     posts = np.array([(post.x, post.y, post.height_m) for post in parameters.posts], dtype=np.float64).reshape(-1, 3)
     low_x, low_y, high_x, high_y = shapely.total_bounds(np.array([paved, *facades]))
     return Town(

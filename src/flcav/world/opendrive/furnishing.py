@@ -78,6 +78,7 @@ def furnish(
         streets={kind: STREETS[kind] for kind in kinds},
         poles=tuple(find_candidate_poles(net)),
         signs=found.signs,
+        limits_known=found.limits,
         posts=found.posts,
         objects=found.objects,
         signals=found.signals,

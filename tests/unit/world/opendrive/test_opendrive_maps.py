@@ -18,6 +18,7 @@ from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.importing import import_town
 from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map
+from flcav.world.opendrive.objects.signs import find_signs
 from flcav.world.static import Part, build_static_world
 from flcav.world.traffic.demand import draw_tour
 from flcav.world.traffic.reach import find_driven, find_walked
@@ -242,13 +243,54 @@ def test_areas_that_defeat_exact_overlay_are_snapped(monkeypatch: pytest.MonkeyP
     assert unite([shapely.box(0, 0, 1, 1), shapely.box(1, 0, 2, 1)]).area == pytest.approx(2.0)
 
 
+LIMITS = {  # attributes of a sign -> its kind, or why it is left out
+    'value="30"': "speed_30",
+    'value="60" unit="km/h"': "speed_60",
+    'value="25" unit="m/s"': "speed_90",
+    'value="50"': "a limit of 50 km/h, which no sign shows",
+    'value="20" unit="mph"': "a limit of 32 km/h, which no sign shows",
+    'value="60" unit="furlongs"': "a limit without a number",
+    'value=""': "a limit without a number",
+    'value="nan"': "a limit without a number",
+    'value="-1"': "a limit without a number",
+    'value="1e300" unit="mph"': "a limit without a number",
+    'subtype="56"': "a limit without a number",
+    "": "a limit without a number",
+}
+
+
+@pytest.mark.parametrize("attributes", LIMITS)
+def test_a_limit_that_no_sign_shows_is_left_out_with_the_reason(attributes: str) -> None:
+    root = read_map(CROSS)
+    signal = f'<signal id="1" s="20" t="-5" type="274" orientation="+" {attributes}/>'
+    next(root.iterfind("road")).append(ElementTree.fromstring(f"<signals>{signal}</signals>"))
+    describe_map(root)
+    signs = find_signs(root, (-458_000.0, -5_428_000.0))
+    assert signs.limits
+    if LIMITS[attributes].startswith("speed"):
+        assert [sign.kind for sign in signs.found] == [LIMITS[attributes]]
+        assert not signs.left
+    else:
+        assert (signs.found, dict(signs.left)) == ((), {LIMITS[attributes]: 1})
+
+
+def test_a_town_whose_limits_are_left_out_has_no_invented_ones(tmp_path: Path) -> None:
+    root = read_map(CROSS)
+    assert "speed_60" in import_town(CROSS, tmp_path / "by rule").town.signs.kind  # of streets of 50 km/h
+    signal = '<signal id="1" s="20" t="-5" type="274" value="50" orientation="+"/>'
+    next(root.iterfind("road")).append(ElementTree.fromstring(f"<signals>{signal}</signals>"))
+    imported = import_town(write(root, tmp_path / "map.xodr"), tmp_path / "town")
+    assert "Signs of the map taken over: 0; left out: 1 (a limit of 50 km/h, which no sign shows)." in imported.notes
+    assert not any(kind.startswith("speed") for kind in imported.town.signs.kind)
+
+
 def test_signs_and_poles_of_the_map_stand_where_it_says(tmp_path: Path) -> None:
     root = read_map(CROSS)
     for road in root.findall("road")[:1]:
         road.append(
             ElementTree.fromstring(
                 '<signals><signal id="1" s="20" t="-5" type="206" orientation="-" zOffset="1.9" height="0.8"/>'
-                '<signal id="2" s="30" t="-5" type="274" value="50" orientation="+"/>'
+                '<signal id="2" s="30" t="-5" type="274" value="60" orientation="+"/>'
                 '<signal id="3" s="30" t="-5" type="274" value="many"/>'
                 '<signal id="4" s="400" t="0" type="206"/><signal id="5" s="9" t="0" type="306"/>'
                 '<signal id="6" s="9" t="0" type="1000001" dynamic="yes"/>'

@@ -1,8 +1,9 @@
 """Reading of Argoverse 2's sensor dataset: logs in Feather files, as av2-api reads them.
 
 Frames: `egovehicle` is at the centre of the rear axle, x ahead, y left, z up; `city` is the world; cameras are optical.
-A sweep's points are of both stacked LiDARs, in the ego frame at the sweep's time, their motion compensated. Images have
-no distortion: av2-api's camera model has none, the coefficients in `intrinsics.feather` are of the raw images.
+A sweep's points are of both stacked LiDARs, in the ego frame at the sweep's time, their motion compensated; their times
+are those of the measurements, from the sweep's time on, when the spin begins. Images have no distortion: av2-api's
+camera model has none, the coefficients in `intrinsics.feather` are of the raw images.
 """
 
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError
+from flcav.dataset.checks.frames import LONGEST_SPIN_S
 from flcav.dataset.formats.reading import (
     AgentNames,
     LogSource,
@@ -62,13 +64,15 @@ EGO_FROM_AGENT = pose(0.0, 0.0, -AXLE_M)
 
 
 class Log(NamedTuple):
-    """A log: its folder, split and agent, and the times of its sweeps."""
+    """A log: its folder, split and agent, the times of its sweeps, and what is not in it."""
 
     folder: Path
     split: str | None
     agent: str
     sweeps: tuple[int, ...]  # [ns]
     labelled: bool
+    lost: int  # annotated times without a sweep
+    dark: int  # sweeps without a picture, summed over the cameras that have pictures
 
 
 class Labels(NamedTuple):
@@ -97,7 +101,12 @@ class Argoverse2Source(LogSource):
             for scene in choose_split(folder, {scene: _split_of(path) for scene, path in found.items()}, split)
         }
         bare = [log.folder.name for log in self._logs.values() if not log.labelled]
-        self.notes = (f"no annotations.feather in {len(bare)} of {len(self._logs)} logs, so no boxes",) if bare else ()
+        lost, dark = (sum(column) for column in zip(*((log.lost, log.dark) for log in self._logs.values())))
+        self.notes = (
+            *((f"no annotations.feather in {len(bare)} of {len(self._logs)} logs, so no boxes",) if bare else ()),
+            *((f"no sweep at {lost} annotated times, so no frames there",) if lost else ()),
+            *((f"no picture within {LATE_NS // 10**6} ms of a sweep, of cameras with others: {dark}",) if dark else ()),
+        )
         self._labelled = not bare
         self._split_of = {scene: log.split for scene, log in self._logs.items()}
 
@@ -129,7 +138,7 @@ class Argoverse2Source(LogSource):
                 )
                 for name, t in taken.items()
             }
-            points = _read_sweep(log.folder / "sensors" / "lidar" / f"{sweep}.feather", mounts[MOUNT][:3, 3])
+            points, times_s = _read_sweep(log.folder / "sensors" / "lidar" / f"{sweep}.feather", mounts[MOUNT][:3, 3])
             own = np.flatnonzero(labels.sweep == sweep) if labels else np.zeros(0, np.int64)
             boxes = labels.boxes[own] if labels else Boxes.empty()
             city_from_ego = poses.at(sweep)
@@ -143,6 +152,7 @@ class Argoverse2Source(LogSource):
                 calibration=calibration,
                 assumed=calibration,
                 lidar={LIDAR: points},
+                point_times={LIDAR: times_s},
                 annotations=annotate(
                     labels.track[own].tolist() if labels else (),
                     boxes,
@@ -195,8 +205,13 @@ def _open_log(folder: Path, names: AgentNames) -> Log:
     sweeps = _list_times(folder / "sensors" / "lidar", "feather")
     if not len(sweeps):
         raise InputError(f"{folder / 'sensors' / 'lidar'}: no sweeps in it")
-    labelled = (folder / "annotations.feather").is_file()
-    return Log(folder, _split_of(folder), names.of("ego", calibration), tuple(sweeps.tolist()), labelled)
+    annotations = folder / "annotations.feather"
+    labelled = annotations.is_file()
+    annotated = _read_feather(annotations, ("timestamp_ns",))["timestamp_ns"].unique().to_pylist() if labelled else ()
+    lost = len(set(annotated) - set(sweeps.tolist()))
+    times = (_list_times(folder / "sensors" / "cameras" / name, "jpg") for name in lenses)
+    dark = sum(_nearest(own, sweep) is None for own in times if len(own) for sweep in sweeps.tolist())
+    return Log(folder, _split_of(folder), names.of("ego", calibration), tuple(sweeps.tolist()), labelled, lost, dark)
 
 
 def _list_times(folder: Path, suffix: str) -> NDArray[np.int64]:
@@ -209,12 +224,20 @@ def _nearest(times: NDArray[np.int64], sweep: int) -> int | None:
     return nearest if abs(nearest - sweep) <= LATE_NS else None
 
 
-def _read_sweep(path: Path, origin: Array) -> NDArray[np.float32]:
-    """Return (N, 4) x, y, z [m] from `origin` in the ego frame, and intensity [0, 1]."""
-    table = _read_feather(path, ("x", "y", "z", "intensity"))
-    x, y, z, intensity = (table[name].to_numpy().astype(np.float32) for name in ("x", "y", "z", "intensity"))
+def _read_sweep(path: Path, origin: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return (N, 4) x, y, z [m] from `origin` in the ego frame, intensity [0, 1], and (N,) times after the sweep's [s].
+
+    Raises `InputError` where a point is not finite, or was measured LONGEST_SPIN_S or more before or after.
+    """
+    names = ("x", "y", "z", "intensity")
+    table = _read_feather(path, (*names, "offset_ns"))
+    x, y, z, intensity = (table[name].to_numpy().astype(np.float32) for name in names)
     xyz = np.column_stack((x, y, z)) - origin.astype(np.float32)
-    return check_finite(np.column_stack((xyz, intensity / np.float32(255))), path)
+    points = check_finite(np.column_stack((xyz, intensity / np.float32(255))), path)
+    times_s = (table["offset_ns"].to_numpy() / 1e9).astype(np.float32)
+    if not (np.abs(times_s) < LONGEST_SPIN_S).all():
+        raise InputError(f"{path}: a point's 'offset_ns' is no time within the spin")
+    return points, times_s
 
 
 def _read_mounts(folder: Path) -> dict[str, Array]:

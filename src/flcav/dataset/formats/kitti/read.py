@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flcav.config import InputError
-from flcav.dataset.formats.kitti.files import Calibration as KittiCalibration
 from flcav.dataset.formats.kitti.files import (
+    SUFFIXES,
     Objects,
     check_objects,
     read_calibration,
@@ -24,6 +24,7 @@ from flcav.dataset.formats.kitti.files import (
     read_points,
     read_split,
 )
+from flcav.dataset.formats.kitti.files import Calibration as KittiCalibration
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import (
     AgentNames,
@@ -70,7 +71,7 @@ class KittiSource(LogSource):
     FORMAT = "kitti"
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
-        """Raises `InputError` where `folder` has no frames, none of `split`, or a frame no calibration."""
+        """Raises `InputError` where `folder` has no frames, none of `split`, or a file of a frame is missing."""
         self._folder, self._split = folder, split
         shots = _find_shots(folder)
         split_of = {shot.scene: shot.split for shot in shots}
@@ -79,16 +80,16 @@ class KittiSource(LogSource):
         self._shots: dict[str, list[Shot]] = defaultdict(list)
         self._agent: dict[str, str] = {}
         self._calibration: dict[str, Calibration] = {}
+        every = [shot for shot in shots if shot.scene in chosen]
+        _check_complete(every)
         names = AgentNames()
-        for shot in shots:
-            if shot.scene in chosen:
-                calibration = _path(shot, "calib")
-                mounted = _calibrate(read_calibration(calibration))
-                self._shots[shot.scene].append(shot)
-                text = "" if shot.exported else calibration.read_text()
-                agent = self._agent[shot.number] = names.of(shot.vehicle, text)
-                self._calibration.setdefault(agent, mounted)
-        every = [shot for own in self._shots.values() for shot in own]
+        for shot in every:
+            calibration = _path(shot, "calib")
+            mounted = _calibrate(read_calibration(calibration))
+            self._shots[shot.scene].append(shot)
+            text = "" if shot.exported else calibration.read_text()
+            agent = self._agent[shot.number] = names.of(shot.vehicle, text)
+            self._calibration.setdefault(agent, mounted)
         if not any(shot.exported for shot in every):
             self._beams, self._range_m = BEAMS, RANGE_M
         bare = sum(not _path(shot, "label_2").is_file() for shot in every)
@@ -150,7 +151,10 @@ def _read_frame(shot: Shot, agent: str, calibration: Calibration) -> LinkedFrame
 
 
 def _find_shots(folder: Path) -> list[Shot]:
-    """Return the frames of `training` and `testing` in the order of their numbers."""
+    """Return the frames of `training` and `testing` in the order of their numbers, in folders with a point cloud.
+
+    A frame is one that is listed, or that any of its files is there of.
+    """
     listed = {}
     for name in LISTS:
         path = folder / "ImageSets" / f"{name}.txt"
@@ -159,13 +163,24 @@ def _find_shots(folder: Path) -> list[Shot]:
     origin = _read_origins(folder / FRAMES)
     shots = []
     for part in FOLDERS:
-        for path in sorted((folder / part / "velodyne").glob("*.bin")):
-            split = listed.get((part, path.stem), "test" if part == "testing" else None)
-            where = origin.get(path.stem, (f"kitti-{part}-{path.stem}", 0, "ego", 0.0))
-            shots.append(Shot(folder / part, path.stem, split, *where, path.stem in origin))
+        found = {kind: {path.stem for path in (folder / part / kind).glob(f"*.{SUFFIXES[kind]}")} for kind in SUFFIXES}
+        numbers = set().union(*found.values(), (number for own, number in listed if own == part))
+        for number in sorted(numbers) if found["velodyne"] else ():
+            split = listed.get((part, number), "test" if part == "testing" else None)
+            where = origin.get(number, (f"kitti-{part}-{number}", 0, "ego", 0.0))
+            shots.append(Shot(folder / part, number, split, *where, number in origin))
     if not shots:
         raise InputError(f"{folder}: no KITTI folder; it holds no 'training/velodyne' with point clouds")
     return shots
+
+
+def _check_complete(shots: list[Shot]) -> None:
+    """Raise `InputError` where a file of a frame is missing; a folder without any labels is complete, too."""
+    labelled = {shot.folder for shot in shots if _path(shot, "label_2").is_file()}
+    for shot in shots:
+        for part in SUFFIXES:
+            if not _path(shot, part).is_file() and (part != "label_2" or shot.folder in labelled):
+                raise InputError(f"{_path(shot, part)}: no such file; a frame of KITTI has one")
 
 
 def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
@@ -186,5 +201,4 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
 
 
 def _path(shot: Shot, part: str) -> Path:
-    suffix = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}[part]
-    return shot.folder / part / f"{shot.number}.{suffix}"
+    return shot.folder / part / f"{shot.number}.{SUFFIXES[part]}"

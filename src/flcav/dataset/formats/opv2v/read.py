@@ -57,7 +57,7 @@ class Opv2vSource(LogSource):
     FORMAT = "opv2v"
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
-        """Raises `InputError` where there is no scenario, none of `split`, or an agent's first frame is malformed."""
+        """Raises `InputError` where there is no scenario, none of `split`, or a file of a frame is missing."""
         self._folder, self._split = folder, split
         found = _find_scenarios(folder)
         split_of = {scene: _split_of(path) for scene, path in found.items()}
@@ -65,15 +65,14 @@ class Opv2vSource(LogSource):
         self._calibration: dict[str, Calibration] = {}
         self._track: dict[str, dict[str, str]] = {}
         names = AgentNames()
+        self._blind: set[str] = set()  # agents with a camera of which there is no picture
         self._shots = {scene: self._open(scene, found[scene], names) for scene in self._split_of}
+        blind, agents = len(self._blind), len(self._calibration)
+        self.notes = (f"no pictures of a camera of {blind} of {agents} agents, so no images of it",) if blind else ()
 
     def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Shot]:
         known = self._track[scene] = _read_names(folder / PROTOCOL)
-        stamps = {
-            path: sorted(file.stem for file in path.glob("*.yaml") if file.stem.isdigit())
-            for path in sorted(folder.iterdir())
-            if path.is_dir()
-        }
+        stamps = {path: _list_stamps(path) for path in sorted(folder.iterdir()) if path.is_dir()}
         rank = {stamp: number for number, stamp in enumerate(sorted({s for own in stamps.values() for s in own}))}
         shots = []
         for path, own in stamps.items():
@@ -84,6 +83,8 @@ class Opv2vSource(LogSource):
                 lidar, cameras = calibration.agent_from_sensor[LIDAR] + 0.0, calibration.intrinsics  # no -0.0
                 agent = names.of(vehicle, (lidar.tobytes(), *((name, cameras[name].tobytes()) for name in cameras)))
                 self._calibration.setdefault(agent, calibration)
+                if not cameras.keys() <= _list_cameras(path):
+                    self._blind.add(agent)
                 shots += [Shot(path / stamp, agent, int(stamp), rank[stamp] * PERIOD_S) for stamp in own]
         return sorted(shots, key=lambda shot: (shot.spin, shot.agent))
 
@@ -215,6 +216,26 @@ def _read_names(path: Path) -> dict[str, str]:
 
 def _picture(stem: Path, camera: str) -> Path:
     return stem.with_name(f"{stem.name}_{camera}.png")
+
+
+def _list_cameras(folder: Path) -> set[str]:
+    """Return the cameras of an agent's folder that there is a picture of."""
+    return {name for name in CAMERAS if next(folder.glob(f"*_{name}.png"), None) is not None}
+
+
+def _list_stamps(folder: Path) -> list[str]:
+    """Return the times of an agent's frames, in order; raises `InputError` where a file of one is missing.
+
+    A frame has a YAML file, a point cloud, and a picture of each camera that the folder has pictures of.
+    """
+    endings = [".yaml", ".pcd", *(f"_{name}.png" for name in sorted(_list_cameras(folder)))]
+    found = {end: {path.name.removesuffix(end) for path in folder.glob(f"*{end}")} for end in endings}
+    stamps = sorted(stamp for stamp in set().union(*found.values()) if stamp.isdigit())
+    for stamp in stamps:
+        for end in endings:
+            if not (path := folder / f"{stamp}{end}").is_file():
+                raise InputError(f"{path}: no such file; a frame of OPV2V has one")
+    return stamps
 
 
 def _find_scenarios(folder: Path) -> dict[str, Path]:

@@ -16,6 +16,7 @@ from flcav.world.opendrive.road_surface import Road
 SIGNS: dict[str, Literal["stop", "yield"]] = {"206": "stop", "205": "yield"}  # numbers of the German catalogue
 LIMIT_SIGN = "274"
 KMH = {"km/h": 1.0, "mph": 1.609344, "m/s": 3.6}
+LIMITS_KMH = (5.0, 200.0)  # least and largest limit that is believed
 PLATE_M = (1.2, 4.5)  # heights at which a plate is believed to hang
 POST_M = (0.3, 15.0)  # heights of poles that are taken over
 PAINTED = (crosswalks.MARKING, stop_lines.MARKING)  # types of signals that are paint
@@ -27,6 +28,7 @@ class Signs:
 
     found: tuple[SignParameters, ...]
     left: Counter[str]
+    limits: bool  # whether the map has speed-limit signs, taken over or left out
 
 
 @dataclass(frozen=True)
@@ -40,19 +42,22 @@ class Posts:
 def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> Signs:
     """Return the stop, give-way and speed-limit signs of a map, in town coordinates: map + `offset_m` [m].
 
-    A sign faces the traffic that it is for, by its orientation.
+    A sign faces the traffic that it is for, by its orientation. Left out are signs of other types, limits that say no
+    number or for which there is no sign, and signs without a place on their road.
     """
-    found, left = [], Counter[str]()
+    found, left, limits = [], Counter[str](), False
     for row in root.iterfind("road"):
         road = Road(row)
         for signal in row.iterfind("signals/signal"):
             name = signal.get("type", "")
             if name in PAINTED or signal.get("dynamic") == "yes":
                 continue
-            kind = SIGNS.get(name) or _limit_kind(signal)
+            limits |= name == LIMIT_SIGN
+            limit = read_limit(signal)
+            kind = SIGNS.get(name) or _limit_kind(limit)
             place = locate(road, signal, offset_m)
             if kind is None:
-                left["a limit without a number" if name == LIMIT_SIGN else f"of the type {shorten(name)}"] += 1
+                left[f"of the type {shorten(name)}" if name != LIMIT_SIGN else _tell_limit(limit)] += 1
                 continue
             if place is None:
                 left["no place on the road"] += 1
@@ -69,7 +74,7 @@ def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> Sign
                     height_m=round(up, 2) if PLATE_M[0] <= up <= PLATE_M[1] else SIGN_HEIGHT_M,
                 )
             )
-    return Signs(tuple(found), left)
+    return Signs(tuple(found), left, limits)
 
 
 def find_posts(root: ElementTree.Element, offset_m: tuple[float, float]) -> Posts:
@@ -93,14 +98,19 @@ def find_posts(root: ElementTree.Element, offset_m: tuple[float, float]) -> Post
 
 
 def read_limit(signal: ElementTree.Element) -> float | None:
-    """Return the limit [m/s] of a speed-limit sign; None for other signs, and where it says no number."""
-    value = read_number(signal, "value")
-    if signal.get("type") != LIMIT_SIGN or not 5 <= value * KMH.get(signal.get("unit", "km/h"), 1.0) <= 200:
-        return None
-    return value * KMH.get(signal.get("unit", "km/h"), 1.0) / 3.6
+    """Return the limit [m/s] of a speed-limit sign; None for other signs, and where it says no number in a known unit.
+
+    A number without a unit is one in km/h.
+    """
+    limit = read_number(signal, "value") * KMH.get(signal.get("unit") or "km/h", 0.0)
+    return limit / 3.6 if signal.get("type") == LIMIT_SIGN and LIMITS_KMH[0] <= limit <= LIMITS_KMH[1] else None
 
 
-def _limit_kind(signal: ElementTree.Element) -> Literal["speed_30", "speed_60", "speed_90"] | None:
-    """Return the kind of sign that is nearest to a speed limit; None for other signs."""
-    limit = read_limit(signal)
-    return None if limit is None else SPEED_SIGNS[min(SPEED_SIGNS, key=lambda known: abs(known - 3.6 * limit))]
+def _limit_kind(limit: float | None) -> Literal["speed_30", "speed_60", "speed_90"] | None:
+    """Return the kind of sign that shows a limit [m/s]; None where none does, and without a limit."""
+    return None if limit is None else SPEED_SIGNS.get(round(3.6 * limit))
+
+
+def _tell_limit(limit: float | None) -> str:
+    """Return why the sign of a limit [m/s] is left out."""
+    return "a limit without a number" if limit is None else f"a limit of {3.6 * limit:.0f} km/h, which no sign shows"

@@ -26,6 +26,7 @@ class MapObjects:
     """The objects and signals of a map in town coordinates, and notes on how many there are."""
 
     signs: tuple[SignParameters, ...]
+    limits: bool  # whether there are speed-limit signs in the map, among `signs` or left out
     posts: tuple[PostParameters, ...]
     objects: tuple[ObjectParameters, ...]
     signals: tuple[SignalParameters, ...]
@@ -52,6 +53,7 @@ def take_objects(
     told = f"Controllers with several of these heads: {several}; switched alike here: {alike}."
     return MapObjects(
         signs=signs.found,
+        limits=signs.limits,
         posts=posts.found,
         objects=objects.found,
         signals=heads.found,

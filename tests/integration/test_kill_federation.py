@@ -1,0 +1,32 @@
+"""tools/kill_federation.py: stages II and III, in one process and in several, end as if nothing had been killed."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+TOOL = Path(__file__).parents[2] / "tools" / "kill_federation.py"
+FEW = {"scenes": 2, "spins": 1, "cavs": 2}
+RECIPE = {
+    "splits": dict.fromkeys(("pool", "validation", "registry", "edge", "test"), FEW),
+    "training": {"steps": 2, "local_steps": 2},
+    "tasks": {"weather": {"plan": {"samples": 2, "edge_rounds": 3, "cloud_rounds": 2}}},
+    "regions": {"suburb": {"role": "pretrain"}, "ring": {"role": "federate", "vehicles": 2}},
+    "budgets_mb": {"wireless": 90, "wireline": 90},
+    "placement": {"rule": "none"},
+    "recording": {"warmup_s": 5.0, "weather": "clear"},
+}
+
+
+@pytest.mark.slow
+def test_a_killed_federation_ends_as_an_undisturbed_one(tmp_path: Path) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_text(yaml.safe_dump(RECIPE))
+    for jobs, stage in ((2, "edge"), (2, "cloud"), (1, "cloud")):  # steps that are there are not done again
+        asked = [str(path), "--out", str(tmp_path / "out"), "--kills", "3", "--jobs", str(jobs), "--stage", stage]
+        done = subprocess.run([sys.executable, TOOL, *asked], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith("3 kills, ")
+        assert ", 0 of them otherwise than an undisturbed one" in done.stdout

@@ -1,0 +1,106 @@
+"""Clients that fail in a round: how many may, who is named, and what says that too few are left."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from regression import START, Regression, ledger, vehicles
+
+from flcav.federation.rounds import ClientFailed
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.selection import Selection
+from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.state import FederationState
+from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.krum import Krum
+from flcav.federation.strategies.median import Median
+from flcav.federation.trainable import Trainable
+
+SCHEDULE = Schedule(rounds=2, steps=5, learning_rate=0.05, final_learning_rate=0.01, seed=3)
+
+
+def edge() -> Account:
+    return Account(ledger(), "edge", "regression", "wireless")
+
+
+def failing(number: int, fail: int) -> dict[str, Regression]:
+    clients = vehicles("grid", number)
+    for each in [*clients.values()][:fail]:
+        each.fail = True
+    return clients
+
+
+@pytest.mark.parametrize(("number", "fail"), [(4, 2), (5, 2), (2, 1)])
+def test_by_default_a_round_goes_on_with_half_of_the_clients_and_names_the_others(number: int, fail: int):
+    clients, state = failing(number, fail), FederationState()
+    found = federate(clients, START, SCHEDULE, edge(), state=state)
+    usable = {name: client for name, client in clients.items() if not client.fail}
+    assert [record.clients for record in state.records] == [tuple(usable)] * SCHEDULE.rounds
+    assert all(record.failed.keys() == clients.keys() - usable.keys() for record in state.records)
+    assert all("no power" in reason for record in state.records for reason in record.failed.values())
+    np.testing.assert_array_equal(found.weights["w"], federate(usable, START, SCHEDULE, edge()).weights["w"])
+
+
+@pytest.mark.parametrize(
+    ("number", "fail", "least", "wanted"),
+    [(4, 3, None, 2), (5, 3, None, 3), (1, 1, None, 1), (4, 1, "all", 4), (4, 2, 3, 3), (4, 4, 1, 1)],
+)
+def test_fewer_clients_than_are_wanted_end_the_federation_with_their_reasons(
+    number: int, fail: int, least: Any, wanted: int
+):
+    told = f"round 1: {number - fail} of {number} clients sent an update that can be used, {wanted} are wanted"
+    with pytest.raises(ClientFailed, match=rf"{told} \(grid/cav0: .*no power"):
+        federate(failing(number, fail), START, SCHEDULE, edge(), rules=Rules(least_clients=least))
+
+
+def test_half_of_all_have_to_tell_their_samples_and_half_of_those_drawn_have_to_send():
+    class Miscounting(Regression):
+        def count_samples(self, steps: int) -> int:
+            raise OSError("no memory")
+
+    def run(clients: Mapping[str, Trainable], rule: str) -> FederationState:
+        state, selection = FederationState(), Selection.model_validate({"rule": rule, "clients": 2, **extra[rule]})
+        federate(clients, START, replace(SCHEDULE, rounds=1), edge(), rules=Rules(selection=selection), state=state)
+        return state
+
+    extra: dict[str, dict[str, bool]] = {"uniform": {"unbiased": True}, "importance": {}}
+    deaf = {
+        name: Miscounting(each.inputs, each.targets) if i < 3 else each
+        for i, (name, each) in enumerate(vehicles("grid", 5).items())
+    }
+    with pytest.raises(ClientFailed, match=r"2 of 5 clients .*, 3 are wanted .*no memory"):
+        run(deaf, "uniform")
+    assert run(failing(5, 2), "importance").records[0].failed.keys() == {"grid/cav0", "grid/cav1"}
+    with pytest.raises(ClientFailed, match=r"2 of 5 clients .*, 3 are wanted .*no power"):
+        run(failing(5, 3), "importance")
+
+
+@pytest.mark.parametrize(
+    ("strategy", "told"),
+    [(Krum(byzantine=1), "krum: 5 clients or more are wanted .* there are 4"), (Median(), None)],
+    ids=["krum", "median"],
+)
+def test_a_strategy_that_needs_more_than_half_says_so(strategy: Strategy, told: str | None):
+    clients = failing(7, 3)
+    if told is None:
+        federate(clients, START, SCHEDULE, edge(), strategy=strategy)
+    else:
+        with pytest.raises(ClientFailed, match=rf"round 1: {told} \(grid/cav0: .*no power"):
+            federate(clients, START, SCHEDULE, edge(), strategy=strategy)
+
+
+def test_the_cloud_needs_every_edge_server():
+    servers = {name: EdgeServer(failing(4, fail), 1, edge(), START) for name, fail in (("grid", 3), ("ring", 2))}
+    with pytest.raises(ClientFailed, match=r"1 of 2 clients .*, 2 are wanted \(grid: .*1 of 4 clients"):
+        federate(servers, START, SCHEDULE, edge(), rules=Rules().of_servers())
+
+
+@pytest.mark.parametrize("wrong", [0, -1, 1.5, True, "half", 10**6 + 1])
+def test_bounds_that_make_no_sense_are_one_sentence(wrong: Any):
+    with pytest.raises(ValidationError, match="expected 'all' or a whole number from 1 to 1000000") as caught:
+        Rules(least_clients=wrong)
+    assert caught.value.error_count() == 1
