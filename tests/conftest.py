@@ -4,6 +4,10 @@ from collections.abc import Generator
 
 import pytest
 
+from flcav.threads import use_threads
+
+use_threads(1)  # of each of the two workers and its children: threads that wait for a core burn time
+
 LONGEST = ("test_runs.py", "test_run_recipes.py", "test_examples.py", "test_wheel.py")
 
 

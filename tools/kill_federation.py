@@ -8,7 +8,8 @@ Stage II of the recipe's first federating region and task, or stage III of its f
 federated once in one process, then again and again by processes that get SIGKILL after a random time; each goes on
 where the last one stopped. Vehicles train in `--jobs` client processes, which end with the process that is killed.
 Weights, ledger and result have to be the same files. Exits with 1 where they are not. What comes before the stage is
-done first, as by `flcav run`.
+done first, as by `flcav run`. Noise of differential privacy has to be `seeded`: by secrets no two federations are the
+same.
 """
 
 import argparse
@@ -50,6 +51,9 @@ def main() -> None:
     asked = parser.parse_args()
     use_threads(1)
     graph, work = Graph(load_run_recipe(asked.recipe), asked.recipe.parent), asked.out / WORK
+    privacy = graph.settings[MAIN].federation.privacy
+    if privacy is not None and not privacy.seeded:
+        parser.error("noise drawn by secrets differs from federation to federation; 'privacy.seeded' repeats it")
     step = find_step(graph, asked.stage)
     apart(lambda: run_steps([*list_needed(graph.steps, [step]), step], work, jobs=1, notify=ignore_steps, stale="redo"))
     record, whole, step = read_record(work / step.name), hashes(work / step.name), step.on(asked.jobs)

@@ -71,7 +71,7 @@ def shrunk(name: str) -> RunRecipe:
     limits = {"samples": (20, None), "edge_rounds": (1, 1), "cloud_rounds": (1, 1)}
     placement = asked["placement"] | {"group_range_m": 400.0}
     return RunRecipe.model_validate(
-        asked | {"splits": TINY, "training": QUICK, "limits": limits, "placement": placement}
+        asked | {"splits": TINY, "training": QUICK, "limits": limits, "placement": placement, "retrainings": 0}
     )
 
 

@@ -1,6 +1,5 @@
 """`flcav federate`: stage II of a run recipe alone, round by round."""
 
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,15 +66,16 @@ def federate(
 
 
 def _describe(result: "StageResult") -> str:
-    """Return a federation in words; on a network with its time and the vehicles that it lost."""
+    """Return a federation in words, with the vehicles that failed or were lost; on a network with its time."""
+    from flcav.federation.state import describe_failures
+
     told = f"{result.task} in {result.region}, {result.rounds} rounds"
     told += f", {result.clients} vehicles, {result.samples} samples"
-    seconds = [record.seconds for record in result.records or () if record.seconds is not None]
-    if not seconds:
-        return told
-    lost = Counter(f"{name} ({why})" for record in result.records or () for name, why in record.failed.items())
-    told += f", {sum(seconds):.1f} s on the network"
-    return ", lost: ".join([told, *([", ".join(f"{each} in {count}" for each, count in lost.items())] if lost else [])])
+    records = result.records or ()
+    seconds = [record.seconds for record in records if record.seconds is not None]
+    told += f", {sum(seconds):.1f} s on the network" if seconds else ""
+    failures = describe_failures([record.failed for record in records])
+    return f"{told}, {failures}" if failures else told
 
 
 def _telling(notify: "Notify") -> "Notify":
@@ -83,8 +83,9 @@ def _telling(notify: "Notify") -> "Notify":
     from flcav.pipeline.federations.alone import tells_of_round
 
     def tell(step: str, done: int, total: int, note: str) -> None:
-        notify(step, done, total, note)
-        if tells_of_round(step, note):
+        of_round = tells_of_round(step, note)
+        notify(step, done, total, "" if of_round else note)
+        if of_round:
             typer.echo(f"{step}, round {done} of {total}: {note}")
 
     return tell

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from flcav.federation.state import FAILED
 from flcav.pipeline.rigs import RIG
 from flcav.pipeline.steps import FINISHED, Notify
 
@@ -35,8 +36,9 @@ def live_steps(title: str) -> Iterator[Notify]:
             if step not in rows:
                 rows[step] = bars.add_task(f"  {step}", total=None, note="")
             bars.update(rows[step], completed=done, total=max(total, 1), note=note)
-            if EPSILON in note:  # what a round cost stays on the terminal
-                console.print(f"{title}: {step}, round {done} of {total}: {note}", highlight=False)
+            if EPSILON in note or FAILED in note:  # what a round cost, and whom it lost, stays on the terminal
+                told = f"{title}: {step}, round {done} of {total}: {note}"
+                console.print(told, highlight=False, soft_wrap=True)
             if note in FINISHED:
                 finished += 1
                 bars.update(rows[step], visible=False)

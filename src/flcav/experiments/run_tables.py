@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 
 from flcav.experiments.cloud_rounds import cloud_tables
+from flcav.federation.state import FAILED
 from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
 from flcav.pipeline.arms import resolve_settings
@@ -122,7 +123,7 @@ def _budgets(run: Run) -> str:
 
 
 def _rounds(run: Run) -> str:
-    """Return what became of the rounds of each vehicle on the network: planned, combined, lost and why, their time."""
+    """Return what became of each vehicle's rounds on the network: planned, combined, failed and why, their time."""
     main, rows = run.arms[MAIN], []
     for task, plan in main.plan.tasks.items():
         stages = [stage for stage in main.stages if stage.task == task]
@@ -142,7 +143,7 @@ def _rounds(run: Run) -> str:
                     f"{sum(each.seconds or 0.0 for each in joined):.1f}",
                 ]
             )
-    header = ("task", "vehicle", "speed", "rounds planned", "combined", "lost", "time of its rounds, s")
+    header = ("task", "vehicle", "speed", "rounds planned", "combined", FAILED, "time of its rounds, s")
     return format_table(header, rows)
 
 

@@ -120,7 +120,7 @@ class Rounds(FlowerStrategy):
         self._asked: list[str] = []  # who was asked for anything in this round
         self._failed: dict[str, str] = {}  # by client what was wrong in this round
         self._lost: set[str] = set()  # those of them whom the network lost
-        self._shortage: TooFewClients | None = None  # why no update was asked for in this round
+        self._shortage: ClientFailed | TooFewClients | None = None  # why there is no update in this round
         self._drawn: dict[str, float] = {}  # of unbiased selection: probability of the clients that were drawn
         self._secure: SecureSum | None = None  # of this round
         self._shares: dict[str, float] = {}  # of unbiased selection: of all samples, by client
@@ -206,9 +206,10 @@ class Rounds(FlowerStrategy):
     ) -> tuple[ArrayRecord | None, MetricRecord | None]:
         """Return the aggregated weights, and as metrics the number of samples and the mean loss weighted by samples.
 
-        Where the network lost clients, or fewer were chosen, than secure aggregation needs, the weights stay as they
-        were. Raises `ClientFailed` where fewer clients than are wanted sent a usable update, `TooFewClients` where too
-        few are left for secure aggregation and the network lost none, ValueError where the strategy returns arrays of
+        Where the network lost clients, and fewer are left than secure aggregation or the strategy needs, or where fewer
+        were chosen than secure aggregation needs, the weights stay as they were. Raises `ClientFailed` where fewer
+        clients than are wanted sent a usable update, or than the strategy needs though the network lost none,
+        `TooFewClients` where so few are left for secure aggregation, ValueError where the strategy returns arrays of
         other names, shapes or types.
         """
         number = self._done + server_round
@@ -218,7 +219,7 @@ class Rounds(FlowerStrategy):
             if self._shortage is not None:
                 raise self._shortage
             weights = self._combine(received, number)
-        except TooFewClients as error:
+        except (ClientFailed, TooFewClients) as error:
             if not self._lost and self._chose_enough():
                 raise
             weights, received = self._start, Intake(None)
@@ -241,7 +242,8 @@ class Rounds(FlowerStrategy):
         """Raise `ClientFailed` where fewer clients than are wanted sent what can be used, or than the strategy needs.
 
         By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
-        a norm or a number of samples, and of those who were then to send an update.
+        a norm or a number of samples, and of those who were then to send an update. `all` is of both, too, a number of
+        those who were to send. Where the network lost clients that the strategy needs, the round has no update.
         """
         least = self._rules.least_clients
         reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
@@ -252,11 +254,13 @@ class Rounds(FlowerStrategy):
             if usable < wanted:
                 told = f"{usable} of {len(asked)} clients sent an update that can be used, {wanted} are wanted"
                 raise ClientFailed(f"round {number}: {told} ({reasons})")
-        if isinstance(self._strategy, Robust) and self._failed.keys() - self._lost:
+        if isinstance(self._strategy, Robust):
             try:
                 self._strategy.check_clients(sum(name not in self._failed for name in self._chosen))
             except InputError as error:
-                raise ClientFailed(f"round {number}: {error} ({reasons})") from None
+                if not self._lost:
+                    raise ClientFailed(f"round {number}: {error} ({reasons})") from None
+                self._shortage = ClientFailed(str(error))
 
     def _receive_norms(self, asked: Iterable[str], replies: Iterable[Message]) -> dict[str, float]:
         """Return the norms of the clients' updates times their shares of all samples, by client in node order."""

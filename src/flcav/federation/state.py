@@ -1,5 +1,6 @@
 """State of a federation between rounds, as arrays for a checkpoint, and the record of each round."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -15,6 +16,7 @@ Arrays = dict[str, NDArray[np.number]]  # by name
 ClientStates = dict[str, dict[str, Arrays]]  # by client and kind
 
 SERVER, CLIENT, PERSONAL = "server", "client", "personal"
+FAILED = "failed or lost"  # begins what is told of clients without an update
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,16 @@ class RoundRecord(Record):
     loss: float = 0.0  # mean training loss, weighted by samples
     samples: int = 0  # of the clients together
     divergence: Annotated[RoundDivergence | None, LEFT_OUT] = None  # of the regions; None: no cloud round of several
+
+
+def describe_failures(rounds: Sequence[Mapping[str, str]]) -> str:
+    """Return who failed or was lost in some rounds, with the reason, and of several rounds in how many.
+
+    rounds: of each by client what was wrong, as `RoundRecord` has it. Where nobody failed, the words are "".
+    """
+    failed = Counter(f"{name} ({why})" for each in rounds for name, why in each.items())
+    told = ", ".join(f"{each} in {count}" if len(rounds) > 1 else each for each, count in failed.items())
+    return f"{FAILED}: {told}" if told else ""
 
 
 @dataclass

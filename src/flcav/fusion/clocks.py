@@ -59,11 +59,11 @@ def set_clocks(sightings: Sequence[Sighting], at_s: float) -> list[Sighting]:
 def trace_objects(surveyed: Sequence[Sighting], at_s: float) -> list[Trace]:
     """Return the paths of moving objects that road sensors tell of at two instants or more."""
     found: dict[int, dict[float, list[tuple[Array, float]]]] = {}
-    for told, member in zip(surveyed, average_boxes([tell(each) for each in surveyed], at_s).member, strict=True):
-        boxes = told.boxes.transform(told.world_from_agent)
-        certain = 1 / variance_of(boxes)[:, :2].mean(axis=1)
-        for number, place, weight in zip(member.tolist(), boxes.center[:, :2], certain.tolist(), strict=True):
-            found.setdefault(number, {}).setdefault(round(told.time_s, 3), []).append((place, weight))
+    told = [tell(each) for each in surveyed]
+    for each, member in zip(told, average_boxes(told, at_s).member, strict=True):
+        certain = 1 / variance_of(each.boxes)[:, :2].mean(axis=1)
+        for number, place, weight in zip(member.tolist(), each.boxes.center[:, :2], certain.tolist(), strict=True):
+            found.setdefault(number, {}).setdefault(round(each.time_s, 3), []).append((place, weight))
     traces = []
     for seen in found.values():
         times = np.array(sorted(seen))

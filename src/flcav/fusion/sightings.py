@@ -1,4 +1,4 @@
-"""What one agent observes in one spin, and tells of it in the world frame."""
+"""Sightings: the boxes, the posts and the pose of one agent in one spin, and what of them it tells others."""
 
 from dataclasses import dataclass, field, replace
 

@@ -104,7 +104,7 @@ def name_repeat(arm: str, repeat: int) -> str:
 
 
 def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: int, arm: Arm) -> Setting:
-    learned = arm.plan == "joint" and any(task.history for task in recipe.tasks.values())
+    learned = _learns(recipe, arm.plan)
     return Setting(
         name,
         repeat,
@@ -123,6 +123,11 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         learned and recipe.replan != "none",
         learned and recipe.replan == "rounds",
     )
+
+
+def _learns(recipe: RunRecipe, rule: PlanRule) -> bool:
+    """Return whether a plan by `rule` is the best one by learning curves; others divide the budgets by themselves."""
+    return rule == "joint" and any(task.history for task in recipe.tasks.values())
 
 
 def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
@@ -160,6 +165,12 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
                 f"federation.network: rounds are timed before they are run, and {selection.rule} selection under "
                 "central noise draws in secret; 'privacy.seeded' simulates both"
             )
+        if setting.federation.secure is not None and selection.rule == "all" and _plans_joiners(recipe, setting):
+            raise InputError(
+                "federation.secure: a plan within horizon_s may leave a round to one vehicle, by their speeds or the "
+                "time of messages, and secure aggregation takes two or more; choose another 'selection' than all, or "
+                "leave out horizon_s"
+            )
         if isinstance(edge, FedMD) and setting.central is None:
             _check_outputs(recipe, setting)
         if setting.distillation.pose_graph and setting.central is None:
@@ -175,6 +186,13 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
         how = setting.federation
         for task in recipe.tasks if how.personal or how.upload.layers or how.score_statistics else ():
             _check_arrays(task, recipe.tasks[task].network, setting)
+
+
+def _plans_joiners(recipe: RunRecipe, setting: Setting) -> bool:
+    """Return whether a plan says which vehicles join a round, as it does where it times each of them."""
+    speeds = any(recipe.regions[region].speed for region in recipe.with_role("federate"))
+    timed = recipe.federation.network is not None or speeds
+    return recipe.horizon_s is not None and timed and setting.central is None and _learns(recipe, setting.plan)
 
 
 def _check_outputs(recipe: RunRecipe, setting: Setting) -> None:

@@ -59,7 +59,8 @@ class Recipe(Config):
     """A recording recipe: a town, its traffic runs, and the agents that observe them.
 
     A scene is one traffic run with its own parked cars. After a warm-up of `warmup_s`, in which the town fills, every
-    agent observes `spins_per_scene` spins, `every_s` apart. Raises pydantic's ValidationError, which names the field.
+    agent observes `spins_per_scene` spins, `every_s` apart, and with `window_s` one more before and after each of them.
+    Raises pydantic's ValidationError, which names the field.
 
     >>> from flcav import Recipe
     >>> recipe = Recipe(town="grid", seed=1, scenes=6, cavs=4, poles="all")
@@ -73,10 +74,14 @@ class Recipe(Config):
     )  # seed of traffic, parked cars and sensor noise; the same seed gives the same bytes
     split: str = Field(default="train", pattern=r"^[A-Za-z0-9_-]+$")  # data split, e.g. train, validation, test
     scenes: int = Field(default=1, ge=1, le=MOST)  # scenes, each a traffic run of its own
-    frames: int | None = Field(default=None, ge=1, le=MOST)  # total number of frames; it overrides `scenes`
+    frames: int | None = Field(
+        default=None, ge=1, le=MOST
+    )  # total number of frames, those of `window_s` included; it overrides `scenes`
     warmup_s: Warmup = 60.0  # traffic before the first spin; two numbers: drawn uniformly between them for each scene
-    spins_per_scene: int = Field(default=10, ge=1, le=MOST)  # LiDAR spins; every agent records a frame at each
-    every_s: Duration = 1.0  # time between two spins, a multiple of 0.1 s
+    spins_per_scene: int = Field(
+        default=10, ge=1, le=MOST
+    )  # LiDAR spins without those of `window_s`; every agent records a frame at each
+    every_s: Duration = 1.0  # time between two of these spins, a multiple of 0.1 s
     window_s: Annotated[float, Field(ge=0, le=10), AfterValidator(_multiple_of_step)] = (
         0.0  # above 0: a further spin so long before and after each of the others, a multiple of 0.1 s
     )

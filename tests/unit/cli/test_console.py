@@ -5,8 +5,10 @@ from pathlib import Path
 import pytest
 import yaml
 
+from flcav.cli.federate import _describe, _telling
 from flcav.cli.main import run
 from flcav.cli.steps import live_steps
+from flcav.pipeline.results.training import FederatedRound, StageResult
 
 NAME = "cars [3D] :car:"
 RECIPE = Path(__file__).parents[3] / "recipes" / "allocation" / "objects.yaml"
@@ -31,12 +33,35 @@ def test_a_task_s_name_is_no_markup(
         assert told.out.count(NAME) >= times
 
 
-def test_what_a_round_cost_in_privacy_stays_on_the_terminal(capsys: pytest.CaptureFixture[str]):
+def test_what_a_round_cost_in_privacy_and_who_failed_stays_on_the_terminal(capsys: pytest.CaptureFixture[str]):
     with live_steps("run") as notify:
         notify("grid-edge-fl-weather", 1, 6, "loss 0.512")
         notify("grid-edge-fl-weather", 2, 6, "loss 0.480, epsilon 3.21")
+        notify("grid-edge-fl-weather", 3, 6, "loss 0.460, failed or lost: grid/cav1 (no power)")
         notify("grid-edge-fl-weather", 1, 1, "done")
     assert capsys.readouterr().err.splitlines() == [
         "run: grid-edge-fl-weather, round 2 of 6: loss 0.480, epsilon 3.21",
+        "run: grid-edge-fl-weather, round 3 of 6: loss 0.460, failed or lost: grid/cav1 (no power)",
         "run: grid-edge-fl-weather done",
     ]
+
+
+def test_stage_two_alone_tells_a_round_once_with_who_failed(capsys: pytest.CaptureFixture[str]):
+    note = "loss 0.460, failed or lost: grid/cav1 (no power)"
+    with live_steps("federate") as notify:
+        _telling(notify)("grid-federate-weather", 3, 6, note)
+        _telling(notify)("pretrain-weather", 1, 1, "done")
+    told = capsys.readouterr()
+    assert told.out == f"grid-federate-weather, round 3 of 6: {note}\n"
+    assert told.err == "federate: pretrain-weather done\n"
+
+
+@pytest.mark.parametrize("timed", ["", ", 3.0 s on the network"])
+def test_a_federation_s_last_line_names_who_failed_or_was_lost(timed: str):
+    failed = ({"ring/cav1": "no power"}, {"ring/cav1": "no power", "ring/cav0": "late"}, {})
+    for given, words in ((failed, ", failed or lost: ring/cav1 (no power) in 2, ring/cav0 (late) in 1"), (({},), "")):
+        seconds = 3.0 / len(given) if timed else None
+        rounds = enumerate(given, start=1)
+        records = tuple(FederatedRound("ring", i, (), each, 0, 0.0, 0, 0, None, seconds) for i, each in rounds)
+        stage = StageResult("edge", "weather", "ring", len(records), 16, 2, (), records=records)
+        assert _describe(stage) == f"weather in ring, {len(records)} rounds, 2 vehicles, 16 samples{timed}{words}"

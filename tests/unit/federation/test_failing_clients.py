@@ -62,9 +62,10 @@ def test_half_of_all_have_to_tell_their_samples_and_half_of_those_drawn_have_to_
         def count_samples(self, steps: int) -> int:
             raise OSError("no memory")
 
-    def run(clients: Mapping[str, Trainable], rule: str) -> FederationState:
+    def run(clients: Mapping[str, Trainable], rule: str, least: Any = None) -> FederationState:
         state, selection = FederationState(), Selection.model_validate({"rule": rule, "clients": 2, **extra[rule]})
-        federate(clients, START, replace(SCHEDULE, rounds=1), edge(), rules=Rules(selection=selection), state=state)
+        rules = Rules(selection=selection, least_clients=least)
+        federate(clients, START, replace(SCHEDULE, rounds=1), edge(), rules=rules, state=state)
         return state
 
     extra: dict[str, dict[str, bool]] = {"uniform": {"unbiased": True}, "importance": {}}
@@ -77,6 +78,10 @@ def test_half_of_all_have_to_tell_their_samples_and_half_of_those_drawn_have_to_
     assert run(failing(5, 2), "importance").records[0].failed.keys() == {"grid/cav0", "grid/cav1"}
     with pytest.raises(ClientFailed, match=r"2 of 5 clients .*, 3 are wanted .*no power"):
         run(failing(5, 3), "importance")
+    for clients, rule, left in ((deaf, "uniform", 2), (failing(5, 3), "importance", 2)):
+        with pytest.raises(ClientFailed, match=f"{left} of 5 clients .*, 5 are wanted"):
+            run(clients, rule, "all")
+        assert len(run(clients, rule, 1).records[0].failed) == 3  # of those who were to report
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,9 @@ from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.stages import EdgeServer, Schedule, edge_seeds, federate
 from flcav.federation.state import FederationState
+from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.krum import Krum
+from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.clock.rounds import NetworkSettings, RoundRules
 from flcav.network.ledger import Budget, Ledger
@@ -171,6 +174,38 @@ def test_a_masked_round_that_the_network_leaves_too_few_for_has_no_update_and_th
     assert {*failed} == {*lost, *joins}
     assert all(others in failed[name] and "2 are needed" in failed[name] for name in joins if name not in lost)
     assert (state.records[1].samples, state.records[1].loss) == (0, 0.0)
+    assert after[1] == (after[0][0], 0.0)
+    assert after[2][0] != after[1][0]
+
+
+FIVE = tuple(f"grid/cav{i}" for i in range(5))
+
+
+@pytest.mark.parametrize("left", [0, 1, 4])
+@pytest.mark.parametrize(
+    ("strategy", "told"),
+    [(Krum(), "krum: 5 clients or more are wanted"), (TrimmedMean(), "trimmed-mean: a fraction of 0.2")],
+    ids=["krum", "trimmed-mean"],
+)
+def test_a_round_with_fewer_than_the_strategy_needs_has_no_update_and_the_next_goes_on(
+    strategy: Strategy, told: str, left: int
+) -> None:
+    state, after = FederationState(), []
+    lost = {(2, name): GONE for name in FIVE[left:]}
+    federate(
+        {name: Walk() for name in FIVE},
+        START,
+        Schedule(3, 1, 0.1, 0.1, 3),
+        Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless", lost),
+        strategy=strategy,
+        state=state,
+        on_round=lambda number, weights, loss: after.append((weights["w"][0], loss)),
+    )
+    assert [record.clients for record in state.records] == [FIVE, (), FIVE]
+    failed = state.records[1].failed
+    assert {name: failed[name] for name in FIVE[left:]} == dict.fromkeys(FIVE[left:], GONE.reason)
+    assert {*failed} == {*FIVE}
+    assert all(told in failed[name] for name in FIVE[:left])
     assert after[1] == (after[0][0], 0.0)
     assert after[2][0] != after[1][0]
 

@@ -44,3 +44,9 @@ def test_two_detections_find_a_car_once():
 def test_no_frames_are_refused():
     with pytest.raises(ValueError, match="0 frames"):
         count_found_cars([], [], [])
+
+
+def test_detections_without_scores_are_refused_and_none_at_all_have_none():
+    assert count_found_cars([cars()], [cars((10, 0))], [cars()]) == FoundCars(1, 0, 0.0)
+    with pytest.raises(ValueError, match="without scores"):
+        count_found_cars([cars((10, 0))], [cars()], [cars()])  # nor is there a target to match them to

@@ -28,7 +28,7 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies, resolve_settings
 from flcav.pipeline.federations.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
-from flcav.pipeline.recipe import Federation, RunRecipe, Training
+from flcav.pipeline.recipe import Arm, Federation, RunRecipe, Training
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import StatisticsScore
 from flcav.pipeline.stages import statistics
@@ -85,6 +85,31 @@ def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any
     for recipe, arms in (settings({}, **federation), settings({"other": federation})):
         with pytest.raises(InputError, match=said):
             check_federations(recipe, arms)
+
+
+def test_secure_aggregation_is_refused_where_the_plan_says_who_joins() -> None:
+    def check(secure: dict[str, Any], *changes: dict[str, Any], **federation: Any) -> None:
+        recipe, _ = settings({"masked": secure}, **federation)
+        for more in changes:
+            recipe = recipe.model_copy(update=more)
+        check_federations(recipe, resolve_settings(recipe, {"objects": "ideal-road"}).values())
+
+    regions = settings({})[0].regions
+    slow = {"regions": {**regions, "grid": regions["grid"].model_copy(update={"speed": {"cav1": 0.5}})}}
+    soon, masked = {"horizon_s": 40.0}, {"secure": {}}
+    with pytest.raises(
+        InputError, match=r"federation.secure: a plan within horizon_s may leave a round to one vehicle"
+    ):
+        check(masked, slow, soon)
+    with pytest.raises(
+        InputError, match=r"federation.secure: a plan within horizon_s may leave a round to one vehicle"
+    ):
+        check(masked | {"network": {}}, soon, network={})
+    check(masked, slow)  # without a horizon all join every round
+    check(masked, soon)
+    check(masked | {"selection": {"rule": "uniform", "clients": 3}}, slow, soon)
+    arms = {"masked": Arm(plan="equal-stages", federation=masked)}
+    check({}, slow, soon, {"arms": arms})
 
 
 def test_a_pose_graph_without_gtsam_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,6 +215,9 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
     assert read_times(tmp_path / "busy") == {"a/cav0": pytest.approx([BUSY_S] * 3, rel=0.3)}
     (tmp_path / "busy" / TIMES).open("a").write("a/cav0,0.0")  # a kill
     assert len(read_times(tmp_path / "busy")["a/cav0"]) == 3
+    (resumed,) = time_clients({"a/cav0": Busy()}, tmp_path / "busy").values()
+    resumed.train({}, steps=1, learning_rate=0.1, seed=3)
+    assert {name: len(times) for name, times in read_times(tmp_path / "busy").items()} == {"a/cav0": 4}
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2), 3)
     network = learning.build_network()
     clients = make_clients(learning, Slope(), {f"a/cav{i}": [np.float32(i), np.float32(1)] for i in range(2)})
@@ -202,6 +230,16 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
     assert ends[0] == ends[1]
     assert {name: len(times) for name, times in read_times(tmp_path / "timed").items()} == {"a/cav0": 3, "a/cav1": 3}
     assert read_times(tmp_path / "plain") == {}
+
+
+def test_unbiased_federations_are_timed_too(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
+    clients = make_clients(learning, Slope(), {f"a/cav{i}": [np.float32(i + 1)] for i in range(3)})
+    how = (FEDAVG, 0, Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
+    schedule = learning.schedule(2, 1, "edge", "a")
+    rules = Rules.model_validate({"selection": {"rule": "uniform", "clients": 2, "unbiased": True}})
+    federate_edge(EdgeFederation(learning, learning.build_network(), clients, schedule, *how), rules, timed=True)
+    assert sum(map(len, read_times(tmp_path).values())) == 2 * 2
 
 
 def test_measured_speeds_are_those_of_a_recipe() -> None:
@@ -253,6 +291,35 @@ def test_regional_models_are_beside_that_of_all(tmp_path: Path) -> None:
     for name in ("weight", "bias"):
         assert found["a"][name] != found["b"][name]
         assert found[None][name] == pytest.approx((found["a"][name] + found["b"][name]) / 2)
+
+
+class Powerless:
+    """A client that fails in every training."""
+
+    def train(self, weights: Weights, **how: Any) -> LocalUpdate:
+        raise OSError("no power")
+
+
+def test_the_note_of_a_round_names_who_failed_in_it(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
+    network, notes = learning.build_network(), []
+    clients: Any = make_clients(learning, Slope(), {f"a/cav{i}": [np.float32(i + 1)] for i in range(4)})
+    clients |= dict.fromkeys(("a/cav0", "a/cav2"), Powerless())
+
+    def report(done: int, total: int, note: str = "") -> None:
+        notes.append(note.partition(", ")[2])
+
+    for rounds in (2, 3):  # the third goes on from the checkpoint of the second
+        how = (FEDAVG, 0, Ledger(Budget(1.0, 1.0)), tmp_path / "edge", report)
+        schedule = learning.schedule(rounds, 1, "edge", "a")
+        federate_edge(EdgeFederation(learning, network, clients, schedule, *how), Rules())
+    names = [f"{name} (OSError('no power'))" for name in ("a/cav0", "a/cav2")]
+    assert notes == ["failed or lost: " + ", ".join(names)] * 3
+    notes.clear()
+    start = {"a": RegionStart(clients, to_arrays(network), earlier=0)}
+    where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), tmp_path / "cloud", report)
+    federate_cloud(CloudFederation(learning, network, start, 2, *where), 2, Rules())
+    assert notes == ["failed or lost: " + ", ".join(f"{name} in 2" for name in names)] * 2
 
 
 def test_both_stages_in_two_processes_end_with_the_bytes_of_one_also_where_labels_change(tmp_path: Path) -> None:

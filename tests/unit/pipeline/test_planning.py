@@ -247,7 +247,7 @@ def test_slow_vehicles_are_planned_into_the_rounds_that_they_have_time_for() -> 
     assert joins is not None
     for name, joined in own.joins.items():  # what is over stays
         assert [each for each in joins[name] if each <= own.edge_rounds] == [e for e in joined if e <= own.edge_rounds]
-    after = later.tasks["objects"].joins_after(own.edge_rounds)
+    after = later.tasks["objects"].joins_after_edge()
     assert {each for joined in after.values() for each in joined} == set(
         range(1, 1 + later.tasks["objects"].cloud_rounds)
     )
@@ -278,7 +278,6 @@ def test_doubling_up_to_a_recipe_s_budget_is_worth_more_than_trainings_differ_an
     spreads = read_spreads("demo", Path())
     differ = max(spreads["objects", town, "main", "cloud", "", ""].sd for town in ("grid", "ring"))
     half, own, twice, more = ((plan_recipe(name, factor).predicted or {})["cloud"] for factor in (0.5, 1, 2, 4))
-    print(f"{name}: half of the wireless budget {half:.3f}, all {own:.3f}, twice {twice:.3f}, four times {more:.3f}")
     assert own - half > differ
     assert 0 < twice - own < differ  # docs/runs.md: where more megabytes cease to help
     assert more - twice < 0.001
@@ -294,7 +293,6 @@ def test_plans_of_the_comparison_of_plans_stay_within_what_the_history_covers() 
     for factor, rule in product(BUDGETS, get_args(PlanRule)):
         plan = plan_recipe("allocation", factor, factor, rule)
         counts = (plan.samples, plan.edge_rounds, plan.cloud_rounds)
-        print(f"budgets x {factor:g}, {rule}: {counts} of {covered}, predicted {(plan.predicted or {})['cloud']:.3f}")
         assert (np.array(counts) <= covered).all()
 
 

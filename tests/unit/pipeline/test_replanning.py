@@ -25,9 +25,10 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.network import DrivenRounds
 from flcav.pipeline.planning.course import Course, Replanning
 from flcav.pipeline.planning.rounds import Follower, Planner, restrict_problem
-from flcav.pipeline.planning.stages import continue_joins, count_carried_out
+from flcav.pipeline.planning.stages import continue_joins, count_carried_out, remake_plan
 from flcav.pipeline.planning.terms import Terms
-from flcav.pipeline.recipe import Training
+from flcav.pipeline.planning.updates import follow_plan
+from flcav.pipeline.recipe import Federation, Training
 from flcav.pipeline.results.plans import Plan, RoundPlan, TaskPlan
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import StageResult
@@ -221,9 +222,32 @@ def test_regions_of_different_rounds_count_by_their_vehicles() -> None:
 
     both = (result("a", 7, 3, {"a/cav0": (1, 7)}), result("b", 3, 1, {"b/cav0": (2, 3)}))
     joins: dict[str, tuple[int, ...]] = {"a/cav0": (1, 2), "b/cav0": (1, 2)}
-    found = count_carried_out(replace(plan_of(4, 1), joins=joins), both)
+    found = count_carried_out(replace(plan_of(4, 1), joins=joins), both, 1)
     assert found.edge_rounds == 6  # (3 x 7 + 1 x 3) / 4
-    assert found.joins == {"a/cav0": (0, 6), "b/cav0": (5, 6)}  # both end with the sixth
+    assert found.joins == {"a/cav0": (1, 7), "b/cav0": (2, 3)}  # a region's rounds are counted from its first
+    assert found.ran == {"a": 7, "b": 3}
+    same = count_carried_out(replace(plan_of(4, 1), joins=joins), (both[0], replace(both[1], rounds=7)), 1)
+    assert (same.edge_rounds, same.ran) == (7, None)
+
+
+def test_a_plan_that_is_not_made_anew_has_the_cloud_rounds_that_all_regions_have_vehicles_for() -> None:
+    first = replace(plan_of(4, 3), joins=dict.fromkeys(VEHICLES, tuple(range(1, 11))))
+    both = [ran_stage(region, rounds, replace(first, cloud_rounds=cloud), 2) for region, rounds, cloud in CARRIED]
+    ended = replace(both[0], rounds=4)  # a privacy budget ended the stage before its plan
+    for stages, many in ((both, 5), ([ended, both[1]], 4)):
+        ran = count_carried_out(first, stages, 2)
+        assert (ran.edge_rounds, ran.cloud_rounds) == (many, 2)
+        assert ran.joins is not None
+        for name, joined in ran.joins.items():
+            assert joined == tuple(range(1, 1 + next(own.rounds for own in stages if own.region == name[0]) + 2 * 2))
+    short = {**problem().model_dump(), "budgets_mb": {"wireless": 10.0, "wireline": 99.0}}
+    none = remake_plan(
+        Plan("joint", {"t": first}), Problem.model_validate(short), "edge", {"t": 0.6}, Price(9.9, 0.0), {"t": ran}
+    )
+    assert none.tasks == {"t": ran}  # nothing is left for a cloud round
+
+
+CARRIED = (("a", 5, 2), ("b", 4, 3))  # region, its edge rounds, cloud rounds by its last plan
 
 
 def test_no_vehicle_joins_more_rounds_than_it_has_time_for_after_a_plan_is_made_anew() -> None:
@@ -234,25 +258,111 @@ def test_no_vehicle_joins_more_rounds_than_it_has_time_for_after_a_plan_is_made_
         plans = [replace(plan_of(rounds, 0), joins=joins_of(most, rounds)) for rounds in (4, 4 + int(rng.integers(4)))]
         before, new = plans
         over = int(rng.integers(5))
+        ran = {region: over + int(rng.integers(-1, 2)) for region in "ab"}  # of the mean `over`
         assert before.joins is not None
         assert new.joins is not None
-        past = {name: [each for each in joined if each <= over] for name, joined in before.joins.items()}
+        before = replace(before, edge_rounds=over, ran=ran)
+        past = {
+            name: [each for each in joined if each <= ran[name[0]]] for name, joined in (before.joins or {}).items()
+        }
+        time = {name: max(most[name], len(joined)) for name, joined in new.joins.items()}  # of so many rounds of 2 s
+        spare_s = {name: 2.0 * (time[name] - len(joined)) for name, joined in new.joins.items()}
+        task = problem(tasks=[{**problem().tasks[0].model_dump(), "train_s": 2.0}]).tasks[0]
         try:
-            joins = continue_joins(before, new, over)
+            joins = continue_joins(before, new, over, task, spare_s)
         except Infeasible:
-            left = {name: len(new.joins[name]) - len(past[name]) for name in past}
-            fewest = min(sum(max(many, 0) for name, many in left.items() if name[0] == region) for region in "ab")
+            left = {name: max(time[name] - len(past[name]), 0) for name in past}
+            fewest = min(sum(many for name, many in left.items() if name[0] == region) for region in "ab")
             assert fewest < new.edge_rounds - over
             refused += 1
             continue
         assert joins is not None
         for name, joined in joins.items():
-            assert [each for each in joined if each <= over] == past[name]
-            assert len({*joined}) == len(joined) <= max(len(new.joins[name]), len(past[name]))
+            assert [each for each in joined if each <= ran[name[0]]] == past[name]
+            assert len({*joined}) == len(joined) <= max(time[name], len(past[name]))
         for region in "ab":
-            later = {each for name, joined in joins.items() if name[0] == region for each in joined if each > over}
-            assert later == {*range(over + 1, new.edge_rounds + 1)}
+            own = [each for name, joined in joins.items() if name[0] == region for each in joined]
+            later = {each - ran[region] for each in own if each > ran[region]}
+            assert later == {*range(1, new.edge_rounds - over + 1)}
     assert 0 < refused < 100
+
+
+@pytest.mark.parametrize("cloud_rounds", [1, 2])
+@pytest.mark.parametrize("horizon_s", [None, 40.0, 17.0])
+def test_a_region_that_ran_more_rounds_than_the_mean_joins_the_cloud_rounds(
+    cloud_rounds: int, horizon_s: float | None
+) -> None:
+    asked = timed(problem(cloud=(cloud_rounds, cloud_rounds)), horizon_s, "t")
+    first = replace(plan_of(6, cloud_rounds), joins=dict.fromkeys(VEHICLES, tuple(range(1, 7 + cloud_rounds))))
+    ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 7), ("b", 5))], 1)
+    assert (ran.edge_rounds, (ran.joins or {})["a/cav0"][:7]) == (6, (1, 2, 3, 4, 5, 6, 7))
+    made = remake_plan(Plan("joint", {"t": first}), asked, "edge", {"t": 0.6}, Price(0.0, 0.0), {"t": ran})
+    own = made.tasks["t"]
+    after = own.joins_after_edge()
+    assert (own.cloud_rounds, own.predicted == ran.predicted) == (cloud_rounds, False)  # not the plan of before
+    if horizon_s != 17.0:
+        assert after == dict.fromkeys(VEHICLES, tuple(range(1, 1 + cloud_rounds)))
+    else:  # 8 rounds of 2 s, of which those of the region that ran more have one left each
+        assert {name: len(rounds) for name, rounds in after.items()} == {
+            "a/cav0": 1,
+            "a/cav1": 1,
+            "b/cav0": cloud_rounds,
+        }
+        assert {*after["a/cav0"], *after["a/cav1"]} == {*range(1, 1 + cloud_rounds)}
+
+
+def test_the_cloud_s_plans_go_on_from_the_last_edge_round_of_each_region() -> None:
+    asked = timed(problem(cloud=(2, 2)), 99.0, "t")
+    first = replace(plan_of(6, 2), joins=dict.fromkeys(VEHICLES, tuple(range(1, 9))))
+    ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 7), ("b", 5))], 1)
+    begun = remake_plan(Plan("joint", {"t": first}), asked, "edge", {"t": 0.6}, Price(0.0, 0.0), {"t": ran})
+    terms = Terms("cloud", (2, 1), 1, Price(99.0, 99.0), Price(99.0, 99.0))
+    own = Planner(asked, begun, "t", terms).replan(begun.tasks["t"], 1, 0.6, Price(30.0, 9.0))
+    for plan in (begun.tasks["t"], own):
+        assert plan.ran == {"a": 7, "b": 5}
+        assert plan.joins == {name: tuple(range(1, {"a": 10, "b": 8}[name[0]])) for name in VEHICLES}
+        rules = [follow_plan(Federation(), plan, after_edge=after).selection.joins for after in (False, True)]
+        assert rules == [plan.joins, dict.fromkeys(VEHICLES, (1, 2))]
+
+
+def test_time_that_one_task_takes_beyond_its_plan_is_gone_for_the_others() -> None:
+    first = replace(plan_of(6, 1), joins=dict.fromkeys(VEHICLES, tuple(range(1, 8))))
+    ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 7), ("b", 5))], 1)
+    ran = replace(ran, joins={**(ran.joins or {}), "a/cav1": (1, 2, 3, 8)})
+    plan, asked = Plan("joint", {"t": first, "u": first}), timed(problem(), 30.0, "t", "u")
+    made = remake_plan(plan, asked, "edge", dict.fromkeys("tu", 0.6), Price(0.0, 0.0), dict.fromkeys("tu", ran))
+    joined = [own.joins_after_edge() for own in made.tasks.values()]
+    assert [{name for name, own in each.items() if own} for each in joined] == [{*VEHICLES}, {"a/cav1", "b/cav0"}]
+
+
+def test_all_tasks_go_on_as_planned_where_one_of_them_has_too_little_time_left() -> None:
+    first = replace(plan_of(6, 1), joins=dict.fromkeys(VEHICLES, tuple(range(1, 8))))
+    ran = count_carried_out(first, [ran_stage(region, rounds, first) for region, rounds in (("a", 5), ("b", 7))], 1)
+    plan, sent = Plan("joint", {"t": first, "u": first}), Price(0.0, 0.0)
+    for horizon_s, anew in ((28.0, False), (30.0, True)):  # 14 rounds of 2 s, 13 of which b/cav0 has joined; 15
+        made = remake_plan(
+            plan, timed(problem(), horizon_s, "t", "u"), "edge", dict.fromkeys("tu", 0.6), sent, {"u": ran}
+        )
+        assert (made.tasks != {"t": first, "u": ran}) == anew
+
+
+VEHICLES = ("a/cav0", "a/cav1", "b/cav0")
+
+
+def timed(asked: Problem, horizon_s: float | None, *names: str) -> Problem:
+    """Return the problem of tasks with these names, whose vehicles train for 2 s in a round, within a horizon [s]."""
+    own = asked.tasks[0].model_dump() | {"vehicle_train_s": dict.fromkeys(VEHICLES, 2.0)}
+    tasks = [own | {"name": name} for name in names]
+    return Problem.model_validate(asked.model_dump() | {"horizon_s": horizon_s, "tasks": tasks})
+
+
+def ran_stage(region: str, rounds: int, plan: TaskPlan, k: int = 1) -> StageResult:
+    """Return a region's stage II whose last plan gave all its vehicles all its rounds, `rounds` of the edge."""
+    number = rounds + k * plan.cloud_rounds
+    own = {name: tuple(range(1, number + 1)) for name in VEHICLES if name.startswith(region)}
+    last = replace(plan, edge_rounds=rounds, joins=own)
+    made = RoundPlan(rounds, 0.5, Price(0, 0), Price(0, 0), last)
+    return StageResult("edge", "t", region, rounds, 9, len(own), (), plans=(made,))
 
 
 def joins_of(most: dict[str, int], rounds: int) -> dict[str, tuple[int, ...]]:

@@ -102,17 +102,24 @@ def test_a_killed_federation_goes_on_with_its_secrets(
     assert len(secrets) == len(set(secrets.values())) == len(states) * len(parties)
     assert {name.partition("|")[0] for name in secrets} == {*states}
     ends = []
+    begun = (killed / "round1.safetensors").exists()
     for name in ("one", "another", "forgetful"):
         shutil.copytree(killed, tmp_path / name)
         if name == "forgetful":
             (tmp_path / name / SECRETS).unlink()
+            if begun:
+                with pytest.raises(InputError, match=rf"{SECRETS} is missing or .*; remove the folder to begin anew"):
+                    federate(tmp_path / name, how, 0)
+                continue
         federate(tmp_path / name, how, 0)
         ends.append((tmp_path / name / WEIGHTS).read_bytes())
         left = b"".join(path.read_bytes() for path in (tmp_path / name).rglob("*") if path.is_file())
         assert not any(secret in left or secret.hex().encode() in left for secret in secrets.values())
         assert not (tmp_path / name / SECRETS).exists()
-    assert ends[0] == ends[1] != ends[2]
-    if (killed / "round1.safetensors").exists():  # is not done again
+    assert ends[0] == ends[1] not in ends[2:]
+    federate(tmp_path / "one", how, 0)  # killed after its end, which removes the secrets
+    assert (tmp_path / "one" / WEIGHTS).read_bytes() == ends[0]
+    if begun:  # is not done again
         assert (killed / "round1.safetensors").read_bytes() == (tmp_path / "one/round1.safetensors").read_bytes()
 
 

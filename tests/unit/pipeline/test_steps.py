@@ -4,6 +4,7 @@ import os
 import platform
 import shutil
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -18,6 +19,7 @@ import flcav
 from flcav.config import Config, InputError
 from flcav.pipeline.provenance import checkout
 from flcav.pipeline.steps import Step, Work, run_side_by_side, run_steps
+from flcav.pipeline.steps.cluster import packed, replace_folder, stamps
 from flcav.pipeline.steps.engines import find_seed
 from flcav.pipeline.steps.step import DONE_NOW
 
@@ -424,3 +426,20 @@ def test_runs_side_by_side_keep_to_their_own_folders(tmp_path):
     assert values[tmp_path / "one"]["sum"] == 3
     assert values[tmp_path / "two"] == {"a": 1}
     assert {"one/sum", "two/a"} <= set(seen)
+
+
+def test_files_that_come_from_another_machine_keep_their_permissions(tmp_path: Path) -> None:
+    there, here = tmp_path / "there", tmp_path / "here"
+    (there / "below").mkdir(parents=True)
+    (there / "empty").mkdir()
+    modes = {"secrets.safetensors": 0o600, "weights.safetensors": 0o644, "below/linked.bin": 0o444}
+    for name, mode in modes.items():
+        (there / name).write_text(name)
+        (there / name).chmod(mode)
+    with packed(there, stamps(there)) as pieces:
+        (tmp_path / "archive").write_bytes(b"".join(pieces))
+    with (tmp_path / "archive").open("rb") as archive:
+        replace_folder(here, None, archive)
+    assert {name: stat.S_IMODE((here / name).stat().st_mode) for name in modes} == modes
+    assert stamps(here).keys() == stamps(there).keys()
+    assert all((here / name).read_text() == name for name in modes)

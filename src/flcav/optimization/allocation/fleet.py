@@ -20,7 +20,7 @@ larger of the two bounds is kept. The best of the plans is returned, with its ga
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import islice
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from flcav.optimization.allocation.allocate import (
     resolve_problem,
     sum_prices,
 )
-from flcav.optimization.allocation.vehicles import Shares, TooSlow, split_plan, trains
+from flcav.optimization.allocation.vehicles import Shares, TooSlow, split_plan, sum_busy, trains
 from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Clock, Infeasible
 
@@ -204,10 +204,7 @@ def _timed(asked: Problem, carried: Carried) -> Carried:
     plan, shares = carried
     if asked.horizon_s is None or not trains(asked):
         return carried
-    busy: dict[str, float] = {}
-    for share in chain.from_iterable(shares.values()):
-        busy[share.vehicle] = busy.get(share.vehicle, 0.0) + share.busy_s
-    return replace(plan, busy_s=max([plan.busy_s or 0.0, *busy.values()])), shares
+    return replace(plan, busy_s=max([plan.busy_s or 0.0, *sum_busy(shares).values()])), shares
 
 
 def _certified(asked: Problem, found: Sequence[Carried], bound: float | None, limit: str) -> Carried:

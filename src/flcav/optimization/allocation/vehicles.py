@@ -17,6 +17,7 @@ depend on the machine's speed.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,6 +109,14 @@ def split_plan(problem: Problem, plans: Sequence[TaskPlan]) -> Shares:
             for (part, row), rounds in zip(own, joined)
         )
     return shares
+
+
+def sum_busy(shares: Shares) -> dict[str, float]:
+    """Return how long each vehicle is busy with its shares of all tasks [s]."""
+    busy: dict[str, float] = {}
+    for share in chain.from_iterable(shares.values()):
+        busy[share.vehicle] = busy.get(share.vehicle, 0.0) + share.busy_s
+    return busy
 
 
 def _held(task: AllocationTask, plan: TaskPlan, vehicle: str) -> int:

@@ -45,6 +45,8 @@ def count_found_cars(
         raise ValueError("cars of 0 frames cannot be counted")
     cars = found = false = 0
     for seen, wanted, others in zip(detections, targets, neutral, strict=True):
+        if seen.score is None and len(seen):
+            raise ValueError("detections without scores cannot be counted")
         kept = seen if seen.score is None else seen[seen.score >= SCORE]
         matched, near = assign_targets(kept, wanted, OVERLAP, "bev"), _is_near(wanted)
         cars += int(near.sum())

@@ -12,7 +12,7 @@ from safetensors.numpy import load_file, save
 from flcav.config import InputError
 from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.rounds import OnRound
-from flcav.federation.state import FederationState
+from flcav.federation.state import FederationState, describe_failures
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Weights
 from flcav.files import atomic_path, sha256, write_bytes, write_in_pieces
@@ -50,6 +50,8 @@ class FederationCheckpoints:
         self._task, self._folder, self._book, self._report = task, folder, book, report
         self._states, self._identity, self._score, self._privacy = states, identity, score, privacy
         self._hashes: dict[str, str] = {}  # of the files of weights, by name
+        self._told: dict[str, int] = {}  # of how many records failures were told, by state
+        self._goes_on = False  # after rounds that were carried out before, to an end that it has not reached
         self.losses: list[float] = []
         self.scores: list[Mapping[str, float]] = []
 
@@ -63,6 +65,7 @@ class FederationCheckpoints:
         number = 0 if found is None else found.round
         if damage:
             self._report(number, max(number, 1), damage)
+        self._goes_on = bool(damage) or (found is not None and not (self._folder / LEDGER).exists())
         if found is None:
             return weights, 0
         if found.by != self._identity:
@@ -78,14 +81,15 @@ class FederationCheckpoints:
             begins = f"{name}|"
             mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
             own.restore(mine, found.records[name])
+            self._told[name] = len(own.records)
         last = load_file(round_path(self._folder, number))
         return {name: last[name] for name in weights}, number  # files order names otherwise, and noise follows them
 
     def keep_secrets(self, parties: Mapping[str, Sequence[str]]) -> None:
-        """Restore the secrets of the parties of each state, by its name, or draw them; to be called before any round.
+        """Restore the secrets of the parties of each state, by its name, or draw them before the first round.
 
-        They are in a file that only its owner may read, so that a round that is repeated has the same noise; `finish`
-        removes it. Raises `InputError` where it is damaged.
+        To be called after `resume`. They are in a file that only its owner may read, so that a round that is repeated
+        has the same noise; `finish` removes it. Raises `InputError` where it is damaged, or missing after a round.
         """
         path = self._folder / SECRETS
         try:
@@ -93,6 +97,9 @@ class FederationCheckpoints:
         except SafetensorError as error:
             raise InputError(f"{path} is damaged ({error}); remove the folder to begin anew") from None
         asked = {f"{name}|{party}": (name, party) for name, found in parties.items() for party in found}
+        if self._goes_on and asked.keys() - kept.keys():
+            told = "is missing or not complete: a round that is repeated would have other noise"
+            raise InputError(f"{path} {told}; remove the folder to begin anew")
         for key, (name, party) in asked.items():
             if key in kept:
                 self._states[name].secrets[party] = np.asarray(kept[key], np.uint8)
@@ -124,7 +131,7 @@ class FederationCheckpoints:
                 (self._folder / name).unlink(missing_ok=True)
             note = [f"{LOSS} {loss:.3f}", *self._tell_privacy()]
             note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self._score else {}).items()]
-            self._report(round_, rounds, ", ".join(note))
+            self._report(round_, rounds, ", ".join([*note, *self._tell_failures()]))
 
         return keep
 
@@ -136,6 +143,13 @@ class FederationCheckpoints:
             return []
         seeded = f" ({SEEDED})" if self._privacy.seeded else ""
         return [f"epsilon {max(private):.2f} at delta {self._privacy.delta:g}{seeded}"]
+
+    def _tell_failures(self) -> list[str]:
+        """Return who failed or was lost since the last note, in words; of stage III in all rounds of edge servers."""
+        records = [record for name, own in self._states.items() for record in own.records[self._told.get(name, 0) :]]
+        self._told = {name: len(own.records) for name, own in self._states.items()}
+        told = describe_failures([record.failed for record in records])
+        return [told] if told else []
 
     def _write(self, name: str, data: bytes, hashes: dict[str, str]) -> None:
         write_bytes(self._folder / name, data)

@@ -4,6 +4,7 @@ It is CPU time: that of a machine on which nothing else runs. No result depends 
 """
 
 import contextlib
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.federation.trainable import Trainable, Update, Weights
+from flcav.federation.trainable import Trainable, Update, Weights, count_samples
 from flcav.pipeline.results.saved import Saved
 
 TIMES = "train_s.csv"  # in the folder of a federation
@@ -44,11 +45,17 @@ class TimedClient:
             file.write(f"{self.name},{spent:.6f}\n")
         return update
 
+    def count_samples(self, steps: int) -> int:
+        """Return the client's number of samples; raises TypeError of a client that does not count them."""
+        return count_samples(self.client, steps)
+
 
 def time_clients(clients: Mapping[str, Trainable], folder: Path) -> dict[str, TimedClient]:
-    """Return clients whose times of training are kept in `folder`."""
+    """Return clients whose times of training are kept in `folder`; a line there that was cut off is removed."""
     folder.mkdir(parents=True, exist_ok=True)
     path = (folder / TIMES).resolve()  # actors may have another working directory
+    if path.exists():
+        os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
     return {name: TimedClient(name, client, path) for name, client in clients.items()}
 
 

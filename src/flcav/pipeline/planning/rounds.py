@@ -15,7 +15,7 @@ from flcav.optimization.allocation.replanning import PlanState, TaskState, condi
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible, price_counts
 from flcav.pipeline.planning.allocation import allocate_tasks, make_task_plan
-from flcav.pipeline.planning.stages import continue_joins
+from flcav.pipeline.planning.stages import continue_joins, find_spare
 from flcav.pipeline.planning.terms import Terms, links_mb, subtract
 from flcav.pipeline.recipe import EDGE, PRETRAIN
 from flcav.pipeline.results.plans import Plan, TaskPlan
@@ -88,12 +88,12 @@ class Planner:
             allotted, shares = allocate_tasks(asked)
             own = next(each for each in allotted if each.name == self.task)
             new = make_task_plan(before.sizes, own, asked, shares)
-            joins = continue_joins(before, new, over)
+            joins = continue_joins(before, new, over, tasks[self.task], find_spare(asked, shares))
         except Infeasible:
             return terms.settle(terms.cut(before, done, sent_mb), done, sent_mb)
         past = (PRETRAIN,) if terms.stage == EDGE else (PRETRAIN, EDGE)
         predicted = {**(new.predicted or {}), **{each: (before.predicted or {})[each] for each in past}}
-        new = replace(new, predicted=predicted, joins=joins, uploads=before.uploads)
+        new = replace(new, predicted=predicted, joins=joins, uploads=before.uploads, ran=before.ran)
         return terms.settle(new, done, sent_mb)
 
 

@@ -3,18 +3,23 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
+from math import floor
 from typing import Literal
 
 import numpy as np
 
 from flcav.network.plan import Price
 from flcav.optimization.allocation.replanning import PlanState, Sent, TaskState, condition_problem
-from flcav.optimization.problem import Problem
+from flcav.optimization.allocation.vehicles import Shares, sum_busy
+from flcav.optimization.problem import MOST, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible
 from flcav.pipeline.planning.allocation import allocate_tasks, make_task_plan
 from flcav.pipeline.recipe import EDGE, PRETRAIN
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
+
+ROUNDING = 1e-6  # of a round, which there is time for all the same
+Joins = Mapping[str, tuple[int, ...]]  # rounds by vehicle
 
 
 def remake_plan(
@@ -28,9 +33,10 @@ def remake_plan(
     """Return the plan of the rest of a run after `stage`, which `plan` was carried out in; fixed plans stay.
 
     `problem` is that of the first plan, `reached` the score of each of its tasks now, `used_mb` what they have sent.
-    Counts are totals, including what is spent. Scores predicted of stages that are over are kept. Where what is left of
-    the budgets allows no other plan, the counts are those of `plan`. `done` are the plans of tasks whose stage came out
-    otherwise than planned, with the rounds that were carried out.
+    Counts are totals, including what is spent. Scores predicted of stages that are over are kept. `done` are the plans
+    of tasks whose stage came out otherwise than planned, with the rounds that were carried out. Where what is left of
+    the budgets allows no other plan, or in any task a region's vehicles have too little time left for its rounds, the
+    plans of all tasks are those of before: of `done`, or else of `plan`.
     """
     states, tasks = {}, {**plan.tasks, **done}
     for task in problem.tasks:
@@ -47,7 +53,12 @@ def remake_plan(
         allotted, shares = allocate_tasks(rest)
         made = {own.name: make_task_plan(tasks[own.name].sizes, own, rest, shares) for own in allotted}
         over = {name: tasks[name].edge_rounds if stage == EDGE else 0 for name in made}
-        joins = {name: continue_joins(tasks[name], new, over[name]) for name, new in made.items()}
+        spare_s, joins = find_spare(rest, shares), {}
+        for own in rest.tasks:
+            new = made[own.name]
+            joins[own.name] = continue_joins(tasks[own.name], new, over[own.name], own, spare_s)
+            for name, joined in (joins[own.name] or {}).items():
+                spare_s[name] -= (len(joined) - len((new.joins or {})[name])) * own.round_s(name)
     except Infeasible:
         made, joins = {}, {}
     for name, new in made.items():
@@ -56,46 +67,68 @@ def remake_plan(
         assert before.predicted is not None
         past = (PRETRAIN,) if stage == PRETRAIN else (PRETRAIN, EDGE)
         predicted = {**new.predicted, **{each: before.predicted[each] for each in past}}
-        tasks[name] = replace(new, predicted=predicted, joins=joins[name], uploads=before.uploads)
+        tasks[name] = replace(new, predicted=predicted, joins=joins[name], uploads=before.uploads, ran=before.ran)
     return Plan(plan.rule, tasks, stage, dict(reached))
 
 
-def count_carried_out(plan: TaskPlan, stages: Sequence[StageResult]) -> TaskPlan:
+def count_carried_out(plan: TaskPlan, stages: Sequence[StageResult], k: int) -> TaskPlan:
     """Return the plan of a task with the edge rounds that its regions carried out, and who joined them.
 
-    `stages` are the results of stage II. Where regions ran different numbers of rounds, theirs is the mean by vehicles,
-    and the last round of each has that number: first ones of a region that ran more have numbers below 1.
+    `stages` are the results of stage II; a cloud round has `k` edge rounds. Where regions ran different numbers of
+    rounds, the plan has their mean by vehicles. There are no more cloud rounds than the last plan of any region has,
+    since no later one says which of its vehicles have time for them.
     """
-    rounds = round(float(np.average([each.rounds for each in stages], weights=[each.clients for each in stages])))
-    joins = plan.joins
-    if joins is not None:
-        last = {
-            name: tuple(number + rounds - each.rounds for number in own)
-            for each in stages
-            for made in (each.plans or ())[-1:]
-            for name, own in (made.plan.joins or {}).items()
-        }
-        joins = {name: last.get(name, own) for name, own in joins.items()}
-    return replace(plan, edge_rounds=rounds, joins=joins)
+    ran = {each.region or "": each.rounds for each in stages}
+    rounds = round(float(np.average([*ran.values()], weights=[each.clients for each in stages])))
+    last = [each.plans[-1].plan if each.plans else plan for each in stages]
+    cloud = min(own.cloud_rounds for own in (plan, *last))
+    plan = replace(plan, edge_rounds=rounds, cloud_rounds=cloud, ran=ran if len({*ran.values()}) > 1 else None)
+    if plan.joins is None:
+        return plan
+    joins: dict[str, tuple[int, ...]] = {}
+    for each, own in zip(stages, last, strict=True):
+        for name, joined in (own.joins or {}).items():
+            edge = [number for number in joined if number <= each.rounds]
+            later = [number - own.edge_rounds for number in joined if 0 < number - own.edge_rounds <= k * cloud]
+            if name.startswith(f"{each.region}/"):
+                joins[name] = (*edge, *(each.rounds + number for number in later))
+    return replace(plan, joins={name: joins[name] for name in plan.joins})
 
 
-def continue_joins(before: TaskPlan, new: TaskPlan, over: int) -> Mapping[str, tuple[int, ...]] | None:
+def find_spare(problem: Problem, shares: Shares) -> dict[str, float]:
+    """Return the time that each vehicle's shares of all tasks leave of the horizon [s]; inf without a horizon."""
+    horizon_s = np.inf if problem.horizon_s is None else problem.horizon_s
+    return {name: horizon_s - busy_s for name, busy_s in sum_busy(shares).items()}
+
+
+def continue_joins(
+    before: TaskPlan, new: TaskPlan, over: int, task: AllocationTask, spare_s: Mapping[str, float]
+) -> Joins | None:
     """Return the first `over` rounds that vehicles joined by the plan `before`, and the later ones by the `new` one.
 
-    No vehicle joins more rounds than the new plan gives it in all: where it would, the later rounds of its region are
-    dealt anew, round robin, to those that have rounds left. Raises `Infeasible` where these are too few for the rounds.
+    Of `before`, and here, the rounds of a region are counted from its first; where regions ran different numbers of
+    edge rounds, `over` and `new` count their mean. spare_s: what the new plan leaves of each vehicle's time [s], as
+    `find_spare` finds it; a round takes the `round_s` of `task`. No vehicle joins more rounds in all than it has time
+    for: where it would, the later rounds of its region are dealt anew, round robin, to those that have rounds left.
+    Raises `Infeasible` where these are too few for the rounds.
     """
     if before.joins is None or new.joins is None:
         return new.joins
-    past = {name: tuple(each for each in before.joins[name] if each <= over) for name in new.joins}
-    later = {name: tuple(each for each in joined if each > over) for name, joined in new.joins.items()}
-    most = {name: len(joined) for name, joined in new.joins.items()}
+    more = {name: before.edge_rounds_of(name) - before.edge_rounds for name in new.joins}  # than the mean
+    past = {name: tuple(each for each in before.joins[name] if each <= over + more[name]) for name in new.joins}
+    later = {name: tuple(each + more[name] for each in own if each > over) for name, own in new.joins.items()}
+    most = {name: len(joined) + _further(spare_s[name], task.round_s(name)) for name, joined in new.joins.items()}
     for region in dict.fromkeys(name.rpartition("/")[0] for name in later):
         own = [name for name in later if name.rpartition("/")[0] == region]
         if any(len(past[name]) + len(later[name]) > most[name] for name in own):
             rounds = sorted({*chain.from_iterable(later[name] for name in own)})
             later |= _deal({name: most[name] - len(past[name]) for name in own}, rounds)
     return {name: past[name] + later[name] for name in later}
+
+
+def _further(spare_s: float, round_s: float) -> int:
+    """Return how many more rounds of `round_s` there is time for; below 0: how many fewer."""
+    return MOST if round_s == 0 else floor(min(spare_s / round_s, MOST) + ROUNDING)
 
 
 def _deal(left: Mapping[str, int], rounds: Sequence[int]) -> dict[str, tuple[int, ...]]:

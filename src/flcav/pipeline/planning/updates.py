@@ -38,14 +38,15 @@ def update_forms(settings: Iterable[Setting]) -> list[UpdateForm]:
     return forms
 
 
-def follow_plan(how: Federation, plan: TaskPlan, done: int) -> Rules:
-    """Return the rules by which vehicles join the rounds that the plan gives them, after `done` rounds.
+def follow_plan(how: Federation, plan: TaskPlan, *, after_edge: bool) -> Rules:
+    """Return the rules by which vehicles join the rounds that the plan gives them, of stage II or after it.
 
     Another selection than that of all vehicles goes before the plan's.
     """
     if plan.joins is None or how.selection.rule != "all":
         return how
-    return how.model_copy(update={"selection": Selection(rule="planned", joins=plan.joins_after(done))})
+    joins = plan.joins_after_edge() if after_edge else plan.joins
+    return how.model_copy(update={"selection": Selection(rule="planned", joins=joins)})
 
 
 def model_mb(task: Task, network: str | None, forms: Sequence[UpdateForm] = (UpdateForm(),)) -> float:

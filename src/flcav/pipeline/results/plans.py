@@ -22,8 +22,11 @@ class TaskPlan:
     model_mb: float  # of one model update
     predicted: Mapping[str, float] | None  # score after each stage, by the learning curve; None: a fixed plan
     joins: Annotated[Mapping[str, tuple[int, ...]] | None, LEFT_OUT] = (
-        None  # by vehicle the rounds it joins, of 1 … edge rounds + k · cloud rounds; None: every vehicle joins all.
-        # Where regions ran different numbers of edge rounds, the last of each has the number of their mean
+        None  # by vehicle the rounds of its region that it joins, of 1 … edge rounds + k · cloud rounds; None: all
+    )
+
+    ran: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
+        None  # edge rounds of each region, where they differ; `edge_rounds` is then their mean by vehicles
     )
 
     uploads: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
@@ -42,10 +45,14 @@ class TaskPlan:
         """Sizes of the task's messages."""
         return MessageSizes(self.sample_mb, self.model_mb, self.exchange_mb, self.labels_mb)
 
-    def joins_after(self, rounds: int) -> Mapping[str, tuple[int, ...]]:
-        """Return the rounds that each vehicle joins, numbered from 1 after the first `rounds`; empty: all join all."""
-        own = self.joins or {}
-        return {name: tuple(each - rounds for each in joined if each > rounds) for name, joined in own.items()}
+    def edge_rounds_of(self, vehicle: str) -> int:
+        """Return the edge rounds of the region of a vehicle, "region/vehicle"."""
+        return (self.ran or {}).get(vehicle.rpartition("/")[0], self.edge_rounds)
+
+    def joins_after_edge(self) -> Mapping[str, tuple[int, ...]]:
+        """Return the rounds after stage II that each vehicle joins, numbered from 1; empty: all join all."""
+        own = {name: (self.edge_rounds_of(name), joined) for name, joined in (self.joins or {}).items()}
+        return {name: tuple(each - over for each in joined if each > over) for name, (over, joined) in own.items()}
 
 
 @dataclass(frozen=True)

@@ -127,8 +127,8 @@ def federate_cloud(
     checkpoints = FederationCheckpoints(*kept)
     rules.check_personal(to_arrays(own.network))
     parties = {region: rules.secret_parties([*each.clients]) for region, each in own.regions.items()}
-    checkpoints.keep_secrets({f"{EDGE}/{region}": found for region, found in parties.items()})
     start, done = checkpoints.resume(to_arrays(own.network))
+    checkpoints.keep_secrets({f"{EDGE}/{region}": found for region, found in parties.items()})
     wireless = Account(own.book, CLOUD, learning.task.name, "wireless", outages)
     wireline = Account(own.book, CLOUD, learning.task.name, "wireline")
     earlier = max(each.earlier for each in own.regions.values())

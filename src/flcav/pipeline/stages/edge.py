@@ -90,8 +90,8 @@ def federate_edge(
     checkpoints = FederationCheckpoints(
         learning.task, own.folder, own.book, own.report, {EDGE: state}, identity, scored, rules.privacy
     )
-    checkpoints.keep_secrets({EDGE: rules.secret_parties([*own.clients])})
     start, done = checkpoints.resume(to_arrays(own.network))
+    checkpoints.keep_secrets({EDGE: rules.secret_parties([*own.clients])})
     account = Account(own.book, EDGE, learning.task.name, "wireless", outages)
     how: Any = {"strategy": own.strategy, "state": state, "earlier": own.earlier}
     run, clients = (

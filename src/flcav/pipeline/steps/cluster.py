@@ -220,12 +220,21 @@ def packed(folder: Path, names: Iterable[str]) -> Iterator[Iterator[bytes]]:
 def replace_folder(folder: Path, names: Collection[str] | None, archive: IO[bytes]) -> None:
     """Replace `folder` by the files of a ZIP archive and, of the files it held, those in `names` (None: no others).
 
-    It is replaced as a whole: an interruption leaves the old folder, or none.
+    Files have the permissions that they were packed with. The folder is replaced as a whole: an interruption leaves the
+    old folder, or none.
     """
     new = reserve_sibling(folder, "new")
     new.mkdir(parents=True)
     with zipfile.ZipFile(archive) as files:
-        files.extractall(new)
+        for each in files.infolist():
+            if each.is_dir():
+                files.extract(each, new)
+                continue
+            place = new / each.filename
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.touch(mode=0o600)  # secrets are nobody else's while they are written, either
+            files.extract(each, new)
+            place.chmod(each.external_attr >> 16 & 0o777)
         here = set(files.namelist())
     for name in set(names or ()) - here:
         (new / name).parent.mkdir(parents=True, exist_ok=True)

@@ -170,7 +170,7 @@ def _open_drive(
     }
 
     def drive(by: TaskPlan, rounds: int) -> DrivenCloud:
-        rules, numbers = follow_plan(how, by, by.edge_rounds), range(1, rounds + 1)
+        rules, numbers = follow_plan(how, by, after_edge=True), range(1, rounds + 1)
         seeds = {name: [seed for n in numbers for seed in edge_seeds(schedule, n, name, k)] for name in own.regions}
         driven = {name: network(rules, seeds[name]) for name, network in networks.items()}
         return join_regions(driven, k, how.network, update_bytes(to_arrays(own.network)))

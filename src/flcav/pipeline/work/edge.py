@@ -184,6 +184,6 @@ def _open_drive(
 
     def drive(by: TaskPlan, rounds: int) -> DrivenRounds:
         seeds = [own.schedule.work(number).seed for number in range(1, rounds + 1)]
-        return simulate(follow_plan(settings.federation, by, by.edge_rounds if own.earlier else 0), seeds)
+        return simulate(follow_plan(settings.federation, by, after_edge=bool(own.earlier)), seeds)
 
     return drive

@@ -204,12 +204,12 @@ def replan_step(work: Work, settings: ReplanSettings) -> None:
             used[task.name][entry.link] += entry.bytes * (entry.direction == "up")
     sent = {task: Price(own["wireless"] / BYTES_PER_MB, own["wireline"] / BYTES_PER_MB) for task, own in used.items()}
     used_mb = Price(*(sum(own[link] for own in used.values()) / BYTES_PER_MB for link in LINKS))
+    k, groups = problem.edge_rounds_per_cloud_round, problem.tasks[0].edge_groups
     ran = {
-        task: count_carried_out(done.tasks[task], [StageResult.load(work.inputs[step]) for step in steps])
+        task: count_carried_out(done.tasks[task], [StageResult.load(work.inputs[step]) for step in steps], k)
         for task, steps in settings.edges.items()
     }
     made = remake_plan(done, problem, settings.stage, reached, used_mb, ran)
-    k, groups = problem.edge_rounds_per_cloud_round, problem.tasks[0].edge_groups
     booked = {}
     for task in settings.edges:
         own = made.tasks[task]

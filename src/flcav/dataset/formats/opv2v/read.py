@@ -72,10 +72,10 @@ class Opv2vSource(LogSource):
 
     def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Shot]:
         known = self._track[scene] = _read_names(folder / PROTOCOL)
-        stamps = {path: _list_stamps(path) for path in sorted(folder.iterdir()) if path.is_dir()}
-        rank = {stamp: number for number, stamp in enumerate(sorted({s for own in stamps.values() for s in own}))}
+        found = {path: _list_stamps(path) for path in sorted(folder.iterdir()) if path.is_dir()}
+        rank = {stamp: number for number, stamp in enumerate(sorted({s for own, _ in found.values() for s in own}))}
         shots = []
-        for path, own in stamps.items():
+        for path, (own, pictured) in found.items():
             if own:
                 kind = "pole" if path.name.startswith("-") else "cav"
                 vehicle = known.get(path.name, f"{kind}{path.name.lstrip('-')}")
@@ -83,7 +83,7 @@ class Opv2vSource(LogSource):
                 lidar, cameras = calibration.agent_from_sensor[LIDAR] + 0.0, calibration.intrinsics  # no -0.0
                 agent = names.of(vehicle, (lidar.tobytes(), *((name, cameras[name].tobytes()) for name in cameras)))
                 self._calibration.setdefault(agent, calibration)
-                if not cameras.keys() <= _list_cameras(path):
+                if not cameras.keys() <= pictured:
                     self._blind.add(agent)
                 shots += [Shot(path / stamp, agent, int(stamp), rank[stamp] * PERIOD_S) for stamp in own]
         return sorted(shots, key=lambda shot: (shot.spin, shot.agent))
@@ -223,19 +223,20 @@ def _list_cameras(folder: Path) -> set[str]:
     return {name for name in CAMERAS if next(folder.glob(f"*_{name}.png"), None) is not None}
 
 
-def _list_stamps(folder: Path) -> list[str]:
-    """Return the times of an agent's frames, in order; raises `InputError` where a file of one is missing.
+def _list_stamps(folder: Path) -> tuple[list[str], set[str]]:
+    """Return the times of an agent's frames, in order, and its cameras that the folder has pictures of.
 
-    A frame has a YAML file, a point cloud, and a picture of each camera that the folder has pictures of.
+    A frame has a YAML file, a point cloud, and a picture of each of these. Raises `InputError` where a file is missing.
     """
-    endings = [".yaml", ".pcd", *(f"_{name}.png" for name in sorted(_list_cameras(folder)))]
+    cameras = _list_cameras(folder)
+    endings = [".yaml", ".pcd", *(f"_{name}.png" for name in sorted(cameras))]
     found = {end: {path.name.removesuffix(end) for path in folder.glob(f"*{end}")} for end in endings}
     stamps = sorted(stamp for stamp in set().union(*found.values()) if stamp.isdigit())
     for stamp in stamps:
         for end in endings:
             if not (path := folder / f"{stamp}{end}").is_file():
                 raise InputError(f"{path}: no such file; a frame of OPV2V has one")
-    return stamps
+    return stamps, cameras
 
 
 def _find_scenarios(folder: Path) -> dict[str, Path]:
