@@ -1,11 +1,13 @@
 """A federation of 100, 1,000 and 10,000 simulated vehicles with updates of LeNet's size: CPU time and peak memory.
 
-Each number in a process of its own, one round with every vehicle. A vehicle is made when it is its turn; its training
-is one draw of random numbers, so that what is measured is the federation itself.
+Each number in a process of its own, one round with every vehicle, several times in turns; ratios are medians over the
+turns. A vehicle is made when it is its turn; its training is one draw of random numbers, so that what is measured is
+the federation itself.
 """
 
 import json
 import resource
+import statistics
 import subprocess
 import sys
 import time
@@ -22,7 +24,7 @@ from flcav.perception.weather.config import LeNetConfig
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
 
-NUMBERS = 100, 1_000, 10_000
+NUMBERS, REPEATS = (100, 1_000, 10_000), 5
 
 
 class Vehicle:
@@ -59,16 +61,24 @@ def measure(vehicles: int) -> None:
     print(json.dumps({"cpu_s": spent, "mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3}))
 
 
+def ask(vehicles: int) -> tuple[float, float]:
+    """Return CPU time [s] and peak memory [MB] of a process of its own."""
+    told = subprocess.run([sys.executable, __file__, str(vehicles)], check=True, capture_output=True, text=True)
+    found = json.loads(told.stdout)
+    return found["cpu_s"], found["mb"]
+
+
 def main() -> None:
-    found = {}
+    turns = [{vehicles: ask(vehicles) for vehicles in NUMBERS} for _ in range(REPEATS)]
+    print(f"one round, median of {REPEATS}")
     for vehicles in NUMBERS:
-        told = subprocess.run([sys.executable, __file__, str(vehicles)], check=True, capture_output=True, text=True)
-        found[vehicles] = json.loads(told.stdout)
-        cpu_s, mb = found[vehicles]["cpu_s"], found[vehicles]["mb"]
+        cpu_s, mb = (statistics.median(turn[vehicles][each] for turn in turns) for each in range(2))
         print(f"{vehicles:>6} vehicles {cpu_s:7.2f} CPU-s, {1e3 * cpu_s / vehicles:.2f} ms each, peak {mb:.0f} MB")
-    few, more, most = (found[vehicles] for vehicles in NUMBERS)
-    print(f"  time of 10,000 / 10 x that of 1,000: {most['cpu_s'] / (10 * more['cpu_s']):.2f} (aim: 1, linear)")
-    print(f"  memory of 10,000 / that of 100: {most['mb'] / few['mb']:.2f} (aim <= 1.20)")
+    few, more, most = NUMBERS
+    linear = statistics.median(turn[most][0] / (turn[more][0] * most / more) for turn in turns)
+    memory = statistics.median(turn[most][1] / turn[few][1] for turn in turns)
+    print(f"  time of 10,000 / 10 x that of 1,000: {linear:.2f} (aim: 1, linear)")
+    print(f"  memory of 10,000 / that of 100: {memory:.2f} (aim <= 1.20)")
 
 
 if __name__ == "__main__":

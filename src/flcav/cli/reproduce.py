@@ -80,7 +80,7 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
 }
 SEEDS: Mapping[str, int] = {
     **dict.fromkeys((Target.demo_arms, *EXCHANGES, *ATTACKS), 5),
-    Target.placement: 8,
+    **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
 }
 
 
@@ -104,7 +104,8 @@ def reproduce(
         None,
         "--seeds",
         min=1,
-        help="Number of seeds, from 1: 5 of demo-arms and federation-*, 8 of placement, 3 of the others if not given.",
+        help="Number of seeds, from 1: 8 of federation-exchange and placement, 5 of demo-arms and the other "
+        "federation-*, 3 of the others if not given.",
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."

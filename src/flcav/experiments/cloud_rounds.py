@@ -1,18 +1,19 @@
 """Cloud rounds over retrainings: weight divergence of the regions, and what their mean gains over stage II."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import cast
 
 import numpy as np
 from scipy.stats import spearmanr
 
-from flcav.federation.divergence import Divergence
+from flcav.federation.divergence import RoundDivergence
 from flcav.markdown import format_table
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.training import StageResult
+from flcav.pipeline.results.training import FederatedRound, StageResult
 
 PARTS = ("whole", "learned", "statistics")  # of `Divergence`
+CORRELATION = "rank correlation with the mean gain"
 
 
 def cloud_tables(run: Run) -> dict[str, str]:
@@ -22,7 +23,7 @@ def cloud_tables(run: Run) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     kept = {task: own for task in run.recipe.tasks if (own := [*_trainings(run, task)])}
-    if kept and run.recipe.retrainings and all(_divergences(stage) for own in kept.values() for stage in own):
+    if kept and run.recipe.retrainings and all(_span(stage) for own in kept.values() for stage in own):
         found["divergence"] = "\n\n".join(_divergence(run, task, own) for task, own in kept.items())
     if kept and all(stage.statistics for own in kept.values() for stage in own):
         found["statistics"] = "\n\n".join(_statistics(task, own) for task, own in kept.items())
@@ -37,10 +38,23 @@ def _trainings(run: Run, task: str) -> Iterator[StageResult]:
             yield stage
 
 
-def _divergences(stage: StageResult) -> tuple[Divergence, Divergence] | None:
-    """Return the divergence that the first cloud round begins with, and that of what the last one averages."""
-    rounds = [each.divergence for each in stage.records or () if each.divergence is not None]
-    return (rounds[0].begun, rounds[-1].trained) if rounds else None
+def _span(stage: StageResult) -> RoundDivergence | None:
+    return span_divergence(stage.records or ())
+
+
+def _divergence(run: Run, task: str, trainings: Sequence[StageResult]) -> str:
+    measured = [found for stage in trainings if (found := _span(stage)) is not None]
+    gains = {f"{region}: cloud - edge FL": own for region, own in _gains(run, task).items()}
+    return format_divergence([f"{task}, training {i + 1}" for i in range(len(trainings))], measured, gains)
+
+
+def span_divergence(records: Iterable[FederatedRound]) -> RoundDivergence | None:
+    """Return the divergence that the first cloud round begins with, and that of what the last one averages.
+
+    None where there was no cloud round of several regions among `records`.
+    """
+    rounds = [each.divergence for each in records if each.divergence is not None]
+    return RoundDivergence(rounds[0].begun, rounds[-1].trained) if rounds else None
 
 
 def _gains(run: Run, task: str) -> Mapping[str, Sequence[float]]:
@@ -53,27 +67,29 @@ def _gains(run: Run, task: str) -> Mapping[str, Sequence[float]]:
     }
 
 
-def _divergence(run: Run, task: str, trainings: Sequence[StageResult]) -> str:
-    """Return a row per training, the means, and each column's rank correlation (Spearman's rho) with the mean gain."""
-    measured = [pair for stage in trainings if (pair := _divergences(stage)) is not None]
+def format_divergence(
+    names: Sequence[str], measured: Sequence[RoundDivergence], gains: Mapping[str, Sequence[float]]
+) -> str:
+    """Return a row per training, the means, and each column's rank correlation (Spearman's rho) with the mean gain.
+
+    names: of the trainings. gains: by what they are gained in, of each training.
+    """
     columns: dict[str, list[float]] = {}
-    for place, when in enumerate(("after edge FL", "before averaging")):
+    for when, own in (("after edge FL", "begun"), ("before averaging", "trained")):
         for part in PARTS:
-            values = [getattr(pair[place], part) for pair in measured]
+            values = [getattr(getattr(each, own), part) for each in measured]
             if None not in values:
                 columns[f"{part}, {when}"] = values
-    gains = _gains(run, task)
     gain = np.mean([*gains.values()], axis=0)
+    shown = {**gains, "mean gain": gain} if len(gains) > 1 else gains
     rows = [
-        [f"{task}, training {number}", *(f"{own[number - 1]:.4f}" for own in columns.values())]
-        + [f"{own[number - 1]:+.3f}" for own in (*gains.values(), gain)]
-        for number in range(1, len(trainings) + 1)
+        [name, *(f"{own[number]:.4f}" for own in columns.values()), *(f"{own[number]:+.3f}" for own in shown.values())]
+        for number, name in enumerate(names)
     ]
     means = [f"{np.mean(own):.4f}" for own in columns.values()]
-    rows.append(["mean", *means, *(f"{np.mean(own):+.3f}" for own in (*gains.values(), gain))])
-    ranks = [_correlate(own, gain) for own in columns.values()]
-    rows.append(["rank correlation with the mean gain", *ranks, *("" for _ in gains), ""])
-    return format_table(("", *columns, *(f"{region}: cloud - edge FL" for region in gains), "mean gain"), rows)
+    rows.append(["mean", *means, *(f"{np.mean(own):+.3f}" for own in shown.values())])
+    rows.append([CORRELATION, *(_correlate(own, gain) for own in columns.values()), *("" for _ in shown)])
+    return format_table(("", *columns, *shown), rows)
 
 
 def _correlate(values: Sequence[float], gain: Sequence[float]) -> str:

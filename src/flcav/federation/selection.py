@@ -69,6 +69,11 @@ class Selection(Config):
         """Return whether updates are weighted by the inverse of their clients' probability."""
         return self.unbiased or self.rule == "importance"
 
+    @property
+    def predicts(self) -> bool:
+        """Return whether it is a deadline for round times that a network is to predict."""
+        return self.rule == "deadline" and not self.seconds
+
     def check_clients(self, names: Sequence[str]) -> None:
         """Raise `InputError` where these clients cannot be selected so."""
         if self.clients is not None and self.clients > len(names):

@@ -28,7 +28,7 @@ from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
 from flcav.federation.state import ClientStates, FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust
+from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust, needs_known_number
 from flcav.federation.trainable import Counts, Distiller, LocalUpdate, Trainable, Weights
 from flcav.federation.upload import name_like
 from flcav.seeds import derive_seed
@@ -215,7 +215,8 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
     """Raise `InputError` where a strategy and rules do not go together, or not with so many clients."""
     told, selection = type(strategy).__name__, rules.selection
     selection.check_clients(names)
-    least, chosen = rules.least_clients, int(expected_clients(selection, names))
+    planned = selection.rule == "planned"  # any number, all at most: a round with too few has no update
+    least, chosen = rules.least_clients, len(names) if planned else int(expected_clients(selection, names))
     if isinstance(least, int) and selection.rule not in ("poisson", "importance") and least > chosen:
         raise InputError(f"least_clients: {least} are wanted in a round, and {chosen} take part")
     single = isinstance(strategy, Robust | Exchanges)  # looks at each update
@@ -231,12 +232,13 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
         _check_outputs(rules)
     if isinstance(rules.personal, RegionalModels) and isinstance(strategy, Corrects):
         raise InputError(f"{told} corrects local steps, and so does the pull of regional models, 'personal'")
-    if rules.privacy is not None and selection.rule == "planned":
+    if rules.privacy is not None and planned:
         raise InputError("privacy: rounds of a plan have other numbers of clients, and noise is for one number")
     if isinstance(strategy, Robust):
-        if selection.rule in ("poisson", "planned"):
+        if selection.rule not in ("poisson", "planned"):
+            strategy.check_clients(chosen)
+        elif needs_known_number(strategy):
             raise InputError(f"{told} needs a known number of clients, and {selection.rule} selection has any")
-        strategy.check_clients(chosen)
     if rules.secure is not None:
         _check_secure(told, rules, rules.secure, chosen, single)
     if rules.privacy is not None:

@@ -1,20 +1,22 @@
 """Model cards: how a network was trained and evaluated (Mitchell et al., "Model Cards for Model Reporting", 2019)."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
 from flcav.config import Config
+from flcav.dataset.ground import POLE
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.files import Json, sha256, write_bytes
 from flcav.markdown import format_bullets, format_table
-from flcav.perception.agents import FrameSelection
+from flcav.perception.agents import FrameSelection, kind_of
 from flcav.perception.task import KnownLidar
 from flcav.records import LEFT_OUT, Record
 from flcav.sensors.rig import RIGS
+from flcav.sources.randomisation import DRAWN_BEAMS
 
 CARD_KEY = "flcav.card"  # key of the card in the metadata of a safetensors file
 LICENCE = "Apache-2.0"
@@ -117,24 +119,32 @@ def write_card(card: Card, path: Path) -> None:
     write_bytes(path, card.markdown().encode())
 
 
-def read_lidar(recipe: Mapping[str, Json]) -> KnownLidar:
-    """Return beams and range of the vehicles' first LiDAR by the recipe of a recording, or as an import knows them.
+def read_lidar(recipe: Mapping[str, Json], agents: Iterable[str] | None = None) -> KnownLidar:
+    """Return beams and range of the agents' first LiDAR by the recipe of a recording, or as an import knows them.
 
-    recipe: of a manifest, or of a card's entry, which names the rig. None where it does not say, and where they are
-    drawn.
+    recipe: of a manifest, or of a card's entry, which names the rig. agents: whose LiDAR; that of the poles where all
+    are poles, else that of the vehicles. None where it does not say.
     """
-    if recipe.get("randomise") is not None:
-        return KnownLidar()
-    rig: Any = recipe.get("vehicle_rig")
+    kinds = {kind_of(agent) for agent in agents or ()}
+    rig: Any = recipe.get("pole_rig" if kinds == {POLE} else "vehicle_rig")
     known: Any = RIGS[rig].model_dump(mode="json") if isinstance(rig, str) and rig in RIGS else rig
     try:
         settings = next(iter(known["lidars"].values()))["settings"]
         beams, range_m = settings["channels"], settings.get("range_m")
     except (TypeError, KeyError, AttributeError, StopIteration):
         beams, range_m = recipe.get("beams"), recipe.get("range_m")
-    return KnownLidar(
-        beams if isinstance(beams, int) else None, float(range_m) if isinstance(range_m, int | float) else None
-    )
+    span = (beams, beams) if isinstance(beams, int) else None
+    if recipe.get("randomise") is not None and kinds != {POLE}:
+        span = DRAWN_BEAMS
+    return KnownLidar(span, float(range_m) if isinstance(range_m, int | float) else None)
+
+
+def join_lidars(known: Sequence[KnownLidar]) -> KnownLidar:
+    """Return the LiDARs of several recordings as one: fewest and most beams, the range where it is the same."""
+    spans = [lidar.beams for lidar in known if lidar.beams is not None]
+    beams = (min(low for low, _ in spans), max(high for _, high in spans)) if spans else None
+    ranges = {lidar.range_m for lidar in known}
+    return KnownLidar(beams if len(spans) == len(known) else None, ranges.pop() if len(ranges) == 1 else None)
 
 
 def _rig_name(rig: Any) -> str | None:

@@ -16,7 +16,7 @@ from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.files import Json
 from flcav.perception.agents import FrameSelection, choose_frames
-from flcav.perception.card import Card, read_lidar
+from flcav.perception.card import Card, join_lidars, read_lidar
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
 from flcav.perception.metrics.benchmark import evaluate_kitti, is_kitti
@@ -264,16 +264,14 @@ def _check_around(task: Task, around: bool) -> None:
 
 
 def find_trained_lidar(task: Task, network: Weights) -> KnownLidar:
-    """Return the LiDAR that a network was trained with, by its card, as far as that says it and it is one."""
+    """Return the LiDARs that a network was trained with, by its card, as far as that says."""
     if isinstance(network, nn.Module):
         return KnownLidar()
     try:
         card = read_card(Path(network or find_shipped(task)))
     except InputError:
         return KnownLidar()
-    known = [read_lidar(entry.recipe) for entry in card.data]
-    beams, ranges = {lidar.beams for lidar in known}, {lidar.range_m for lidar in known}
-    return KnownLidar(beams.pop() if len(beams) == 1 else None, ranges.pop() if len(ranges) == 1 else None)
+    return join_lidars([read_lidar(entry.recipe, entry.agents) for entry in card.data])
 
 
 def threshold_of(task: Task, threshold: float | None) -> float:

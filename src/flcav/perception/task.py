@@ -172,9 +172,9 @@ class RigBound(Protocol):
 
 @dataclass(frozen=True)
 class KnownLidar:
-    """Beams and range of the vehicles' first LiDAR, as far as a recording names them."""
+    """Beams and range of the agents' first LiDAR, as far as a recording names them."""
 
-    beams: int | None = None  # None: not known
+    beams: tuple[int, int] | None = None  # fewest and most, which differ where LiDARs are drawn; None: not known
     range_m: float | None = None  # largest range; None: not known
 
 

@@ -9,7 +9,7 @@ from flcav.federation.privacy import affordable_rounds
 from flcav.federation.stages import check_rules
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.strategies.strategy import Corrects
+from flcav.federation.strategies.strategy import Corrects, needs_known_number
 from flcav.federation.trainable import statistics_names
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.pose_graph import check_gtsam
@@ -81,8 +81,8 @@ class Setting:
     @property
     def edge_federation(self) -> Federation:
         """Return the federation without what decides stage III alone."""
-        of_cloud: Mapping[str, object] = {"personal": (), "cloud_strategy": None, "score_statistics": False}
-        return self.federation.model_copy(update=of_cloud)
+        of_cloud = ("personal", "cloud_strategy", "cloud_rate", "score_statistics")
+        return self.federation.model_copy(update={name: Federation.model_fields[name].default for name in of_cloud})
 
 
 def resolve_settings(recipe: RunRecipe, labels: Mapping[str, str]) -> dict[str, Setting]:
@@ -156,21 +156,12 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
             raise InputError("federation.network: importance selection draws the clients after they have trained")
         if setting.federation.network is not None and selection.unbiased:
             raise InputError("federation.network: unbiased weights need known probabilities, and the radio loses any")
-        if setting.federation.network is not None and selection.rule == "deadline" and privacy is not None:
-            raise InputError(
-                "federation.network: a deadline leaves other numbers of clients, and noise is for one number"
-            )
         if setting.federation.network is not None and privacy is not None and privacy.hides_draws(selection):
             raise InputError(
                 f"federation.network: rounds are timed before they are run, and {selection.rule} selection under "
                 "central noise draws in secret; 'privacy.seeded' simulates both"
             )
-        if setting.federation.secure is not None and selection.rule == "all" and _plans_joiners(recipe, setting):
-            raise InputError(
-                "federation.secure: a plan within horizon_s may leave a round to one vehicle, by their speeds or the "
-                "time of messages, and secure aggregation takes two or more; choose another 'selection' than all, or "
-                "leave out horizon_s"
-            )
+        _check_numbers(recipe, setting, edge)
         if isinstance(edge, FedMD) and setting.central is None:
             _check_outputs(recipe, setting)
         if setting.distillation.pose_graph and setting.central is None:
@@ -186,6 +177,31 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
         how = setting.federation
         for task in recipe.tasks if how.personal or how.upload.layers or how.score_statistics else ():
             _check_arrays(task, recipe.tasks[task].network, setting)
+
+
+def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
+    """Raise `InputError` where rounds are left with other numbers of vehicles than an arm's strategy or rules take.
+
+    These numbers are known when a region's rounds are timed, which is after its recordings and pretraining.
+    """
+    how, predicted = setting.federation, setting.federation.selection.predicts
+    if predicted and how.network is None:
+        raise InputError(
+            "selection: a deadline needs the predicted 'seconds' of a round by client, or a federation.network"
+        )
+    if predicted:
+        why, instead = "federation.network: a predicted deadline leaves other numbers of vehicles to its rounds", ""
+    elif how.selection.rule == "all" and _plans_joiners(recipe, setting):
+        why = "horizon_s: a plan by speeds or the time of messages leaves other numbers of vehicles to its rounds"
+        instead = "; choose another 'selection' than all, or leave out horizon_s"
+        if how.secure is not None:
+            raise InputError(f"{why}, some of them one, and secure aggregation takes two or more{instead}")
+    else:
+        return
+    if how.privacy is not None:
+        raise InputError(f"{why}, and noise is for one number{instead}")
+    if needs_known_number(strategy):
+        raise InputError(f"{why}, and {type(strategy).__name__} needs a known one{instead}")
 
 
 def _plans_joiners(recipe: RunRecipe, setting: Setting) -> bool:

@@ -185,6 +185,9 @@ class Federation(Rules):
         None  # of the cloud; default: `strategy`, or fedavg where that corrects local steps or is fedmd
     )
     edge_rounds_per_cloud_round: int = Field(default=1, ge=1, le=100)  # in every region
+    cloud_rate: float | None = Field(
+        default=None, gt=0
+    )  # learning rate of the first cloud round; default: `final_rate`
     score_statistics: bool = False  # validate stage III also with each region's own statistics of batch normalisation
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
 

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
 import yaml
@@ -34,6 +33,8 @@ CELL_M, FAR_CELL_M = 5.0, 50.0  # of the terrain within the town's bounds, and b
 STEEPEST = 0.035  # slope of one of three long waves of the terrain
 LARGEST = 1.06  # factor of a car's length: parked cars keep apart
 PATTERNS = ("hdl64e", "vlp32c twice", "vls128", "os1_128", "even")  # of beams; "twice": two LiDARs, one on the other
+EVEN_BEAMS = (40, 96)  # fewest and most of the pattern "even"
+DRAWN_BEAMS = (40, 128)  # fewest and most of all `PATTERNS`
 DROPPING = 0.4  # fraction of the LiDARs that lose many returns
 
 
@@ -50,7 +51,7 @@ def town_files(town: Town) -> Mapping[str, bytes]:
     files = {"town.net.xml": town.net.read_bytes(), "town.yaml": yaml.safe_dump(values, sort_keys=False).encode()}
     if town.relief is not None:
         heights = io.BytesIO()
-        pq.write_table(pa.table(dict(zip("xyz", town.relief.points.T))), heights, compression="zstd")
+        pq.write_table(town.relief.table(), heights, compression="zstd")
         files[HEIGHTS] = heights.getvalue()
     return files
 
@@ -168,7 +169,9 @@ def _draw_lidar(lidar: MountedLidar, draw: Draw) -> MountedLidar:
 def _draw_beams(pattern: str, draw: Draw) -> tuple[tuple[float, ...], int]:
     """Return the elevations [deg] and the azimuth steps of one of `PATTERNS`; each unit's beams are a little off."""
     if pattern == "even":
-        elevations = np.linspace(draw.uniform(2, 15), draw.uniform(-25, -16), int(draw.integers(40, 97)))
+        elevations = np.linspace(
+            draw.uniform(2, 15), draw.uniform(-25, -16), int(draw.integers(EVEN_BEAMS[0], EVEN_BEAMS[1] + 1))
+        )
         steps = int(draw.integers(1000, 2001))
     else:
         known = BEAMS[pattern.removesuffix(" twice")]

@@ -34,6 +34,7 @@ from flcav.world.meshes.mesh import Mesh, join_meshes, sheet, transform_mesh
 
 GROUND_M = -0.03  # height of open ground, a little below the road
 UNDER_M, ROUGH_M = 1.5, 1.0  # by which sloping ground reaches below roads and sidewalks, and how roughly it is cut
+DECK_M = 1.0  # thickness of a bridge's deck
 LAND_M = 150.0  # width of open ground beyond the town's bounds
 TOWNS_KEPT = 4  # size of the cache of meshes
 
@@ -53,6 +54,7 @@ class Part(IntEnum):
     SIGN = 9
     SIGNAL = 10
     POLE = 11  # of the map that the town was imported from
+    DECK = 12  # of a bridge
 
 
 class StaticWorld(NamedTuple):
@@ -131,6 +133,7 @@ Owned = tuple[Part, int, Mesh]  # kind of object, its row, its mesh in the world
 def _parts(town: Town) -> Iterator[Owned]:
     """Yield the meshes of all static objects of a town."""
     yield Part.GROUND, 0, _ground(town)
+    yield from _decks(town)
     yield from chain(_roads(town), _sidewalks(town), _buildings(town), _plants(town), _furniture(town))
 
 
@@ -151,6 +154,15 @@ def _roads(town: Town) -> Iterator[Owned]:
     return (
         (Part.ROAD, row, _plate(polygon, 0.0, Material.ROAD, town.relief)) for row, polygon in enumerate(town.roads)
     )
+
+
+def _decks(town: Town) -> Iterator[Owned]:
+    """Yield the decks of bridges, each as its road, its underside and its two sides."""
+    for row, deck in enumerate(() if town.relief is None else town.relief.decks):
+        yield Part.DECK, row, drape_area(deck.outline, deck.surface, 0.0, Material.ROAD)
+        yield Part.DECK, row, drape_area(deck.outline, deck.surface, -DECK_M, Material.WALL)
+        for side in deck.sides:
+            yield Part.DECK, row, sheet(np.stack((side - (0.0, 0.0, DECK_M), side)), Material.WALL)
 
 
 def _sidewalks(town: Town) -> Iterator[Owned]:

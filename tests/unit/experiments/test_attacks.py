@@ -1,5 +1,7 @@
 """Lies and inferences against formulas written out, autograd and SciPy, on pictures made of clusters."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -15,6 +17,7 @@ from flcav.experiments.attacks.tables import fault_tables
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.reading import read_round
 from flcav.federation.stages import Schedule
+from flcav.intervals import OWN_SCENES
 
 START = draw_head(1)
 CENTRES = np.random.default_rng(0).normal(0, 3, (CLASSES, 120)).clip(0)
@@ -101,13 +104,18 @@ def test_membership_is_told_by_ranks_and_by_the_mean_loss():
 
 def test_an_attack_leaves_the_secure_federation_s_accuracy(drives: Drives):
     known = np.concatenate([each.features for each in drives.vehicles.values()])
-    open_, _ = attack(drives, known, Rules(), 1)
-    masked, summed = attack(drives, known, Rules(secure=SecureAggregation()), 1)
+    seen, secure = attack(drives, known, Rules(), 1), attack(drives, known, Rules(secure=SecureAggregation()), 1)
+    open_, masked, summed = seen.by_update, secure.by_update, secure.by_sum
     assert open_.recognised_one == 1
     assert masked.recognised_one < 0.5
     assert summed.recognised_one < 0.5
     assert masked.accuracy == pytest.approx(open_.accuracy, abs=0.05)
     members, others = split_members(drives, 1)
     assert not {*members["cav0"].features[:, 0]} & {*others["cav0"].features[:, 0]} - {0.0}
-    level = make_level("none", None, [open_, open_])
+    level = make_level(drives.test, "none", None, [seen, replace(seen, right=seen.right & (np.arange(48) % 6 > 0))])
     assert level.mean["accuracy"].mean == pytest.approx(open_.accuracy)
+    spread = level.mean["accuracy"].shared
+    assert spread is not None
+    assert spread.scenes == 6
+    assert level.mean["membership_auc"].shared == OWN_SCENES
+    assert make_level(drives.test, "sum", None, [secure], by_sum=True).seeds == (summed,)

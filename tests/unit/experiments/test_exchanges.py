@@ -1,15 +1,18 @@
 """The comparison of exchanges: whose accuracy counts where, seconds of rounds, means, verdicts, tables, the figure."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from flcav.experiments.exchanges import run as exchanges
 from flcav.experiments.exchanges.clock import mean_round_s
 from flcav.experiments.exchanges.run import (
     NAMES,
+    NO_CLOUD,
     NONE,
     OTHERS,
     OWN,
@@ -19,12 +22,14 @@ from flcav.experiments.exchanges.run import (
     draw_results,
     judge_differences,
     measure_places,
+    measure_seed,
     summarise,
 )
 from flcav.experiments.exchanges.tables import tables
 from flcav.experiments.scales import shrink_recipe
+from flcav.federation.divergence import Divergence, RoundDivergence
 from flcav.federation.upload import name_like
-from flcav.network.ledger import LedgerEntry
+from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.propagation import State
@@ -32,7 +37,7 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, resolve_settings
-from flcav.pipeline.recipe import CLOUD, MAIN, PRETRAIN, Federation, load_run_recipe
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Federation, load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
 
@@ -40,7 +45,7 @@ RECIPE = load_run_recipe(recipe_path("runs/exchange"))
 
 
 def test_every_arm_of_the_recipe_is_compared_and_can_be_federated() -> None:
-    assert set(NAMES.values()) == {PRETRAIN, MAIN, *RECIPE.arms}
+    assert set(NAMES.values()) == {PRETRAIN, EDGE, MAIN, *RECIPE.arms}
     check_federations(RECIPE, resolve_settings(RECIPE, {"weather": "annotated"}).values())
 
 
@@ -56,7 +61,7 @@ def test_arms_of_objects_have_the_names_of_those_of_the_weather() -> None:
 
 
 def test_without_an_unseen_region_it_has_no_column() -> None:
-    names = (NONE, WHOLE, "int8", "output layer (FedPer)")
+    names = (NONE, NO_CLOUD, WHOLE, "int8", "output layer (FedPer)")
     seeds = {}
     for number in (1, 2):
         own = replace(arm(0.5, 9.0), accuracy={OWN: 0.5 + 0.01 * number, OTHERS: 0.4})
@@ -65,6 +70,7 @@ def test_without_an_unseen_region_it_has_no_column() -> None:
     shown = tables(results)
     assert shown["accuracy"].splitlines()[0] == "| | arm, 2 seeds | AP50, own region | AP50, other regions |"
     assert "compared with | no federation" in shown["accuracy"].splitlines()[2]
+    assert shown["cloud"] == ""  # not measured
     assert len(shown["accuracy"].splitlines()) == 2 + len(names)
     assert "unseen" not in shown["differences"]
     assert len(shown["differences"].splitlines()) == 2 + len(names) - 1
@@ -97,6 +103,7 @@ def test_a_region_has_its_own_model_where_it_keeps_one() -> None:
     heads = measure_places(cast(Any, run), "heads", CLOUD)
     assert heads == pytest.approx({OWN: 0.85, OTHERS: (0.2 + 0.3 + 0.4 + 0.1) / 4, UNSEEN: 0.4})
     assert measure_places(cast(Any, run), "heads", PRETRAIN) == pytest.approx(whole)
+    assert measure_places(cast(Any, run), MAIN, EDGE) == pytest.approx({OWN: 0.65})
 
 
 def links_of(*present: bool) -> RadioLinks:
@@ -129,6 +136,34 @@ def test_scenes_go_on_in_stage_three_and_who_is_away_does_not_count() -> None:
     assert mean_round_s(sent[:1], {"grid": scenes}, 1) is None
 
 
+def test_edge_federation_alone_has_the_accuracy_the_messages_and_the_rounds_of_stage_two(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exchanges, "link_regions", lambda *_: {"grid": [links_of(True, True)]})
+    sent = [entry("grid/cav0", "up", 2_000_000), entry("grid/cav0", "up", 1_000_000, CLOUD)]
+    sent.append(LedgerEntry(PRETRAIN, "weather", "wireless", "up", 0, "suburb", 9_000_000))
+    Ledger(Budget(60, 30), sent).save(tmp_path / "ledgers" / "main.parquet")
+    clients = {EDGE: ("cav0", "cav1"), CLOUD: ("cav0",)}
+    stages = [
+        SimpleNamespace(stage=stage, records=[SimpleNamespace(server="grid", clients=names, epsilon=None)])
+        for stage, names in clients.items()
+    ]
+    plan = SimpleNamespace(tasks={"weather": SimpleNamespace(edge_rounds=1, cloud_rounds=1)})
+    reached = {PRETRAIN: 0.5, EDGE: 0.6, CLOUD: 0.7}
+    run = SimpleNamespace(
+        recipe=RECIPE,
+        arms={MAIN: SimpleNamespace(regional=None, stages=stages, plan=plan)},
+        test=lambda *, arm, stage, region, task: SimpleNamespace(estimate=SimpleNamespace(mean=reached[stage])),
+    )
+    found = measure_seed(cast(Any, run), tmp_path)
+    assert {*found} == {NONE, NO_CLOUD, WHOLE}
+    alone, whole = found[NO_CLOUD], found[WHOLE]
+    assert alone.accuracy == {OWN: 0.6}
+    assert whole.accuracy == pytest.approx({OWN: 0.7, OTHERS: 0.7, UNSEEN: 0.7})
+    assert (alone.wireless_up_mb, whole.wireless_up_mb) == (2.0, 3.0)
+    assert (alone.clients, whole.clients) == (2.0, 1.5)
+
+
 def arm(own: float, up_mb: float, epsilon: float | None = None) -> ExchangeArm:
     return ExchangeArm(
         {OWN: own, OTHERS: own - 0.1, UNSEEN: own - 0.2}, up_mb, 14.0, 1.0, 1.0, 3.5, 0.4 if up_mb else None, epsilon
@@ -142,8 +177,26 @@ def results_of(seeds: int) -> Any:
         arms = {name: arm(0.75 + shift + 0.001 * (number % 2), 14.0) for name in NAMES}
         arms |= {NONE: arm(0.6 + shift + 0.002 * (number % 3), 0.0), WHOLE: arm(0.75 + shift, 14.0)}
         arms |= {"models (Ditto)": arm(0.85 + shift + 0.002 * (number % 2), 14.0)}
+        arms |= {NO_CLOUD: replace(arm(0.7 + shift, 9.0), accuracy={OWN: 0.75 + shift - 0.01 * number})}
         found[str(number)] = arms | {"local noise, 1": arm(0.15 + 0.02 * (number % 2), 14.0, 43.2)}
     return summarise(RECIPE, found)
+
+
+def test_what_cloud_rounds_gain_stands_beside_how_far_the_regions_are_apart() -> None:
+    results = results_of(4)
+    assert [*results.accuracy[NO_CLOUD]] == [*results.differences[NO_CLOUD]] == [OWN]
+    assert "| what the cloud does | no cloud round | 0.75" in tables(results)["accuracy"]
+    apart = {
+        str(seed): RoundDivergence(Divergence(0.1 * seed, 0.3, 0.01), Divergence(0.5 - 0.1 * seed, 0.4, 0.02))
+        for seed in range(1, 5)
+    }
+    shown = tables(replace(results, divergence=apart))["cloud"].splitlines()
+    assert "| own region: cloud - edge FL |" in shown[0]
+    assert shown[2].startswith("| seed 1 | 0.1000 | 0.0100 | 0.3000 | 0.4000 |")
+    assert shown[2].endswith("| +0.010 |")
+    assert shown[6].endswith("| +0.025 |")
+    assert "| +1.00 (p 0.00) |" in shown[7]
+    assert "| -1.00 (p 0.00) |" in shown[7]
 
 
 def test_differences_are_paired_and_judged_together() -> None:

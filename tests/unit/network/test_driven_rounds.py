@@ -178,6 +178,17 @@ def test_a_masked_round_that_the_network_leaves_too_few_for_has_no_update_and_th
     assert after[2][0] != after[1][0]
 
 
+@pytest.mark.parametrize("rules", [{"secure": {}}, {"secure": {"threshold": 2}}, {"least_clients": 2}], ids=str)
+def test_a_first_round_that_the_network_predicts_for_one_vehicle_does_not_end_the_run(rules: dict[str, Any]) -> None:
+    plan = {"rule": "planned", "joins": {name: (1, 2) if name == NAMES[0] else (2,) for name in NAMES}}
+    clients: dict[str, Trainable] = {name: Walk() for name in NAMES}
+    account, state = Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless"), FederationState()
+    how = Rules.model_validate(rules | {"selection": plan})
+    federate(clients, START, Schedule(2, 1, 0.1, 0.1, 3), account, rules=how, state=state)
+    alone = () if how.secure else NAMES[:1]
+    assert [record.clients for record in state.records] == [alone, NAMES]
+
+
 FIVE = tuple(f"grid/cav{i}" for i in range(5))
 
 

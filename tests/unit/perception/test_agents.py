@@ -12,9 +12,10 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.fusion.detector import ROAD
 from flcav.geometry import concatenate, pose
 from flcav.perception.agents import choose_frames
-from flcav.perception.card import read_lidar
+from flcav.perception.card import join_lidars, read_lidar
 from flcav.perception.networks import find_trained_lidar
 from flcav.perception.objects import predict as prediction
 from flcav.perception.objects.model import second, second_tiny, small_config, tiny_config
@@ -24,9 +25,10 @@ from flcav.perception.task import KnownLidar
 from flcav.perception.trajectory.config import CONFIGURATIONS as TRAJECTORIES
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import read_card, save_network
+from flcav.perception.weights import find_shipped, read_card, save_network
 from flcav.sensors.frame import Calibration, Frame
 from flcav.sensors.rig import RIGS
+from flcav.sources.randomisation import DRAWN_BEAMS
 
 from .frames import cloud_in, detections, frame
 
@@ -149,9 +151,12 @@ def test_a_rig_unlike_the_network_s_is_said_and_its_height_corrected(recorded):
     assert chosen.sentence == f"4 vehicle and 2 pole frames; {chosen.rig}"
     assert chosen.summary()["rig"] == chosen.rig
     assert choose_frames(OBJECTS, tiny_config(), taller, "poles").rig == ""
-    beams = choose_frames(OBJECTS, tiny_config(), recorded(beams=32), trained=KnownLidar(beams=64))
+    beams = choose_frames(OBJECTS, tiny_config(), recorded(beams=32), trained=KnownLidar((64, 64)))
     assert beams.rig == "unlike in the network's training the LiDAR has 32 beams, not 64"
-    assert choose_frames(OBJECTS, tiny_config(), recorded(beams=64), trained=KnownLidar(64, 120)).rig == ""
+    drawn = choose_frames(OBJECTS, tiny_config(), recorded(beams=32), trained=KnownLidar(DRAWN_BEAMS))
+    assert drawn.rig == "unlike in the network's training the LiDAR has 32 beams, not 40 to 128"
+    for trained in (KnownLidar((64, 64), 120), KnownLidar(DRAWN_BEAMS)):
+        assert choose_frames(OBJECTS, tiny_config(), recorded(beams=64), trained=trained).rig == ""
 
 
 @pytest.mark.parametrize(
@@ -166,12 +171,26 @@ def test_another_range_is_said_as_far_as_the_network_looks(recorded, here: float
 
 def test_the_lidar_of_a_training_is_that_of_its_rig():
     settings = RIGS["kitti_lidar"].lidars["velodyne"].settings
-    known = KnownLidar(settings.channels, settings.range_m)
-    assert known == KnownLidar(64, 120)
+    known = KnownLidar((settings.channels, settings.channels), settings.range_m)
+    assert known == KnownLidar((64, 64), 120)
     assert read_lidar({"vehicle_rig": "kitti_lidar"}) == known
     assert read_lidar({"vehicle_rig": RIGS["kitti_lidar"].model_dump(mode="json")}) == known
-    assert read_lidar({"vehicle_rig": "kitti_lidar", "randomise": "streets"}) == KnownLidar()
-    assert find_trained_lidar(OBJECTS, None) == KnownLidar()  # the package's knows many, drawn ones
+    assert read_lidar({"vehicle_rig": "kitti_lidar", "randomise": "streets"}) == KnownLidar(DRAWN_BEAMS, 120)
+    assert find_trained_lidar(OBJECTS, None) == KnownLidar(DRAWN_BEAMS, 120)  # the package's knows many, drawn ones
+
+
+def test_the_lidar_of_a_road_detector_s_training_is_the_poles():
+    both = {"vehicle_rig": "lidar32", "pole_rig": "lidar_pole"}
+    assert read_lidar(both, ("pole1", "pole2")).beams == (64, 64)
+    assert read_lidar(both, ("cav0", "pole2")).beams == read_lidar(both).beams == (32, 32)
+    assert find_trained_lidar(OBJECTS, find_shipped(OBJECTS, ROAD)).beams == (64, 64)
+
+
+def test_the_lidars_of_several_recordings_are_one_by_what_all_of_them_say():
+    few, many = KnownLidar((32, 32), 100), KnownLidar(DRAWN_BEAMS, 120)
+    assert join_lidars([few, many]) == KnownLidar((32, 128))
+    assert join_lidars([many, KnownLidar(None, 120)]) == KnownLidar(None, 120)
+    assert join_lidars([]) == KnownLidar()
 
 
 def test_cameras_of_vehicles_and_poles_are_used_alike_and_paths_are_those_of_vehicles(street):

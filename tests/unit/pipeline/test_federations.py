@@ -2,6 +2,7 @@
 
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ from flcav.federation.strategies.fedavgm import FedAvgM
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 from flcav.fusion.distillation import Distillation
 from flcav.network.ledger import Budget, Ledger
+from flcav.perception.client import TaskClient
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
 from flcav.perception.weather.task import WEATHER
@@ -87,7 +89,7 @@ def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any
             check_federations(recipe, arms)
 
 
-def test_secure_aggregation_is_refused_where_the_plan_says_who_joins() -> None:
+def test_what_needs_a_known_number_is_refused_where_the_plan_says_who_joins() -> None:
     def check(secure: dict[str, Any], *changes: dict[str, Any], **federation: Any) -> None:
         recipe, _ = settings({"masked": secure}, **federation)
         for more in changes:
@@ -96,20 +98,54 @@ def test_secure_aggregation_is_refused_where_the_plan_says_who_joins() -> None:
 
     regions = settings({})[0].regions
     slow = {"regions": {**regions, "grid": regions["grid"].model_copy(update={"speed": {"cav1": 0.5}})}}
-    soon, masked = {"horizon_s": 40.0}, {"secure": {}}
-    with pytest.raises(
-        InputError, match=r"federation.secure: a plan within horizon_s may leave a round to one vehicle"
+    soon = {"horizon_s": 40.0}
+    planned: dict[str, dict[str, Any]] = {
+        "secure aggregation takes two or more": {"secure": {}},
+        "noise is for one number": {"privacy": PRIVACY},
+        "Krum needs a known one": {"strategy": {"krum": {"byzantine": 0}}, "cloud_strategy": "fedavg"},
+    }
+    for told, asked in planned.items():
+        said = rf"horizon_s: a plan by .* leaves other numbers of vehicles .*{told}.*; choose another 'selection'"
+        with pytest.raises(InputError, match=said):
+            check(asked, slow, soon)
+        with pytest.raises(InputError, match=said):
+            check(asked | {"network": {}}, soon, network={})
+        check(asked, slow)  # without a horizon all join every round
+        check(asked, soon)
+        check(asked | {"selection": {"rule": "round-robin", "clients": 3}}, slow, soon)
+        arms = {"masked": Arm(plan="equal-stages", federation=asked)}
+        check({}, slow, soon, {"arms": arms})
+    check({"strategy": "median"}, slow, soon)  # of any number
+
+
+@pytest.mark.parametrize(
+    ("federation", "said"),
+    [
+        (
+            {"strategy": {"trimmed-mean": {"fraction": 0.3}}, "cloud_strategy": "fedavg"},
+            "and TrimmedMean needs a known one",
+        ),
+        ({"privacy": PRIVACY}, "and noise is for one number"),
+        ({"strategy": "median"}, None),
+        ({"secure": {}}, None),  # a round with too few has no update
+    ],
+)
+def test_a_predicted_deadline_is_refused_with_what_needs_a_known_number(federation: Any, said: str | None) -> None:
+    deadline, seconds = {"rule": "deadline", "deadline_s": 9}, {"grid/cav0": 1.0}
+
+    def check(selection: dict[str, Any], **network: Any) -> None:
+        check_federations(*settings({}, **federation, selection=selection, **network))
+
+    with (
+        nullcontext() if said is None else pytest.raises(InputError, match=f"federation.network: a predicted .* {said}")
     ):
-        check(masked, slow, soon)
+        check(deadline, network={})
+    check(deadline | {"seconds": seconds}, network={})
+    check(deadline | {"seconds": seconds})
     with pytest.raises(
-        InputError, match=r"federation.secure: a plan within horizon_s may leave a round to one vehicle"
+        InputError, match="selection: a deadline needs the predicted 'seconds' of a round by client, or"
     ):
-        check(masked | {"network": {}}, soon, network={})
-    check(masked, slow)  # without a horizon all join every round
-    check(masked, soon)
-    check(masked | {"selection": {"rule": "uniform", "clients": 3}}, slow, soon)
-    arms = {"masked": Arm(plan="equal-stages", federation=masked)}
-    check({}, slow, soon, {"arms": arms})
+        check(deadline)
 
 
 def test_a_pose_graph_without_gtsam_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -346,6 +382,32 @@ def test_both_stages_in_two_processes_end_with_the_bytes_of_one_also_where_label
 
     assert end(2) == end(1)
     assert end(1, renewed=False)[0] != end(1)[0]
+
+
+def test_cloud_rounds_begin_the_learning_rate_anew_where_that_is_asked_for_and_stage_two_stays_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, (main, anew) = settings({"anew": {"cloud_rate": 0.4, "personal": ["head.*"]}})
+    assert anew.federation.cloud_rate == 0.4
+    assert anew.edge_federation == main.edge_federation == main.federation
+
+    rates: list[float] = []
+    train = TaskClient.train
+
+    def telling(client: Any, weights: Any, *, learning_rate: float, **how: Any) -> Any:
+        rates.append(learning_rate / LineTask.practice.learning_rate)
+        return train(client, weights, learning_rate=learning_rate, **how)
+
+    monkeypatch.setattr(TaskClient, "train", telling)
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1, final_rate=0.1), 3)
+    network = learning.build_network()
+    clients = make_clients(learning, Slope(), {"a/cav0": [np.float32(1), np.float32(2)]})
+    starts = {"a": RegionStart(clients, to_arrays(network), earlier=2)}
+    for rate, expected in ((None, [0.1, 0.1]), (0.4, [0.4, 0.1])):
+        how = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), tmp_path / str(rate), ignore_progress)
+        federate_cloud(CloudFederation(learning, network, starts, 1, *how, rate=rate), 2, Rules())
+        assert rates == pytest.approx(expected)
+        rates.clear()
 
 
 def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:

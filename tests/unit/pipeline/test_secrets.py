@@ -21,7 +21,7 @@ from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.federations.rounds import SECRETS
+from flcav.pipeline.federations.secrets import SECRETS, SECRETS_HASH
 from flcav.pipeline.recipe import Training
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.stages.clients import Strategies, make_clients
@@ -101,25 +101,22 @@ def test_a_killed_federation_goes_on_with_its_secrets(
     parties = [SERVER] if where == "central" else [f"cav{i}" for i in range(VEHICLES)]
     assert len(secrets) == len(set(secrets.values())) == len(states) * len(parties)
     assert {name.partition("|")[0] for name in secrets} == {*states}
+    shutil.copytree(killed, tmp_path / "forgetful")
+    (tmp_path / "forgetful" / SECRETS).unlink()
+    with pytest.raises(InputError, match=rf"{SECRETS} is missing or not .*; remove the folder to begin anew"):
+        federate(tmp_path / "forgetful", how, 0)
     ends = []
-    begun = (killed / "round1.safetensors").exists()
-    for name in ("one", "another", "forgetful"):
+    for name in ("one", "another"):
         shutil.copytree(killed, tmp_path / name)
-        if name == "forgetful":
-            (tmp_path / name / SECRETS).unlink()
-            if begun:
-                with pytest.raises(InputError, match=rf"{SECRETS} is missing or .*; remove the folder to begin anew"):
-                    federate(tmp_path / name, how, 0)
-                continue
         federate(tmp_path / name, how, 0)
         ends.append((tmp_path / name / WEIGHTS).read_bytes())
         left = b"".join(path.read_bytes() for path in (tmp_path / name).rglob("*") if path.is_file())
         assert not any(secret in left or secret.hex().encode() in left for secret in secrets.values())
-        assert not (tmp_path / name / SECRETS).exists()
-    assert ends[0] == ends[1] not in ends[2:]
+        assert not {SECRETS, SECRETS_HASH} & {path.name for path in (tmp_path / name).iterdir()}
+    assert ends[0] == ends[1]
     federate(tmp_path / "one", how, 0)  # killed after its end, which removes the secrets
     assert (tmp_path / "one" / WEIGHTS).read_bytes() == ends[0]
-    if begun:  # is not done again
+    if (killed / "round1.safetensors").exists():  # is not done again
         assert (killed / "round1.safetensors").read_bytes() == (tmp_path / "one/round1.safetensors").read_bytes()
 
 
@@ -154,6 +151,16 @@ def test_two_runs_of_one_seed_differ_unless_they_are_seeded(tmp_path: Path) -> N
 def test_damaged_secrets_are_one_sentence(tmp_path: Path) -> None:
     kill(edge, tmp_path, rules("local"), 5)
     data = (tmp_path / SECRETS).read_bytes()
-    (tmp_path / SECRETS).write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match=rf"{SECRETS} is damaged \(.*\); remove the folder to begin anew"):
-        edge(tmp_path, rules("local"))
+    for damaged in (data[: len(data) // 2], data[:-1] + bytes([data[-1] ^ 1])):
+        (tmp_path / SECRETS).write_bytes(damaged)
+        with pytest.raises(InputError, match=rf"{SECRETS} is damaged: .*; remove the folder to begin anew"):
+            edge(tmp_path, rules("local"))
+
+
+def test_secrets_that_were_drawn_right_before_a_kill_are_kept(tmp_path: Path) -> None:
+    kill(edge, tmp_path / "whole", rules("local"), 1)
+    shutil.copytree(tmp_path / "whole", tmp_path / "halved")
+    (tmp_path / "halved" / SECRETS_HASH).unlink()  # killed between both files
+    for name in ("whole", "halved"):
+        edge(tmp_path / name, rules("local"))
+    assert (tmp_path / "whole" / WEIGHTS).read_bytes() == (tmp_path / "halved" / WEIGHTS).read_bytes()

@@ -12,7 +12,14 @@ from flcav.perception.task import KnownLidar
 from flcav.seeds import stream
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
-from flcav.sources.randomisation import draw_terrain, randomise_rig, randomise_sizes, randomise_town, town_files
+from flcav.sources.randomisation import (
+    DRAWN_BEAMS,
+    draw_terrain,
+    randomise_rig,
+    randomise_sizes,
+    randomise_town,
+    town_files,
+)
 from flcav.sources.recipe import Recipe
 from flcav.world.map.parameters import BOUNDARIES
 from flcav.world.map.relief import Relief
@@ -95,7 +102,10 @@ def test_every_car_has_a_lidar_of_its_own(source: EmbeddedSource):
     assert 2.05 < heights.max() <= 2.13
     assert {lidar.settings.range_m for lidar in drawn} == {120.0}
     assert len({lidar.settings.channels for lidar in drawn}) > 8  # even patterns differ in it
-    assert read_lidar(source.describe()) == KnownLidar()
+    assert read_lidar(source.describe()) == KnownLidar(DRAWN_BEAMS, 120)
+    beams = [lidar.settings.channels for lidar in drawn]
+    assert min(beams) >= DRAWN_BEAMS[0]
+    assert max(beams) == DRAWN_BEAMS[1]
 
 
 def test_cars_alone_change_their_sizes(source: EmbeddedSource):

@@ -17,6 +17,7 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.intervals import OWN_SCENES, SharedScenes, share_scenes
 from flcav.perception.client import camera_ahead
 from flcav.perception.networks import resolve_network
 from flcav.perception.task import build_network
@@ -26,7 +27,7 @@ from flcav.perception.weather.predict import tensor_of
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
 from flcav.progress import Report, ignore_progress
-from flcav.seeds import derive_seed
+from flcav.seeds import derive_seed, stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.world.weather import WEATHER_CLASSES
@@ -109,6 +110,17 @@ def predict(weights: Weights, features: Vector) -> tuple[Vector, Vector]:
 def find_right(weights: Weights, pictures: Pictures) -> NDArray[np.bool_]:
     """Return whether the network names the class of each picture (N,)."""
     return predict(weights, pictures.features)[1].argmax(axis=1) == pictures.labels
+
+
+def spread_over_scenes(pictures: Pictures, values: Sequence[NDArray[np.float64]]) -> SharedScenes:
+    """Return how the mean over seeds of a number of each picture varies by the scenes, which all seeds have.
+
+    values: (N,) of each seed. Of a single seed the spread is not told from that of the seeds.
+    """
+    if len(values) == 1:
+        return OWN_SCENES
+    measures = [lambda times, each=each: times @ each / np.maximum(times.sum(axis=1), 1) for each in values]
+    return share_scenes(measures, [pictures.scenes] * len(values), rng=stream(0, "scenes"))
 
 
 def measure_losses(weights: Weights, pictures: Pictures) -> NDArray[np.float64]:

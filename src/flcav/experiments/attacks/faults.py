@@ -15,7 +15,15 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.experiments.attacks.drives import CLASSES, Drives, Vehicle, draw_head, find_right, record_drives
+from flcav.experiments.attacks.drives import (
+    CLASSES,
+    Drives,
+    Vehicle,
+    draw_head,
+    find_right,
+    record_drives,
+    spread_over_scenes,
+)
 from flcav.federation.rounds import ClientFailed
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
@@ -25,7 +33,7 @@ from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.median import Median
 from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights, learned_names
-from flcav.intervals import MeanOverSeeds, mean_over_seeds, share_scenes
+from flcav.intervals import MeanOverSeeds, mean_over_seeds
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.provenance import Provenance, provenance
@@ -150,10 +158,8 @@ def summarise(
     scenes = drives.test.scenes
 
     def mean(values: list[NDArray[np.float64]], share: bool) -> MeanOverSeeds:
-        measures = [lambda times, each=each: times @ each / np.maximum(times.sum(axis=1), 1) for each in values]
-        shared = share_scenes(measures, [scenes] * len(values), rng=stream(0, "scenes")) if len(values) > 1 else None
         means = [float(each.mean()) for each in values]
-        return mean_over_seeds(means, share=share, **({} if shared is None else {"shared": shared}))
+        return mean_over_seeds(means, share=share, shared=spread_over_scenes(drives.test, values))
 
     floats = {key: [each.astype(float) for each in values] for key, values in right.items()}
     rows = tuple(

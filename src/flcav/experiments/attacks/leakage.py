@@ -21,6 +21,7 @@ from flcav.experiments.attacks.drives import (
     find_right,
     measure_losses,
     record_drives,
+    spread_over_scenes,
 )
 from flcav.experiments.attacks.inference import (
     invert,
@@ -35,7 +36,7 @@ from flcav.federation.runtimes.reading import read_round
 from flcav.federation.selection import Selection
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import Weights
-from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.intervals import OWN_SCENES, MeanOverSeeds, mean_over_seeds
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.provenance import Provenance, provenance
@@ -60,6 +61,15 @@ class Leaked:
     membership_advantage: float
     recognised_one: float  # share of vehicles whose picture the inversion of a step on one picture names
     recognised_round: float  # share of vehicles of which the inversion of a whole update names a picture
+
+
+@dataclass(frozen=True)
+class Attacked:
+    """A federation of one seed that was attacked."""
+
+    by_update: Leaked  # by each vehicle's update
+    by_sum: Leaked  # by the mean of all
+    right: NDArray[np.bool_]  # (N,) whether the network at its end names the class of each picture of the test
 
 
 @dataclass(frozen=True)
@@ -104,14 +114,14 @@ def repeat_leakage(out: Path, seeds: int, progress: Report = ignore_progress) ->
         privacy = Privacy(where="local", clip=CLIP, noise=noise, delta=DELTA, seeded=True) if noise else None
         found = []
         for seed in range(1, seeds + 1):
-            found.append(attack(drives, known, Rules(privacy=privacy), seed)[0])
+            found.append(attack(drives, known, Rules(privacy=privacy), seed))
             done += 1
             progress(done, (len(NOISES) + 1) * seeds, f"noise {noise:g}, seed {seed}")
         epsilon = None if privacy is None else account_epsilon(privacy, Selection(), names, ROUNDS)
-        levels.append(make_level(f"{noise:g}" if noise else "none", epsilon, found))
-    secure = Rules(secure=SecureAggregation())
-    by_update, by_sum = zip(*(attack(drives, known, secure, seed) for seed in range(1, seeds + 1)), strict=True)
-    masked, summed = make_level("masked update", None, by_update), make_level("sum of all", None, by_sum)
+        levels.append(make_level(drives.test, f"{noise:g}" if noise else "none", epsilon, found))
+    secure = [attack(drives, known, Rules(secure=SecureAggregation()), seed) for seed in range(1, seeds + 1)]
+    masked = make_level(drives.test, "masked update", None, secure)
+    summed = make_level(drives.test, "sum of all", None, secure, by_sum=True)
     results = LeakageResult(len(known), CLIP, DELTA, ROUNDS, tuple(levels), masked, summed, provenance())
     lines = {
         "accuracy": [level.mean["accuracy"] for level in levels],
@@ -138,8 +148,8 @@ def take(pictures: Pictures, places: Sequence[int] | NDArray[np.int64]) -> Pictu
     return Pictures(pictures.features[places], pictures.labels[places], scenes)
 
 
-def attack(drives: Drives, known: Vector, rules: Rules, seed: int) -> tuple[Leaked, Leaked]:
-    """Return accuracy and leakage of a federation under these rules: by each vehicle's update, and by their mean.
+def attack(drives: Drives, known: Vector, rules: Rules, seed: int) -> Attacked:
+    """Return accuracy and leakage of a federation under these rules.
 
     known: (N, 120), the pictures that one is to be recognised among.
     """
@@ -151,16 +161,17 @@ def attack(drives: Drives, known: Vector, rules: Rules, seed: int) -> tuple[Leak
     single = {name: Vehicle(pictures, 1) for name, pictures in first.items()}
     final = federate(vehicles, start, schedule, account, rules=rules).weights
     losses = [np.concatenate([measure_losses(final, each) for each in part.values()]) for part in (members, others)]
-    accuracy, auc = float(find_right(final, drives.test).mean()), membership_auc(*losses)
-    advantage = membership_advantage(*losses)
+    right = find_right(final, drives.test)
+    told = (float(right.mean()), membership_auc(*losses), membership_advantage(*losses))
     seen_one, mean_one = read_round(single, start, Schedule(1, 1, LONG_STEP, LONG_STEP, seed), rules)
     seen, mean = read_round(vehicles, start, schedule, rules)
 
     def tell(sent_one: Mapping[str, Weights], sent: Mapping[str, Weights]) -> Leaked:
         one, whole = share_recognised(start, sent_one, first, known), share_recognised(start, sent, members, known)
-        return Leaked(accuracy, auc, advantage, one, whole)
+        return Leaked(*told, one, whole)
 
-    return tell(seen_one, seen), tell(dict.fromkeys(members, mean_one), dict.fromkeys(members, mean))
+    by_sum = tell(dict.fromkeys(members, mean_one), dict.fromkeys(members, mean))
+    return Attacked(tell(seen_one, seen), by_sum, right)
 
 
 def share_recognised(start: Weights, sent: Mapping[str, Weights], own: Mapping[str, Pictures], known: Vector) -> float:
@@ -169,9 +180,15 @@ def share_recognised(start: Weights, sent: Mapping[str, Weights], own: Mapping[s
     return float(np.mean([(own[name].features == found).all(axis=1).any() for name, found in named.items()]))
 
 
-def make_level(name: str, epsilon: float | None, seeds: Sequence[Leaked]) -> Level:
-    """Return a level with the means over its seeds."""
-    numbers = {field.name: [getattr(each, field.name) for each in seeds] for field in fields(Leaked)}
-    shares = {key: key != "membership_advantage" for key in numbers}
-    means = {key: mean_over_seeds(values, share=shares[key]) for key, values in numbers.items()}
-    return Level(name, epsilon, tuple(seeds), means)
+def make_level(
+    test: Pictures, name: str, epsilon: float | None, seeds: Sequence[Attacked], *, by_sum: bool = False
+) -> Level:
+    """Return a level with the means over its seeds: of the accuracy over the scenes of `test`, too."""
+    leaked = tuple(each.by_sum if by_sum else each.by_update for each in seeds)
+    spread = {"accuracy": spread_over_scenes(test, [each.right.astype(float) for each in seeds])}
+    means = {}
+    for key in (field.name for field in fields(Leaked)):
+        values = [getattr(each, key) for each in leaked]
+        share = key != "membership_advantage"
+        means[key] = mean_over_seeds(values, share=share, shared=spread.get(key, OWN_SCENES))
+    return Level(name, epsilon, leaked, means)

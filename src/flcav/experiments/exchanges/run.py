@@ -9,16 +9,18 @@ verdicts are corrected together.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 
+from flcav.experiments.cloud_rounds import span_divergence
 from flcav.experiments.exchanges.clock import link_regions, mean_round_s
+from flcav.federation.divergence import RoundDivergence
 from flcav.files import Json
 from flcav.intervals import MeanOverSeeds, mean_over_seeds
-from flcav.network.ledger import Direction, Ledger, Link
+from flcav.network.ledger import Ledger
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import Run
@@ -28,9 +30,10 @@ from flcav.report import style
 from flcav.report.charts.exchanges import Mark, draw_exchanges
 from flcav.verdicts import Claim, Judged, judge
 
-NONE, WHOLE = "no federation", "whole weights (FedAvg)"
+NONE, NO_CLOUD, WHOLE = "no federation", "no cloud round", "whole weights (FedAvg)"
 ARMS: Mapping[str, Mapping[str, str]] = {  # by what they are about: name in the tables -> arm
     "compared with": {NONE: PRETRAIN, WHOLE: MAIN},
+    "what the cloud does": {NO_CLOUD: EDGE, "learning rate begun anew": "restarted"},
     "what is sent": {
         "fp16": "fp16",
         "int8": "int8",
@@ -67,7 +70,7 @@ PLACES = (OWN, OTHERS, UNSEEN)
 class ExchangeArm:
     """Results of one arm in one seed; megabytes are those of stages II and III, 1 MB = 10^6 bytes."""
 
-    accuracy: Mapping[str, float]  # the task's measure by `PLACES`; without an unseen region there is none of it
+    accuracy: Mapping[str, float]  # the task's measure by those of `PLACES` that its networks were tested in
     wireless_up_mb: float
     wireless_down_mb: float
     wireline_up_mb: float
@@ -84,6 +87,7 @@ class ExchangeResult(Record):
     seeds: Mapping[str, Mapping[str, ExchangeArm]]  # by seed and arm
     accuracy: Mapping[str, Mapping[str, MeanOverSeeds]]  # by arm and place
     differences: Mapping[str, Mapping[str, MeanOverSeeds]]  # to whole weights, by arm and place
+    divergence: Annotated[Mapping[str, RoundDivergence] | None, LEFT_OUT] = None  # by seed, of whole weights
     recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
@@ -123,9 +127,11 @@ def compare_exchanges(recipe: RunRecipe, runs: Sequence[Run], folders: Sequence[
 
     `folders` hold the runs' steps and the arms' ledgers.
     """
-    return summarise(
-        recipe, {str(run.recipe.seed): measure_seed(run, folder) for run, folder in zip(runs, folders, strict=True)}
-    )
+    seeds = {str(run.recipe.seed): measure_seed(run, folder) for run, folder in zip(runs, folders, strict=True)}
+    stages = {str(run.recipe.seed): run.arms[MAIN].stages for run in runs}
+    rounds = {seed: [each for stage in own for each in stage.records or ()] for seed, own in stages.items()}
+    divergence = {seed: found for seed, own in rounds.items() if (found := span_divergence(own)) is not None}
+    return replace(summarise(recipe, seeds), divergence=divergence or None)
 
 
 def summarise(recipe: RunRecipe, seeds: Mapping[str, Mapping[str, ExchangeArm]]) -> ExchangeResult:
@@ -140,13 +146,15 @@ def summarise(recipe: RunRecipe, seeds: Mapping[str, Mapping[str, ExchangeArm]])
         return [round(own - whole, 9) for own, whole in pairs]
 
     arms = next(iter(seeds.values()))
-    places = tuple(place for place in PLACES if place in arms[WHOLE].accuracy)
     return ExchangeResult(
         seeds=seeds,
-        accuracy={name: {place: mean_over_seeds(values(name, place), share=True) for place in places} for name in arms},
+        accuracy={
+            name: {place: mean_over_seeds(values(name, place), share=True) for place in arm.accuracy}
+            for name, arm in arms.items()
+        },
         differences={
-            name: {place: mean_over_seeds(differences(name, place)) for place in places if place != OTHERS}
-            for name in arms
+            name: {place: mean_over_seeds(differences(name, place)) for place in arm.accuracy if place != OTHERS}
+            for name, arm in arms.items()
             if name != WHOLE
         },
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
@@ -162,17 +170,20 @@ def measure_seed(run: Run, folder: Path) -> dict[str, ExchangeArm]:
     links = link_regions(run.recipe, task, folder / WORK, rounds)
     found = {NONE: ExchangeArm(measure_places(run, MAIN, PRETRAIN), 0.0, 0.0, 0.0, 0.0, 0.0, None, None)}
     for name, arm in NAMES.items():
+        arm, stages = (MAIN, (EDGE,)) if name == NO_CLOUD else (arm, (EDGE, CLOUD))
         if name == NONE or arm not in run.arms:
             continue
-        book = Ledger.load(folder / "ledgers" / f"{arm}.parquet")
-        records = [each for stage in run.arms[arm].stages for each in stage.records or ()]
+        whole = Ledger.load(folder / "ledgers" / f"{arm}.parquet")
+        book = Ledger(whole.budget, [entry for entry in whole.entries if entry.stage in stages])
+        kept = [stage for stage in run.arms[arm].stages if stage.stage in stages]
+        records = [each for stage in kept for each in stage.records or ()]
         spent = [each.epsilon for each in records if each.epsilon is not None]
         found[name] = ExchangeArm(
-            accuracy=measure_places(run, arm, CLOUD),
-            wireless_up_mb=_sent_mb(book, "wireless", "up"),
-            wireless_down_mb=_sent_mb(book, "wireless", "down"),
-            wireline_up_mb=_sent_mb(book, "wireline", "up"),
-            wireline_down_mb=_sent_mb(book, "wireline", "down"),
+            accuracy=measure_places(run, arm, stages[-1]),
+            wireless_up_mb=book.used_mb("wireless", direction="up"),
+            wireless_down_mb=book.used_mb("wireless", direction="down"),
+            wireline_up_mb=book.used_mb("wireline", direction="up"),
+            wireline_down_mb=book.used_mb("wireline", direction="down"),
             clients=float(np.mean([len(each.clients) for each in records if each.server != CLOUD])),
             seconds=mean_round_s(book.entries, links, plan.edge_rounds),
             epsilon=max(spent) if spent else None,
@@ -185,7 +196,7 @@ def measure_places(run: Run, arm: str, stage: str) -> dict[str, float]:
 
     It is by the task's measure, of the region's own model where it keeps one, and else of the model for all. Others are
     the regions of pretraining and the other federating ones, averaged over both. In the unseen region, where there is
-    one, it is the model for all.
+    one, it is the model for all. After stage II each region's network is tested at home alone.
     """
     (task,), home, unseen = run.recipe.tasks, run.recipe.with_role("federate"), run.recipe.with_role("unseen")
     known = [name for name in run.recipe.regions if name not in unseen]
@@ -198,15 +209,13 @@ def measure_places(run: Run, arm: str, stage: str) -> dict[str, float]:
         own = kept.get((model, region))
         return run.test(arm=arm, stage=stage, region=region, task=task).estimate.mean if own is None else own
 
+    if stage == EDGE:
+        return {OWN: float(np.mean([accuracy(region, region) for region in home]))}
     of_all = [run.test(arm=arm, stage=stage, region=region, task=task).estimate.mean for region in unseen]
     return {
         OWN: float(np.mean([accuracy(region, region) for region in home])),
         OTHERS: float(np.mean([accuracy(model, region) for model in home for region in known if region != model])),
     } | ({UNSEEN: float(np.mean(of_all))} if of_all else {})
-
-
-def _sent_mb(book: Ledger, link: Link, direction: Direction) -> float:
-    return sum(book.used_mb(link, stage=stage, direction=direction) for stage in (EDGE, CLOUD))
 
 
 def judge_differences(results: ExchangeResult) -> dict[str, Judged]:

@@ -4,10 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from flcav.experiments.cloud_rounds import format_divergence
 from flcav.experiments.exchanges.run import (
+    NO_CLOUD,
     NONE,
     OWN,
     UNSEEN,
+    WHOLE,
     ExchangeArm,
     ExchangeResult,
     judge_differences,
@@ -20,13 +23,17 @@ WORDS = {HELD: "higher", NOT_HELD: "lower", UNDECIDED: UNDECIDED}  # of the clai
 
 
 def tables(results: ExchangeResult) -> dict[str, str]:
-    """Return Markdown by name: accuracy, costs, differences."""
-    return {"accuracy": _accuracy(results), "costs": _costs(results), "differences": _differences(results)}
+    """Return Markdown by name: accuracy, costs, differences, cloud; the last is empty where it was not measured."""
+    found = {"accuracy": _accuracy(results), "costs": _costs(results), "differences": _differences(results)}
+    return found | {"cloud": _cloud(results)}
 
 
 def _accuracy(results: ExchangeResult) -> str:
+    def tell(name: str, place: str) -> str:
+        return results.accuracy[name][place].describe() if place in results.accuracy[name] else ""
+
     rows = [
-        [group, name, *(results.accuracy[name][place].describe() for place in results.places)]
+        [group, name, *(tell(name, place) for place in results.places)]
         for group, names in results.groups.items()
         for name in names
     ]
@@ -65,7 +72,8 @@ def _differences(results: ExchangeResult) -> str:
         if one.verdict == UNDECIDED and one.p is not None:
             seeds = f"more than {MOST_SEEDS}" if one.seeds is None else str(one.seeds)
         p = "" if one.p is None else format_p(one.p)
-        told = [places[place].describe(sign=True) for place in (OWN, UNSEEN) if place in places]
+        shown = [place for place in (OWN, UNSEEN) if place in results.places]
+        told = [places[place].describe(sign=True) if place in places else "" for place in shown]
         rows.append([name, told[0], p, WORDS[one.verdict], seeds, *told[1:]])
     header = (
         "arm",
@@ -76,3 +84,13 @@ def _differences(results: ExchangeResult) -> str:
         *([f"the same, {UNSEEN}"] if UNSEEN in results.places else []),
     )
     return format_table(header, rows)
+
+
+def _cloud(results: ExchangeResult) -> str:
+    """Return the divergence of the regions in each seed beside what the cloud rounds gain in the own region."""
+    if not results.divergence:
+        return ""
+    seeds = {seed: results.seeds[seed] for seed in results.divergence}
+    gain = [arms[WHOLE].accuracy[OWN] - arms[NO_CLOUD].accuracy[OWN] for arms in seeds.values()]
+    names = [f"seed {seed}" for seed in seeds]
+    return format_divergence(names, [*results.divergence.values()], {f"{OWN}: cloud - edge FL": gain})

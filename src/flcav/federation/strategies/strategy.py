@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
+from flcav.config import InputError
 from flcav.federation.trainable import Correction, LocalUpdate, Update, Weights
 
 
@@ -88,3 +89,13 @@ class Robust(Protocol):
     def check_clients(self, clients: int) -> None:
         """Raise `InputError` where the strategy cannot combine the updates of so few clients."""
         ...
+
+
+def needs_known_number(strategy: Strategy) -> bool:
+    """Return whether the strategy cannot combine the updates of every number of clients."""
+    try:
+        if isinstance(strategy, Robust):
+            strategy.check_clients(1)
+    except InputError:
+        return True
+    return False

@@ -141,7 +141,7 @@ def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
 
 
 def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], trained: KnownLidar) -> str:
-    """Return how the LiDAR of the vehicles' frames differs from the one of the network's training, in words.
+    """Return how the LiDAR of the frames' agents differs from the one of the network's training, in words.
 
     That is by its number of beams, its range as far as the network looks, its height above the ground and its
     direction, of which the last two are corrected (see `flcav.perception.objects.truth.network_from_lidar`). "" where
@@ -156,10 +156,10 @@ def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], trai
     moved = [mount for mount in mounts if level_mount(mount, config) is not None]
     heights = dict.fromkeys(f"{mount[2, 3]:.2f}" for mount in moved if abs(mount[2, 3] + config.ground_z_m) > LEVEL_M)
     turned = dict.fromkeys(f"{math.degrees(angle):.0f}" for mount in moved if (angle := turn_of(mount)) > LEVEL_RAD)
-    here = read_lidar(data.manifest.recipe) if mounts else KnownLidar()
+    here = read_lidar(data.manifest.recipe, agents) if agents else KnownLidar()
     differences = []
-    if trained.beams is not None and here.beams is not None and here.beams != trained.beams:
-        differences.append(f"has {here.beams} beams, not {trained.beams}")
+    if trained.beams is not None and here.beams is not None and not _covers(trained.beams, here.beams):
+        differences.append(f"has {_span(here.beams)} beams, not {_span(trained.beams)}")
     if trained.range_m is not None and here.range_m is not None:
         seen_m, known_m = (min(far_m, config.reach_m) for far_m in (here.range_m, trained.range_m))
         if abs(seen_m - known_m) > RANGE_SLACK * known_m:
@@ -169,6 +169,14 @@ def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], trai
     if turned:
         differences.append(f"is turned by {', '.join(turned)} degrees (corrected)")
     return f"unlike in the network's training the LiDAR {' and '.join(differences)}" if differences else ""
+
+
+def _covers(beams: tuple[int, int], others: tuple[int, int]) -> bool:
+    return beams[0] <= others[0] and others[1] <= beams[1]
+
+
+def _span(beams: tuple[int, int]) -> str:
+    return str(beams[0]) if beams[0] == beams[1] else f"{beams[0]} to {beams[1]}"
 
 
 def crop_to_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.float32]:

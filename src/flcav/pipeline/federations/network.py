@@ -88,14 +88,13 @@ def drive_rounds(
     """
     outages: dict[tuple[int, str], Outage] = {}
     records, joins, now = [], dict.fromkeys(fleet.clients, ()), 0.0
-    predicts = rules.selection.rule == "deadline" and not rules.selection.seconds
     for number, seed in enumerate(seeds, start=1):
         links = scenes[(earlier + number - 1) % len(scenes)]
         present = {name for name, here in zip(links.vehicle, links.present[0].tolist(), strict=True) if here}
         chosen = rules.selection.choose(fleet.clients, number, seed)
         outages |= {(number, each): Outage(AWAY) for each in chosen if fleet.work(each).client not in present}
         there = [each for each in chosen if (number, each) not in outages]
-        if predicts:
+        if rules.selection.predicts:
             slow = _find_slow(fleet, links, there, number, rules.selection.deadline_s or 0.0)
             outages |= {(number, each): Outage(TOO_SLOW) for each in slow}
             there = [each for each in there if each not in slow]
@@ -109,7 +108,7 @@ def drive_rounds(
         ends = max((timing.end_s for timing in clients), default=now)
         records.append(RoundRecord(number, now, ends, 0.0, 0.0, clients))
         now = ends
-    selection = Selection(rule="planned", joins=joins) if predicts else rules.selection
+    selection = Selection(rule="planned", joins=joins) if rules.selection.predicts else rules.selection
     return DrivenRounds(rules.model_copy(update={"selection": selection}), outages, tuple(records))
 
 

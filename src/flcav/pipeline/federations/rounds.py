@@ -5,8 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
 from flcav.config import InputError
@@ -15,16 +13,16 @@ from flcav.federation.rounds import OnRound
 from flcav.federation.state import FederationState, describe_failures
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Weights
-from flcav.files import atomic_path, sha256, write_bytes, write_in_pieces
+from flcav.files import sha256, write_bytes
 from flcav.network.ledger import Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays, save_network, to_arrays
 from flcav.pipeline.federations.checkpoint import Checkpoint, find_checkpoint
+from flcav.pipeline.federations.secrets import read_secrets, remove_secrets, write_secrets
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.progress import Report
 
 LOSS = "loss"  # begins the note of a round
-SECRETS = "secrets.safetensors"  # of who draws noise, while a federation is under way
 
 
 class FederationCheckpoints:
@@ -88,26 +86,18 @@ class FederationCheckpoints:
     def keep_secrets(self, parties: Mapping[str, Sequence[str]]) -> None:
         """Restore the secrets of the parties of each state, by its name, or draw them before the first round.
 
-        To be called after `resume`. They are in a file that only its owner may read, so that a round that is repeated
-        has the same noise; `finish` removes it. Raises `InputError` where it is damaged, or missing after a round.
+        To be called after `resume`. They are kept in a file, so that a round that is repeated has the same noise;
+        `finish` removes it. Raises `InputError` where it is damaged, or missing though secrets were drawn.
         """
-        path = self._folder / SECRETS
-        try:
-            kept = load_file(path) if path.exists() else {}
-        except SafetensorError as error:
-            raise InputError(f"{path} is damaged ({error}); remove the folder to begin anew") from None
         asked = {f"{name}|{party}": (name, party) for name, found in parties.items() for party in found}
-        if self._goes_on and asked.keys() - kept.keys():
-            told = "is missing or not complete: a round that is repeated would have other noise"
-            raise InputError(f"{path} {told}; remove the folder to begin anew")
+        if not asked:
+            return
+        kept = read_secrets(self._folder, asked, self._goes_on)
         for key, (name, party) in asked.items():
             if key in kept:
-                self._states[name].secrets[party] = np.asarray(kept[key], np.uint8)
+                self._states[name].secrets[party] = kept[key]
         drawn = {key: self._states[name].keep_secret(party) for key, (name, party) in asked.items()}
-        if drawn.keys() - kept.keys():
-            with atomic_path(path) as temporary:
-                temporary.touch(mode=0o600)
-                write_in_pieces(temporary, save(drawn))
+        write_secrets(self._folder, drawn)
 
     def make_saver(self, rounds: int) -> OnRound:
         """Return the callback that saves a checkpoint after each of `rounds` rounds."""
@@ -165,7 +155,7 @@ class FederationCheckpoints:
             network = load_round_network(self._task, start, self._folder, rounds, averaged, start_share)
         save_network(self._task, network, self._folder / WEIGHTS)
         self._book.save(self._folder / LEDGER)
-        (self._folder / SECRETS).unlink(missing_ok=True)
+        remove_secrets(self._folder)
 
 
 def _state_name(round_: int) -> str:

@@ -54,6 +54,7 @@ class CloudFederation:
     validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
     keeps_statistics: bool = False  # whether each region's statistics of batch normalisation are written, too
+    rate: float | None = None  # of the first round, where it is begun anew
 
     def score(self, round_: int) -> Mapping[str, float]:
         """Return the scores, by region, of the network that a federation of so many rounds ends with."""
@@ -132,7 +133,7 @@ def federate_cloud(
     wireless = Account(own.book, CLOUD, learning.task.name, "wireless", outages)
     wireline = Account(own.book, CLOUD, learning.task.name, "wireline")
     earlier = max(each.earlier for each in own.regions.values())
-    schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier)
+    schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier, anew=own.rate)
     how: Any = {"strategy": own.strategies.cloud, "rules": rules.of_servers(), "state": state}
 
     def make_saver(rounds: int) -> OnRound:

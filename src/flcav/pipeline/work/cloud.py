@@ -146,8 +146,8 @@ def _open_federation(
     frames = {} if settings.replan is None else settings.replan.frames
     watched = {name: Frames.open(work.inputs[step]) for name, step in frames.items()}
     k, where = settings.federation.edge_rounds_per_cloud_round, (book, work.folder, work.report)
-    kept = bool(settings.validation)
-    return CloudFederation(learning, start, servers.starts, k, strategies, *where, watched, shared, kept)
+    kept, rate = bool(settings.validation), settings.federation.cloud_rate
+    return CloudFederation(learning, start, servers.starts, k, strategies, *where, watched, shared, kept, rate)
 
 
 def _score_statistics(work: Work, settings: CloudSettings, federation: CloudFederation) -> tuple[StatisticsScore, ...]:

@@ -10,7 +10,14 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from flcav.intervals import MeanOverSeeds
 from flcav.report import style
 
-COLOURS = (style.INK, style.BLUE, style.ORANGE, style.GREEN, style.VERMILLION)  # in the order of the groups
+COLOURS = (
+    style.INK,
+    style.BLUE,
+    style.ORANGE,
+    style.GREEN,
+    style.VERMILLION,
+    style.PURPLE,
+)  # in the order of the groups
 ROW, GAP = 0.235, 0.6  # height of a row [inch], and between two groups [rows]
 
 

@@ -45,6 +45,7 @@ _OF_PART = {
     Part.SIGN: "traffic_sign",
     Part.SIGNAL: "traffic_light",
     Part.POLE: "pole",
+    Part.DECK: "road",
 }
 _RIDER = (Material.SKIN, Material.CLOTH, Material.TROUSERS)
 

@@ -1,5 +1,9 @@
-"""Relief of a town: the height of the ground, linear over the triangles of a Delaunay triangulation (TIN)."""
+"""Relief of a town: the height of the ground, linear over the triangles of a Delaunay triangulation (TIN), and bridges.
 
+A bridge's deck has a surface of its own above the ground.
+"""
+
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -17,16 +21,18 @@ from flcav.parquet import read_parquet
 
 Array = NDArray[np.float64]
 
+PLACE = ("deck", "section")  # columns of a town's heights with bridges
 AXLE_SHARE, TRACK_SHARE = 0.3, 0.4  # from the middle of a vehicle to its wheels, of its length and width
 FARTHEST_M = 1e8
 
 
 class Relief:
-    """The heights of a town's ground; immutable."""
+    """The heights of a town's ground, and the decks of its bridges; immutable."""
 
-    def __init__(self, points: Array) -> None:
+    def __init__(self, points: Array, decks: "Sequence[Deck]" = ()) -> None:
         """Take the points (N, 3) of the ground, world frame [m]; raises `ValueError` where they span no area."""
         self.points = points
+        self.decks = tuple(decks)
         if len(points) < 3 or not (np.abs(points) <= FARTHEST_M).all():
             raise ValueError("a relief needs three points or more, with finite coordinates")
         try:
@@ -34,8 +40,8 @@ class Relief:
         except QhullError:
             raise ValueError("the points of a relief span no area") from None
 
-    def __getstate__(self) -> dict[str, Array]:
-        return {"points": self.points}
+    def __getstate__(self) -> dict[str, object]:
+        return {"points": self.points, "decks": self.decks}
 
     @cached_property
     def triangles(self) -> NDArray[np.int32]:
@@ -64,45 +70,105 @@ class Relief:
         """Return how high (N,) [m] points (N, 3), world frame [m], are above the ground."""
         return points[:, 2] - self.heights(*points[:, :2].T)
 
-    def tilts(self, x: Array, y: Array, yaw: Array, size: Array) -> tuple[Array, Array, Array]:
-        """Return height [m], pitch and roll [rad] of bodies (...) that stand on four wheels at these places.
+    def table(self) -> pa.Table:
+        """Return the points as a table with the columns x, y, z [m].
 
-        `size` (..., 3) is length, width, height [m]; the wheels are `AXLE_SHARE` and `TRACK_SHARE` of it from the
-        middle. A positive pitch turns the nose down, a positive roll lifts the left side, as in `geometry.pose`.
+        With bridges also `deck` and `section`, the numbers of a point's deck and of its cross-section; -1: ground.
         """
-        along, aside = AXLE_SHARE * size[..., 0], TRACK_SHARE * size[..., 1]
-        cos, sin = np.cos(yaw), np.sin(yaw)
-
-        def wheel(ahead: int, left: int) -> Array:
-            return self.heights(
-                x + ahead * along * cos - left * aside * sin, y + ahead * along * sin + left * aside * cos
-            )
-
-        (front_left, front_right), (rear_left, rear_right) = ((wheel(a, 1), wheel(a, -1)) for a in (1, -1))
-        rise = (front_left + front_right - rear_left - rear_right) / 2
-        bank = (front_left + rear_left - front_right - rear_right) / 2
-        height = (front_left + front_right + rear_left + rear_right) / 4
-        pitch = -np.arctan2(rise, 2 * along)
-        return height, pitch, np.arctan2(bank * np.cos(pitch), 2 * aside)
+        if not self.decks:
+            return pa.table(dict(zip("xyz", self.points.T)))
+        rows = [np.column_stack((self.points, np.full((len(self.points), 2), -1.0)))]
+        for number, deck in enumerate(self.decks):
+            rows += [
+                np.column_stack((section, np.broadcast_to((number, i), (len(section), 2))))
+                for i, section in enumerate(deck.sections)
+            ]
+        x, y, z, number, section = np.concatenate(rows).T
+        places = {"deck": number.astype(np.int32), "section": section.astype(np.int32)}
+        return pa.table({"x": x, "y": y, "z": z} | places)
 
     def save(self, path: Path) -> None:
-        """Write the points as Parquet with the columns x, y, z."""
-        pq.write_table(pa.table(dict(zip("xyz", self.points.T))), path, compression="zstd")
+        """Write the table as Parquet."""
+        pq.write_table(self.table(), path, compression="zstd")
 
     @classmethod
     def load(cls, path: Path) -> "Relief":
         """Return the relief that `save` wrote; raises `InputError` where the file is damaged."""
         table = read_parquet(path)
-        if table.column_names != ["x", "y", "z"] or any(column.null_count for column in table.columns):
-            raise InputError(f"{path}: not the heights of a town (its columns must be x, y, z)")
+        names = table.column_names
+        if names not in ([*"xyz"], [*"xyz", *PLACE]) or any(column.null_count for column in table.columns):
+            raise InputError(
+                f"{path}: not the heights of a town (its columns must be x, y, z, or these and deck, section)"
+            )
         try:
-            return cls(np.stack([table[name].to_numpy().astype(np.float64) for name in "xyz"], axis=1))
+            points = np.stack([table[name].to_numpy().astype(np.float64) for name in "xyz"], axis=1)
+            if names == [*"xyz"]:
+                return cls(points)
+            number, section = (table[name].to_numpy().astype(np.int64) for name in PLACE)
+            decks = [_split_sections(points[number == i], section[number == i]) for i in np.unique(number[number >= 0])]
+            return cls(points[number < 0], [Deck(sections) for sections in decks])
         except (ValueError, TypeError) as error:
             raise InputError(f"{path}: not the heights of a town ({error})") from None
 
     @cached_property
     def _tin(self) -> Delaunay:
         return Delaunay(self.points[:, :2])
+
+
+class Deck:
+    """The deck of a bridge: the surface of a road where it passes above another one; immutable."""
+
+    def __init__(self, sections: Sequence[Array]) -> None:
+        """Take its cross-sections (T, 3) along the road, each from right to left [m].
+
+        Raises `ValueError` where they span no area.
+        """
+        self.sections = tuple(sections)
+        self.surface = Relief(np.unique(np.concatenate(self.sections), axis=0))
+        if len(self.sections) < 2 or not self.outline.area > 0:
+            raise ValueError("a deck needs two cross-sections or more that span an area")
+
+    def __getstate__(self) -> dict[str, object]:
+        return {"sections": self.sections, "surface": self.surface}
+
+    @cached_property
+    def sides(self) -> tuple[Array, Array]:
+        """Return the right and the left edge, (K, 3) each [m]."""
+        return np.stack([s[0] for s in self.sections]), np.stack([s[-1] for s in self.sections])
+
+    @cached_property
+    def outline(self) -> BaseGeometry:
+        """Return the area of the deck, seen from above."""
+        right, left = self.sides
+        return shapely.make_valid(shapely.Polygon(np.concatenate((right, left[::-1]))[:, :2]))
+
+
+def find_tilts(
+    heights: Callable[[Array, Array], Array], x: Array, y: Array, yaw: Array, size: Array
+) -> tuple[Array, Array, Array]:
+    """Return height [m], pitch and roll [rad] of bodies (...) that stand on four wheels at these places.
+
+    `heights` are those of what they stand on; `size` (..., 3) is length, width, height [m]; the wheels are `AXLE_SHARE`
+    and `TRACK_SHARE` of it from the middle. A positive pitch turns the nose down, a positive roll lifts the left side,
+    as in `geometry.pose`.
+    """
+    along, aside = AXLE_SHARE * size[..., 0], TRACK_SHARE * size[..., 1]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+
+    def wheel(ahead: int, left: int) -> Array:
+        return heights(x + ahead * along * cos - left * aside * sin, y + ahead * along * sin + left * aside * cos)
+
+    (front_left, front_right), (rear_left, rear_right) = ((wheel(a, 1), wheel(a, -1)) for a in (1, -1))
+    rise = (front_left + front_right - rear_left - rear_right) / 2
+    bank = (front_left + rear_left - front_right - rear_right) / 2
+    height = (front_left + front_right + rear_left + rear_right) / 4
+    pitch = -np.arctan2(rise, 2 * along)
+    return height, pitch, np.arctan2(bank * np.cos(pitch), 2 * aside)
+
+
+def _split_sections(points: Array, section: NDArray[np.int64]) -> list[Array]:
+    """Return the cross-sections of points (N, 3) with these numbers (N,), in the order of the rows."""
+    return np.split(points, np.flatnonzero(np.diff(section)) + 1)
 
 
 @compiled

@@ -27,6 +27,7 @@ PACKAGED: tuple[str, ...] = (*TOWNS, *HILLY)  # all that come with flcav
 HEIGHTS = "heights.parquet"  # file of a town's relief, beside its net
 HILLS = "hills.parquet"  # that of a town of `HILLY`, beside the net of the level one
 KERB_M = 0.12  # height of a sidewalk above the road
+CLEAR_M = 3.0  # nothing stands nearer to a bridge
 MARGIN_M = 5.0  # from the outermost surface or building to the bounds
 
 
@@ -167,7 +168,11 @@ def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
 
 
 def lift_town(town: Town, relief: Relief) -> Town:
-    """Return a level town lifted onto a relief: poles, signs and signals by the ground at their feet."""
+    """Return a level town lifted onto a relief: poles, signs and signals by the ground at their feet.
+
+    Under and on bridges nothing stands: poles, signs, trees and furniture there are left out.
+    """
+    town = _clear_bridges(town, relief)
 
     def raise_by(position: Array, foot: Array) -> Array:
         lift = relief.heights(*foot[:, :2].T)
@@ -180,6 +185,37 @@ def lift_town(town: Town, relief: Relief) -> Town:
         poles=replace(poles, position=raise_by(poles.position, poles.position)),
         signs=replace(signs, position=raise_by(signs.position, signs.position)),
         signals=replace(signals, position=raise_by(signals.position, signals.foot)),
+    )
+
+
+def _clear_bridges(town: Town, relief: Relief) -> Town:
+    """Return a town without what stands on or under bridges, or within `CLEAR_M` of them."""
+    if not relief.decks:
+        return town
+    taken = shapely.union_all([deck.outline for deck in relief.decks]).buffer(CLEAR_M)
+    shapely.prepare(taken)
+
+    def is_free(feet: Array) -> NDArray[np.bool_]:
+        return ~shapely.contains_xy(taken, *feet[:, :2].T)
+
+    poles, signs = is_free(town.poles.position), is_free(town.signs.position)
+    return replace(
+        town,
+        trees=town.trees[is_free(town.trees)],
+        clutter=tuple((kind, rows[is_free(rows)]) for kind, rows in town.clutter),
+        lamps=town.lamps[is_free(town.lamps)],
+        posts=town.posts[is_free(town.posts)],
+        poles=Poles(
+            town.poles.id[poles],
+            town.poles.position[poles],
+            town.poles.yaw[poles],
+            tuple(kind for kind, kept in zip(town.poles.kind, poles) if kept),
+        ),
+        signs=Signs(
+            town.signs.position[signs],
+            town.signs.yaw[signs],
+            tuple(kind for kind, kept in zip(town.signs.kind, signs) if kept),
+        ),
     )
 
 

@@ -2,13 +2,16 @@
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from flcav.config import InputError, shorten
+from flcav.world.opendrive.bridges import CLEAR_M, Borders, Spans, find_bridges
 from flcav.world.opendrive.road_surface import Road
 from flcav.world.opendrive.standard import FARTHEST_M
 
@@ -20,18 +23,17 @@ TOLERANCE_M = 0.003  # by which the surface may differ from a cross-section that
 TWIST_M = 0.008  # and by which it may leave the plane between two of them
 BEND_SHARE = 0.1  # of an error in plan that counts as one of height
 ASIDE_M = (2.0, 6.0)  # beyond the outermost lanes the ground goes on at their height
-CLEAR_M = 4.0  # such points are left out within this distance of another road
-BRIDGE_M = 2.5  # a road at least this far above another one passes over it
+FINE_M = 2.0  # between points across a road near a bridge: so that the ground beside it begins at its edge
 CELL_M = 0.5  # points of different roads in one cell are one
 FAR_M = 400.0  # from the outermost points to the edge of the terrain
 
 
 @dataclass(frozen=True)
 class Heights:
-    """The points of a map's terrain."""
+    """The points of a map's terrain and of the decks of its bridges."""
 
     points: Array  # (N, 3) [m]; empty where the map is level at height 0
-    bridges: int  # roads of which parts pass above another one; the terrain follows the lower
+    decks: tuple[tuple[Array, ...], ...]  # of each its cross-sections (T, 3) along the road, from right to left [m]
 
 
 def sample_heights(root: ElementTree.Element, origin: Path) -> Heights:
@@ -41,57 +43,100 @@ def sample_heights(root: ElementTree.Element, origin: Path) -> Heights:
     """
     roads = [Road(row) for row in root.iterfind("road")]
     if all(road.is_level for road in roads):
-        return Heights(np.zeros((0, 3)), 0)
+        return Heights(np.zeros((0, 3)), ())
     with np.errstate(all="ignore"):  # numbers that overflow are refused below
-        sections = [_cross_sections(road) for road in roads]
-    for road, parts in zip(roads, sections):
-        if not all((np.abs(points) <= (FARTHEST_M, FARTHEST_M, HIGHEST_M)).all() for points in parts):
+        strips = [_cross_sections(road) for road in roads]
+    for road, own in zip(roads, strips):
+        if not all((np.abs(p) <= (FARTHEST_M, FARTHEST_M, HIGHEST_M)).all() for strip in own for p in strip):
             far = f"{FARTHEST_M / 1000:g} km, or {HIGHEST_M:g} m in height"
             raise InputError(f"{origin}: road {shorten(road.id)} reaches beyond {far}")
-    surface = np.concatenate([inner for inner, _ in sections])
-    aside = np.concatenate([outer for _, outer in sections])
-    owner = np.repeat(np.arange(len(roads)), [len(inner) for inner, _ in sections])
-    above = _find_above(surface, owner)
-    bridges = len(np.unique(owner[above]))
-    surface = surface[~above]
+    edges = [Borders(*(np.concatenate([strip.inner[row] for strip in own]) for row in (0, -1))) for own in strips]
+    spans = find_bridges(edges)
+    decks = [deck for own, span in zip(strips, spans) for deck in _list_decks(own, span)]
+    grounds = [_sample_ground(own, span) for own, span in zip(strips, spans)]
+    surface, aside = (np.concatenate([ground[i] for ground in grounds]) for i in (0, 1))
     distance, _ = KDTree(surface[:, :2]).query(aside[:, :2])
     room = np.minimum(np.array(ASIDE_M) - 0.1, CLEAR_M)
     aside = aside[distance > np.tile(room, len(aside) // len(room))]
     merged = _merge(np.concatenate((surface, aside)))
-    return Heights(np.concatenate((merged, surround(merged))).round(4), bridges)
+    return Heights(np.concatenate((merged, surround(merged))).round(4), tuple(decks))
 
 
-def _cross_sections(road: Road) -> tuple[Array, Array]:
-    """Return the points (N, 3) of a road's surface at the borders of its lanes, and those (M, 3) beside it."""
+class Strip(NamedTuple):
+    """The K cross-sections of a lane section."""
+
+    inner: Array  # (T, K, 3) at the borders of the lanes, from right to left [m]
+    outer: Array  # (2 len(ASIDE_M), K, 3) beside the road: on its right, then on its left [m]
+
+
+def _cross_sections(road: Road) -> list[Strip]:
+    """Return the cross-sections of a road, lane section by lane section."""
     count = max(int(np.ceil(road.length / STEP_M)), 1)
     stations = np.unique(np.clip([*np.linspace(0.0, road.length, count + 1), *road.stations], 0.0, road.length))
-    inner, outer = [], []
+    out = []
     for s, borders in road.sections(stations):
         t = np.stack([*borders.values(), np.zeros(len(s))])  # (lanes and the reference line, K)
         t = t if road.is_tilted_across else np.stack((t.min(axis=0), np.zeros(len(s)), t.max(axis=0)))
         t = np.sort(t, axis=0)
         points = road.point(np.tile(s, len(t)), t.ravel()).reshape(*t.shape, 3)
-        kept = _find_needed(points)
-        s, t = s[kept], t[:, kept]
-        inner.append(points[:, kept].reshape(-1, 3))
-        for side, edge in ((-1, t.min(axis=0)), (1, t.max(axis=0))):
-            beyond = edge[:, None] + side * np.array(ASIDE_M)
-            points = road.point(np.repeat(s, len(ASIDE_M)), beyond.ravel())
-            points[:, 2] = np.repeat(road.height(s, edge), len(ASIDE_M))
-            outer.append(points)
+        outer = []
+        for side, edge in ((-1, t[0]), (1, t[-1])):
+            for beyond_m in ASIDE_M:
+                beside = road.point(s, edge + side * beyond_m)
+                beside[:, 2] = road.height(s, edge)
+                outer.append(beside)
+        out.append(Strip(points, np.stack(outer)))
+    return out
+
+
+def _list_decks(strips: list[Strip], spans: Spans) -> list[tuple[Array, ...]]:
+    """Return the decks of a road, each as its cross-sections."""
+    sections = [strip.inner[:, i].round(4) for strip in strips for i in range(strip.inner.shape[1])]
+    return [tuple(sections[deck]) for deck in spans.decks]
+
+
+def _sample_ground(strips: list[Strip], spans: Spans) -> tuple[Array, Array]:
+    """Return the points (N, 3) of a road's surface outside its bridges, and those (M, 3) beside it.
+
+    Where a deck ends within the road, its last cross-section is the ground's, too. The M are in the order of `ASIDE_M`.
+    """
+    raised = np.zeros(len(spans.near), np.bool_)
+    for deck in spans.decks:
+        raised[deck.start + (deck.start > 0) : deck.stop - (deck.stop < len(raised))] = True
+    inner, outer, first = [np.zeros((0, 3))], [np.zeros((0, 3))], 0
+    for strip in strips:
+        rows = np.arange(first, first + strip.inner.shape[1])
+        first += len(rows)
+        for part in np.split(rows, np.flatnonzero(np.diff(raised[rows])) + 1):
+            if not raised[part[0]]:
+                own = part - rows[0]
+                kept = own[_find_needed(strip.inner[:, own], spans.near[part])]
+                inner.append(strip.inner[:, kept].reshape(-1, 3))
+                inner.append(_fill_across(strip.inner[:, own[spans.near[part]]]))
+                outer.append(strip.outer[:, kept].reshape(2, len(ASIDE_M), -1, 3).swapaxes(1, 2).reshape(-1, 3))
     return np.concatenate(inner), np.concatenate(outer)
 
 
-def _find_needed(points: Array) -> NDArray[np.int64]:
+def _fill_across(points: Array) -> Array:
+    """Return points (N, 3) between neighbours of each column of points (T, K, 3), `FINE_M` apart or less."""
+    out = [np.zeros((0, 3))]
+    for one, other in pairwise(points):
+        count = int(np.ceil(np.linalg.norm(other - one, axis=1).max(initial=0.0) / FINE_M))
+        out += [one + share * (other - one) for share in np.linspace(0.0, 1.0, count + 1)[1:-1]]
+    return np.concatenate(out)
+
+
+def _find_needed(points: Array, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the columns of points (T, K, 3) between which the others are linear, to `TOLERANCE_M` (Douglas-Peucker).
 
     Rows are in the order of t. Height errors count in full; errors in plan as far as the cross-section is tilted, and
-    at least to `BEND_SHARE`.
+    at least to `BEND_SHARE`. Those that are `fixed` (K,) are among them.
     """
     across = points[-1] - points[0]
     tilt = np.abs(across[:, 2]) / np.maximum(np.hypot(across[:, 0], across[:, 1]), 0.1)
     weight = np.array([1.0, 1.0, 0.0]) * max(BEND_SHARE, float(np.nan_to_num(tilt.max()))) + (0.0, 0.0, 1.0)
-    kept, waiting = {0, points.shape[1] - 1}, [(0, points.shape[1] - 1)]
+    kept = {0, points.shape[1] - 1, *np.flatnonzero(fixed).tolist()}
+    waiting = list(pairwise(sorted(kept)))
     while waiting:
         first, last = waiting.pop()
         if last - first < 2:
@@ -108,18 +153,6 @@ def _find_needed(points: Array) -> NDArray[np.int64]:
             kept.add(first + 1 + worst)
             waiting += [(first, first + 1 + worst), (first + 1 + worst, last)]
     return np.array(sorted(kept))
-
-
-def _find_above(points: Array, owner: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return (N,) whether a point lies `BRIDGE_M` or more above a point of another road within `CLEAR_M`."""
-    if np.ptp(points[:, 2]) < BRIDGE_M:
-        return np.zeros(len(points), np.bool_)
-    one, other = KDTree(points[:, :2]).query_pairs(CLEAR_M, output_type="ndarray").T
-    rise = points[one, 2] - points[other, 2]
-    crossing = (owner[one] != owner[other]) & (np.abs(rise) >= BRIDGE_M)
-    out = np.zeros(len(points), np.bool_)
-    out[np.where(rise > 0, one, other)[crossing]] = True
-    return out
 
 
 def _merge(points: Array) -> Array:

@@ -23,7 +23,7 @@ from flcav.config import InputError
 from flcav.extras import format_install_command
 from flcav.files import find_existing
 from flcav.world.map.parameters import GeoReference, MapSource
-from flcav.world.map.relief import Relief
+from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet
 from flcav.world.map.town import HEIGHTS, Town, load_town
 from flcav.world.opendrive.document import describe_map, read_map
@@ -179,8 +179,8 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
     document = describe_map(root)
     notes = [*mend_map(root)]
     heights = sample_heights(root, xodr)
-    if heights.bridges:
-        notes.append(f"Roads that pass above others, which lie at the lower one's height there: {heights.bridges}.")
+    if heights.decks:
+        notes.append(f"Bridges, on which roads pass above others: {len(heights.decks)}.")
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=beside) as scratch:
         prefix, folder = Path(scratch) / "map", Path(scratch) / out.name
         folder.mkdir()
@@ -220,7 +220,9 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
         (folder / "town.yaml").write_text(text, encoding="utf-8")
         if len(heights.points):
-            Relief(heights.points + np.array([dx, dy, 0.0])).save(folder / HEIGHTS)
+            offset = np.array([dx, dy, 0.0])
+            decks = [Deck([section + offset for section in sections]) for sections in heights.decks]
+            Relief(heights.points + offset, decks).save(folder / HEIGHTS)
         town = load_town(folder)
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(folder, out)

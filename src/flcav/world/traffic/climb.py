@@ -3,12 +3,13 @@
 SUMO moves them in plan. Their horizontal velocity stays as it is; the vertical one follows from the ground they pass.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.world.map.relief import Relief
+from flcav.world.map.relief import find_tilts
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,7 @@ class OnRelief(NamedTuple):
 
 
 def stand_on_relief(
-    relief: Relief,
+    heights: Callable[[Array, Array], Array],
     centre: Array,
     yaw: Array,
     velocity: Array,
@@ -35,16 +36,16 @@ def stand_on_relief(
 ) -> OnRelief:
     """Return the motion of actors on a relief, given that in plan.
 
-    `centre` (T, A, 2) [m], `yaw` (T, A) [rad], `velocity` and `acceleration` (T, A, 3); `size` (A, 3) [m]. Those who
-    are `upright` (A,) do not tilt.
+    `heights` are those of what each actor stands on, at x, y (T, A) [m]. `centre` (T, A, 2) [m], `yaw` (T, A) [rad],
+    `velocity` and `acceleration` (T, A, 3); `size` (A, 3) [m]. Those who are `upright` (A,) do not tilt.
     """
 
     def height_at(time_s: float) -> Array:
         moved = centre + time_s * velocity[..., :2] + time_s**2 / 2 * acceleration[..., :2]
         x, y = moved[..., 0], moved[..., 1]
-        return np.where(upright, relief.heights(x, y), relief.tilts(x, y, yaw, size)[0])
+        return np.where(upright, heights(x, y), find_tilts(heights, x, y, yaw, size)[0])
 
-    _, pitch, roll = relief.tilts(centre[..., 0], centre[..., 1], yaw, size)
+    _, pitch, roll = find_tilts(heights, centre[..., 0], centre[..., 1], yaw, size)
     tilt = np.where(upright[:, None], 0.0, np.stack((pitch, roll), axis=2))
     tilt[np.isnan(yaw)] = np.nan
     before, now, after = (height_at(time_s) for time_s in (-STEP_S, 0.0, STEP_S))

@@ -20,6 +20,7 @@ from flcav.world.map.town import KERB_M, Town
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.shapes import SHAPES
 from flcav.world.trace import Event, Trace
+from flcav.world.traffic.bridges import find_footing
 from flcav.world.traffic.climb import stand_on_relief
 from flcav.world.traffic.demand import Parked, list_vehicle_types, park, write_demand
 from flcav.world.traffic.sumo import simulate_in
@@ -120,7 +121,8 @@ def _build_trace(
     centre = _centre(state, np.append(half_length, np.zeros(len(still))))
     tilt = None
     if town.relief is not None:
-        ground = stand_on_relief(town.relief, centre, yaw, velocity, acceleration, size, pedestrian)
+        heights = find_footing(town.relief, town.net, centre, yaw)
+        ground = stand_on_relief(heights, centre, yaw, velocity, acceleration, size, pedestrian)
         z, tilt, velocity, acceleration = z + ground.height, ground.tilt, ground.velocity, ground.acceleration
     lights = [(light, len(letters)) for light, letters in zip(raw["light"], raw["light_state"][0])]
     letters = [list("".join(row)) for row in raw["light_state"][now[:, SMOOTHING_STEPS]]]

@@ -12,7 +12,7 @@ from shapely import box, contains_xy
 from shapely.geometry import Polygon
 
 from flcav.geometry import Boxes, angles_of, inverse, points_in_boxes, pose, rotations
-from flcav.world.map.relief import Relief
+from flcav.world.map.relief import Deck, Relief, find_tilts
 from flcav.world.materials import Material
 from flcav.world.meshes.drape import FLAT_M, drape_area, drape_polygon, drape_wall
 from flcav.world.opendrive.heights import sample_heights
@@ -93,18 +93,52 @@ def test_the_terrain_of_a_road_is_its_surface() -> None:
     np.testing.assert_allclose(relief.heights(x, y), z, atol=0.02)
 
 
-def test_a_road_that_passes_over_another_is_told() -> None:
+def cross(hdg: float = 0.7 + np.pi / 2) -> ElementTree.Element:
+    """Return two roads of 120 m that cross at (3, -2): one along 0.7 at height 0, the other 6 m above it at the middle.
+
+    The upper one climbs by 10 % from both ends.
+    """
     root = ElementTree.Element("OpenDRIVE")
-    root.append(road("<line/>", 60.0, LANES))
-    over = road(
-        "<line/>", 60.0, '<elevationProfile><elevation s="0" a="6" b="0" c="0" d="0"/></elevationProfile>' + LANES
+    climb = (
+        '<elevationProfile><elevation s="0" a="0" b="0.1" c="0" d="0"/>'
+        '<elevation s="60" a="6" b="-0.1" c="0" d="0"/></elevationProfile>'
     )
-    over.set("id", "2")
-    over[0][0].set("hdg", "1.2")
-    root.append(over)
+    for name, heading, inside in (("1", 0.7, ""), ("2", hdg, climb)):
+        row = road("<line/>", 120.0, inside + LANES)
+        row.set("id", name)
+        row[0][0].attrib |= {
+            "x": str(3 - 60 * np.cos(heading)),
+            "y": str(-2 - 60 * np.sin(heading)),
+            "hdg": str(heading),
+        }
+        root.append(row)
+    return root
+
+
+def test_a_road_that_passes_over_another_has_a_bridge_there(tmp_path: Path) -> None:
+    root = cross()
     found = sample_heights(root, Path("map"))
-    assert found.bridges == 1
-    assert Relief(found.points).heights(3.0, -2.0) == pytest.approx(0.0)
+    relief = Relief(found.points, [Deck(sections) for sections in found.decks])
+    relief.save(tmp_path / "heights.parquet")
+    again = Relief.load(tmp_path / "heights.parquet")
+    (deck,) = again.decks
+    assert contains_xy(deck.outline, 3.0, -2.0)
+    lower, upper = (Road(row) for row in root)
+    s = np.linspace(1.0, 119.0, 237)
+    for t in (-3.0, 0.0, 3.0):
+        x, y, z = lower.point(s, np.full(len(s), t)).T
+        np.testing.assert_allclose(again.heights(x, y), z, atol=0.02)  # no lower where it passes below
+        x, y, z = upper.point(s, np.full(len(s), t)).T
+        raised = contains_xy(deck.outline, x, y)
+        np.testing.assert_allclose(np.where(raised, deck.surface.heights(x, y), again.heights(x, y)), z, atol=0.06)
+        assert 15 < raised.sum() / 2 < 40  # [m]
+
+
+def test_roads_at_almost_one_height_have_no_bridge() -> None:
+    level = cross()
+    for row in level.iterfind("road/elevationProfile/elevation"):
+        row.attrib |= {"a": "2", "b": "0"}
+    assert not sample_heights(level, Path("map")).decks
 
 
 def test_heights_are_linear_over_triangles() -> None:
@@ -150,18 +184,20 @@ def slope(ahead: float, left: float) -> Relief:
 
 def test_a_body_on_a_slope_lies_in_it() -> None:
     yaw, size = np.array([0.6]), np.array([[4.0, 2.0, 1.5]])
-    height, pitch, roll = slope(0.2, -0.1).tilts(np.array([5.0]), np.array([1.0]), yaw, size)
+    height, pitch, roll = find_tilts(slope(0.2, -0.1).heights, np.array([5.0]), np.array([1.0]), yaw, size)
     turn = rotations(yaw, pitch, roll)[0]
     normal = np.array([-0.2, 0.1, 1.0]) / np.linalg.norm((0.2, 0.1, 1.0))
     np.testing.assert_allclose(turn[:, 2], normal, atol=2e-3)
     assert height[0] == pytest.approx(0.9)
-    assert slope(0.2, 0.0).tilts(np.zeros(1), np.zeros(1), np.zeros(1), size)[1][0] == pytest.approx(-np.arctan(0.2))
+    assert find_tilts(slope(0.2, 0.0).heights, np.zeros(1), np.zeros(1), np.zeros(1), size)[1][0] == pytest.approx(
+        -np.arctan(0.2)
+    )
 
 
 def test_whoever_drives_uphill_climbs() -> None:
     velocity = np.array([[[10.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
     found = stand_on_relief(
-        slope(0.1, 0.0),
+        slope(0.1, 0.0).heights,
         centre=np.zeros((1, 2, 2)),
         yaw=np.zeros((1, 2)),
         velocity=velocity,

@@ -1,0 +1,116 @@
+"""Actors on bridges and below them: which of two streets above each other an actor in plan is on.
+
+SUMO's net is plane. An actor above or below a deck is on it where a lane that leads over it is nearer, and points more
+in the actor's direction, than any lane that leads below.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString
+from shapely.geometry.base import BaseGeometry
+
+from flcav.geometry import heading_vectors
+from flcav.world.map.relief import Deck, Relief
+from flcav.world.map.roads import RoadNet, read_net
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+REACH_M = 15.0  # half a long vehicle, and the way of .3 s: so far beside a deck actors are told to be on it
+ALONG = np.cos(np.pi / 4)  # lanes that lead over a deck keep to its direction
+TURNED_M = 6.0  # distance that counts as much as a right angle between an actor and a lane
+BATCH = 1000  # actors that are compared with all lanes at a time
+EDGE_M = 0.05  # a point so far beside a deck still is on it
+
+
+class Segments(NamedTuple):
+    """S pieces of lanes, seen from above."""
+
+    start: Array  # (S, 2) [m]
+    along: Array  # (S, 2) to their ends [m]
+
+
+def find_footing(relief: Relief, net: Path, centre: Array, yaw: Array) -> Callable[[Array, Array], Array]:
+    """Return the heights [m], at x, y (T, A) [m], of what each actor stands on: the ground or a deck.
+
+    The actors are at `centre` (T, A, 2) [m] with `yaw` (T, A) [rad], NaN where absent; `net` is the streets' file.
+    """
+    if not relief.decks:
+        return relief.heights
+    streets = read_net(net)
+    on = [(deck, _find_on(deck, streets, centre, yaw)) for deck in relief.decks]
+
+    def heights(x: Array, y: Array) -> Array:
+        out = relief.heights(x, y)
+        for deck, rows in on:
+            area = deck.outline.buffer(EDGE_M)
+            shapely.prepare(area)
+            at = np.nonzero(rows)
+            own = np.maximum(out[at], deck.surface.heights(x[at], y[at]))
+            out[at] = np.where(shapely.contains_xy(area, x[at], y[at]), own, out[at])
+        return out
+
+    return heights
+
+
+def _find_on(deck: Deck, net: RoadNet, centre: Array, yaw: Array) -> Mask:
+    """Return (T, A) whether an actor near a deck is on it, or about to be."""
+    zone = deck.outline.buffer(REACH_M)
+    shapely.prepare(zone)
+    out = shapely.contains_xy(zone, centre[..., 0], centre[..., 1])
+    over, below = split_lanes(deck, net, zone)
+    place, ahead = centre[out], heading_vectors(yaw[out])
+    found = [
+        _misfit(over, place[rows], ahead[rows]) < _misfit(below, place[rows], ahead[rows])
+        for rows in np.split(np.arange(len(place)), np.arange(BATCH, len(place), BATCH))
+    ]
+    out[out] = np.concatenate(found)
+    return out
+
+
+def split_lanes(deck: Deck, net: RoadNet, zone: BaseGeometry) -> tuple[Segments, Segments]:
+    """Return the pieces of the lanes within `zone` that lead over a deck, and of those that do not.
+
+    A lane that leads over it keeps to its direction and crosses neither of its sides.
+    """
+    right, left = (side[:, :2] for side in deck.sides)
+    middle = (right + left) / 2
+    axis = np.gradient(middle, axis=0)
+    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
+    sides = shapely.union_all([LineString(right), LineString(left)])
+    over, below = [], []
+    for edge in net.edges.values():
+        for lane in edge.lanes:
+            if lane.kind == "walkingarea" or len(lane.shape) < 2:
+                continue
+            for part in shapely.get_parts(LineString(lane.shape).intersection(zone)):
+                if part.geom_type != "LineString":
+                    continue
+                points = shapely.get_coordinates(part)
+                along = np.diff(points, axis=0)
+                nearest = np.linalg.norm(points[:-1, None] + along[:, None] / 2 - middle, axis=2).argmin(axis=1)
+                kept = np.abs((along * axis[nearest]).sum(axis=1)).sum() >= ALONG * np.linalg.norm(along, axis=1).sum()
+                (over if kept and not part.intersects(sides) else below).append(Segments(points[:-1], along))
+    return _join(over), _join(below)
+
+
+def _join(parts: list[Segments]) -> Segments:
+    empty = np.zeros((0, 2))
+    return Segments(*(np.concatenate([empty, *rows]) for rows in (zip(*parts) if parts else ((), ()))))
+
+
+def _misfit(lanes: Segments, place: Array, ahead: Array) -> Array:
+    """Return (N,) [m] how far bodies at `place` (N, 2) that look `ahead` (N, 2) are from the lane that fits best."""
+    if not len(lanes.start):
+        return np.full(len(place), np.inf)
+    length = np.maximum(np.linalg.norm(lanes.along, axis=1), 1e-9)
+    towards = place[:, None] - lanes.start
+    share = np.clip((towards * lanes.along).sum(axis=2) / length**2, 0.0, 1.0)
+    away = np.linalg.norm(towards - share[..., None] * lanes.along, axis=2)
+    cross = ahead[:, None, 0] * lanes.along[:, 1] - ahead[:, None, 1] * lanes.along[:, 0]
+    return (away + TURNED_M * np.abs(cross) / length).min(axis=1)
