@@ -13,7 +13,7 @@ from scipy.stats import spearmanr, t
 from shapely.geometry import Point
 
 from flcav.experiments.maps import import_map
-from flcav.experiments.placement import predictors
+from flcav.experiments.placement import predictors, spread
 from flcav.experiments.placement.claims import describe_claims, judge_claims, list_claims
 from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps, overlap_of_circles
 from flcav.experiments.placement.predictors import RECALL, count_added_labels, expect_labels
@@ -31,6 +31,7 @@ from flcav.experiments.placement.records import (
     SeedGains,
 )
 from flcav.experiments.placement.run import choose_near, list_regions, plan_half_width, summarise_gains
+from flcav.experiments.placement.spread import spread_over_scenes
 from flcav.experiments.placement.tables import tables
 from flcav.fusion.detector import TRAINED_IN
 from flcav.fusion.road import RoadView
@@ -38,6 +39,7 @@ from flcav.geometry import Boxes, pose
 from flcav.optimization.curves.held_out import rank_correlation
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError
 from flcav.perception.objects.model import second_tiny
+from flcav.perception.outcomes import Outcomes
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import load_run_recipe
 from flcav.sensors.frame import Annotations, Calibration, Frame
@@ -201,11 +203,34 @@ def test_means_over_seeds_and_the_spread_of_two_poles(beside: Path) -> None:
     pairs = [(0.06 - 0.02, 0.0), (0.06 - 0.0, 0.0), (0.02 - 0.0, 0.0)]  # of both seeds
     assert own.pair_sd[TOWN] == pytest.approx(np.mean([np.var(each, ddof=1) for each in pairs]) ** 0.5)
     assert own.means.correlation[COVERAGE][NEAR].mean == 0.5
+    assert own.scene_sd is None
+    drawn = tuple(replace(each, scene_sd={TOWN: sd, NEAR: 0.1}) for each, sd in zip(seeds, (0.01, 0.07)))
+    told = summarise_gains(RECIPE, {"grid": drawn}, beside)
+    assert told.regions["grid"].scene_sd == {TOWN: pytest.approx(0.05), NEAR: pytest.approx(0.1)}
+    assert "| grid | all over the town | 0.031 | 0.050 | 12 |" in tables(told)["spread"]
     again = PlacementProof.from_json(results.as_json(), "result.json")
     assert tables(again) == tables(results)
     assert "| grid | 1 | VRCSP | +0.040" in tables(results)["rules"]
     assert all(f"| grid | {name} |" in tables(results)["correlation"] for name in PREDICTORS)
     assert any("VRCSP gains +0.020" in sentence for sentence in results.sentences())
+
+
+def test_the_draw_of_scenes_moves_two_poles_apart_as_far_as_their_scenes_differ(monkeypatch) -> None:
+    reached = np.random.default_rng(3).uniform(0, 1, (3, 20))  # of three poles in each scene
+    scenes = np.array([f"s{number:02d}" for number in range(20)])
+
+    def measure(outcomes: Outcomes, times: np.ndarray) -> np.ndarray:
+        return times @ outcomes.arrays["reached"] / times.sum(axis=1)
+
+    monkeypatch.setattr(spread, "OBJECTS", SimpleNamespace(measure=measure))
+    tested = [Outcomes(scenes, {"reached": own}) for own in reached]
+    counted = {TOWN: np.ones(20, dtype=bool), NEAR: np.arange(20) < 19}
+    found = spread_over_scenes(tested, counted, 1)
+    pairs = [np.var(reached[one] - reached[other]) / 20 for one, other in ((0, 1), (0, 2), (1, 2))]
+    assert found[TOWN] == pytest.approx(np.mean(pairs) ** 0.5, rel=0.05)
+    assert found[NEAR] > 0
+    assert spread_over_scenes([tested[0], tested[0]], counted, 1) == {TOWN: 0.0, NEAR: 0.0}
+    assert spread_over_scenes(tested[:1], counted, 1) == {TOWN: 0.0, NEAR: 0.0}
 
 
 def test_regions_of_a_seed_are_pooled_before_seeds(beside: Path) -> None:

@@ -159,6 +159,7 @@ def test_a_town_takes_as_many_sensors_as_its_errors_are_spread() -> None:
     assert (found.errors, found.poles) == (5, 9)
     assert found.shares[:4] == (0.4, pytest.approx(0.6), 0.8, 0.8)
     assert found.wanted == (1, 2, 3)
+    assert [found.count_for_reached(share) for share in (0.5, 0.75, 0.9, 1.0)] == [1, 2, 3, 3]
     straight = [number for number, kind in zip(town.poles.id.tolist(), town.poles.kind) if kind == "straight"]
     assert found.kinds["straight"] == pytest.approx(3 / len(straight))
     assert cover_town(town, errors[[0, 4]], 30.0).wanted == (1, 1, None)

@@ -14,7 +14,7 @@ from flcav.pipeline.results.run import ArmResult, LinkUse, Run, Spent
 from flcav.pipeline.results.tests import Difference, Finding, Test, Tested
 from flcav.pipeline.results.training import Pretrained, Validated
 from flcav.report.pictures.clouds import Detections, Sweep
-from flcav.report.pictures.maps import ErrorMap, poles_of
+from flcav.report.pictures.maps import DENSEST, ErrorMap, poles_of
 from flcav.world.map.town import load_town
 
 MEANS = {"grid": (0.412, 0.503, 0.511), "ring": (0.381, 0.447, 0.468)}
@@ -124,7 +124,7 @@ def error_map(town: str = "grid", errors: int = 61) -> ErrorMap:
     xy = road[rng.integers(len(road), size=errors)] + rng.normal(0, 4, (errors, 2))
     kind = np.where(rng.random(errors) < 0.7, "miss", "false_positive")
     xyz = np.c_[xy, np.full(errors, 0.8)]
-    return ErrorMap(place, xyz, kind, poles_of(place), chosen={"2": 40.0}, densest=("8",))
+    return ErrorMap(place, xyz, kind, poles_of(place), chosen={"2": 40.0}, conventional={DENSEST: ("8",)})
 
 
 def sweep() -> Sweep:

@@ -12,6 +12,7 @@ from matplotlib.text import Text
 from flcav.intervals import MeanOverSeeds
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE
 
 TESTED, ROUNDS = made_up_run.chart_rows(), made_up_run.rounds()
 BUDGETS, SENT = made_up_run.BUDGETS, made_up_run.sent()
@@ -60,9 +61,19 @@ def test_the_map_shows_every_error_once_and_the_reach_of_the_chosen_pole() -> No
     assert {"placed", "densest traffic"} <= words
 
 
-def test_a_chosen_pole_that_is_also_the_densest_says_both() -> None:
-    axes = figures.town_map(replace(made_up_run.error_map(), densest=("2",))).axes[0]
-    assert "placed and densest traffic" in {text.get_text() for text in axes.texts}
+def test_a_chosen_pole_says_which_conventional_rules_choose_it_too() -> None:
+    both = {DENSEST: ("2",), MOST_VISIBLE: ("2", "3")}
+    axes = figures.town_map(replace(made_up_run.error_map(), conventional=both)).axes[0]
+    notes = {text.get_text() for text in axes.texts}
+    assert {"placed, densest traffic\nand most visible objects", "most visible objects"} <= notes
+
+
+def test_zones_stand_on_the_map_with_their_density() -> None:
+    scene = replace(made_up_run.error_map(), zones={"3": 49.6}, zone_m=30.0)
+    axes = figures.town_map(scene).axes[0]
+    (zone,) = (patch for patch in axes.patches if isinstance(patch, Circle) and patch.get_radius() == 30.0)
+    assert zone.get_center() == pytest.approx(tuple(scene.poles["3"][:2]))
+    assert "50/ha" in {text.get_text() for text in axes.texts}
 
 
 def test_sweeps_count_what_was_found_missed_and_false() -> None:

@@ -91,7 +91,7 @@ def place(
     limit = budget if budget is not None else float(count or result.cost)
     conventional = _place_conventionally(candidates, given, limit, here, traces)
     if map_ is not None and here is not None:
-        _draw(map_, here, given, result, conventional["traffic-density"])
+        _draw(map_, here, given, result, conventional)
     cost = given.cost_of(result)
     if as_json:
         random = place_at_random(candidates, limit)
@@ -165,17 +165,23 @@ def _tell(given: "Given", placed: "Placement | None") -> "Json":
     return {"chosen": _name(given, placed), "covered": placed.covered, "covered_weight": placed.covered_weight}
 
 
-def _draw(path: Path, town: "Town", given: "Given", placed: "Placement", densest: "Placement | None") -> None:
-    """Write the map of the errors, the poles, and the placement beside the conventional one."""
+def _draw(
+    path: Path, town: "Town", given: "Given", placed: "Placement", conventional: "dict[str, Placement | None]"
+) -> None:
+    """Write the map of the errors, the poles, and the placement beside the conventional ones that are known."""
     from flcav.files import write_bytes
     from flcav.report import style
     from flcav.report.charts.figures import town_map
-    from flcav.report.pictures.maps import ErrorMap
+    from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE, ErrorMap
 
     names = [str(pole) for pole in given.ids]
     ranges = {names[pole]: float(given.ranges_m[sensor]) for pole, sensor in zip(placed.chosen, placed.sensors)}
-    conventional = () if densest is None else tuple(names[pole] for pole in densest.chosen)
+    noted = {
+        note: [names[pole] for pole in own.chosen]
+        for note, rule in ((DENSEST, "traffic-density"), (MOST_VISIBLE, "visible-objects"))
+        if (own := conventional[rule]) is not None
+    }
     scene = ErrorMap(
-        town, given.errors, given.kind, dict(zip(names, given.poles, strict=True)), ranges, conventional, heat=True
+        town, given.errors, given.kind, dict(zip(names, given.poles, strict=True)), ranges, noted, heat=True
     )
     write_bytes(path, style.png(town_map(scene)))

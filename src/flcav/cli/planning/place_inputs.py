@@ -62,8 +62,8 @@ def read_given(
     names, ranges, sensor_cost = (None,), np.array([range_m], np.float64), np.zeros(1)
     if sensors is not None:
         kinds = _read(sensors, SENSORS, SENSORS)
+        _check_unique(kinds["name"].to_pylist(), sensors, "sensors", "name")
         names, sensor_cost = tuple(map(str, kinds["name"].to_pylist())), _costs(kinds, sensors)
-        _check_unique(names, sensors, "sensors", "name")
         ranges = numbers(kinds, ("range_m",), sensors)[:, 0]
     kind = mistakes["kind"].to_pylist() if "kind" in mistakes.column_names else ["error"] * mistakes.num_rows
     return Given(
@@ -134,6 +134,8 @@ def _read(path: Path, needed: Sequence[str], known: Sequence[str]) -> pa.Table:
 def _check_unique(names: Sequence[Hashable], path: Path, what: str, column: str) -> None:
     first: dict[Hashable, int] = {}
     for row, name in enumerate(names):
+        if name is None or name == "" or name != name:  # the last of a NaN
+            raise InputError(f"{path}: row {row + 1} has no {column}")
         if name in first:
             raise InputError(f"{path}: rows {first[name] + 1} and {row + 1} are two {what} of the {column} {name!r}")
         first[name] = row

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.optimization.placement.cheapest import cover_share
+from flcav.optimization.placement.instance import TIE
 from flcav.optimization.placement.solve import find_candidates, place_count
 from flcav.world.map.town import Town
 
 ASKED = (0.25, 0.5, 0.75)  # shares of the errors to cover
+REACHED = (0.5, 0.75, 0.9)  # shares of the errors in reach of any pole
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,10 @@ class TownCover:
     shares: tuple[float, ...]  # of the errors, covered at best by 1, 2, ... sensors on as many poles
     wanted: tuple[int | None, ...]  # fewest sensors for each of `ASKED`; None where all poles cover less
     kinds: Mapping[str, float]  # by kind of scenario, mean number of errors within range of a candidate pole of it
+
+    def count_for_reached(self, share: float) -> int:
+        """Return the fewest sensors for a share of the errors that sensors on all poles together cover."""
+        return 1 + next(n for n, own in enumerate(self.shares) if own >= share * self.shares[-1] * (1 - TIE))
 
 
 def cover_town(town: Town, errors: NDArray[np.float64], range_m: float) -> TownCover:

@@ -28,7 +28,7 @@ from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.figures import town_map
 from flcav.report.charts.placement import draw_cover
-from flcav.report.pictures.maps import ErrorMap, poles_of
+from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE, ErrorMap, poles_of
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.world.line_of_sight import count_visible_actors
@@ -170,8 +170,16 @@ def _place(candidates: Candidates, town: Town, scores: Mapping[str, NDArray[np.f
 
 
 def _draw(town: Town, errors: NDArray[np.float64], kind: NDArray[np.str_], results: Fig3b) -> bytes:
-    (best,) = (each for each in results.placed if (each.rule, each.count) == ("VRCSP", 1))
-    (dense,) = (each for each in results.placed if (each.rule, each.count) == ("traffic density", 1))
-    chosen = {str(pole): RANGE_M for pole in best.poles}
-    scene = ErrorMap(town, errors, kind, poles_of(town), chosen, tuple(map(str, dense.poles)), heat=True)
+    first = {each.rule: [str(pole) for pole in each.poles] for each in results.placed if each.count == 1}
+    scene = ErrorMap(
+        town,
+        errors,
+        kind,
+        poles_of(town),
+        chosen=dict.fromkeys(first["VRCSP"], RANGE_M),
+        conventional={DENSEST: first["traffic density"], MOST_VISIBLE: first["visible objects"]},
+        zones={str(zone.pole): zone.per_hectare for zone in results.zones},
+        zone_m=ZONE_M,
+        heat=True,
+    )
     return style.png(town_map(scene))

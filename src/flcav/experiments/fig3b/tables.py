@@ -1,6 +1,6 @@
 """Markdown tables of Fig. 3b."""
 
-from flcav.experiments.fig3b.cover import ASKED
+from flcav.experiments.fig3b.cover import ASKED, REACHED
 from flcav.experiments.fig3b.run import COUNTS, Fig3b
 from flcav.markdown import format_table
 
@@ -28,11 +28,15 @@ def tables(results: Fig3b) -> dict[str, str]:
             *(f"{each.shares[count - 1]:.0%}" for count in COUNTS),
             f"{each.shares[-1]:.0%}",
             *("" if wanted is None else wanted for wanted in each.wanted),
+            *(each.count_for_reached(share) for share in REACHED),
         ]
         for each in results.towns or ()
     ]
     covered = (*(f"covered by {count}" for count in COUNTS), "by all poles")
-    asked = tuple(f"sensors for {share:.0%}" for share in ASKED)
+    asked = (
+        *(f"sensors for {share:.0%}" for share in ASKED),
+        *(f"for {share:.0%} of those in reach" for share in REACHED),
+    )
     return {
         "towns": format_table(("town", "errors", "poles", *covered, *asked), towns),
         "zones": format_table(header, zones),

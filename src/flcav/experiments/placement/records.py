@@ -64,6 +64,7 @@ class SeedGains:
     poles: tuple[PoleGain, ...]  # that see road users
     choices: tuple[ChoiceGain, ...]
     correlation: Mapping[str, ByFrames]  # Spearman's, by predictor
+    scene_sd: Annotated[ByFrames | None, LEFT_OUT] = None  # of two poles' difference, by the draw of the test scenes
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,7 @@ class RegionProof:
     # recordings and trainings of its own, so that it is more than the spread of retraining on the same frames.
     pair_sd: ByFrames
     seeds_wanted: Mapping[str, int | None]  # that make the half-width of such a difference `HALF_WIDTH`
+    scene_sd: Annotated[ByFrames | None, LEFT_OUT] = None  # the part of `pair_sd` by the draw of test scenes
 
     def sentences(self) -> list[str]:
         """Return correlations, advantages and the number of seeds in words."""

@@ -11,7 +11,6 @@ so that pooled numbers are means over regions first, and over seeds then.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -39,12 +38,12 @@ from flcav.experiments.placement.records import (
     RegionProof,
     SeedGains,
 )
+from flcav.experiments.placement.spread import pool_over_seeds, spread_over_scenes, spread_over_seeds
 from flcav.intervals import MOST_SEEDS, MeanOverSeeds, half_width, mean_over_seeds
 from flcav.optimization.curves.held_out import rank_correlation
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.outcomes import Outcomes, as_measurable
-from flcav.perception.tasks import task_named
+from flcav.perception.outcomes import Outcomes
 from flcav.perception.weights import load_network
 from flcav.pipeline.arms import Names, resolve_settings
 from flcav.pipeline.frames import Frames
@@ -121,7 +120,7 @@ def summarise_gains(
     """
     regions = {}
     for region, seeds in measured.items():
-        spread = {frames: _spread_of_pairs(seeds, frames) for frames in FRAMES}
+        spread = {frames: spread_over_seeds(seeds, frames) for frames in FRAMES}
         regions[region] = RegionProof(
             town=recipe.regions[region].town or region,
             overlaps=list_overlaps(recipe, region, beside),
@@ -129,6 +128,7 @@ def summarise_gains(
             means=_mean([[seed] for seed in seeds]),
             pair_sd=spread,
             seeds_wanted={frames: plan_half_width(sd) if len(seeds) > 1 else None for frames, sd in spread.items()},
+            scene_sd=pool_over_seeds(seeds),
         )
     return PlacementProof(
         range_m=recipe.placement.range_m,
@@ -201,11 +201,12 @@ def measure_gains(run: Run, work: Path, region: str) -> SeedGains:
         TOWN: np.ones(len(places), dtype=np.bool_),
         NEAR: choose_near(places, spots, recipe.placement.range_m),
     }
-    tested = {
-        (test.arm, test.stage): _precision(work / test.step / OUTCOMES, counted)
+    outcomes = {
+        (test.arm, test.stage): Outcomes.load(work / test.step / OUTCOMES)
         for test in run.tested
         if (test.region, test.task) == (region, TASK)
     }
+    tested = {each: _precision(own, counted, region) for each, own in outcomes.items()}
     without = tested[MAIN, EDGE]
     gains = {
         arm: {frames: value[frames] - without[frames] for frames in value}
@@ -216,6 +217,8 @@ def measure_gains(run: Run, work: Path, region: str) -> SeedGains:
     poles = _measure_poles(recipe, folders, placed, gains)
     if not poles:
         raise InputError(f"region '{region}': no arm has a sensor on a single pole that sees road users")
+    known = {pole.pole for pole in poles}
+    single = [arm for arm, own in placed.items() if own.rule == "fixed" and own.chosen in {(pole,) for pole in known}]
     several = tuple(
         ChoiceGain(RULES[each.rule], len(each.chosen), each.chosen, gains[arm])
         for arm, each in placed.items()
@@ -229,6 +232,7 @@ def measure_gains(run: Run, work: Path, region: str) -> SeedGains:
         poles=poles,
         choices=(*_choose_one(poles), *sorted(several, key=lambda choice: choice.count)),
         correlation={name: _correlate(poles, name) for name in PREDICTORS},
+        scene_sd=spread_over_scenes([outcomes[arm, EDGE] for arm in single], counted, recipe.seed),
     )
 
 
@@ -282,12 +286,11 @@ def _placed(run: Run, arm: str, region: str) -> Placed:
     return next(each for each in run.arms[arm].placed if each.region == region)
 
 
-def _precision(path: Path, counted: Mapping[str, NDArray[np.bool_]]) -> dict[str, float]:
+def _precision(outcomes: Outcomes, counted: Mapping[str, NDArray[np.bool_]], region: str) -> dict[str, float]:
     """Return AP50 on each choice of frames; raises `InputError` where one holds nothing to find."""
-    outcomes, task = Outcomes.load(path), as_measurable(task_named(TASK))
-    found = {frames: float(task.measure(outcomes, own[None].astype(np.int64))[0]) for frames, own in counted.items()}
+    found = {frames: float(OBJECTS.measure(outcomes, own[None].astype(np.int64))[0]) for frames, own in counted.items()}
     if any(np.isnan(value) for value in found.values()):
-        raise InputError(f"{path.parent.name}: the test frames hold nothing to find; take more scenes")
+        raise InputError(f"region '{region}': the test frames hold nothing to find; take more scenes")
     return found
 
 
@@ -305,20 +308,6 @@ def _choose_one(poles: Sequence[PoleGain]) -> tuple[ChoiceGain, ...]:
 def _correlate(poles: Sequence[PoleGain], name: str) -> dict[str, float]:
     predictor = [pole.predictors[name] for pole in poles]
     return {frames: rank_correlation([pole.gain[frames] for pole in poles], predictor) for frames in FRAMES}
-
-
-def _spread_of_pairs(seeds: Sequence[SeedGains], frames: str) -> float:
-    """Return the standard deviation over seeds of the difference of two poles' gains, variances averaged over pairs.
-
-    Poles that some seed lacks are left out; 0 of a single seed.
-    """
-    each = [{pole.pole: pole.gain[frames] for pole in seed.poles} for seed in seeds]
-    common = sorted(set.intersection(*(set(own) for own in each)))
-    gains = np.array([[own[pole] for pole in common] for own in each])
-    if len(seeds) < 2 or len(common) < 2:
-        return 0.0
-    variances = [np.var(gains[:, i] - gains[:, j], ddof=1) for i, j in combinations(range(len(common)), 2)]
-    return float(np.sqrt(np.mean(variances)))
 
 
 def draw_proof(results: PlacementProof) -> dict[str, bytes]:

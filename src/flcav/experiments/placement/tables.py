@@ -113,14 +113,19 @@ def _seeds(region: RegionProof) -> str:
 
 def _spread(results: PlacementProof) -> str:
     """Return how far the difference of two poles' gains varies between seeds, and the seeds that this asks for."""
-    rows = []
+    rows, known = [], all(own.scene_sd is not None for own in results.regions.values())
     for name, own in results.regions.items():
         several = len(own.seeds) > 1
         for frames in FRAMES:
             wanted = own.seeds_wanted[frames] or (f"more than {MOST_SEEDS}" if several else "")
-            rows.append([name, frames, f"{own.pair_sd[frames]:.3f}" if several else "", wanted])
-    spread = "standard deviation over seeds of the difference of two poles' gains"
-    return format_table(("region", "test frames", spread, f"seeds for a half-width of {HALF_WIDTH}"), rows)
+            spread = [own.pair_sd[frames], *([own.scene_sd[frames]] if known and own.scene_sd else [])]
+            rows.append([name, frames, *(f"{sd:.3f}" if several else "" for sd in spread), wanted])
+    header = (
+        "standard deviation over seeds of the difference of two poles' gains",
+        *(["by the draw of the test scenes alone"] if known else []),
+        f"seeds for a half-width of {HALF_WIDTH}",
+    )
+    return format_table(("region", "test frames", *header), rows)
 
 
 def _overlaps(region: RegionProof) -> str:

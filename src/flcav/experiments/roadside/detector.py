@@ -13,6 +13,7 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.maps import import_map
+from flcav.experiments.roadside.labels import RoadLabels, measure_road_labels
 from flcav.fusion.detector import THRESHOLD, road_detector
 from flcav.fusion.road import MIN_RETURNS
 from flcav.geometry import Boxes
@@ -71,6 +72,7 @@ class RoadDetectorResult(Record):
     threshold: float  # lowest score of a label, see `flcav.fusion.detector`
     fitted: float  # lowest threshold with `LEAST_PRECISION` on the validation towns, as computed here
     towns: tuple[TownScore, ...]
+    labels: Annotated[RoadLabels | None, LEFT_OUT] = None  # that vehicles get; None in older results
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
     def sentences(self) -> list[str]:
@@ -119,6 +121,7 @@ def evaluate_road_detector(
         threshold=THRESHOLD,
         fitted=fit_threshold([frames[town] for town in VALIDATION]),
         towns=tuple(score_town(town, town in VALIDATION, each) for town, each in frames.items()),
+        labels=measure_road_labels(out / "labels"),
         provenance=provenance(),
     )
     return results, results.pictures()

@@ -8,6 +8,7 @@ from flcav.experiments.roadside.cameras import CameraResult
 from flcav.experiments.roadside.detector import BINS_M, WITHIN_M, RoadDetectorResult
 from flcav.experiments.roadside.fig4 import ARMS as PLACED
 from flcav.experiments.roadside.fig4 import EDGES_M, Fig4
+from flcav.experiments.roadside.labels import EXACT, RoadLabels
 from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
 from flcav.experiments.roadside.ranges import SensorRanges
 from flcav.markdown import format_table
@@ -16,7 +17,7 @@ WHEN = ("as stated", "after the pose graph")
 
 
 def detector_tables(results: RoadDetectorResult) -> dict[str, str]:
-    """Return Markdown by name: towns, distances."""
+    """Return Markdown by name: towns, distances, and labels where they were counted."""
     towns = [
         [
             f"{each.town}{' (trained there)' if each.seen else ''}",
@@ -40,7 +41,24 @@ def detector_tables(results: RoadDetectorResult) -> dict[str, str]:
     return {
         "towns": format_table(header, towns),
         "distances": format_table(("recall", *(f"{low} to {high} m" for low, high in near)), rows),
+        **({"labels": _labels(results.labels)} if results.labels is not None else {}),
     }
+
+
+def _labels(labels: RoadLabels) -> str:
+    """Return what becomes of the ideal detector's labels with the trained one."""
+    parts = {
+        "all": labels.ideal,
+        "beyond the field of the trained detector": labels.beyond,
+        "in its field, not found": labels.missed,
+        f"found, at a 3D IoU below {EXACT}": labels.coarse,
+        f"found, at a 3D IoU of {EXACT} or more": labels.exact,
+        "labels of the trained detector on other objects": labels.other,
+        "labels of the trained detector at a bird's-eye IoU below 0.5 with all objects": labels.false,
+    }
+    sweeps, ideal = max(labels.sweeps, 1), max(labels.ideal, 1)
+    rows = [[name, count, f"{count / sweeps:.2f}", f"{count / ideal:.0%}"] for name, count in parts.items()]
+    return format_table(("labels of an ideal detector", f"in {labels.sweeps} sweeps", "a sweep", "share"), rows)
 
 
 def average_tables(results: RoadAverageResult) -> dict[str, str]:

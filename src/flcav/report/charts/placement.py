@@ -41,25 +41,29 @@ def draw_gains(panels: Mapping[tuple[str, str], Mapping[int, Sequence[tuple[floa
 def draw_cover(
     shares: Mapping[str, Sequence[float]], kinds: Sequence[str], around: Mapping[str, Sequence[float | None]]
 ) -> Figure:
-    """Return the share of errors covered against the number of sensors, and errors around a pole by kind of scenario.
+    """Return shares of errors covered against the number of sensors, and errors around a pole by kind of scenario.
 
-    shares: by town, of 1, 2, ... sensors. around: by town, mean number of errors in reach of a pole of each of `kinds`;
+    The shares are of all errors, and of those that sensors on all poles together cover. shares: by town, of 1, 2, ...
+    sensors. around: by town, mean number of errors in reach of a pole of each of `kinds`;
     None where the town has no such pole.
     """
-    figure = style.canvas(8.4, 3.4)
-    left, right = figure.subplots(1, 2)
+    figure = style.canvas(12.0, 3.4)
+    left, middle, right = figure.subplots(1, 3)
     others = iter(style.OTHER_COLOURS)
     colours = {town: style.TOWN_COLOURS.get(town) or next(others) for town in shares}
     for town, own in shares.items():
-        left.plot(range(len(own) + 1), [0.0, *own], "o-", color=colours[town], markersize=4, label=town)
+        for axes, most in ((left, 1.0), (middle, own[-1] or 1.0)):
+            covered = [0.0, *(share / most for share in own)]
+            axes.plot(range(len(own) + 1), covered, "o-", color=colours[town], markersize=4, label=town)
     for row, (town, means) in enumerate(around.items()):
         known = [(place, mean) for place, mean in enumerate(means) if mean is not None]
         places = [place + (row - (len(around) - 1) / 2) * 0.16 for place, _ in known]
         right.bar(places, [mean for _, mean in known], width=0.14, color=colours[town])
-    left.set(xlim=(0, None), ylim=(0, 1.02), xlabel="sensors, placed best", ylabel="share of errors covered")
+    for axes, of in ((left, "errors"), (middle, "errors in reach")):
+        axes.set(xlim=(0, None), ylim=(0, 1.02), xlabel="sensors, placed best", ylabel=f"share of {of} covered")
     right.set_xticks(range(len(kinds)), kinds)
     right.set_ylabel("errors in reach of a pole, mean")
-    for axes in (left, right):
+    for axes in (left, middle, right):
         axes.grid(axis="y")
     style.key(figure, left.get_lines())
     return figure

@@ -187,7 +187,7 @@ def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
         np.array([error.kind for error in errors], dtype=np.str_),
         {number: at for number, at in maps.poles_of(town).items() if int(number) in {p.pole for p in placed.poles}},
         {str(pole): placed.range_m for pole in placed.chosen},
-        (str(placed.densest),),
+        {maps.DENSEST: (str(placed.densest),)},
     )
 
 

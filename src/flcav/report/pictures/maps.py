@@ -1,6 +1,6 @@
 """The map of a town with registered errors, candidate poles and the chosen ones."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,6 +40,7 @@ WIDE = 3.0  # width of a note, divided by its height
 CELL_M = 2.0  # of the map of the errors' density
 BLUR_M = 12.0  # standard deviation of its smoothing: half of a crossing
 HEAT = LinearSegmentedColormap.from_list("heat", ["#fff3e0", "#f6b26b", "#c0392b"])
+DENSEST, MOST_VISIBLE = "densest traffic", "most visible objects"  # what the poles of conventional rules have
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
@@ -52,7 +53,9 @@ class ErrorMap:
     kind: NDArray[np.str_]  # (E,) a key of KINDS, or a kind of a user's own
     poles: Mapping[str, Array]  # candidate sites by id: (3,) world [m]
     chosen: Mapping[str, float] = field(default_factory=dict)  # poles with a sensor: its range [m] by the pole's id
-    densest: Collection[str] = ()  # ids of the poles with most actors within range
+    conventional: Mapping[str, Collection[str]] = field(default_factory=dict)  # ids of a rule's poles by what they have
+    zones: Mapping[str, float] = field(default_factory=dict)  # errors per hectare within `zone_m` of a pole, by its id
+    zone_m: float = 0.0
     heat: bool = False  # whether to show the density of the errors
 
 
@@ -78,7 +81,7 @@ def draw_town(axes: Axes, town: Town) -> None:
 
 
 def draw_errors(axes: Axes, scene: ErrorMap) -> None:
-    """Draw the town, its registered errors and its poles: the chosen ones with their range, the densest as a square."""
+    """Draw the town, errors, zones and poles: the chosen ones with their range, those of conventional rules square."""
     draw_town(axes, scene.town)
     if scene.heat and len(scene.errors):
         draw_density(axes, scene)
@@ -93,13 +96,20 @@ def draw_errors(axes: Axes, scene: ErrorMap) -> None:
         if not len(xyz):
             continue
         axes.plot(*xyz[:, :2].T, linestyle="none", label=f"{label} ({len(xyz)})", **look)
+    for number, per_hectare in scene.zones.items():
+        x, y = scene.poles[number][:2]
+        axes.add_patch(
+            Circle((x, y), scene.zone_m, fill=False, edgecolor=style.INK, linewidth=0.8, linestyle=":", zorder=1.5)
+        )
+        look = {"fontsize": style.SMALL, "path_effects": HALO, "zorder": 6}
+        axes.text(x, y - scene.zone_m, f"{per_hectare:.0f}/ha", ha="center", va="center_baseline", **look)
     notes: list[Array] = []  # their positions (2,)
     for number, (x, y, _) in scene.poles.items():
-        chosen, densest = number in scene.chosen, number in scene.densest
+        chosen, rules = number in scene.chosen, [name for name, own in scene.conventional.items() if number in own]
         face, ink = (style.BLUE, "white") if chosen else ("white", style.INK)
-        axes.plot(x, y, "s" if densest else "o", markersize=13, color=face, markeredgecolor=style.INK, zorder=5)
+        axes.plot(x, y, "s" if rules else "o", markersize=13, color=face, markeredgecolor=style.INK, zorder=5)
         axes.text(x, y, number, ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
-        if note := " and ".join(word for word, said in (("placed", chosen), ("densest traffic", densest)) if said):
+        if note := _join([*(["placed"] if chosen else []), *rules]):
             others = [xyz[:2] for other, xyz in scene.poles.items() if other != number]
             notes.append(_write_beside(axes, note, np.array([x, y]), np.array([*others, *notes]).reshape(-1, 2)))
 
@@ -118,6 +128,13 @@ def draw_density(axes: Axes, scene: ErrorMap) -> None:
     bar = axes.figure.colorbar(zones, ax=axes, shrink=0.6, pad=0.02, aspect=25)
     bar.set_label("errors per hectare", color=style.MUTED)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+
+
+def _join(words: Sequence[str]) -> str:
+    """Return "a", "a and b", or on two lines "a, b and c"; "" of none."""
+    if len(words) < 3:
+        return " and ".join(words)
+    return f"{', '.join(words[:-1])}\nand {words[-1]}"
 
 
 def _write_beside(axes: Axes, note: str, at: Array, others: Array) -> Array:
