@@ -1,10 +1,11 @@
 """Association of LiDAR detections with boxes in a camera's pictures, which corrects the camera's extrinsics.
 
 A car found by the LiDAR is projected into the picture. Its distance to a box of the picture is that of their four sides
-in standard deviations, in which the uncertainty of the extrinsics and that of both detections have a part; pairs are
-the assignment of least cost (Kuhn, "The Hungarian method", 1955) with a gate. Pairs of all pictures of a camera give
-its extrinsics, by a robust fit of the sides with the calibration as a prior, and these give better pairs: both are
-repeated until the pairs stay (Besl, McKay, "A method for registration of 3-D shapes", 1992, have this for points).
+in standard deviations, in which the uncertainty of the extrinsics and that of both detections have a part. Pairs within
+a gate of this distance are assigned by their likelihood (Kuhn, "The Hungarian method", 1955). Pairs of all pictures of
+a camera give its extrinsics, by a robust fit of the sides with the calibration as a prior, and these give better pairs:
+both are repeated until the pairs stay, `ROUNDS` times at most (Besl, McKay, "A method for registration of 3-D shapes",
+1992, have this for points).
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, linear_sum_assignment
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -24,8 +26,10 @@ from flcav.sensors.camera.lens import project_points
 Array = NDArray[np.float64]
 
 SIDE_PX, SIDE_SHARE = 2.0, 0.08  # standard deviation of a side: hypot of pixels and of a share of the box's own size
-GATE = float(chi2.ppf(0.999, 4))  # largest squared distance of a pair, of four sides
+GATE = chi2.ppf(0.999, (1, 2, 3, 4))  # largest squared distance of a pair, by the number of sides that count
+FAR = 1e6  # cost of a pair outside the gate
 ROUNDS = 12  # most repetitions of association and fit
+STILL_M = 0.5  # cars of several pictures nearer to each other than this, LiDAR frame, are one that stands
 NEAREST_M = 1.0  # least depth of all of a car before the camera
 BORDER_PX = 1.5  # a side this near to the border of the picture may lie outside
 # Of a car's outline, in shares of half its length, of half its width, and of its height above its floor: sills, waist
@@ -75,10 +79,11 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Association:
-    """The pairs of each shot, and the view that they are consistent with."""
+    """The pairs of each shot, and the view that they were made with."""
 
     pairs: tuple[Pairs, ...]
     view: View
+    settled: bool  # whether the pairs stayed; False: they still changed after the last round
 
 
 def spread_of_calibration(rotation_deg: float, position_m: float) -> Array:
@@ -97,39 +102,45 @@ def apply_error(camera_from_lidar: Array, error: Array) -> Array:
 def correct_extrinsics(shots: Sequence[Shot], calibrated: View, rounds: int = ROUNDS) -> Association:
     """Return the pairs of all shots of one camera, and its view with corrected extrinsics and their covariance.
 
-    The extrinsics of `calibrated` are the prior of the fit. Without a pair they stay.
+    The extrinsics of `calibrated` are the prior of the fit. Without a pair they stay. After `rounds` fits the pairs are
+    taken as they are, settled or not.
     """
     view, last = calibrated, None
-    for _ in range(rounds):
+    for left in reversed(range(rounds + 1)):
         pairs = tuple(pair(shot, view) for shot in shots)
         now = [(each.car.tolist(), each.box.tolist()) for each in pairs]
-        if now == last or not any(map(len, pairs)):
+        settled = now == last or not any(map(len, pairs))
+        if settled or not left:
             break
         view, last = fit_extrinsics(shots, pairs, calibrated), now
-    return Association(tuple(pair(shot, view) for shot in shots), view)
+    return Association(pairs, view, settled)
 
 
 def pair(shot: Shot, view: View) -> Pairs:
     """Return the pairs of a shot's cars and boxes of least cost, and what remains alone.
 
-    The cost is the squared distance in standard deviations, scaled to four sides where some lie outside the picture;
-    pairs farther apart than `GATE` are none.
+    Pairs with a squared distance beyond the `GATE` of their sides are none. The cost is -2 log of the density of the
+    offsets, but for a constant: the squared distance plus the log-determinant of the covariance, scaled to four sides
+    where some lie outside the picture.
     """
     sides, slope = _project_with_slope(shot.cars, view)
     seen = np.flatnonzero(np.isfinite(sides).all(axis=1))
-    cost = np.full((len(seen), len(shot.boxes)), GATE)
+    cost = np.full((len(seen), len(shot.boxes)), FAR)
     offset_px = np.zeros_like(cost)
     for row, car in enumerate(seen):
         spread = slope[car] @ view.covariance @ slope[car].T
         for column, box in enumerate(shot.boxes):
             inside = sides_inside(sides[car], view) & sides_inside(box, view)
-            if inside.any():
-                off = (box - sides[car])[inside]
-                whole = spread[np.ix_(inside, inside)] + np.diag(np.full(len(off), side_px(box) ** 2))
-                cost[row, column] = min(off @ np.linalg.solve(whole, off) * 4 / len(off), GATE)
-                offset_px[row, column] = np.sqrt((off**2).mean())
+            if not inside.any():
+                continue
+            off = (box - sides[car])[inside]
+            whole = spread[np.ix_(inside, inside)] + np.diag(np.full(len(off), side_px(box) ** 2))
+            square = off @ np.linalg.solve(whole, off)
+            offset_px[row, column] = np.sqrt((off**2).mean())
+            if square < GATE[len(off) - 1]:
+                cost[row, column] = (square + np.linalg.slogdet(whole)[1]) * 4 / len(off)
     row, column = linear_sum_assignment(cost)
-    near = cost[row, column] < GATE
+    near = cost[row, column] < FAR
     row, column = row[near], column[near]
     return Pairs(
         seen[row],
@@ -144,12 +155,15 @@ def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: Vi
     """Return the view whose extrinsics fit the pairs best, and their covariance.
 
     By least squares of the sides' offsets in standard deviations, under a Cauchy loss, and of the error of `calibrated`
-    in its own: rotation and translation are corrected as far as the pairs show them.
+    in its own: rotation and translation are corrected as far as the pairs show them. A car that stands at one place in
+    several pictures counts as much as one in a single picture, since its offsets are alike in all of them.
     """
     cars = [shot.cars[own.car] for shot, own in zip(shots, pairs, strict=True)]
     boxes = np.concatenate([shot.boxes[own.box] for shot, own in zip(shots, pairs, strict=True)])
     points = np.concatenate([outline(each) for each in cars])
     sigma = np.array([side_px(box) for box in boxes])[:, None]
+    centers = np.concatenate([each.center for each in cars])
+    share = 1 / (cdist(centers, centers) < STILL_M).sum(axis=1, keepdims=True)
     whiten = np.linalg.inv(np.linalg.cholesky(calibrated.covariance))
 
     def residuals(error: Array) -> Array:
@@ -157,7 +171,9 @@ def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: Vi
         sides = _sides(points, moved)
         inside = sides_inside(sides, moved) & sides_inside(boxes, moved)
         off = np.where(inside & np.isfinite(sides), (boxes - sides) / sigma, 0.0)
-        robust = np.sign(off) * np.sqrt(np.log1p(off**2))  # its square is the Cauchy loss; the prior stays Gaussian
+        robust = np.sign(off) * np.sqrt(
+            share * np.log1p(off**2)
+        )  # its square is the Cauchy loss; the prior stays Gaussian
         return np.concatenate((robust.ravel(), whiten @ error))
 
     found = least_squares(residuals, np.zeros(6), x_scale=np.sqrt(np.diag(calibrated.covariance)))

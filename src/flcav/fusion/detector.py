@@ -32,7 +32,7 @@ from flcav.world.map.relief import Relief
 ROAD = "shipped/road.safetensors"  # relative to the folder of the task objects; of pictures, to that of signs
 TRAINED_IN = ("arterial", "suburb")  # towns
 THRESHOLD = 0.7  # lowest score of a label
-PICTURE_THRESHOLD = 0.15  # lowest score of a car in a picture: chosen in the town `ring`
+PICTURE_THRESHOLD = 0.07  # lowest score of a car in a picture: chosen in the town `ring`
 OFF_ROAD_M = 0.5  # farthest that the centre of a car may lie from the drivable surface of the map
 CATEGORY = {"Car": "car"}  # actor category by detection class
 

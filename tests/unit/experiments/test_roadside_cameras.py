@@ -71,7 +71,7 @@ def test_a_pair_is_right_if_both_are_one_actor() -> None:
 
 def test_a_camera_has_a_row_for_each_choice_of_extrinsics() -> None:
     told = Associated(Offset(30.0, 2.5), pairs=8, right=6, found=5, lone_cars=2, lone_boxes=1, residual_px=12.34)
-    camera = CameraResult("left", 20, 10, 9, dict.fromkeys((CALIBRATED, CORRECTED, EXACT), told))
+    camera = CameraResult("left", 20, 10, 9, dict.fromkeys((CALIBRATED, CORRECTED, EXACT), told), True)
     intervals = 9
     arms = ("first suite alone", "three suites as calibrated", "three suites registered")
     result = Fig4((), (0,) * intervals, dict.fromkeys(arms, (0,) * intervals), dict.fromkeys(arms, 0.0), (camera,))
@@ -80,3 +80,15 @@ def test_a_camera_has_a_row_for_each_choice_of_extrinsics() -> None:
     assert rows[2] == "| left | as calibrated | 30 cm, 2.50° | 10 | 9 | 5 (0.50) | 8 | 6 (0.75) | 2 | 1 | 12.3 |"
     assert "of 10 cars 5 are rightly associated as calibrated, off by 2.50 degrees" in result.sentences()[-1]
     assert Fig4.from_json(result.as_json(), "x") == result
+    moving = replace(result, cameras=(replace(camera, settled=False),))
+    assert [each.sentences()[-1].endswith("; the pairs had not settled") for each in (result, moving)] == [False, True]
+
+
+def test_a_result_of_before_the_cameras_is_read() -> None:
+    arms = dict.fromkeys(("first suite alone", "three suites as calibrated", "three suites registered"), (0,) * 9)
+    old = {"suites": [], "cars": [0] * 9, "found": arms, "range_m": dict.fromkeys(arms, 0.0)}
+    result = Fig4.from_json(old, "x")
+    assert result.cameras is None
+    assert "cameras" not in result.as_json()
+    assert len(fig4_tables(result)["cameras"].splitlines()) == 2
+    assert len(result.sentences()) == 3

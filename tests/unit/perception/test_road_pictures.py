@@ -8,38 +8,52 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError
+from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
+from flcav.perception.signs import infer
 from flcav.perception.signs.augment import draw
 from flcav.perception.signs.background import compare_with_background, learn_picture_background, picture_reader
 from flcav.perception.signs.config import CONFIGURATIONS
 from flcav.perception.signs.infer import detect_signs
 from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.samples import sample_from_frame
+from flcav.perception.signs.predict import Detections
+from flcav.perception.signs.samples import RecordedPictures, sample_from_frame
 from flcav.perception.signs.task import SIGNS
-from flcav.sensors.frame import Annotations, Views
+from flcav.sensors.frame import Annotations, Frame, Views
 from perception.frames import frame
 
 ROAD = CONFIGURATIONS["road"]
 GREY, RED = 100, (200, 20, 30)
+NOTHING = Detections(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0))
 
 
 class Street:
     """Five pictures of a grey street by one camera of a pole; a red car stands elsewhere in each."""
 
-    folder = Path("street")
+    def __init__(self, agent: str = "pole1") -> None:
+        self.folder, self.agent = Path("street"), agent
 
     def select(self, *, agents: set[str]) -> list[int]:
-        return list(range(5)) if agents == {"pole1"} else []
+        return list(range(5)) if agents == {self.agent} else []
+
+    def numbers(self, frames: list[int] | None) -> list[int]:
+        return list(range(5)) if frames is None else frames
+
+    def frame(self, number: int) -> Frame:
+        return frame([], agent=self.agent)
+
+    def check_labelled(self, what: str) -> None:
+        assert what == "objects"
 
     def cameras(self, number: int) -> list[str]:
         return ["left"]
 
     def name(self, number: int) -> str:
-        return f"s_{number:04d}_pole1"
+        return f"s_{number:04d}_{self.agent}"
 
     @property
     def keys(self) -> list:
-        return [frame([], agent="pole1") for _ in range(5)]
+        return [self.frame(number) for number in range(5)]
 
     def plane(self, number: int, camera: str, plane: str) -> np.ndarray:
         picture = np.full((64, 96, 3), GREY, np.uint8)
@@ -101,11 +115,39 @@ def test_channels_are_not_mixed_by_augmentation() -> None:
     assert {tuple(pixel) for pixel in drawn.reshape(-1, 3).tolist()} == {(40, 80, 0)}
 
 
+def test_findings_in_a_dataset_are_of_pictures_beside_their_background(monkeypatch, tmp_path) -> None:
+    (tmp_path / MANIFEST).touch()
+    monkeypatch.setattr(Dataset, "open", lambda path: STREET)
+    shown = []
+    monkeypatch.setattr(infer, "detect", lambda network, picture, threshold: shown.append(picture) or NOTHING)
+    findings = list(detect_signs(SignDetector(ROAD), tmp_path, 0.5, [1, 3]))
+    for number, finding, seen in zip((1, 3), findings, shown, strict=True):
+        assert (finding.seen == Street().plane(number, "left", "rgb")).all()
+        assert (seen == picture_reader(STREET, background=True)(number, "left")).all()
+    assert findings[0].path == tmp_path / f"{STREET.frame(1).key}/left"
+    assert findings[0].result.lines() == ["0 boxes"]
+
+
+def test_cameras_that_move_are_refused(monkeypatch, tmp_path) -> None:
+    moving = cast("Dataset", Street("cav0"))
+    (tmp_path / MANIFEST).touch()
+    monkeypatch.setattr(Dataset, "open", lambda path: moving)
+    refused = (
+        lambda: picture_reader(moving, background=True)(1, "left"),
+        lambda: RecordedPictures(moving, ROAD),
+        lambda: next(detect_signs(SignDetector(ROAD), tmp_path, 0.5)),
+    )
+    for call in refused:
+        with pytest.raises(InputError, match=r"^street: cav0 moves, .*; choose them with --agents poles$"):
+            call()
+    assert (picture_reader(moving, background=False)(1, "left") == Street().plane(1, "left", "rgb")).all()
+
+
 def test_what_it_cannot_do_is_refused() -> None:
     network = SignDetector(ROAD)
-    with pytest.raises(InputError, match="beside their background"):
+    with pytest.raises(InputError, match="a dataset is wanted"):
         next(detect_signs(network, Path("street"), 0.5))
-    with pytest.raises(InputError, match="not sent"):
+    with pytest.raises(InputError, match="vehicles have none"):
         SIGNS.pack_samples(STREET, ROAD, [0])
     with pytest.raises(InputError, match="finds car, van"):
         SIGNS.register_errors(network, STREET)

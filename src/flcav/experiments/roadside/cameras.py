@@ -55,6 +55,7 @@ class CameraResult:
     cars: int  # found by the LiDAR, with `VISIBLE_PX` in a picture
     pictured: int  # of these, with a box in the picture
     by_extrinsics: dict[str, Associated]  # `CALIBRATED`, `CORRECTED`, `EXACT`
+    settled: bool  # whether the corrected pairs stayed, see `flcav.fusion.association.Association`
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,7 @@ def associate_camera(
             CORRECTED: judge(corrected.pairs, corrected.view),
             EXACT: judge([pair(shot, true) for shot in shots], true),
         },
+        corrected.settled,
     )
 
 

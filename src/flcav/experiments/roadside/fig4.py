@@ -91,7 +91,7 @@ class Fig4(Record):
     cars: tuple[int, ...]  # seen by any suite, in each interval of `EDGES_M`
     found: dict[str, tuple[int, ...]]  # of these, by arm
     range_m: dict[str, float]  # to which an arm finds the share `REACHED` of the cars; 0 where nowhere
-    cameras: tuple[CameraResult, ...] = ()
+    cameras: Annotated[tuple[CameraResult, ...] | None, LEFT_OUT] = None  # None: of before they were measured
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
     def sentences(self) -> list[str]:
@@ -103,11 +103,12 @@ class Fig4(Record):
             for each in self.suites
         ]
         told += [f"{arm}: {REACHED:.0%} of the cars are found up to {self.range_m[arm]:.0f} m" for arm in ARMS]
-        for each in self.cameras:
+        for each in self.cameras or ():
             before, after = (each.by_extrinsics[name] for name in (CALIBRATED, CORRECTED))
             told.append(
                 f"{each.name}: of {each.cars} cars {before.found} are rightly associated as calibrated, off by "
                 f"{before.off.rotation_deg:.2f} degrees, {after.found} corrected, off by {after.off.rotation_deg:.2f}"
+                + ("" if each.settled else "; the pairs had not settled")
             )
         return told
 

@@ -126,7 +126,7 @@ def fig4_tables(results: Fig4) -> dict[str, str]:
     return {
         "residuals": format_table(("suite", "from the first [m]", "off as calibrated", "off as registered"), rows),
         "range": format_table(header, [["cars", *results.cars, ""], *found]),
-        "cameras": _tabulate_cameras(results.cameras),
+        "cameras": _tabulate_cameras(results.cameras or ()),
     }
 
 

@@ -11,7 +11,7 @@ from flcav.config import InputError
 from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
 from flcav.perception.images import Picture
-from flcav.perception.signs.background import picture_reader
+from flcav.perception.signs.background import check_stands, picture_reader
 from flcav.perception.signs.config import SignsConfig
 from flcav.sensors.frame import Frame
 
@@ -31,13 +31,17 @@ class Sample:
 class RecordedPictures(Sequence[Sample]):
     """The labelled images of all cameras in frames of a dataset (None: all).
 
-    Images are read on access and cached up to `KEPT_BYTES`. Raises `InputError` if no frame has a camera.
+    Images are read on access and cached up to `KEPT_BYTES`. Raises `InputError` if no frame has a camera, and for
+    frames of vehicles if the network sees pictures beside their background.
     """
 
     def __init__(self, data: Dataset, config: SignsConfig, frames: Sequence[int] | None = None) -> None:
         data.check_labelled("signs" if config.labels == "signs" else "objects")
         self._data, self._config, self._read = data, config, picture_reader(data, config.background)
-        self._of = [(number, camera) for number in data.numbers(frames) for camera in data.frame(number).images]
+        numbers = data.numbers(frames)
+        if config.background:
+            check_stands(data, numbers)
+        self._of = [(number, camera) for number in numbers for camera in data.frame(number).images]
         if not self._of:
             raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
         self._kept: dict[int, Sample] = {}

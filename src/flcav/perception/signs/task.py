@@ -89,10 +89,14 @@ class SignsTask(SignsOutcomes):
         result = mean_average_precision(found, truths, network.config.classes, network.config.smallest_px)
         return replace(result, scenes=len(set(kept.scene.tolist())))
 
+    def check_for_vehicles(self, config: SignsConfig) -> None:
+        """Raise `InputError` for a network of pictures beside their background, which vehicles do not have."""
+        if config.background:
+            raise InputError("signs: this network sees pictures of poles beside their background, vehicles have none")
+
     def pack_samples(self, data: Dataset, config: SignsConfig, frames: Sequence[int]) -> Iterator[bytes]:
         """Yield the message of each frame: its images with their boxes."""
-        if config.background:
-            raise InputError("samples of signs: pictures beside their background are not sent, choose another network")
+        self.check_for_vehicles(config)
         RecordedPictures(data, config, frames)  # raises for frames without cameras
         return (pack_frame(data, i, config) for i in frames)
 
