@@ -171,9 +171,8 @@ def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: Vi
         sides = _sides(points, moved)
         inside = sides_inside(sides, moved) & sides_inside(boxes, moved)
         off = np.where(inside & np.isfinite(sides), (boxes - sides) / sigma, 0.0)
-        robust = np.sign(off) * np.sqrt(
-            share * np.log1p(off**2)
-        )  # its square is the Cauchy loss; the prior stays Gaussian
+        # Its square is the Cauchy loss; the prior stays Gaussian.
+        robust = np.sign(off) * np.sqrt(share * np.log1p(off**2))
         return np.concatenate((robust.ravel(), whiten @ error))
 
     found = least_squares(residuals, np.zeros(6), x_scale=np.sqrt(np.diag(calibrated.covariance)))
