@@ -105,15 +105,20 @@ def correct_extrinsics(shots: Sequence[Shot], calibrated: View, rounds: int = RO
     The extrinsics of `calibrated` are the prior of the fit. Without a pair they stay. After `rounds` fits the pairs are
     taken as they are, settled or not.
     """
-    view, last = calibrated, None
-    for left in reversed(range(rounds + 1)):
-        pairs = tuple(pair(shot, view) for shot in shots)
-        now = [(each.car.tolist(), each.box.tolist()) for each in pairs]
-        settled = now == last or not any(map(len, pairs))
-        if settled or not left:
+    view, pairs = calibrated, tuple(pair(shot, calibrated) for shot in shots)
+    settled = not any(map(len, pairs))
+    for _ in range(rounds):
+        if settled:
             break
-        view, last = fit_extrinsics(shots, pairs, calibrated), now
+        view, before = fit_extrinsics(shots, pairs, calibrated), pairs
+        pairs = tuple(pair(shot, view) for shot in shots)
+        settled = not any(map(len, pairs)) or _list_partners(pairs) == _list_partners(before)
     return Association(pairs, view, settled)
+
+
+def _list_partners(pairs: Sequence[Pairs]) -> list[tuple[list[int], list[int]]]:
+    """Return the cars and the boxes of each shot's pairs."""
+    return [(each.car.tolist(), each.box.tolist()) for each in pairs]
 
 
 def pair(shot: Shot, view: View) -> Pairs:
@@ -216,7 +221,7 @@ def _sides(points: Array, view: View) -> Array:
     pixels = project_points(view.intrinsics, view.distortion, seen).reshape(n, k, 2) + HALF_PX
     hulls = shapely.convex_hull(shapely.multipoints(np.where(before[:, None, None], pixels, -1.0)))
     shown = shapely.intersection(hulls, shapely.box(0, 0, *view.size))
-    return np.where((shapely.area(shown) > 0)[:, None], shapely.bounds(shown), np.nan)
+    return np.where(np.asarray(shapely.area(shown))[:, None] > 0, shapely.bounds(shown), np.nan)
 
 
 def _project_with_slope(cars: Boxes, view: View) -> tuple[Array, Array]:
