@@ -24,12 +24,15 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar
+from flcav.perception.signs.model import SignDetector
+from flcav.perception.signs.task import SIGNS
 from flcav.perception.weights import find_shipped, load_network
 from flcav.world.map.relief import Relief
 
-ROAD = "shipped/road.safetensors"  # relative to the folder of the task objects
+ROAD = "shipped/road.safetensors"  # relative to the folder of the task objects; of pictures, to that of signs
 TRAINED_IN = ("arterial", "suburb")  # towns
 THRESHOLD = 0.7  # lowest score of a label
+PICTURE_THRESHOLD = 0.07  # lowest score of a car in a picture: chosen in the town `ring`
 OFF_ROAD_M = 0.5  # farthest that the centre of a car may lie from the drivable surface of the map
 CATEGORY = {"Car": "car"}  # actor category by detection class
 
@@ -38,6 +41,12 @@ CATEGORY = {"Car": "car"}  # actor category by detection class
 def load_road_network() -> Second:
     """Return the package's network for roadside sensors."""
     return load_network(OBJECTS, find_shipped(OBJECTS, ROAD))
+
+
+@lru_cache(maxsize=1)
+def load_picture_network() -> SignDetector:
+    """Return the package's network that finds cars in pictures of roadside cameras, trained in the same towns."""
+    return load_network(SIGNS, find_shipped(SIGNS, ROAD))
 
 
 def road_detector(data: Dataset, threshold: float = THRESHOLD) -> Callable[[int], Boxes]:

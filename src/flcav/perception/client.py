@@ -15,7 +15,7 @@ from flcav.dataset.store import Dataset
 from flcav.files import Json
 from flcav.network.messages import from_names, pack
 from flcav.perception.images import pack_pictures
-from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
+from flcav.perception.task import ConfigT, NetworkT, SampleT, Task, find_configuration
 from flcav.perception.training import train_steps
 from flcav.perception.weights import from_arrays, to_arrays
 
@@ -48,6 +48,15 @@ class Shared(Protocol):
         ...
 
 
+@runtime_checkable
+class ForVehicles(Protocol):
+    """A task some of whose networks cannot be trained by vehicles."""
+
+    def check_for_vehicles(self, config: Any) -> None:
+        """Raise `InputError` if vehicles cannot train a network of `config`."""
+        ...
+
+
 class WholeFrames:
     """Default settings of a task without its own: whole frames are uploaded, labelled with their ground truth."""
 
@@ -66,6 +75,13 @@ class WholeFrames:
 def as_shared(task: Task) -> Shared:
     """Return the task's settings for federated training: its own, or `WholeFrames`."""
     return task if isinstance(task, Shared) else WholeFrames()
+
+
+def check_network(task: Task, network: str | None) -> None:
+    """Raise `InputError` where a task has no network of that name (None: its first), or one for no vehicle."""
+    config = find_configuration(task, network)
+    if isinstance(task, ForVehicles):
+        task.check_for_vehicles(config)
 
 
 def pack_frame(data: Dataset, i: int) -> bytes:

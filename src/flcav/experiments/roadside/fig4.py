@@ -1,11 +1,12 @@
-"""Fig. 4 of Wang et al. (IEEE Network 37(3), 2023): LiDAR suites of a crossing and a street registered and fused.
+"""Fig. 4 of Wang et al. (IEEE Network 37(3), 2023): suites of a crossing and a street registered, associated and fused.
 
-Two suites stand at a crossing of `grid`, on either side of it, a third on the straight street that leads away. Each is
+Two LiDARs stand at a crossing of `grid`, on either side of it, a third on the straight street that leads away. Each is
 off from where its calibration says. The second and third are registered to the first by generalised ICP on the static
-background; then the road detector's boxes of all three are averaged.
+background; then the road detector's boxes of all three are averaged. Two cameras hang beside the first LiDAR and two
+beside the third, off as well: their cars are associated with those of the LiDAR, which corrects their extrinsics.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.experiments.roadside.cameras import CALIBRATED, CORRECTED, CameraResult, associate_camera
 from flcav.fusion.average import Told, average_boxes
 from flcav.fusion.detector import THRESHOLD, load_road_network
 from flcav.fusion.registration import Offset, measure_offset, register
@@ -29,6 +31,7 @@ from flcav.progress import Report, ignore_progress
 from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.suites import Shown, draw_suites
+from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
@@ -38,6 +41,12 @@ ACROSS_M = 24.0  # from the first suite over the crossing to the second
 FIRST, SECOND = "lidar", "across"
 SUITES = ((CROSSING, FIRST), (CROSSING, SECOND), (STREET, FIRST))
 NAMES = ("crossing, near side", "crossing, far side", "straight street")
+CAMERAS = {
+    (CROSSING, "camera_left"): "crossing, left camera",
+    (CROSSING, "camera_right"): "crossing, right camera",
+    (STREET, "camera_left"): "straight street, left camera",
+    (STREET, "camera_right"): "straight street, right camera",
+}
 LIDAR = RIGS["lidar_pole"].lidars["lidar"].model_dump(mode="json")
 RECIPE: dict[str, Any] = {
     "town": "grid",
@@ -48,7 +57,10 @@ RECIPE: dict[str, Any] = {
     "every_s": 6.0,
     "cavs": 0,
     "poles": [2, 4],
-    "pole_rig": {"lidars": {FIRST: LIDAR, SECOND: {**LIDAR, "mount": {"x": ACROSS_M, "yaw_deg": 180.0}}}},
+    "pole_rig": {
+        "lidars": {FIRST: LIDAR, SECOND: {**LIDAR, "mount": {"x": ACROSS_M, "yaw_deg": 180.0}}},
+        "cameras": {name: each.model_dump(mode="json") for name, each in RIGS["roadside"].cameras.items()},
+    },
     "calibration_error": {"position_m": 0.3, "rotation_deg": 1.5},
 }
 SWEEPS = 4  # of each suite, whose backgrounds are registered together
@@ -57,6 +69,8 @@ OVERLAP = 0.5  # bird's-eye IoU of a car that was found
 CARS = ("car", "van")
 ARMS = ("first suite alone", "three suites as calibrated", "three suites registered")
 REACHED = 0.8  # recall that makes a range
+
+Found = Mapping[tuple[int, str], Boxes]  # cars in a sweep, LiDAR frame, by frame number and LiDAR
 
 
 @dataclass(frozen=True)
@@ -71,12 +85,13 @@ class Suite:
 
 @dataclass(frozen=True)
 class Fig4(Record):
-    """Residuals of registered suites, and the share of cars found against distance."""
+    """Residuals of registered suites, the share of cars found against distance, and the cameras' associations."""
 
     suites: tuple[Suite, ...]  # the second and the third
     cars: tuple[int, ...]  # seen by any suite, in each interval of `EDGES_M`
     found: dict[str, tuple[int, ...]]  # of these, by arm
     range_m: dict[str, float]  # to which an arm finds the share `REACHED` of the cars; 0 where nowhere
+    cameras: Annotated[tuple[CameraResult, ...] | None, LEFT_OUT] = None  # None: of before they were measured
     provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
     def sentences(self) -> list[str]:
@@ -87,7 +102,15 @@ class Fig4(Record):
             f"{each.after.rotation_deg:.2f} degrees registered"
             for each in self.suites
         ]
-        return told + [f"{arm}: {REACHED:.0%} of the cars are found up to {self.range_m[arm]:.0f} m" for arm in ARMS]
+        told += [f"{arm}: {REACHED:.0%} of the cars are found up to {self.range_m[arm]:.0f} m" for arm in ARMS]
+        for each in self.cameras or ():
+            before, after = (each.by_extrinsics[name] for name in (CALIBRATED, CORRECTED))
+            told.append(
+                f"{each.name}: of {each.cars} cars {before.found} are rightly associated as calibrated, off by "
+                f"{before.off.rotation_deg:.2f} degrees, {after.found} corrected, off by {after.off.rotation_deg:.2f}"
+                + ("" if each.settled else "; the pairs had not settled")
+            )
+        return told
 
 
 def fig4(out: Path, progress: Report = ignore_progress) -> tuple[Fig4, dict[str, bytes]]:
@@ -113,9 +136,15 @@ def fig4(out: Path, progress: Report = ignore_progress) -> tuple[Fig4, dict[str,
         for row in (1, 2)
     )
     placed = {ARMS[0]: guess[:1], ARMS[1]: guess, ARMS[2]: registered}
-    cars, found = _find_cars(data, truth[0], placed)
+    boxes = _detect_cars(data)
+    cars, found = _count_found(data, boxes, truth[0], placed)
     ranges = {arm: find_range(EDGES_M, cars, counts) for arm, counts in found.items()}
-    result = Fig4(suites, cars, found, ranges, provenance())
+    error = parse_config(CalibrationError, RECIPE["calibration_error"], "fig4")
+    cameras = tuple(
+        associate_camera(data, pole, FIRST, camera, name, lambda number: boxes[number, FIRST], error)
+        for (pole, camera), name in CAMERAS.items()
+    )
+    result = Fig4(suites, cars, found, ranges, cameras, provenance())
     shown = [
         Shown(
             arm,
@@ -142,25 +171,30 @@ def _background(data: Dataset, agent: str, lidar: str) -> NDArray[np.float32]:
     return np.concatenate([sweep[~behind.in_front(sweep)] for sweep in sweeps])
 
 
-def _find_cars(
-    data: Dataset, world_from_first: NDArray[np.float64], placed: dict[str, list[NDArray[np.float64]]]
+def _detect_cars(data: Dataset) -> Found:
+    """Return the cars that the road detector finds in every sweep of the suites."""
+    network = load_road_network()
+    read = frame_reader(data, network.config.foreground)
+    return {
+        (number, lidar): detect(network, read(number).lidar[lidar], score_threshold=THRESHOLD)
+        for agent, lidar in SUITES
+        for number in data.select(agents={agent})
+    }
+
+
+def _count_found(
+    data: Dataset, found: Found, world_from_first: NDArray[np.float64], placed: dict[str, list[NDArray[np.float64]]]
 ) -> tuple[tuple[int, ...], dict[str, tuple[int, ...]]]:
     """Return the cars in each interval of `EDGES_M` and those that each arm finds, over all spins.
 
     A car counts where one of the suites has `MIN_RETURNS` from it. Boxes are compared in the first suite's frame.
     """
-    network = load_road_network()
-    read = frame_reader(data, network.config.foreground)
     cars = np.zeros(len(EDGES_M) - 1, dtype=np.int64)
     hits = {arm: np.zeros_like(cars) for arm in placed}
     frames = {(data.keys[n].scene, data.keys[n].index, data.keys[n].agent): n for n in range(len(data))}
     for scene, spin in dict.fromkeys((key.scene, key.index) for key in data.keys):
-        numbers = [frames[scene, spin, agent] for agent, _ in SUITES]
-        boxes = [
-            detect(network, read(number).lidar[lidar], score_threshold=THRESHOLD)
-            for number, (_, lidar) in zip(numbers, SUITES, strict=True)
-        ]
-        views = [(number, lidar) for number, (_, lidar) in zip(numbers, SUITES, strict=True)]
+        views = [(frames[scene, spin, agent], lidar) for agent, lidar in SUITES]
+        boxes = [found[view] for view in views]
         targets = list_cars(data, views).transform(inverse(world_from_first))
         distance = np.linalg.norm(targets.center[:, :2], axis=1)
         cars += np.histogram(distance, EDGES_M)[0]

@@ -1,9 +1,10 @@
 """Markdown tables of the road detector, the road average, sensors' ranges, and Fig. 4."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 from flcav.experiments.roadside.average import ARMS, BOTH, GRAPH, KNOBS, Point, Residual, RoadAverageResult
+from flcav.experiments.roadside.cameras import CameraResult
 from flcav.experiments.roadside.detector import BINS_M, WITHIN_M, RoadDetectorResult
 from flcav.experiments.roadside.fig4 import ARMS as PLACED
 from flcav.experiments.roadside.fig4 import EDGES_M, Fig4
@@ -102,7 +103,7 @@ def _residuals(residuals: Mapping[str, tuple[Residual, Residual]]) -> str:
 
 
 def fig4_tables(results: Fig4) -> dict[str, str]:
-    """Return Markdown by name: residuals, range."""
+    """Return Markdown by name: residuals, range, cameras."""
     rows = [
         [
             each.name,
@@ -125,7 +126,43 @@ def fig4_tables(results: Fig4) -> dict[str, str]:
     return {
         "residuals": format_table(("suite", "from the first [m]", "off as calibrated", "off as registered"), rows),
         "range": format_table(header, [["cars", *results.cars, ""], *found]),
+        "cameras": _tabulate_cameras(results.cameras or ()),
     }
+
+
+def _tabulate_cameras(cameras: Sequence[CameraResult]) -> str:
+    """Return a row for each camera and choice of its extrinsics, as Markdown."""
+    header = (
+        "camera",
+        "extrinsics",
+        "off",
+        "cars",
+        "with a box",
+        "rightly associated",
+        "pairs",
+        "of one car",
+        "cars alone",
+        "boxes alone",
+        "residual [px]",
+    )
+    rows = [
+        [
+            each.name,
+            name,
+            f"{own.off.position_cm:.0f} cm, {own.off.rotation_deg:.2f}°",
+            each.cars,
+            each.pictured,
+            f"{own.found} ({own.found / each.cars:.2f})" if each.cars else "",
+            own.pairs,
+            f"{own.right} ({own.right / own.pairs:.2f})" if own.pairs else "",
+            own.lone_cars,
+            own.lone_boxes,
+            "" if own.residual_px is None else f"{own.residual_px:.1f}",
+        ]
+        for each in cameras
+        for name, own in each.by_extrinsics.items()
+    ]
+    return format_table(header, rows)
 
 
 def range_tables(results: SensorRanges) -> dict[str, str]:

@@ -40,7 +40,8 @@ def draw(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.ran
         wanted = int(rng.integers(len(config.classes))) if number else None
         sample = samples[index] if wanted is None else _one_with(wanted, samples, rng)
         parts.append((draw_window(sample, *size, config, rng, wanted), x, y))
-    return _in_other_colours(join_mosaic(parts, width, height), rng)
+    joined = join_mosaic(parts, width, height)
+    return joined if config.background else _in_other_colours(joined, rng)
 
 
 def _borders(length: int, parts: int, rng: np.random.Generator) -> list[int]:

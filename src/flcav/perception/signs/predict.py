@@ -55,7 +55,7 @@ class BoxesFound(Result):
 
     def lines(self) -> list[str]:
         """Return the number of boxes, then one line per box."""
-        lines = [f"{len(self.boxes)} signs and lights"]
+        lines = [f"{len(self.boxes)} boxes"]
         for box in self.boxes:
             corners = f"({box.x1:.1f}, {box.y1:.1f}) to ({box.x2:.1f}, {box.y2:.1f}) px"
             lines.append(f"{box.label:<14}{box.score:.2f}  {corners}")

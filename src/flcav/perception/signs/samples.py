@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
-from flcav.perception.images import Picture, check_picture
+from flcav.perception.images import Picture
+from flcav.perception.signs.background import check_stands, picture_reader
 from flcav.perception.signs.config import SignsConfig
 from flcav.sensors.frame import Frame
 
@@ -30,13 +31,17 @@ class Sample:
 class RecordedPictures(Sequence[Sample]):
     """The labelled images of all cameras in frames of a dataset (None: all).
 
-    Images are read on access and cached up to `KEPT_BYTES`. Raises `InputError` if no frame has a camera.
+    Images are read on access and cached up to `KEPT_BYTES`. Raises `InputError` if no frame has a camera, and for
+    frames of vehicles if the network sees pictures beside their background.
     """
 
     def __init__(self, data: Dataset, config: SignsConfig, frames: Sequence[int] | None = None) -> None:
-        data.check_labelled("signs")
-        self._data, self._config = data, config
-        self._of = [(number, camera) for number in data.numbers(frames) for camera in data.frame(number).images]
+        data.check_labelled("signs" if config.labels == "signs" else "objects")
+        self._data, self._config, self._read = data, config, picture_reader(data, config.background)
+        numbers = data.numbers(frames)
+        if config.background:
+            check_stands(data, numbers)
+        self._of = [(number, camera) for number in numbers for camera in data.frame(number).images]
         if not self._of:
             raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
         self._kept: dict[int, Sample] = {}
@@ -49,11 +54,8 @@ class RecordedPictures(Sequence[Sample]):
         if index in self._kept:
             return self._kept[index]
         number, camera = self._of[index]
-        picture = self._data.plane(number, camera, "rgb")
-        frame = self._data.frame(number)
-        sample = sample_from_frame(
-            frame, camera, check_picture(picture, f"{self._data.folder} {frame.key}"), self._config
-        )
+        picture = self._read(number, camera)
+        sample = sample_from_frame(self._data.frame(number), camera, picture, self._config)
         if self._kept_bytes + picture.nbytes <= KEPT_BYTES:
             self._kept[index] = sample
             self._kept_bytes += picture.nbytes
@@ -65,12 +67,13 @@ class RecordedPictures(Sequence[Sample]):
 
 
 def sample_from_frame(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
-    """Return a camera's image with the boxes of its signs and lights.
+    """Return a camera's image with the boxes of its signs and lights, or of its actors, as `config.labels` says.
 
-    Boxes smaller than `config.smallest_px`, and boxes cut off by the image's edge, are ignored: a lamp may lie outside.
+    Boxes smaller than `config.smallest_px` are ignored, and so are signs cut off by the image's edge: a lamp may lie
+    outside.
     """
-    shown = select_rectangles(frame, camera, "signs", min_pixels=1)
-    names = [CLASSES["signs"][number] for number in shown.label]
+    shown = select_rectangles(frame, camera, config.labels, min_pixels=1)
+    names = [CLASSES[config.labels][number] for number in shown.label]
     known = np.array([name in config.classes for name in names], dtype=bool)
     label = np.array([config.classes.index(name) for name, ok in zip(names, known) if ok], dtype=np.int64)
     box = shown.box[known]
@@ -80,9 +83,12 @@ def sample_from_frame(frame: Frame, camera: str, picture: Picture, config: Signs
 
 
 def find_targets(box: NDArray[np.float64], size: tuple[int, int], config: SignsConfig) -> NDArray[np.bool_]:
-    """Return (N,) which boxes (N, 4) are targets in an image of `size` (width, height) [px]: whole and large enough."""
+    """Return (N,) which boxes (N, 4) are targets in an image of `size` (width, height) [px].
+
+    They are large enough, and those of signs are whole.
+    """
     whole = (box[:, :2] > 0).all(1) & (box[:, 2:] < size).all(1)
-    return whole & (size_px(box) >= config.smallest_px)
+    return (whole | (config.labels != "signs")) & (size_px(box) >= config.smallest_px)
 
 
 def size_px(boxes: NDArray[np.float64]) -> NDArray[np.float64]:

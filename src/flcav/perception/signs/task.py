@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.files import Json
 from flcav.perception.client import ANNOTATED, camera_ahead
@@ -88,8 +89,14 @@ class SignsTask(SignsOutcomes):
         result = mean_average_precision(found, truths, network.config.classes, network.config.smallest_px)
         return replace(result, scenes=len(set(kept.scene.tolist())))
 
+    def check_for_vehicles(self, config: SignsConfig) -> None:
+        """Raise `InputError` for a network of pictures beside their background, which vehicles do not have."""
+        if config.background:
+            raise InputError("signs: this network sees pictures of poles beside their background, vehicles have none")
+
     def pack_samples(self, data: Dataset, config: SignsConfig, frames: Sequence[int]) -> Iterator[bytes]:
         """Yield the message of each frame: its images with their boxes."""
+        self.check_for_vehicles(config)
         RecordedPictures(data, config, frames)  # raises for frames without cameras
         return (pack_frame(data, i, config) for i in frames)
 
@@ -100,7 +107,7 @@ class SignsTask(SignsOutcomes):
     def infer(
         self, network: SignDetector, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the detections of each image at `path`, by falling score."""
+        """Yield the detections of each image at `path`, by falling score, see `flcav.perception.signs.infer`."""
         yield from detect_signs(network, path, threshold, frames)
 
     def register_errors(
@@ -112,6 +119,8 @@ class SignsTask(SignsOutcomes):
         progress: Report = ignore_progress,
     ) -> Registry:
         """Return the missed signs and the false positives, see `flcav.perception.signs.errors.register_errors`."""
+        if network.config.labels != "signs":
+            raise InputError(f"errors of signs: this network finds {', '.join(network.config.classes)}, which are none")
         data.check_labelled("signs")
         return register_errors(network, data, data.numbers(frames), threshold, progress)
 

@@ -6,6 +6,8 @@ from pathlib import Path
 from flcav.config import InputError, shorten
 from flcav.federation.strategies import sends_outputs
 from flcav.fusion.distillation import Distillation
+from flcav.perception.client import check_network
+from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import count_training_frames
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
@@ -19,11 +21,13 @@ class Outline:
     """The outline of a run.
 
     `beside` is the folder that towns, datasets and histories are looked for in. Raises `InputError` where a task, its
-    labels or a dataset cannot be used.
+    network, its labels or a dataset cannot be used.
     """
 
     def __init__(self, recipe: RunRecipe, beside: Path) -> None:
         self.recipe, self.beside = recipe, beside.absolute()
+        for task, own in recipe.tasks.items():
+            check_network(task_named(task), own.network)
         labels = {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()}
         self.settings = resolve_settings(recipe, labels)
         for setting in self.settings.values():

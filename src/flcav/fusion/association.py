@@ -1,0 +1,235 @@
+"""Association of LiDAR detections with boxes in a camera's pictures, which corrects the camera's extrinsics.
+
+A car found by the LiDAR is projected into the picture. Its distance to a box of the picture is that of their four sides
+in standard deviations, in which the uncertainty of the extrinsics and that of both detections have a part. Pairs within
+a gate of this distance are assigned by their likelihood (Kuhn, "The Hungarian method", 1955). Pairs of all pictures of
+a camera give its extrinsics, by a robust fit of the sides with the calibration as a prior, and these give better pairs:
+both are repeated until the pairs stay, `ROUNDS` times at most (Besl, McKay, "A method for registration of 3-D shapes",
+1992, have this for points).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, linear_sum_assignment
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from flcav.dataset.rectangles import HALF_PX
+from flcav.geometry import Boxes, rotations, transform_points
+from flcav.sensors.camera.lens import project_points
+
+Array = NDArray[np.float64]
+
+SIDE_PX, SIDE_SHARE = 2.0, 0.08  # standard deviation of a side: hypot of pixels and of a share of the box's own size
+GATE = chi2.ppf(0.999, (1, 2, 3, 4))  # largest squared distance of a pair, by the number of sides that count
+FAR = 1e6  # cost of a pair outside the gate
+ROUNDS = 12  # most repetitions of association and fit
+STILL_M = 0.5  # cars of several pictures nearer to each other than this, LiDAR frame, are one that stands
+NEAREST_M = 1.0  # least depth of all of a car before the camera
+BORDER_PX = 1.5  # a side this near to the border of the picture may lie outside
+# Of a car's outline, in shares of half its length, of half its width, and of its height above its floor: sills, waist
+# and bonnet, roof. Mirrors are part of the width.
+OUTLINE = np.array(
+    [
+        (x * a, y * b, z)
+        for a, b, z in ((0.75, 0.88, 0.0), (1.0, 0.72, 0.25), (0.93, 0.92, 0.52), (0.52, 0.66, 0.98))
+        for x in (-1, 1)
+        for y in (-1, 1)
+    ]
+)
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera beside a LiDAR: its extrinsics, how far they may be off, its intrinsics and its picture's size."""
+
+    camera_from_lidar: Array  # (4, 4), optical frame
+    covariance: Array  # (6, 6) of the error `apply_error` takes: rotation [rad], translation [m], optical frame
+    intrinsics: Array  # (3, 3) [px]
+    distortion: Array  # (5,) as in `flcav.sensors.camera.lens`
+    size: tuple[int, int]  # width, height [px]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What LiDAR and camera found at one instant."""
+
+    cars: Boxes  # (N,) LiDAR frame
+    boxes: Array  # (M, 4) x1 y1 x2 y2 [px] from the picture's upper left corner
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The pairs of one shot, and what has no partner."""
+
+    car: NDArray[np.int64]  # (P,) index into the shot's cars
+    box: NDArray[np.int64]  # (P,) index into the shot's boxes
+    residual_px: Array  # (P,) root mean square of the offsets of the sides that lie inside the picture
+    lone_cars: NDArray[np.int64]  # cars that project into the picture
+    lone_boxes: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.car)
+
+
+@dataclass(frozen=True)
+class Association:
+    """The pairs of each shot, and the view that they were made with."""
+
+    pairs: tuple[Pairs, ...]
+    view: View
+    settled: bool  # whether the pairs stayed; False: they still changed after the last round
+
+
+def spread_of_calibration(rotation_deg: float, position_m: float) -> Array:
+    """Return the (6, 6) covariance of extrinsics with these standard deviations about and along each axis."""
+    return np.diag(np.repeat((np.radians(rotation_deg), position_m), 3) ** 2)
+
+
+def apply_error(camera_from_lidar: Array, error: Array) -> Array:
+    """Return extrinsics (4, 4) moved by `error` (6,): a rotation vector [rad], then a shift [m], optical frame."""
+    moved = np.eye(4)
+    moved[:3, :3] = Rotation.from_rotvec(error[:3]).as_matrix()
+    moved[:3, 3] = error[3:]
+    return moved @ camera_from_lidar
+
+
+def correct_extrinsics(shots: Sequence[Shot], calibrated: View, rounds: int = ROUNDS) -> Association:
+    """Return the pairs of all shots of one camera, and its view with corrected extrinsics and their covariance.
+
+    The extrinsics of `calibrated` are the prior of the fit. Without a pair they stay. After `rounds` fits the pairs are
+    taken as they are, settled or not.
+    """
+    view, pairs = calibrated, tuple(pair(shot, calibrated) for shot in shots)
+    settled = not any(map(len, pairs))
+    for _ in range(rounds):
+        if settled:
+            break
+        view, before = fit_extrinsics(shots, pairs, calibrated), pairs
+        pairs = tuple(pair(shot, view) for shot in shots)
+        settled = not any(map(len, pairs)) or _list_partners(pairs) == _list_partners(before)
+    return Association(pairs, view, settled)
+
+
+def _list_partners(pairs: Sequence[Pairs]) -> list[tuple[list[int], list[int]]]:
+    """Return the cars and the boxes of each shot's pairs."""
+    return [(each.car.tolist(), each.box.tolist()) for each in pairs]
+
+
+def pair(shot: Shot, view: View) -> Pairs:
+    """Return the pairs of a shot's cars and boxes of least cost, and what remains alone.
+
+    Pairs with a squared distance beyond the `GATE` of their sides are none. The cost is -2 log of the density of the
+    offsets, but for a constant: the squared distance plus the log-determinant of the covariance, scaled to four sides
+    where some lie outside the picture.
+    """
+    sides, slope = _project_with_slope(shot.cars, view)
+    seen = np.flatnonzero(np.isfinite(sides).all(axis=1))
+    cost = np.full((len(seen), len(shot.boxes)), FAR)
+    offset_px = np.zeros_like(cost)
+    for row, car in enumerate(seen):
+        spread = slope[car] @ view.covariance @ slope[car].T
+        for column, box in enumerate(shot.boxes):
+            inside = sides_inside(sides[car], view) & sides_inside(box, view)
+            if not inside.any():
+                continue
+            off = (box - sides[car])[inside]
+            whole = spread[np.ix_(inside, inside)] + np.diag(np.full(len(off), side_px(box) ** 2))
+            square = off @ np.linalg.solve(whole, off)
+            offset_px[row, column] = np.sqrt((off**2).mean())
+            if square < GATE[len(off) - 1]:
+                cost[row, column] = (square + np.linalg.slogdet(whole)[1]) * 4 / len(off)
+    row, column = linear_sum_assignment(cost)
+    near = cost[row, column] < FAR
+    row, column = row[near], column[near]
+    return Pairs(
+        seen[row],
+        column.astype(np.int64),
+        offset_px[row, column],
+        np.setdiff1d(seen, seen[row]),
+        np.setdiff1d(np.arange(len(shot.boxes)), column),
+    )
+
+
+def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: View) -> View:
+    """Return the view whose extrinsics fit the pairs best, and their covariance.
+
+    By least squares of the sides' offsets in standard deviations, under a Cauchy loss, and of the error of `calibrated`
+    in its own: rotation and translation are corrected as far as the pairs show them. A car that stands at one place in
+    several pictures counts as much as one in a single picture, since its offsets are alike in all of them.
+    """
+    cars = [shot.cars[own.car] for shot, own in zip(shots, pairs, strict=True)]
+    boxes = np.concatenate([shot.boxes[own.box] for shot, own in zip(shots, pairs, strict=True)])
+    points = np.concatenate([outline(each) for each in cars])
+    sigma = np.array([side_px(box) for box in boxes])[:, None]
+    centers = np.concatenate([each.center for each in cars])
+    share = 1 / (cdist(centers, centers) < STILL_M).sum(axis=1, keepdims=True)
+    whiten = np.linalg.inv(np.linalg.cholesky(calibrated.covariance))
+
+    def residuals(error: Array) -> Array:
+        moved = replace(calibrated, camera_from_lidar=apply_error(calibrated.camera_from_lidar, error))
+        sides = _sides(points, moved)
+        inside = sides_inside(sides, moved) & sides_inside(boxes, moved)
+        off = np.where(inside & np.isfinite(sides), (boxes - sides) / sigma, 0.0)
+        # Its square is the Cauchy loss; the prior stays Gaussian.
+        robust = np.sign(off) * np.sqrt(share * np.log1p(off**2))
+        return np.concatenate((robust.ravel(), whiten @ error))
+
+    found = least_squares(residuals, np.zeros(6), x_scale=np.sqrt(np.diag(calibrated.covariance)))
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    return replace(
+        calibrated, camera_from_lidar=apply_error(calibrated.camera_from_lidar, found.x), covariance=covariance
+    )
+
+
+def project_cars(cars: Boxes, view: View) -> Array:
+    """Return the boxes (N, 4) x1 y1 x2 y2 [px] around what the picture shows of the outlines of cars, LiDAR frame.
+
+    NaN for cars that are not wholly before the camera, or outside the picture.
+    """
+    return _sides(outline(cars), view)
+
+
+def outline(cars: Boxes) -> Array:
+    """Return the (N, K, 3) points of cars' outlines, in the frame of their boxes [m]."""
+    own = OUTLINE * (0.5, 0.5, 1.0) - (0, 0, 0.5)
+    tilt = np.zeros((len(cars), 2)) if cars.tilt is None else cars.tilt
+    turned = rotations(cars.yaw, tilt[:, 0], tilt[:, 1])
+    return cars.center[:, None] + np.einsum("nij,nkj->nki", turned, own * cars.size[:, None])
+
+
+def side_px(box: Array) -> float:
+    """Return the standard deviation of a side of a box (4,) [px]."""
+    return float(np.hypot(SIDE_PX, SIDE_SHARE * np.sqrt((box[2] - box[0]) * (box[3] - box[1]))))
+
+
+def sides_inside(boxes: Array, view: View) -> NDArray[np.bool_]:
+    """Return (..., 4) whether each side of boxes (..., 4) lies inside the picture: not on its border."""
+    return (boxes > BORDER_PX) & (boxes < np.array(view.size * 2) - BORDER_PX)
+
+
+def _sides(points: Array, view: View) -> Array:
+    """Return the boxes (N, 4) around what the picture shows of outlines (N, K, 3), LiDAR frame; NaN where nothing."""
+    n, k, _ = points.shape
+    seen = transform_points(view.camera_from_lidar, points.reshape(-1, 3))
+    before = np.all(seen[:, 2].reshape(n, k) > NEAREST_M, axis=1)
+    pixels = project_points(view.intrinsics, view.distortion, seen).reshape(n, k, 2) + HALF_PX
+    hulls = shapely.convex_hull(shapely.multipoints(np.where(before[:, None, None], pixels, -1.0)))
+    shown = shapely.intersection(hulls, shapely.box(0, 0, *view.size))
+    return np.where(np.asarray(shapely.area(shown))[:, None] > 0, shapely.bounds(shown), np.nan)
+
+
+def _project_with_slope(cars: Boxes, view: View) -> tuple[Array, Array]:
+    """Return `project_cars`, and its (N, 4, 6) derivative by an error of the extrinsics."""
+    points, step = outline(cars), 1e-5
+    moved = [
+        _sides(points, replace(view, camera_from_lidar=apply_error(view.camera_from_lidar, step * axis)))
+        for axis in np.eye(6)
+    ]
+    sides = _sides(points, view)
+    return sides, np.stack([(each - sides) / step for each in moved], axis=2)
