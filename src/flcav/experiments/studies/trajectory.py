@@ -95,7 +95,7 @@ def _draw(results: StudyResult[TrajectoryEvaluation]) -> bytes:
             for name, errors in tested.slices.items():
                 slices.setdefault(name, []).extend([errors] if errors else [])
         panels[test] = {
-            f"{name}\n({seeds[0].samples})": [
+            f"{name}\n({round(np.mean([each.samples for each in seeds]))})": [
                 _bar("constant velocity", [each.constant_velocity_FDE for each in seeds]),
                 _bar("single path", [each.single_FDE for each in seeds]),
                 _bar("best of six modes", [each.minFDE_K for each in seeds]),
