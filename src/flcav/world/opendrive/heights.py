@@ -28,6 +28,7 @@ STRAY_M = 0.02  # in a map with bridges, by which the terrain may leave a cross-
 BEND_SHARE = 0.1  # of an error in plan that counts as one of height
 ASIDE_M = (SIDEWALK_M, 6.0)  # beyond the outermost lanes the ground goes on at their height
 FINE_M = 2.0  # between points across a road near a bridge: so that the ground beside it begins at its edge
+MOST_FILLED = 50  # points between two borders of lanes, however wide a lane is
 CELL_M = 0.5  # points of different roads in one cell are one
 FAR_M = 400.0  # from the outermost points to the edge of the terrain
 
@@ -162,10 +163,13 @@ def _sample_ground(strips: list[Strip], spans: Spans) -> tuple[Array, Array]:
 
 
 def _fill_across(points: Array) -> Array:
-    """Return points (N, 3) between neighbours of each column of points (T, K, 3), `FINE_M` apart or less."""
+    """Return points (N, 3) between neighbours of each column of points (T, K, 3), `FINE_M` apart or less.
+
+    There are `MOST_FILLED` at most between two of them.
+    """
     out = [np.zeros((0, 3))]
     for one, other in pairwise(points):
-        count = int(np.ceil(np.linalg.norm(other - one, axis=1).max(initial=0.0) / FINE_M))
+        count = min(int(np.ceil(np.linalg.norm(other - one, axis=1).max(initial=0.0) / FINE_M)), MOST_FILLED + 1)
         out += [one + share * (other - one) for share in np.linspace(0.0, 1.0, count + 1)[1:-1]]
     return np.concatenate(out)
 

@@ -275,3 +275,10 @@ def test_a_street_below_a_skewed_bridge_stays_level(degrees: int) -> None:
     relief = Relief(found.points)
     x, y = np.meshgrid(np.arange(-120.0, 120.5, 0.5), (-3.4, -1.7, 0.0, 1.7, 3.4))
     np.testing.assert_allclose(relief.heights(x, y), 0.0, atol=0.02)
+
+
+def test_a_lane_that_is_wide_beyond_belief_has_few_points() -> None:
+    root = crossing()
+    for width in root.iterfind("road[@id='3']//width"):
+        width.set("c", "0.05")  # to 7 km
+    assert len(sample_heights(root, Path("map")).points) < 100_000
