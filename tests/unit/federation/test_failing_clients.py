@@ -82,7 +82,11 @@ def test_half_of_all_have_to_tell_their_samples_and_half_of_those_drawn_have_to_
     for clients, rule, left in ((deaf, "uniform", 2), (failing(5, 3), "importance", 2)):
         with pytest.raises(ClientFailed, match=f"{left} of 5 clients .*, 5 are wanted"):
             run(clients, rule, "all")
-        assert len(run(clients, rule, 1).records[0].failed) == 3  # of those who were to report
+    assert len(run(failing(5, 3), "importance", 1).records[0].failed) == 3  # of those who were to report
+    with pytest.raises(ClientFailed, match=r"0 of 2 clients .*, 1 are wanted .*no memory"):  # cav1 and cav2 are drawn
+        run(deaf, "uniform", 1)
+    record = run(deaf | {"grid/cav2": vehicles("grid", 5)["grid/cav2"]}, "uniform", 1).records[0]
+    assert (record.clients, {*record.failed}) == (("grid/cav2",), {"grid/cav0", "grid/cav1"})
 
 
 @pytest.mark.parametrize("least", [None, 1, "all"])
@@ -95,9 +99,7 @@ def test_half_of_all_have_to_tell_their_samples_and_half_of_those_drawn_have_to_
     ],
     ids=["uniform", "poisson", "importance"],
 )
-def test_a_round_in_which_no_client_reports_is_no_chance_and_ends_the_federation(
-    selection: dict[str, Any], least: Any
-):
+def test_a_round_in_which_no_client_reports_is_no_chance_and_ends_the_federation(selection: dict[str, Any], least: Any):
     class Broken(Regression):
         def count_samples(self, steps: int) -> int:
             raise OSError("no power")
