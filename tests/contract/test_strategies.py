@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors.numpy import load, save
 
-from flcav.federation.rounds import ClientFailed
+from flcav.federation.attendance import ClientFailed
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.stages import Schedule, federate

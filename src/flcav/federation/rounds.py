@@ -15,8 +15,8 @@ from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
 from numpy.typing import NDArray
 
-from flcav.config import InputError
 from flcav.federation.acceptance import UpdateRefused, read_update
+from flcav.federation.attendance import Attendance, ClientFailed
 from flcav.federation.encoding import count_coordinates, unflatten
 from flcav.federation.noise import derive_key
 from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
@@ -45,14 +45,11 @@ from flcav.federation.secure.messages import SecureSum, TooFewClients
 from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import RunningMean, average
-from flcav.federation.strategies.strategy import Averages, Exchanges, Robust, Stateful, find_weigher
+from flcav.federation.strategies.strategy import Averages, Exchanges, Stateful, find_weigher
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 
 OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
-
-
-class ClientFailed(OSError):
-    """Fewer clients sent a usable update in a round than are wanted: a fault of their machines."""
+Away = Callable[[int], Mapping[str, str]]  # of a round, by client why it is not there when the round begins
 
 
 class Intake:
@@ -96,7 +93,8 @@ class Rounds(FlowerStrategy):
     `rules` say who takes part, what is sent and what is kept private; `work` gives the local training of a round by its
     number; numbers continue after the `done` rounds. `names` are the clients' names by node. `earlier` is the number of
     rounds of earlier federations with the same clients, which privacy is accounted with. `state` is changed in place;
-    `on_round` is called after each aggregation. `centre` is the model that clients are pulled to, if any.
+    `on_round` is called after each aggregation. `centre` is the model that clients are pulled to, if any. `away` tells
+    who is not there when a round begins: they take no part in it.
     """
 
     def __init__(
@@ -110,17 +108,14 @@ class Rounds(FlowerStrategy):
         earlier: int,
         on_round: OnRound,
         centre: Weights | None = None,
+        away: Away = lambda _: {},
     ) -> None:
         self._strategy, self._rules, self._work, self._names = strategy, rules, work, names
         self._state, self._done, self._earlier, self._on_round = state, done, earlier, on_round
-        self._centre = centre
+        self._centre, self._away = centre, away
         self._nodes = {name: node for node, name in names.items()}
         self._start: Weights = {}
-        self._chosen: list[str] = []  # who is to send an update in this round
-        self._asked: list[str] = []  # who was asked for anything in this round
-        self._failed: dict[str, str] = {}  # by client what was wrong in this round
-        self._lost: set[str] = set()  # those of them whom the network lost
-        self._shortage: ClientFailed | TooFewClients | None = None  # why there is no update in this round
+        self._here = Attendance()  # of this round
         self._drawn: dict[str, float] = {}  # of unbiased selection: probability of the clients that were drawn
         self._secure: SecureSum | None = None  # of this round
         self._shares: dict[str, float] = {}  # of unbiased selection: of all samples, by client
@@ -134,8 +129,8 @@ class Rounds(FlowerStrategy):
         """Return one training message per chosen client: the round's weights and its local work.
 
         Under importance selection all clients train and report the norm of their update, and those that are drawn are
-        asked to send it. Under other unbiased selections all first report their number of samples. Where fewer are
-        chosen than `least_clients`, nobody is sent a message.
+        asked to send it. Under other unbiased selections all first report their number of samples. Where fewer take
+        part than `least_clients`, nobody is asked to send an update.
         """
         self._start = to_weights(arrays)
         work, records = self._work(self._done + server_round), {ARRAYS: arrays}
@@ -144,22 +139,26 @@ class Rounds(FlowerStrategy):
         if self._centre is not None:
             records[CENTRE] = to_arrays({name: self._centre[name] for name in learned_names(self._centre)})
         selection, local = self._rules.selection, work.record()
-        self._chosen = selection.choose([*self._names.values()], work.round, self._draws_by(work))
-        self._asked = [*self._names.values()] if selection.unbiased else self._chosen
-        self._failed, self._lost, self._shortage = {}, set(), None
+        chosen = selection.choose([*self._names.values()], work.round, self._draws_by(work))
+        asked = [*self._names.values()] if selection.unbiased else chosen
+        self._here = Attendance(asked, chosen, self._away(work.round))
         if selection.unbiased:
             self._draw_unbiased(grid, local)
         if selection.rule == "importance":
-            asked = self._address(self._chosen, {**records, CONFIG: local, ASK: ConfigRecord({ASK: NORM})})
-            norms = self._receive_norms(self._chosen, grid.send_and_receive(asked))
-            self._drawn = selection.draw(norms, work.seed)
-            self._chosen, records = [*self._drawn], {ASK: ConfigRecord({ASK: SEND})}
-        if short := self._rules.tell_shortage(len(self._chosen)):
-            self._shortage = ClientFailed(short)
+            requests = self._address(chosen, {**records, CONFIG: local, ASK: ConfigRecord({ASK: NORM})})
+            self._drawn = selection.draw(self._receive_norms(chosen, grid.send_and_receive(requests)), work.seed)
+            self._here.chosen, records = [*self._drawn], {ASK: ConfigRecord({ASK: SEND})}
+        self._here.count(self._rules)
+        if self._here.shortage is not None:
             return []
         if self._rules.secure is not None:
             return self._begin_securely(grid, {**records, CONFIG: local}, self._rules.secure)
-        return self._address(self._chosen, {**records, CONFIG: local})
+        return self._address(self._senders, {**records, CONFIG: local})
+
+    @property
+    def _senders(self) -> list[str]:
+        """Return who is asked for an update: all that are chosen, or of an unbiased selection those who reported."""
+        return [*self._drawn] if self._rules.selection.weighs else self._here.chosen
 
     def _draws_by(self, work: LocalWork) -> int:
         """Return the seed that the clients of a round are drawn by: that of the round, or one that nobody knows."""
@@ -177,8 +176,8 @@ class Rounds(FlowerStrategy):
         self._receive_norms(
             names, grid.send_and_receive(self._address(names, {CONFIG: local, ASK: ConfigRecord({ASK: COUNT})}))
         )
-        self._chosen = [name for name in self._chosen if name in self._shares]
-        self._drawn = dict.fromkeys(self._chosen, self._rules.selection.inclusion_probability(len(names)))
+        reported = [name for name in self._here.chosen if name in self._shares]
+        self._drawn = dict.fromkeys(reported, self._rules.selection.inclusion_probability(len(names)))
 
     def _begin_securely(self, grid: Grid, records: dict[str, Any], how: SecureAggregation) -> list[Message]:
         """Exchange keys and shares among the chosen clients, and return the messages to those who are left.
@@ -192,11 +191,11 @@ class Rounds(FlowerStrategy):
             return {name: message.content.config_records[ASK] for name, message in replies}
 
         local = records[CONFIG]
-        self._secure = SecureSum(exchange, how.needed(len(self._chosen)))
+        self._secure = SecureSum(exchange, how.needed(len(self._here.chosen)))
         try:
-            asks = self._secure.agree(self._chosen)
+            asks = self._secure.agree(self._here.chosen)
         except TooFewClients as error:
-            self._shortage, asks = error, {}
+            self._here.shortage, asks = error, {}
         return [each for name, ask in asks.items() for each in self._address([name], {**records, ASK: ask})]
 
     def _address(self, clients: Iterable[str], records: dict[str, Any]) -> Iterator[Message]:
@@ -210,64 +209,33 @@ class Rounds(FlowerStrategy):
         """Return the aggregated weights, and as metrics the number of samples and the mean loss weighted by samples.
 
         Where the network lost clients, and fewer are left than secure aggregation or the strategy needs, or where fewer
-        were chosen than secure aggregation or `least_clients` asks for, the weights stay as they were, and the record
-        names those who were chosen as failed, with the reason. Raises `ClientFailed` where fewer
-        clients than are wanted sent a usable update, or than the strategy needs though the network lost none,
+        take part than secure aggregation or `least_clients` asks for and none failed, the weights stay as they were,
+        and the record names those who were chosen as failed, with the reason; where nobody was drawn it names nobody.
+        Raises `ClientFailed` where fewer clients than are wanted sent a usable update, or than the strategy needs
+        though the network lost none, or where fewer take part than are wanted and clients failed to report,
         `TooFewClients` where so few are left for secure aggregation, ValueError where the strategy returns arrays of
         other names, shapes or types.
         """
-        number = self._done + server_round
-        received = Intake(None) if self._shortage else self._receive(replies)
-        self._check_enough(number)
+        number, here = self._done + server_round, self._here
+        received = Intake(None) if here.shortage else self._receive(replies)
+        here.check(self._rules, self._strategy, number)
         try:
-            if self._shortage is not None:
-                raise self._shortage
+            if here.shortage is not None:
+                raise here.shortage
             weights = self._combine(received, number)
         except (ClientFailed, TooFewClients) as error:
-            if not self._lost and self._chose_enough():
+            if not here.lost and not here.few:
                 raise
             weights, received = self._start, Intake(None)
-            self._failed |= {name: str(error) for name in self._chosen if name not in self._failed}
+            here.failed |= {name: str(error) for name in here.chosen if name not in here.failed}
         loss, epsilon = received.mean_loss(), None
         if self._rules.privacy is not None:
             rounds, names = self._earlier + number, [*self._names.values()]
             epsilon = account_epsilon(self._rules.privacy, self._rules.selection, names, rounds)
-        about = (number, tuple(received.samples), self._failed, epsilon)
+        about = (number, tuple(received.samples), here.failed, epsilon)
         self._state.records.append(RoundRecord(*about, loss, sum(received.samples.values())))
         self._on_round(number, weights, loss)
         return to_arrays(weights), MetricRecord({SAMPLES: sum(received.samples.values()), LOSS: loss})
-
-    def _chose_enough(self) -> bool:
-        """Return whether as many clients were chosen as the rules need; by a plan or by chance they may be fewer."""
-        chosen, secure = len(self._chosen), self._rules.secure
-        return not self._rules.tell_shortage(chosen) and (secure is None or secure.needed(chosen) <= chosen)
-
-    def _check_enough(self, number: int) -> None:
-        """Raise `ClientFailed` where fewer clients than are wanted sent what can be used, or than the strategy needs.
-
-        By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
-        a norm or a number of samples, and of those who were then to send an update. `all` is of both, too, a number of
-        those who were to send. Where the network lost clients that the strategy needs, the round has no update, and so
-        where fewer were chosen than the rules need: that is no fault of a client.
-        """
-        if not self._chose_enough():
-            return
-        least = self._rules.least_clients
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in self._failed.items())
-        for clients in [self._chosen] if isinstance(least, int) else [self._asked, self._chosen]:
-            asked = clients if least is not None else [name for name in clients if name not in self._lost]
-            wanted = len(asked) if least == "all" else -(-len(asked) // 2) if least is None else least
-            usable = sum(name not in self._failed for name in asked)
-            if usable < wanted:
-                told = f"{usable} of {len(asked)} clients sent an update that can be used, {wanted} are wanted"
-                raise ClientFailed(f"round {number}: {told} ({reasons})")
-        if isinstance(self._strategy, Robust):
-            try:
-                self._strategy.check_clients(sum(name not in self._failed for name in self._chosen))
-            except InputError as error:
-                if not self._lost:
-                    raise ClientFailed(f"round {number}: {error} ({reasons})") from None
-                self._shortage = ClientFailed(str(error))
 
     def _receive_norms(self, asked: Iterable[str], replies: Iterable[Message]) -> dict[str, float]:
         """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
@@ -277,7 +245,7 @@ class Rounds(FlowerStrategy):
             if np.isfinite(norm) and norm >= 0 and samples >= 0:
                 told[name] = norm, samples
             else:
-                self._failed[name] = f"a norm of {norm} and {samples} samples"
+                self._here.failed[name] = f"a norm of {norm} and {samples} samples"
         total = sum(samples for _, samples in told.values())
         self._shares = {name: samples / max(total, 1) for name, (_, samples) in told.items()}
         return {name: norm * self._shares[name] for name, (norm, _) in told.items()}
@@ -296,10 +264,10 @@ class Rounds(FlowerStrategy):
                 node = awaited.popleft()
                 found, name = early.pop(node, None), self._names[node]
                 if found is None:
-                    self._failed.setdefault(name, "no answer")  # or what it failed by before
+                    self._here.failed.setdefault(name, "no answer")  # or what it failed by before
                 elif found.has_error():
-                    self._failed[name] = str(found.error.reason)
-                    self._lost |= {name} if found.error.code == LOST_BY_NETWORK else set()
+                    self._here.failed[name] = str(found.error.reason)
+                    self._here.lost |= {name} if found.error.code == LOST_BY_NETWORK else set()
                 else:
                     yield name, found
 
@@ -308,7 +276,7 @@ class Rounds(FlowerStrategy):
         rules = self._rules
         plain = rules.secure is None and rules.privacy is None and not rules.selection.weighs
         received = Intake(find_weigher(self._strategy) if plain else None)
-        for name, message in self._in_order(self._chosen, replies):
+        for name, message in self._in_order(self._senders, replies):
             try:
                 sent = to_update(message)
                 if self._secure is not None:
@@ -317,9 +285,9 @@ class Rounds(FlowerStrategy):
                     like = sent.extra if received.extra is None else received.extra
                     update = read_update(sent, self._start, rules, like)
             except UpdateRefused as error:
-                self._failed[name] = str(error)
+                self._here.failed[name] = str(error)
             except (KeyError, TypeError, ValueError) as error:
-                self._failed[name] = f"a message that is no update ({error})"
+                self._here.failed[name] = f"a message that is no update ({error})"
             else:
                 received.add(name, update)
         return received
@@ -347,7 +315,7 @@ class Rounds(FlowerStrategy):
         elif privacy is not None and not privacy.local:
             sent = self._rules.upload.exchanged(start)
             names = [name for name in learned_names(start) if name in sent]
-            expected = float(len(self._chosen))
+            expected = float(len(self._here.chosen))
             if self._rules.selection.rule == "poisson":  # by chance more or fewer come
                 expected = expected_clients(self._rules.selection, [*self._names.values()])
             work = self._work(number)

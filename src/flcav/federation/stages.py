@@ -17,7 +17,7 @@ from flwr.serverapp.strategy import Result
 
 from flcav.config import InputError
 from flcav.federation.client import OWN, RESIDUAL, check_arguments, client_app
-from flcav.federation.privacy import affordable_rounds, expected_clients
+from flcav.federation.privacy import affordable_rounds
 from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_weights
 from flcav.federation.rounds import OnRound, Rounds
 from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
@@ -135,7 +135,7 @@ def federate(
                 state.clients = read_states()
             on_round(round_, aggregated, loss)
 
-        app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep, centre)
+        app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep, centre, account.find_away)
         lossy = LossyGrid(grid, account, nodes) if account.outages else grid
         link = MeteredGrid(BudgetedGrid(lossy, account, nodes), account, nodes)
         results.append(app.start(link, to_arrays(weights), rounds - done))
@@ -217,9 +217,10 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
     """Raise `InputError` where a strategy and rules do not go together, or not with so many clients."""
     told, selection = type(strategy).__name__, rules.selection
     selection.check_clients(names)
-    planned = selection.rule == "planned"  # any number, all at most: a round with too few has no update
-    chosen = len(names) if planned else int(expected_clients(selection, names))
-    if selection.rule not in ("poisson", "importance") and (short := rules.tell_shortage(chosen)):
+    planned = selection.rule == "planned"
+    any_number = planned or selection.rule in ("poisson", "importance")  # all at most; too few make no update
+    chosen = len(names) if any_number else len(selection.choose(names, 1, 0))
+    if short := rules.tell_shortage(chosen):
         raise InputError(short)
     single = isinstance(strategy, Robust | Exchanges)  # looks at each update
     if selection.weighs:
@@ -230,6 +231,11 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
             raise InputError("privacy: importance selection reads norms of the updates, which no noise covers")
     if selection.unbiased and (alike := _count_alike(strategy, rules)):
         raise InputError(f"selection: {alike} has clients count the same, and 'unbiased' weighs them by samples")
+    if rules.privacy is not None and rules.privacy.amplified(selection) and isinstance(rules.least_clients, int):
+        raise InputError(
+            f"privacy: epsilon of {selection.rule} selection rests on secret draws, and rounds without an update for a "
+            "number of 'least_clients' would tell of them"
+        )
     if isinstance(strategy, FedMD):
         _check_outputs(rules)
     if isinstance(rules.personal, RegionalModels) and isinstance(strategy, Corrects):

@@ -9,7 +9,8 @@ import pytest
 from pydantic import ValidationError
 from regression import START, Regression, ledger, vehicles
 
-from flcav.federation.rounds import ClientFailed
+from flcav.config import InputError
+from flcav.federation.attendance import ClientFailed
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
@@ -81,7 +82,57 @@ def test_half_of_all_have_to_tell_their_samples_and_half_of_those_drawn_have_to_
     for clients, rule, left in ((deaf, "uniform", 2), (failing(5, 3), "importance", 2)):
         with pytest.raises(ClientFailed, match=f"{left} of 5 clients .*, 5 are wanted"):
             run(clients, rule, "all")
-        assert len(run(clients, rule, 1).records[0].failed) == 3  # of those who were to report
+    assert len(run(failing(5, 3), "importance", 1).records[0].failed) == 3  # of those who were to report
+    with pytest.raises(ClientFailed, match=r"0 of 2 clients .*, 1 are wanted .*no memory"):  # cav1 and cav2 are drawn
+        run(deaf, "uniform", 1)
+    record = run(deaf | {"grid/cav2": vehicles("grid", 5)["grid/cav2"]}, "uniform", 1).records[0]
+    assert (record.clients, {*record.failed}) == (("grid/cav2",), {"grid/cav0", "grid/cav1"})
+
+
+@pytest.mark.parametrize("least", [None, 1, "all"])
+@pytest.mark.parametrize(
+    "selection",
+    [
+        {"rule": "uniform", "clients": 2, "unbiased": True},
+        {"rule": "poisson", "probability": 0.9, "unbiased": True},
+        {"rule": "importance", "clients": 2},
+    ],
+    ids=["uniform", "poisson", "importance"],
+)
+def test_a_round_in_which_no_client_reports_is_no_chance_and_ends_the_federation(selection: dict[str, Any], least: Any):
+    class Broken(Regression):
+        def count_samples(self, steps: int) -> int:
+            raise OSError("no power")
+
+    clients = {name: Broken(each.inputs, each.targets, fail=True) for name, each in vehicles("grid", 6).items()}
+    rules, state = Rules.model_validate({"selection": selection, "least_clients": least}), FederationState()
+    with pytest.raises(ClientFailed, match=r"^round 1: .* wanted.*\(grid/cav0: .*no power"):
+        federate(clients, START, SCHEDULE, edge(), rules=rules, state=state)
+    assert not state.records
+
+
+def test_one_client_that_fails_to_report_does_not_pass_for_a_small_draw():
+    rules = Rules.model_validate({"selection": {"rule": "importance", "clients": 1}, "least_clients": 5})
+    with pytest.raises(ClientFailed, match=r"^round 1: least_clients: 5 are wanted .*\(grid/cav0: .*no power"):
+        federate(failing(6, 1), START, SCHEDULE, edge(), rules=rules)
+    state = FederationState()
+    federate(failing(6, 0), START, SCHEDULE, edge(), rules=rules, state=state)
+    assert [record.clients for record in state.records] == [(), ()]
+
+
+@pytest.mark.parametrize(
+    "selection",
+    [{"rule": "poisson", "probability": 0.9}, {"rule": "importance", "clients": 3}, {"rule": "planned"}],
+    ids=["poisson", "importance", "planned"],
+)
+def test_more_clients_than_there_are_cannot_be_wanted(selection: dict[str, Any]):
+    def run(least: int) -> None:
+        rules = Rules.model_validate({"selection": selection, "least_clients": least})
+        federate(vehicles("grid", 6), START, SCHEDULE, edge(), rules=rules)
+
+    run(6)
+    with pytest.raises(InputError, match="least_clients: 7 are wanted in a round, and 6 take part"):
+        run(7)
 
 
 @pytest.mark.parametrize(

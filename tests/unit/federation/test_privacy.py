@@ -206,13 +206,19 @@ def test_strategies_see_the_noisy_mean():
 def test_what_makes_no_sense_is_one_sentence():
     central, local = Privacy(clip=1.0, noise=1.0), Privacy(clip=1.0, noise=1.0, where="local")
     importance, many = Selection(rule="importance", clients=2), clients()
+    poisson, uniform = Selection(rule="poisson", probability=0.5), Selection(rule="uniform", clients=2)
     for strategy, rules, said in (
         (Median(), Rules(privacy=central), r"Median looks at each update, and central noise covers their sum alone"),
         (Scaffold(), Rules(privacy=local), r"Scaffold sends further arrays beside the weights, which the noise"),
         (FEDAVG, Rules(privacy=local, selection=importance), r"privacy: importance selection reads norms"),
+        (FEDAVG, Rules(privacy=central, selection=poisson, least_clients=2), r"privacy: epsilon of poisson selection"),
+        (FEDAVG, Rules(privacy=central, selection=uniform, least_clients=2), r"privacy: epsilon of uniform selection"),
     ):
         with pytest.raises(InputError, match=said):
             check_federation(many, strategy, rules)
+    check_federation(many, FEDAVG, Rules(privacy=local, selection=poisson, least_clients=2))
+    check_federation(many, FEDAVG, Rules(privacy=central, selection=poisson, least_clients="all"))
+    check_federation(many, FEDAVG, Rules(privacy=central, least_clients=2))
     check_federation(many, Median(), Rules(privacy=local))
     for wrong in ({"epsilon": 0}, {"noise": 0}, {"clip": -1}, {"delta": 1}):
         with pytest.raises(ValidationError, match="Input should be"):

@@ -8,7 +8,7 @@ import pytest
 from moving import made_links
 
 from flcav.config import InputError
-from flcav.federation.rounds import ClientFailed
+from flcav.federation.attendance import ClientFailed
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.stages import EdgeServer, Schedule, edge_seeds, federate
@@ -210,6 +210,54 @@ def test_a_first_round_that_the_network_predicts_for_one_vehicle_has_no_update_a
     assert after[0] == (0.0, 0.0)
     assert after[1][0] > 0
     assert [client.trained for client in clients.values()] == [1, 1, 1]
+
+
+SLOW = Outage("predicted past the deadline")
+SHORT = "least_clients: 2 are wanted in a round, and {} part"
+
+
+@pytest.mark.parametrize(
+    ("rule", "away", "failed"),
+    [
+        ("planned", {NAMES[1]: SLOW, NAMES[2]: GONE}, {NAMES[0]: SHORT.format("1 takes")}),
+        ("planned", dict.fromkeys(NAMES, SLOW), dict.fromkeys(NAMES, SLOW.reason)),
+        (
+            "all",
+            {NAMES[0]: GONE, NAMES[2]: GONE},
+            {NAMES[0]: GONE.reason, NAMES[1]: SHORT.format("1 takes"), NAMES[2]: GONE.reason},
+        ),
+        ("all", dict.fromkeys(NAMES, GONE), dict.fromkeys(NAMES, GONE.reason)),
+    ],
+    ids=["one in time", "none in time", "one there", "none there"],
+)
+def test_a_round_that_fewer_vehicles_are_there_for_than_are_wanted_has_no_update_and_the_next_goes_on(
+    rule: str, away: dict[str, Outage], failed: dict[str, str]
+) -> None:
+    joins = {name: (2,) if name in away else (1, 2) for name in NAMES} if rule == "planned" else {}
+    rules = Rules.model_validate({"selection": {"rule": rule, "joins": joins}, "least_clients": 2})
+    clients, state = {name: Walk() for name in NAMES}, FederationState()
+    lost = {(1, name): outage for name, outage in away.items()}
+    account = Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless", lost)
+    federate({**clients}, START, Schedule(2, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
+    assert [record.clients for record in state.records] == [(), NAMES]
+    assert [record.failed for record in state.records] == [failed, {}]
+    assert [client.trained for client in clients.values()] == [1, 1, 1]
+
+
+def test_all_are_those_who_are_there() -> None:
+    state, book = FederationState(), Ledger(Budget(1.0, 0.0))
+    account = Account(book, "edge", "t", "wireless", {(1, NAMES[1]): GONE, (2, NAMES[1]): LATE})
+    schedule, rules = Schedule(2, 1, 0.1, 0.1, 3), Rules(least_clients="all")
+    with pytest.raises(ClientFailed, match=r"round 2: 2 of 3 clients .*, 3 are wanted \(grid/cav1: past the deadline"):
+        federate({name: Walk() for name in NAMES}, START, schedule, account, rules=rules, state=state)
+    assert [(record.clients, record.failed) for record in state.records] == [(NAMES[::2], {NAMES[1]: GONE.reason})]
+
+
+def test_a_round_that_chance_leaves_to_nobody_names_nobody() -> None:
+    state, account = FederationState(), Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless")
+    rules = Rules.model_validate({"selection": {"rule": "poisson", "probability": 1e-9}, "least_clients": 1})
+    federate({name: Walk() for name in NAMES}, START, Schedule(1, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
+    assert [(record.clients, record.failed) for record in state.records] == [((), {})]
 
 
 def test_a_round_with_fewer_than_were_to_take_part_by_chance_has_no_update() -> None:

@@ -24,7 +24,7 @@ from flcav.experiments.attacks.drives import (
     record_drives,
     spread_over_scenes,
 )
-from flcav.federation.rounds import ClientFailed
+from flcav.federation.attendance import ClientFailed
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate

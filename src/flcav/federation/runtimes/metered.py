@@ -30,6 +30,11 @@ class Account:
     link: Link  # wireless or wireline
     outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by round and client
 
+    def find_away(self, round_: int) -> dict[str, str]:
+        """Return by client why it is not there when a round begins: all that take no part in it."""
+        lost = self.outages.items()
+        return {name: each.reason for (number, name), each in lost if number == round_ and each.sent_bytes is None}
+
     def describe(self, direction: Direction, round_: int, client: str, size: int) -> LedgerEntry:
         """Return the entry of a message of `size` bytes."""
         return LedgerEntry(self.stage, self.task, self.link, direction, round_, client, size)

@@ -1,0 +1,66 @@
+"""Attendance of a federated round: who is asked, who is to send an update, who fails, and how many are enough."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from flcav.config import InputError
+from flcav.federation.rules import Rules
+from flcav.federation.secure.messages import TooFewClients
+from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.strategy import Robust
+
+
+class ClientFailed(OSError):
+    """Fewer clients sent a usable update in a round than are wanted: a fault of their machines."""
+
+
+@dataclass
+class Attendance:
+    """Attendance of a round: the clients that are asked, and those of them without an update, with the reason."""
+
+    asked: list[str] = field(default_factory=list)  # for anything
+    chosen: list[str] = field(default_factory=list)  # to send an update, also those that are away
+    away: Mapping[str, str] = field(default_factory=dict)  # who takes no part: by client why it is not there at first
+    failed: dict[str, str] = field(default_factory=dict)  # by client what was wrong
+    lost: set[str] = field(default_factory=set)  # those of them whom the network lost
+    shortage: ClientFailed | TooFewClients | None = None  # why there is no update
+    few: bool = False  # whether fewer take part than the rules need
+
+    def count(self, rules: Rules) -> None:
+        """Note whether too few take part for the rules, by a plan, by chance, or since others are away."""
+        chosen, secure = len(self.chosen), rules.secure
+        absent = {name: self.away[name] for name in self.chosen if name in self.away}
+        if short := rules.tell_shortage(chosen - len(absent)):
+            self.shortage = ClientFailed(short)
+            self.failed |= absent
+            self.lost |= absent.keys()
+        self.few = bool(short) or (secure is not None and secure.needed(chosen) > chosen)
+
+    def check(self, rules: Rules, strategy: Strategy, number: int) -> None:
+        """Raise `ClientFailed` where in round `number` fewer sent what can be used than are wanted or `strategy` needs.
+
+        By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
+        a norm or a number of samples, and of those who were then to send an update. `all` is of both, too, a number of
+        those who were to send; who was away does not count. Where the network lost clients that the strategy needs, the
+        round has no update, and so where fewer take part than the rules need, unless a client failed.
+        """
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in self.failed.items())
+        if self.few:
+            if self.failed.keys() - self.lost:
+                raise ClientFailed(f"round {number}: {self.shortage} ({reasons})")
+            return
+        least = rules.least_clients
+        for clients in [self.chosen] if isinstance(least, int) else [self.asked, self.chosen]:
+            asked = [name for name in clients if name not in (self.lost if least is None else self.away)]
+            wanted = len(asked) if least == "all" else -(-len(asked) // 2) if least is None else least
+            usable = sum(name not in self.failed for name in asked)
+            if usable < wanted:
+                told = f"{usable} of {len(asked)} clients sent an update that can be used, {wanted} are wanted"
+                raise ClientFailed(f"round {number}: {told} ({reasons})")
+        if isinstance(strategy, Robust):
+            try:
+                strategy.check_clients(sum(name not in self.failed for name in self.chosen))
+            except InputError as error:
+                if not self.lost:
+                    raise ClientFailed(f"round {number}: {error} ({reasons})") from None
+                self.shortage = ClientFailed(str(error))
