@@ -2,10 +2,10 @@
 
 A car found by the LiDAR is projected into the picture. Its distance to a box of the picture is that of their four sides
 in standard deviations, in which the uncertainty of the extrinsics and that of both detections have a part. Pairs within
-a gate of this distance are assigned by their likelihood (Kuhn, "The Hungarian method", 1955). Pairs of all pictures of
-a camera give its extrinsics, by a robust fit of the sides with the calibration as a prior, and these give better pairs:
-both are repeated until the pairs stay, `ROUNDS` times at most (Besl, McKay, "A method for registration of 3-D shapes",
-1992, have this for points).
+a gate of this distance are assigned by their likelihood against that of staying alone (Kuhn, "The Hungarian method",
+1955). Pairs of all pictures of a camera give its extrinsics, by a robust fit of the sides with the calibration as a
+prior, and these give better pairs: both are repeated until the pairs stay, `ROUNDS` times at most (Besl, McKay, "A
+method for registration of 3-D shapes", 1992, have this for points).
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 SIDE_PX, SIDE_SHARE = 2.0, 0.08  # standard deviation of a side: hypot of pixels and of a share of the box's own size
 GATE = chi2.ppf(0.999, (1, 2, 3, 4))  # largest squared distance of a pair, by the number of sides that count
-FAR = 1e6  # cost of a pair outside the gate
+LEAST = 0.01  # least gain of a pair within the gate, as a share of what its squared distance leaves of the gate
 ROUNDS = 12  # most repetitions of association and fit
 STILL_M = 0.5  # cars of several pictures nearer to each other than this, LiDAR frame, are one that stands
 NEAREST_M = 1.0  # least depth of all of a car before the camera
@@ -125,28 +125,29 @@ def pair(shot: Shot, view: View) -> Pairs:
     """Return the pairs of a shot's cars and boxes of least cost, and what remains alone.
 
     Pairs with a squared distance beyond the `GATE` of their sides are none. The cost is -2 log of the density of the
-    offsets, but for a constant: the squared distance plus the log-determinant of the covariance, scaled to four sides
-    where some lie outside the picture.
+    offsets, but for a constant: the squared distance plus the log-determinant of the covariance. A car and a box that
+    stay alone cost the gate plus the log-determinant of the box's own covariance, without that of the extrinsics. A
+    pair within the gate that costs more is made only of what stays alone otherwise.
     """
     sides, slope = _project_with_slope(shot.cars, view)
     seen = np.flatnonzero(np.isfinite(sides).all(axis=1))
-    cost = np.full((len(seen), len(shot.boxes)), FAR)
-    offset_px = np.zeros_like(cost)
+    gain = np.zeros((len(seen), len(shot.boxes)))  # cost of staying alone less that of the pair; 0: no pair
+    offset_px = np.zeros_like(gain)
     for row, car in enumerate(seen):
         spread = slope[car] @ view.covariance @ slope[car].T
         for column, box in enumerate(shot.boxes):
             inside = sides_inside(sides[car], view) & sides_inside(box, view)
             if not inside.any():
                 continue
-            off = (box - sides[car])[inside]
-            whole = spread[np.ix_(inside, inside)] + np.diag(np.full(len(off), side_px(box) ** 2))
-            square = off @ np.linalg.solve(whole, off)
+            off, own = (box - sides[car])[inside], side_px(box)
+            whole = spread[np.ix_(inside, inside)] / own**2 + np.eye(len(off))  # in units of the box's own
+            left = GATE[len(off) - 1] - off @ np.linalg.solve(whole, off) / own**2
             offset_px[row, column] = np.sqrt((off**2).mean())
-            if square < GATE[len(off) - 1]:
-                cost[row, column] = (square + np.linalg.slogdet(whole)[1]) * 4 / len(off)
-    row, column = linear_sum_assignment(cost)
-    near = cost[row, column] < FAR
-    row, column = row[near], column[near]
+            if left > 0:
+                gain[row, column] = max(left - np.linalg.slogdet(whole)[1], LEAST * left)
+    row, column = linear_sum_assignment(gain, maximize=True)
+    made = gain[row, column] > 0
+    row, column = row[made], column[made]
     return Pairs(
         seen[row],
         column.astype(np.int64),

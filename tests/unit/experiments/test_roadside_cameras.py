@@ -58,6 +58,17 @@ def test_actors_are_those_that_overlap_by_half() -> None:
     assert known.visible.tolist() == [True, False, False, False, False]
 
 
+def test_without_annotated_actors_nobody_is_known() -> None:
+    whole = frame()
+    none = np.zeros((0, 4))
+    views = {"left": Views(none, none, NONE, np.zeros(0), np.zeros(0))}
+    boxes = whole.annotations.boxes[:0]
+    empty = Annotations(np.zeros(0, str), boxes, np.zeros((0, 3)), np.zeros((0, 3)), NONE, np.zeros(0), views=views)
+    shot = Shot(found((20.0, 0.0)), np.array([(100.0, 100.0, 140.0, 130.0)]))
+    _, known = name_actors(replace(whole, annotations=empty), "lidar", "left", shot)
+    assert (known.cars.tolist(), known.boxes.tolist(), known.visible.tolist()) == ([-1], [-1], [False])
+
+
 def test_a_pair_is_right_if_both_are_one_actor() -> None:
     known = [Known(np.array([4, 7, -1]), np.array([7, 4, -1]), np.array([True, False, False]))]
     pairs = [Pairs(np.array([0, 1, 2]), np.array([1, 0, 2]), np.array([1.0, 5.0, 9.0]), NONE, NONE)]

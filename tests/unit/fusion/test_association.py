@@ -177,6 +177,35 @@ def test_a_wide_covariance_does_not_win_a_box():
     assert len(pair(replace(shot, cars=cars[1:]), shifted)) == 1  # it would do, were there no other
 
 
+LARGE = replace(TRUE, covariance=spread_of_calibration(1.5 * np.sqrt(2), 0.3 * np.sqrt(2)))
+
+
+def neighbours() -> tuple[Boxes, np.ndarray]:
+    """Return two cars 2.5 m apart, and boxes (2, 4): that of the first, and a false one as far on its other side."""
+    center, size = np.array([(25.0, 0.0, -5.2), (25.0, 2.5, -5.2)]), np.tile((4.4, 1.8, 1.5), (2, 1))
+    cars = Boxes(center, size, np.zeros(2), np.full(2, "car"))
+    first, second = pinhole(cars, EXACT)
+    return cars, np.array((first, first + (first - second)))
+
+
+def test_a_lone_car_and_a_false_box_do_not_draw_a_right_pair_apart():
+    cars, boxes = neighbours()
+    for car, box in ((0, 1), (1, 0)):  # within the gate, both
+        assert len(pair(Shot(cars[[car]], boxes[[box]]), LARGE)) == 1
+    found = correct_extrinsics([Shot(cars, boxes)], LARGE)
+    (pairs,) = found.pairs
+    assert (pairs.car.tolist(), pairs.box.tolist()) == ([0], [0])
+    assert (pairs.lone_cars.tolist(), pairs.lone_boxes.tolist()) == ([1], [1])
+    assert measure_offset(EXACT, found.view.camera_from_lidar).rotation_deg < 0.01
+
+
+def test_a_pair_less_likely_than_staying_alone_is_made_of_what_stays_alone():
+    cars, boxes = neighbours()
+    aside = boxes[:1] + np.array((45.0, 0.0, 45.0, 0.0))
+    assert len(pair(Shot(cars[:1], aside), LARGE)) == 1
+    assert pair(Shot(cars[:1], np.concatenate((aside, boxes[:1]))), LARGE).box.tolist() == [1]
+
+
 def test_a_car_that_stands_counts_as_often_as_one_that_is_seen_once():
     def deviations(cars: list[Boxes]) -> np.ndarray:
         made = [Shot(each, pinhole(each, EXACT)) for each in cars]

@@ -28,16 +28,16 @@ NOTHING = Detections(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0))
 
 
 class Street:
-    """Five pictures of a grey street by one camera of a pole; a red car stands elsewhere in each."""
+    """Pictures of a grey street by one camera of a pole; a red car stands elsewhere in each."""
 
-    def __init__(self, agent: str = "pole1") -> None:
-        self.folder, self.agent = Path("street"), agent
+    def __init__(self, agent: str = "pole1", pictures: int = 5) -> None:
+        self.folder, self.agent, self.pictures = Path("street"), agent, pictures
 
     def select(self, *, agents: set[str]) -> list[int]:
-        return list(range(5)) if agents == {self.agent} else []
+        return list(range(self.pictures)) if agents == {self.agent} else []
 
     def numbers(self, frames: list[int] | None) -> list[int]:
-        return list(range(5)) if frames is None else frames
+        return list(range(self.pictures)) if frames is None else frames
 
     def frame(self, number: int) -> Frame:
         return frame([], agent=self.agent)
@@ -53,7 +53,7 @@ class Street:
 
     @property
     def keys(self) -> list:
-        return [self.frame(number) for number in range(5)]
+        return [self.frame(number) for number in range(self.pictures)]
 
     def plane(self, number: int, camera: str, plane: str) -> np.ndarray:
         picture = np.full((64, 96, 3), GREY, np.uint8)
@@ -66,6 +66,14 @@ STREET = cast("Dataset", Street())
 
 def test_the_background_is_the_street_without_what_moves() -> None:
     assert (learn_picture_background(STREET, "pole1", "left") == GREY).all()
+
+
+def test_a_background_is_learned_from_three_pictures_or_more() -> None:
+    assert (learn_picture_background(cast("Dataset", Street(pictures=3)), "pole1", "left") == GREY).all()
+    for pictures, told in ((1, "1 picture"), (2, "2 pictures")):
+        few = cast("Dataset", Street(pictures=pictures))
+        with pytest.raises(InputError, match=rf"^street: pole1 has {told} by left, .* 3 or more; record more"):
+            picture_reader(few, background=True)(0, "left")
 
 
 def test_a_picture_is_seen_beside_its_background() -> None:

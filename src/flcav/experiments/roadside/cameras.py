@@ -18,6 +18,7 @@ from flcav.fusion.detector import PICTURE_THRESHOLD, load_picture_network
 from flcav.fusion.registration import Offset, measure_offset
 from flcav.geometry import Boxes, inverse
 from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.objects.truth import CARS
 from flcav.perception.ops.rectangles import iou
 from flcav.perception.signs.background import picture_reader
 from flcav.perception.signs.predict import detect
@@ -25,7 +26,6 @@ from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
 
 CALIBRATED, CORRECTED, EXACT = "as calibrated", "corrected", "true extrinsics"
-CARS = ("car", "van")
 OVERLAP = 0.5  # bird's-eye IoU of a car that the LiDAR found, and IoU of one that the picture shows
 VISIBLE_PX = 100  # least visible pixels of a car that counts
 SURE_DEG, SURE_M = 0.05, 0.01  # how well extrinsics are known that are called exact
@@ -143,7 +143,8 @@ def name_actors(frame: Frame, lidar: str, camera: str, shot: Shot) -> tuple[Shot
     """Return what LiDAR and camera found in a frame, and which actors that is."""
     truth, views = frame.annotations, frame.annotations.views[camera]
     rows = _actors_of_cars(shot.cars.transform(frame.world_from_sensor(lidar)), truth)
-    visible = (rows >= 0) & (views.pixels[rows] >= VISIBLE_PX)
+    visible = rows >= 0
+    visible[visible] = views.pixels[rows[visible]] >= VISIBLE_PX
     return shot, Known(rows, _actors_of_boxes(shot.boxes, views), visible)
 
 

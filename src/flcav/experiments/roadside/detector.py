@@ -20,7 +20,7 @@ from flcav.geometry import Boxes
 from flcav.intervals import Estimate, bootstrap_over_scenes
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.metrics import match
-from flcav.perception.objects.truth import LOOKALIKE
+from flcav.perception.objects.truth import CARS, LOOKALIKE
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.progress import Report, ignore_progress
 from flcav.records import LEFT_OUT, Record
@@ -32,7 +32,6 @@ from flcav.sources.recipe import Recipe
 
 OVERLAP = 0.5  # bird's-eye IoU of a car that was found
 WITHIN_M = 30.0  # horizontal distance of a car from the pole
-CARS = ("car", "van")
 LEAST_PRECISION = (
     0.98  # on the validation towns, by which the threshold was fixed: three points above the aim elsewhere
 )

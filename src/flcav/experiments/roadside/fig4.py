@@ -26,6 +26,7 @@ from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
 from flcav.perception.foreground import frame_reader, pole_backgrounds
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.predict import detect
+from flcav.perception.objects.truth import CARS
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.progress import Report, ignore_progress
 from flcav.records import LEFT_OUT, Record
@@ -66,7 +67,6 @@ RECIPE: dict[str, Any] = {
 SWEEPS = 4  # of each suite, whose backgrounds are registered together
 EDGES_M = tuple(range(0, 91, 10))  # of distance from the first suite
 OVERLAP = 0.5  # bird's-eye IoU of a car that was found
-CARS = ("car", "van")
 ARMS = ("first suite alone", "three suites as calibrated", "three suites registered")
 REACHED = 0.8  # recall that makes a range
 

@@ -22,7 +22,7 @@ from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.evaluate import OVERLAPS
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import LOWEST_SCORE, ObjectFound, boxes_to_rows, detect, rows_to_boxes
-from flcav.perception.objects.truth import select_class
+from flcav.perception.objects.truth import CARS, select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.steps import Notify, Step, run_steps
@@ -122,7 +122,7 @@ def labelled(data: Dataset, number: int) -> Labelled:
     """Return the cloud (N, 4) of a recorded frame and the boxes of its cars and vans, LiDAR frame."""
     frame = data.frame(number)
     boxes = frame.annotations.boxes.transform(inverse(frame.world_from_sensor(LIDAR)))
-    return frame.lidar[LIDAR], boxes[np.isin(boxes.label, ("car", "van"))]
+    return frame.lidar[LIDAR], boxes[np.isin(boxes.label, CARS)]
 
 
 def detections(network: Second, frames: Sequence[KittiFrame]) -> tuple[tuple[RealScore, ...], tuple[FrameResult, ...]]:

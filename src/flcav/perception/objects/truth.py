@@ -29,6 +29,7 @@ DETECTION_CLASS = {
     "bicycle": "Cyclist",
     "motorcycle": "Cyclist",
 }
+CARS = tuple(kind for kind, name in DETECTION_CLASS.items() if name == "Car")  # categories of actors
 LOOKALIKE = {"truck": "Car", "bus": "Car"}  # neutral: a detection on one is neither true nor false
 MIN_RETURNS = 5  # LiDAR returns that make an object a target
 QUARTERS = 4  # quarter turns of a whole spin

@@ -15,6 +15,7 @@ from flcav.dataset.store import Dataset
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.images import Picture, check_picture
 
+LEAST_PICTURES = 3  # of a camera: the median of fewer shows what moves, too
 MOST_PICTURES = 40  # of each camera, evenly spread over the dataset, that its background is learned from
 LUMA = np.array((0.299, 0.587, 0.114))  # ITU-R BT.601
 
@@ -23,7 +24,7 @@ def picture_reader(data: Dataset, background: bool) -> Callable[[int, str], Pict
     """Return the function that reads the picture of a frame's number and a camera as a network sees it.
 
     For a network of backgrounds (`background`) that is `compare_with_background`, of poles alone. Raises `InputError`
-    as `check_picture` and `check_stands` do.
+    as `check_picture`, `check_stands` and `learn_picture_background` do.
     """
 
     def read(number: int, camera: str) -> Picture:
@@ -54,7 +55,15 @@ def compare_with_background(picture: Picture, background: Picture) -> Picture:
 
 @lru_cache(maxsize=64)
 def learn_picture_background(data: Dataset, agent: str, camera: str) -> NDArray[np.uint8]:
-    """Return the median (H, W, 3) of an agent's pictures by one camera in `data`."""
+    """Return the median (H, W, 3) of an agent's pictures by one camera in `data`.
+
+    Raises `InputError` where there are fewer than `LEAST_PICTURES`.
+    """
     numbers = [number for number in data.select(agents={agent}) if camera in data.cameras(number)]
+    if len(numbers) < LEAST_PICTURES:
+        raise InputError(
+            f"{data.folder}: {agent} has {len(numbers)} picture{'s' * (len(numbers) != 1)} by {camera}, and this "
+            f"network's background is learned from {LEAST_PICTURES} or more; record more scenes or spins"
+        )
     chosen = numbers[:: -(-len(numbers) // MOST_PICTURES)]
     return np.median([data.plane(number, camera, "rgb") for number in chosen], axis=0).astype(np.uint8)

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from flcav.config import InputError, shorten
 from flcav.world.map.relief import Relief
 from flcav.world.opendrive.bridges import CLEAR_M, Borders, Spans, find_bridges
+from flcav.world.opendrive.document import OPEN_ROADS, describe_map
 from flcav.world.opendrive.road_surface import Road
 from flcav.world.opendrive.standard import FARTHEST_M
 from flcav.world.opendrive.streets import SIDEWALK_M, WALKED
@@ -58,7 +59,12 @@ def sample_heights(root: ElementTree.Element, origin: Path) -> Heights:
     edges = [Borders(*(np.concatenate([strip.inner[row] for strip in own]) for row in (0, -1))) for own in strips]
     spans = find_bridges(edges)
     bare = not any(lane.get("type") in WALKED for lane in root.iter("lane"))
-    decks = [deck for own, span in zip(strips, spans) for deck in _list_decks(own, span, widened=bare)]
+    kinds = {name: road.kind for name, road in describe_map(root).roads.items()}
+    decks = [
+        deck
+        for road, own, span in zip(roads, strips, spans)
+        for deck in _list_decks(own, span, widened=bare and kinds[road.id] not in OPEN_ROADS)
+    ]
     points = _sample_terrain(strips, spans)
     while decks:
         relief = Relief(points)  # its triangles may cut across a road where points beside it are few
@@ -100,13 +106,13 @@ def _cross_sections(road: Road) -> list[Strip]:
 def _list_decks(strips: list[Strip], spans: Spans, *, widened: bool) -> list[tuple[Array, ...]]:
     """Return the decks of a road, each as its cross-sections, `widened` by a sidewalk on both sides.
 
-    Those narrower than `NARROW_M` are left out.
+    Those of a road narrower than `NARROW_M` are left out.
     """
     sides = (slice(0, 1), slice(len(ASIDE_M), len(ASIDE_M) + 1)) if widened else (slice(0), slice(0))
     whole = [np.concatenate((strip.outer[sides[0]], strip.inner, strip.outer[sides[1]])).round(4) for strip in strips]
     sections = [points[:, i] for points in whole for i in range(points.shape[1])]
-    decks = [tuple(sections[deck]) for deck in spans.decks]
-    return [deck for deck in decks if any(np.ptp(section[:, :2], axis=0).max() > NARROW_M for section in deck)]
+    width = np.concatenate([np.ptp(strip.inner[..., :2], axis=0).max(axis=1) for strip in strips])
+    return [tuple(sections[deck]) for deck in spans.decks if (width[deck] > NARROW_M).any()]
 
 
 def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> NDArray[np.bool_]:

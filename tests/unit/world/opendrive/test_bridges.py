@@ -253,10 +253,29 @@ def test_a_road_has_a_bridge_over_itself() -> None:
     assert t[deck][0] > 0.6
 
 
-def test_a_road_without_a_width_has_no_deck() -> None:
+def with_sidewalk() -> ElementTree.Element:
+    """Return the crossing with a sidewalk along the lower street, so that none is added."""
     root = crossing()
     for lane in root.iterfind("road[@id='1']//lane[@id='1']"):
-        lane.set("type", "sidewalk")  # so that none are added
+        lane.set("type", "sidewalk")
+    return root
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "width"),
+    [(crossing, "town", 7.0 + 2 * SIDEWALK_M), (crossing, "motorway", 7.0), (with_sidewalk, "town", 7.0)],
+)
+def test_a_deck_is_wider_where_sidewalks_are_added(make, kind: str, width: float) -> None:
+    root = make()
+    for row in root.iterfind("road[@id='2']/type"):
+        row.set("type", kind)
+    (deck,) = sample_heights(root, Path("map")).decks
+    np.testing.assert_allclose([np.ptp(section[:, 0]) for section in deck], width, atol=1e-3)
+
+
+@pytest.mark.parametrize("make", [crossing, with_sidewalk])
+def test_a_road_without_a_width_has_no_deck(make) -> None:
+    root = make()
     for width in root.iterfind("road[@id='2']//width"):
         width.set("a", "0")
     found = sample_heights(root, Path("map"))
