@@ -57,7 +57,7 @@ class View:
 
 @dataclass(frozen=True)
 class Shot:
-    """What LiDAR and camera found at one instant."""
+    """Cars detected by a LiDAR and boxes detected in a camera's picture at one instant."""
 
     cars: Boxes  # (N,) LiDAR frame
     boxes: Array  # (M, 4) x1 y1 x2 y2 [px] from the picture's upper left corner
