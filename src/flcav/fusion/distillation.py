@@ -28,7 +28,7 @@ from flcav.fusion.map_context import MapContext, snap_to_map
 from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Navigation, Sighting, add_pose_variance, tell
-from flcav.geometry import Boxes, inverse, points_in_boxes, pose, spread_over_footprints, transform_points
+from flcav.geometry import Boxes, inverse, points_in_boxes, spread_over_footprints, transform_points
 from flcav.network.messages import from_names, pack, to_names, unpack
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
@@ -44,31 +44,16 @@ RETURNS_M = 0.3  # margin around a box within which a vehicle's returns are the 
 
 
 class Distillation(Config):
-    """Settings of federated distillation: terms of the loss, and navigation of the vehicles."""
+    """Settings of federated distillation: terms of the loss, and what is averaged."""
 
     terms: tuple[Literal["regression", "contrastive"], ...] = Field(
         default=("regression", "contrastive"), min_length=1
     )  # of the loss, beside classification
     contrastive_weight: float = Field(default=0.1, gt=0, le=100)  # of the contrastive term
     temperature: float = Field(default=0.1, ge=0.01, le=10)  # of the contrastive term
-    position_m: float = Field(default=0.2, ge=0, le=10)  # standard deviation of a vehicle's position, along x and y
-    heading_deg: float = Field(default=0.3, ge=0, le=45)  # standard deviation of its heading
-    clock_s: float = Field(default=0.0, ge=0, le=1)  # standard deviation of its clock's offset, one in each scene
     window_s: float = Field(default=0.5, ge=0, le=1)  # before and after a frame, of what is averaged; 0: its spin alone
     map_context: bool = True  # whether headings and classes of the average are snapped to the map, where there is one
     pose_graph: bool = False  # whether a pose graph corrects vehicles' poses and clocks: needs the extra `fusion`
-
-    @property
-    def navigation(self) -> Navigation:
-        """Return what the navigation of a vehicle states of its accuracy: at least a centimetre and .05 degrees."""
-        return Navigation(max(self.position_m, 0.01), max(float(np.radians(self.heading_deg)), 0.001))
-
-    def navigate(self, world_from_agent: Array, rng: np.random.Generator) -> Array:
-        """Return a vehicle's pose (4, 4) as its navigation has it, with errors drawn from `rng`."""
-        off_m, turned = self.position_m * rng.standard_normal(2), np.radians(self.heading_deg) * rng.standard_normal()
-        known = world_from_agent @ pose(0, 0, 0, float(turned))
-        known[:2, 3] = world_from_agent[:2, 3] + off_m
-        return known
 
 
 @dataclass(frozen=True)

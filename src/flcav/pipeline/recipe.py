@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.rules import Rules
 from flcav.fusion.distillation import Distillation
+from flcav.fusion.navigation import NavigationErrors
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
@@ -265,6 +266,7 @@ class RunRecipe(Config):
     placement: Placement = Placement()  # placement of roadside sensors
     federation: Federation = Federation()  # settings of aggregation
     distillation: Distillation | None = None  # of labels "road-average"; None: the defaults
+    navigation: NavigationErrors = NavigationErrors()  # errors of vehicles' poses and clocks, in labels of road sensors
     recording: Recording = Recording()  # changes to how all regions are recorded
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
 

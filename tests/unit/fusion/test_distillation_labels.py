@@ -21,6 +21,7 @@ from flcav.fusion.distillation import (
     unpack_sighting,
 )
 from flcav.fusion.map_context import build_context
+from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, concatenate, inverse, pose
@@ -243,17 +244,17 @@ def test_precision_and_recall_of_labels_count_targets_once_and_neutral_ones_not(
 
 
 def test_navigation_is_off_by_what_it_states() -> None:
-    how = Distillation(position_m=0.4, heading_deg=2.0)
+    how = NavigationErrors(position_m=0.4, heading_deg=2.0)
     at = pose(100.0, -50.0, 0.0, 1.0)
     rng = np.random.default_rng(0)
     known = np.array([how.navigate(at, rng) for _ in range(2000)])
     np.testing.assert_allclose(known[:, :2, 3].std(axis=0), 0.4, rtol=0.1)
     turned = np.degrees(np.arctan2(known[:, 1, 0], known[:, 0, 0]) - 1.0)
     assert turned.std() == pytest.approx(2.0, rel=0.1)
-    assert how.navigation == Navigation(0.4, np.radians(2.0))
-    exact = Distillation(position_m=0, heading_deg=0)
+    assert how.stated == Navigation(0.4, np.radians(2.0))
+    exact = NavigationErrors()
     np.testing.assert_allclose(exact.navigate(at, rng), at)
-    assert exact.navigation.position_m == 0.01
+    assert exact.stated.position_m == 0.01
 
 
 @pytest.mark.parametrize(
@@ -262,7 +263,6 @@ def test_navigation_is_off_by_what_it_states() -> None:
         ({"terms": []}, "terms"),
         ({"terms": ["outputs"]}, "terms"),
         ({"temperature": 0}, "temperature"),
-        ({"position_m": -1}, "position_m"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(fields: dict[str, Any], told: str) -> None:
@@ -289,9 +289,13 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     monkeypatch.setattr("flcav.pipeline.labels.sightings.detect_in", detections)
     truth = FrameTruth("s", boxes(BOTH, z=-1.0), Boxes.empty(), Boxes.empty())
     monkeypatch.setattr(quality, "asked_of", lambda frame, config: truth)
-    how = Distillation(position_m=0.05, heading_deg=0.1)
+    how, errors = Distillation(), NavigationErrors(position_m=0.05, heading_deg=0.1)
     split = Frames(cast(Any, data), (0, 1), {})
-    book, weights, about = Ledger(Budget(1.0, 0.0)), to_arrays(second_tiny()), (how, CONFIG, 0.6, split, (0, 1), (3,))
+    book, weights, about = (
+        Ledger(Budget(1.0, 0.0)),
+        to_arrays(second_tiny()),
+        (how, errors, CONFIG, 0.6, split, (0, 1), (3,)),
+    )
     labels = RoadAverageLabels(*about, "grid", book, folder=tmp_path)
     labels.send_views()
     assert {entry.bytes for entry in book.entries} == {len(seen.message())}

@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 
 from flcav.fusion.distillation import Distillation, Guidance, average_spin
+from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Navigation, Sighting
-from flcav.geometry import Boxes, pose
+from flcav.geometry import Boxes, inverse, pose, transform_points
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.frames import Frames, list_window
-from flcav.pipeline.labels import road_average, sightings
+from flcav.pipeline.labels import pseudo_labels, road_average, sightings
+from flcav.pipeline.labels.pseudo_labels import pseudo_label_samples
 from flcav.pipeline.labels.road_average import RoadAverageLabels
+from flcav.progress import ignore_progress
 from flcav.sensors.frame import Annotations, Calibration, Frame
 
 CONFIG = second_tiny().config
@@ -145,8 +148,8 @@ def test_labels_are_of_windows_and_each_frame_is_sent_once(
 
     monkeypatch.setattr(road_average, "road_views", see)
     monkeypatch.setattr(sightings, "detect_in", lambda network, frames, **how: [car(*PLACE, z=-1.0)])
-    how = Distillation(position_m=0.05, heading_deg=0.1, window_s=window_s)
-    book, about = Ledger(Budget(1.0, 0.0)), (how, CONFIG, 0.6, split, split.vehicles, (3,))
+    how, errors = Distillation(window_s=window_s), NavigationErrors(position_m=0.05, heading_deg=0.1)
+    book, about = Ledger(Budget(1.0, 0.0)), (how, errors, CONFIG, 0.6, split, split.vehicles, (3,))
     labels = RoadAverageLabels(*about, "grid", book)
     labels.renew(1, to_arrays(second_tiny()))
     sent = [(each.direction, each.client) for each in book.entries]
@@ -176,14 +179,37 @@ def test_a_clock_is_off_by_as_much_in_all_spins_of_a_scene_and_posts_are_told_wi
     monkeypatch.setattr(sightings, "detect_in", lambda network, frames, **how: [car(*PLACE, z=-1.0)])
     monkeypatch.setattr(sightings, "find_posts", lambda points, height_m: np.array([(3.0, 4.0)]))
 
-    def off_s(how: Distillation) -> np.ndarray:
-        told = [sightings.make_sighting(cast(Any, None), split.data, i, how)[0] for i in split.vehicles]
+    def off_s(how: Distillation, errors: NavigationErrors) -> np.ndarray:
+        told = [sightings.make_sighting(cast(Any, None), split.data, i, how, errors)[0] for i in split.vehicles]
         late = [each.time_s - split.data.keys[i].time_s for i, each in zip(split.vehicles, told, strict=True)]
         assert all(len(each.posts) == how.pose_graph for each in told)
         return np.array(late).reshape(100, 3, 2)  # scenes, spins, vehicles
 
-    late = off_s(Distillation(clock_s=0.2, pose_graph=True))
+    late = off_s(Distillation(pose_graph=True), NavigationErrors(clock_s=0.2))
     np.testing.assert_allclose(np.ptp(late, axis=1), 0, atol=1e-9)
     assert late[:, 0].std() == pytest.approx(0.2, rel=0.15)
     assert abs(np.corrcoef(late[:, 0].T)[0, 1]) < 0.3  # each vehicle has its own
-    np.testing.assert_allclose(off_s(Distillation()), 0, atol=1e-9)
+    np.testing.assert_allclose(off_s(Distillation(), NavigationErrors()), 0, atol=1e-9)
+
+
+def test_road_boxes_reach_a_vehicle_s_frame_by_the_pose_that_it_tells_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    split = split_of((0.0, 0.5), middle=(0, 1))
+    free = np.zeros((1, 1), bool)
+    view = RoadView(car(*HIDDEN, label="car"), np.zeros(2), free, free)
+    monkeypatch.setattr(pseudo_labels, "road_views", lambda *about: {("s", 0): {3: view}, ("s", 1): {3: view}})
+    for module in (pseudo_labels, sightings):
+        monkeypatch.setattr(module, "detect_in", lambda network, frames, **how: [Boxes.empty()])
+    network = second_tiny()
+
+    def labels(errors: NavigationErrors) -> np.ndarray:
+        about = (network, 0.6, split, split.vehicles, (3,), "grid", ignore_progress)
+        found = pseudo_label_samples(*about, errors=errors)
+        return np.concatenate([sample.boxes.center[:, :2] for name in sorted(found) for sample in found[name]])
+
+    np.testing.assert_allclose(labels(NavigationErrors()), np.tile(HIDDEN, (4, 1)), atol=1e-6)
+    errors = NavigationErrors(position_m=0.1, heading_deg=0.5)
+    told = [sightings.make_sighting(network, split.data, i, Distillation(), errors)[0] for i in split.vehicles]
+    known = [each.world_from_agent for each in sorted(told, key=lambda each: each.agent)]
+    wanted = [transform_points(inverse(at), np.array([(*HIDDEN, 0.0)]))[0, :2] for at in known]
+    np.testing.assert_allclose(labels(errors), wanted, atol=1e-6)
+    assert np.linalg.norm(labels(errors) - HIDDEN, axis=1).min() > 0.02

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
+from flcav.fusion.navigation import NavigationErrors
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.labels.sources import LABEL_SOURCES
@@ -86,6 +87,7 @@ def _federate(outline: Outline, arm: Setting, task: str, stage: str, replan: Rou
         "vehicles": outline.vehicles,
         "labels": arm.labels[task],
         "distillation": arm.distillation if LABEL_SOURCES[arm.labels[task]].averaged else None,
+        "navigation": recipe.navigation if LABEL_SOURCES[arm.labels[task]].from_poles else NavigationErrors(),
         "train_s": recipe.tasks[task].train_s if timed else 0.0,
         "speeds": speeds if timed else {},
         "replan": replan,

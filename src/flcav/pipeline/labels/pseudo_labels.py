@@ -1,6 +1,7 @@
 """Pseudo-labels by the pretrained network and roadside sensors, and ground truth as labels."""
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from flcav.dataset.ground import Ground
 from flcav.fusion.detector import road_detector
 from flcav.fusion.labels import label_sample
+from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.road import RoadView, build_road_view, label_ideally
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send
@@ -19,11 +21,13 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import asked_of, choose_lidar
 from flcav.perception.task import Task
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.labels.sightings import navigate
 from flcav.pipeline.recipe import EDGE
 from flcav.progress import Report
 
 Spin = tuple[str, int]  # scene, and number in the scene
 
+EXACT = NavigationErrors()
 PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
 
 
@@ -61,12 +65,14 @@ def pseudo_label_samples(
     report: Report,
     book: Ledger | None = None,
     trained: bool = False,
+    errors: NavigationErrors = EXACT,
 ) -> dict[str, list[Sample]]:
     """Return each vehicle's sweeps with pseudo-labels, by "region/vehicle".
 
     Labels are the frozen network's detections that score `threshold` or more, and the boxes of the sensors `poles`, by
     the package's road detector if `trained`, else by an ideal one, as their messages have them, which enter `book` as
-    downlinks; stage III passes none, since its labels are those of stage II.
+    downlinks; stage III passes none, since its labels are those of stage II. A vehicle places them by its pose as its
+    navigation, with `errors`, has it.
     """
     data, relief = split.data, Ground(split.data).relief
     views = road_views(split, poles, trained, {(data.keys[i].scene, data.keys[i].index) for i in frames})
@@ -79,6 +85,7 @@ def pseudo_label_samples(
         if book is not None:
             about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
             told = [RoadView.from_message(send(book, view.message(), **about)) for view in told]
+        frame = replace(frame, world_from_agent=navigate(data, i, frame, errors))
         samples.setdefault(name, []).append(label_sample(frame, detections, told, network.config, lidar, relief))
         report(done, len(frames), "labels")
     return samples

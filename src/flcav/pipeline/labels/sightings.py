@@ -1,10 +1,11 @@
-"""Sightings of vehicles for the road average: what they detect, their poses and clocks by their own navigation."""
+"""What vehicles know and tell of a frame: their poses and clocks by their own navigation, and what they detect."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.fusion.distillation import TOLD, Distillation
+from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.posts import find_posts
 from flcav.fusion.sightings import Sighting
 from flcav.geometry import Boxes, transform_points
@@ -15,19 +16,24 @@ from flcav.seeds import stream
 from flcav.sensors.frame import Frame
 
 
-def make_sighting(network: Second, data: Dataset, i: int, how: Distillation) -> tuple[Sighting, Boxes]:
-    """Return what the vehicle of frame `i` tells, and its detections in the LiDAR's frame.
+def navigate(data: Dataset, i: int, frame: Frame, errors: NavigationErrors) -> NDArray[np.float64]:
+    """Return the pose (4, 4) of the vehicle of `frame`, number `i`, by its navigation, for labels of all kinds."""
+    key, recorded = data.keys[i], str(data.manifest.recipe.get("seed"))
+    rng = stream(0, "navigation", recorded, key.scene, key.index, key.agent)
+    return errors.navigate(frame.world_from_agent, rng)
 
-    Errors of its pose are drawn for each frame, the offset of its clock once in a scene.
-    """
+
+def make_sighting(
+    network: Second, data: Dataset, i: int, how: Distillation, errors: NavigationErrors
+) -> tuple[Sighting, Boxes]:
+    """Return what the vehicle of frame `i` tells, and its detections in the LiDAR's frame."""
     key, frame = data.keys[i], data.frame(i)
     (found,) = detect_in(network, [frame], score_threshold=TOLD)
     recorded = str(data.manifest.recipe.get("seed"))
-    known = how.navigate(frame.world_from_agent, stream(0, "navigation", recorded, key.scene, key.index, key.agent))
-    offset_s = how.clock_s * stream(0, "clock", recorded, key.scene, key.agent).standard_normal()
+    offset_s = errors.clock_s * stream(0, "clock", recorded, key.scene, key.agent).standard_normal()
     boxes = found.transform(frame.assumed.agent_from_sensor[choose_lidar(frame)])
-    posts = find_told_posts(frame, how)
-    return Sighting(key.agent, key.time_s + offset_s, known, boxes, posts, how.navigation), found
+    known, posts = navigate(data, i, frame, errors), find_told_posts(frame, how)
+    return Sighting(key.agent, key.time_s + offset_s, known, boxes, posts, errors.stated), found
 
 
 def find_told_posts(frame: Frame, how: Distillation) -> NDArray[np.float64]:

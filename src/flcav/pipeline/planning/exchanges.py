@@ -12,6 +12,7 @@ import numpy as np
 
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.fusion.distillation import Distillation, pack_sighting
+from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.sightings import Sighting
 from flcav.network.ledger import BYTES_PER_MB
 from flcav.perception.client import as_shared
@@ -104,5 +105,5 @@ def _sighting_bytes(drive: Frames, i: int, how: Distillation, config: SecondConf
     """Return the size of a vehicle's message on a frame, with its annotated boxes for detections [bytes]."""
     frame, key = drive.data.frame(i), drive.data.keys[i]
     boxes = asked_of(frame, config).targets
-    posts = find_told_posts(frame, how)
-    return len(pack_sighting(Sighting(key.agent, key.time_s, frame.world_from_agent, boxes, posts, how.navigation)))
+    posts, accuracy = find_told_posts(frame, how), NavigationErrors().stated
+    return len(pack_sighting(Sighting(key.agent, key.time_s, frame.world_from_agent, boxes, posts, accuracy)))

@@ -69,12 +69,12 @@ def label_samples(
     if settings.distillation is not None:
         folder = work.folder if inputs.edge is None else None
         where: Any = (split, frames, poles, inputs.region, book, stage, folder, work.report)
-        averaged = RoadAverageLabels(settings.distillation, frozen.config, threshold, *where)
+        averaged = RoadAverageLabels(settings.distillation, settings.navigation, frozen.config, threshold, *where)
         if inputs.edge is None:
             averaged.send_views()
         return LabelledSamples(averaged, poles)
     first = book if inputs.edge is None else None  # later labels are those of stage II
-    where = (split, frames, poles, inputs.region, work.report, first, kind.trained)
+    where = (split, frames, poles, inputs.region, work.report, first, kind.trained, settings.navigation)
     return LabelledSamples(pseudo_label_samples(frozen, threshold, *where), poles)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 
 from flcav.config import Config
 from flcav.fusion.distillation import Distillation
+from flcav.fusion.navigation import NavigationErrors
 from flcav.perception.tasks import task_named
 from flcav.pipeline.recipe import Budgets, Federation, Training
 from flcav.pipeline.stages.learning import Learning
@@ -77,6 +78,7 @@ class FederationSettings(StepSettings):
     vehicles: Mapping[str, int]  # of each federating region
     labels: str  # kind of labels, see `LABEL_SOURCES`
     distillation: Distillation | None = None  # of the labels "road-average"
+    navigation: NavigationErrors = NavigationErrors()  # of the vehicles
     train_s: float = 0.0  # time that a vehicle of speed 1 trains in a round [s], on a network
     speeds: Mapping[str, float] = {}  # by "region/vehicle"; others have 1
     replan: RoundPlans | None = None  # None: the plan is not made anew after each round

@@ -1,0 +1,31 @@
+"""Errors of vehicles' own navigation: the poses and clocks by which labels of road sensors reach their frames."""
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from flcav.config import Config
+from flcav.fusion.sightings import Navigation
+from flcav.geometry import pose
+
+Array = NDArray[np.float64]
+
+
+class NavigationErrors(Config):
+    """Standard deviations of the errors of vehicles' poses and clocks; those of poses are drawn for each frame."""
+
+    position_m: float = Field(default=0.0, ge=0, le=10)  # of a vehicle's position, along x and along y
+    heading_deg: float = Field(default=0.0, ge=0, le=45)  # of its heading
+    clock_s: float = Field(default=0.0, ge=0, le=1)  # of its clock's offset, one in each scene
+
+    @property
+    def stated(self) -> Navigation:
+        """Return what a vehicle states of its accuracy: at least a centimetre and .001 rad."""
+        return Navigation(max(self.position_m, 0.01), max(float(np.radians(self.heading_deg)), 0.001))
+
+    def navigate(self, world_from_agent: Array, rng: np.random.Generator) -> Array:
+        """Return a vehicle's pose (4, 4) as its navigation has it, with errors drawn from `rng`."""
+        off_m, turned = self.position_m * rng.standard_normal(2), np.radians(self.heading_deg) * rng.standard_normal()
+        known = world_from_agent @ pose(0, 0, 0, float(turned))
+        known[:2, 3] = world_from_agent[:2, 3] + off_m
+        return known
