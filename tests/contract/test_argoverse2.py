@@ -1,6 +1,7 @@
 """Logs of Argoverse 2: one written here with poses computed by hand, and a real one where there is one."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,7 @@ def test_boxes_of_a_vehicle_on_a_slope_are_tilted_as_it_is(tmp_path: Path):
 def test_a_log_without_annotations_has_no_boxes_and_says_so(tmp_path: Path):
     write_log(tmp_path / "log", annotated=False)
     notes = import_dataset("argoverse2", tmp_path / "log", tmp_path / "out")
-    assert notes == ("no annotations.feather in 1 of 1 logs, so no boxes",)
+    assert notes == ("no annotations in 1 of 1 logs, so no boxes",)
     with pytest.raises(InputError, match="imported from argoverse2 without labels of objects"):
         Dataset.open(tmp_path / "out").check_labelled("objects")
 
@@ -113,6 +114,45 @@ def test_a_file_of_a_log_names_itself(
     assert said[-1].removeprefix("flcav: ").startswith(f"{path}: ")
     assert sentence in said[-1]
     assert not (tmp_path / "out").exists()
+
+
+NO_NUMBER = "the column '{}' has no number in row 0, or one too large"
+
+
+@pytest.mark.parametrize(
+    ("name", "changed", "sentence"),
+    [
+        ("annotations.feather", {"length_m": -4.0}, "object 1 has a size that is not positive"),
+        ("annotations.feather", {"qw": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0}, "a rotation is a quaternion of length 0"),
+        ("annotations.feather", {"height_m": np.nan}, NO_NUMBER.format("height_m")),
+        ("city_SE3_egovehicle.feather", {"tx_m": 1e300}, NO_NUMBER.format("tx_m")),
+        ("calibration/intrinsics.feather", {"fx_px": 0.0}, "field 'fx' = 0.0"),
+        (SWEEP, {"x": np.inf}, NO_NUMBER.format("x")),
+    ],
+)
+def test_a_file_with_an_impossible_number_names_itself(
+    name: str, changed: dict[str, float], sentence: str, tmp_path: Path
+):
+    write_log(tmp_path / "log")
+    path = tmp_path / "log" / name
+    table = feather.read_table(path, memory_map=False)
+    for column, value in changed.items():
+        table = table.set_column(table.column_names.index(column), column, pa.array([value] * len(table)))
+    feather.write_feather(table, path)
+    with pytest.raises(InputError, match=f"^{re.escape(f'{path}: {sentence}')}"):
+        import_dataset("argoverse2", tmp_path / "log", tmp_path / "out")
+
+
+def test_a_log_that_nothing_is_annotated_in_has_no_boxes(tmp_path: Path):
+    write_log(tmp_path / "log")
+    path = tmp_path / "log" / "annotations.feather"
+    feather.write_feather(feather.read_table(path, memory_map=False).slice(0, 0), path)
+    far = tmp_path / "log" / "sensors" / "lidar" / f"{10**30}.feather"  # no time in nanoseconds
+    far.write_bytes(b"")
+    assert import_dataset("argoverse2", tmp_path / "log", tmp_path / "out") == (
+        "no annotations in 1 of 1 logs, so no boxes",
+    )
+    assert len(Dataset.open(tmp_path / "out")) == 2
 
 
 def test_sweeps_and_pictures_that_are_not_there_are_told(tmp_path: Path):

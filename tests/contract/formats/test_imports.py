@@ -301,6 +301,54 @@ def test_a_missing_or_truncated_file_names_itself(
     assert not (tmp_path / "out").exists()
 
 
+ODD = [  # format, pattern of a file, what is replaced in it, by what, and the sentence
+    ("kitti", "training/label_2/*.txt", r"^(\w+ \S+) \d", r"\1 7.5e300", "object 1 has an occlusion that is none of"),
+    ("kitti", "ImageSets/val.txt", r"\A", "000000\n", "lists the frame 000000, which 'train' lists, too"),
+    *(
+        ("nuscenes", f"v1.0-flcav/{table}.json", pattern, new, sentence)
+        for table, pattern, new, sentence in (
+            (
+                "sample_annotation",
+                r'"size": \[[^]]*\]',
+                '"size": [0, 4, 2]',
+                "object 1 has a size that is not positive",
+            ),
+            (
+                "calibrated_sensor",
+                r'"camera_intrinsic": \[\s*\[[^}]*?\]\s*\]',
+                '"camera_intrinsic": []',
+                "a camera has no matrix",
+            ),
+            ("sample_data", r'"width": [1-9]\d*', '"width": 0', "no width and height of 'samples/CAM_"),
+            ("sensor", r'"modality": "lidar"', '"modality": "sonar"', "row 0 has a 'modality' that is none: 'sonar'"),
+            ("scene", r'"name": "scene-\d+"', '"name": "seven"', "the scene 'seven' is none of an export by flcav"),
+        )
+    ),
+    ("opv2v", "train/*/*/000000.yaml", r"speed: .*", "speed: fast", "not a frame of OPV2V, a number is wanted"),
+    ("opv2v", "train/*/*/000000.yaml", r"^vehicles:", "objects:", "not a frame of OPV2V, it has no 'vehicles'"),
+    (
+        "opv2v",
+        "train/*/*/000000.yaml",
+        r"(extent:\s*(?:\[|- ))[\d.]+",
+        r"\g<1>0",
+        "object 1 has a size that is not",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "pattern", "old", "new", "sentence"), ODD)
+def test_a_file_with_an_impossible_entry_names_itself(
+    name: str, pattern: str, old: str, new: str, sentence: str, exported: dict[str, Path], tmp_path: Path
+):
+    folder = shutil.copytree(exported[name], tmp_path / "folder")
+    path = _first(folder, pattern)
+    text, count = re.subn(old, new, path.read_text(), flags=re.MULTILINE)
+    assert count
+    path.write_text(text)
+    with pytest.raises(InputError, match=f"^{re.escape(str(path))}: {re.escape(sentence)}"):
+        import_dataset(name, folder, tmp_path / "out")
+
+
 def test_a_listed_frame_of_kitti_without_any_file_names_itself(exported: dict[str, Path], tmp_path: Path):
     folder = shutil.copytree(exported["kitti"], tmp_path / "folder")
     with (folder / "ImageSets" / "train.txt").open("a") as file:
@@ -380,6 +428,10 @@ def test_a_row_that_refers_to_nothing(exported: dict[str, Path], tmp_path: Path)
     shutil.copytree(exported["nuscenes"], tmp_path / "odd")
     path = tmp_path / "odd" / "v1.0-flcav" / "instance.json"
     rows = json.loads(path.read_text())
-    path.write_text(json.dumps([{**row, "category_token": "?"} for row in rows]))
-    with pytest.raises(InputError, match=r"its tables do not fit together, nothing has the token '\?'"):
+    for text in (json.dumps([{**row, "category_token": "?"} for row in rows]), "[]"):  # of no category, of no instance
+        path.write_text(text)
+        with pytest.raises(InputError, match=r"its tables do not fit together, nothing has the token '"):
+            import_dataset("nuscenes", tmp_path / "odd", tmp_path / "out")
+    (path.parent / "scene.json").write_text("[]")
+    with pytest.raises(InputError, match="no scenes in it"):
         import_dataset("nuscenes", tmp_path / "odd", tmp_path / "out")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flcav.config import InputError
+from flcav.config import InputError, parse_config
 from flcav.dataset.payloads import read_image
 from flcav.dataset.store import LazyMapping
 from flcav.files import Json
@@ -26,6 +26,7 @@ from flcav.sensors.labels.outlines import NEAR_M, clip_in_front, compute_truncat
 Array = NDArray[np.float64]
 
 LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track whose difference is a velocity, as nuscenes-devkit's
+FARTHEST = 1e9  # largest number that a measurement is taken to have
 LEVEL_RAD = 1e-6  # pitch and roll of a box that is upright
 EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 
@@ -189,10 +190,21 @@ def check_finite(points: NDArray[np.float32], path: Path) -> NDArray[np.float32]
     return points
 
 
-def pinhole(intrinsics: Array, width: int, height: int) -> Lens:
-    """Return the lens of a (3, 3) camera matrix."""
+def check_sizes(size: Array, path: Path) -> None:
+    """Raise `InputError` where the size (M, 3) of an object that the file at `path` labels is not positive."""
+    if not (size > 0).all():
+        raise InputError(f"{path}: object {int((size > 0).all(axis=1).argmin()) + 1} has a size that is not positive")
+
+
+def pinhole(intrinsics: Array, width: float, height: float, path: Path) -> Lens:
+    """Return the lens of a camera matrix (3, 3), which the file at `path` says.
+
+    Raises `InputError` where no camera has that matrix, or that width and height [px].
+    """
+    if intrinsics.shape != (3, 3):
+        raise InputError(f"{path}: a camera has no matrix of 3 x 3 numbers")
     fx, fy, cx, cy = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    return Lens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+    return parse_config(Lens, {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}, str(path))
 
 
 def measure_picture(path: Path) -> tuple[int, int]:
@@ -239,6 +251,8 @@ def name_splits(split_of: Mapping[str, str | None]) -> dict[str, list[str]]:
 
 def choose_split(folder: Path, split_of: Mapping[str, str | None], split: str | None) -> list[str]:
     """Return the scenes of `split`, all for None; raises `InputError` where there are none."""
+    if not split_of:
+        raise InputError(f"{folder}: no scenes in it")
     chosen = [scene for scene, own in split_of.items() if split is None or own == split]
     if not chosen:
         known = sorted({own for own in split_of.values() if own is not None})

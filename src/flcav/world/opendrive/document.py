@@ -59,6 +59,10 @@ def read_map(path: Path) -> ElementTree.Element:
         )
     if root.find("road") is None:
         raise InputError(f"{path}: has no <road> (OpenDRIVE 1.8, 10.1)")
+    if root.find(".//include") is not None:
+        raise InputError(
+            f"{path}: includes other files, which are not read: put their content in the place of <include>"
+        )
     check_standard(root, path)
     return root
 

@@ -73,6 +73,11 @@ def split_map(root: ElementTree.Element, prefix: Path, origin: Path, *, left_han
     for road in plan.iterfind("road"):
         for objects in road.findall("objects"):
             road.remove(objects)
+    for header in plan.iterfind("header"):
+        for reference in header.findall(
+            "geoReference"
+        ):  # `locate_origin` reads it; netconvert wants one that PROJ knows
+            header.remove(reference)
     if left_hand:
         mirror_map(plan)
     xodr = prefix.with_suffix(".xodr")
@@ -201,8 +206,8 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         if geo is None:
             geo = GeoReference()
             notes.append(
-                f"The map's geo-reference {document.geo_reference!r} is none of +proj=tmerc and +proj=utm: "
-                f"the town lies at {geo.latitude_deg}° N, {geo.longitude_deg}° E."
+                f"The map's geo-reference {document.geo_reference!r} is none of +proj=tmerc and +proj=utm, "
+                f"or of no place: the town lies at {geo.latitude_deg}° N, {geo.longitude_deg}° E."
             )
         if streets.sidewalks_added:
             notes.append("The map has no sidewalks: added along its town streets.")

@@ -11,6 +11,7 @@ from shapely.geometry import LineString, Point, Polygon
 
 from flcav.config import InputError
 from flcav.world.map.lanes import map_layers
+from flcav.world.map.parameters import GeoReference
 from flcav.world.map.roads import Edge, RoadNet, read_net
 from flcav.world.map.surfaces import subtract, unite
 from flcav.world.map.town import Town
@@ -182,6 +183,16 @@ def test_roads_that_are_linked_across_a_country_are_refused(tmp_path: Path) -> N
         import_town(path, tmp_path / "town")
 
 
+def test_a_geo_reference_of_no_place_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "map.xodr"
+    path.write_text(CROSS.read_text().replace("+zone=32", "+zone=99"))
+    imported = import_town(path, tmp_path / "town")
+    assert "+zone=99 +datum=WGS84 +units=m +no_defs' is none of +proj=tmerc and +proj=utm, or of no" in " ".join(
+        imported.notes
+    )
+    assert imported.town.geo == GeoReference()
+
+
 def test_streets_that_lie_a_country_apart_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "map.xodr"
     path.write_text(OBJECTS.read_text().replace('y="5428010.0000"', 'y="1000"', 1))
@@ -197,6 +208,7 @@ def test_streets_that_lie_a_country_apart_are_refused(tmp_path: Path) -> None:
         ('<arc curvature="0.02"/>', "", r"a <geometry> needs one of line, arc"),
         ('id="2" junction', 'id="1" junction', r"each road needs an id of its own, and two have '1' .*10\.1\)"),
         ('revMajor="1"', 'revMajor="2"', "version '2' is not supported"),
+        ("<junction ", '<include file="more.xodr"/><junction ', "includes other files, which are not read"),
         ("<header", "<heading", r"expected <OpenDRIVE> with a <header>: OpenDRIVE 1.8, 6\.4"),
         ("<lanes>", '<lanes><laneOffset s="x"/>', r"<laneOffset> needs a number as 's', not 'x' .*11\.4\)"),
         ("<junction ", '<junction id="10"/><junction ', r"each junction needs an id of its own.*12\.2\)"),

@@ -6,6 +6,7 @@ are those of the measurements, from the sweep's time on, when the spin begins. I
 camera model has none, the coefficients in `intrinsics.feather` are of the raw images.
 """
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -19,11 +20,12 @@ from scipy.spatial.transform import Rotation
 from flcav.config import InputError
 from flcav.dataset.checks.frames import LONGEST_SPIN_S
 from flcav.dataset.formats.reading import (
+    FARTHEST,
     AgentNames,
     LogSource,
     Picture,
     annotate,
-    check_finite,
+    check_sizes,
     choose_split,
     difference_tracks,
     pinhole,
@@ -57,6 +59,7 @@ AXLE_M = 0.33  # height of the rear axle above the ground, which in the log 7fab
 BEAMS = 64  # of both LiDARs: the lasers 0 to 63 of a sweep
 RANGE_M = 200.0  # of a VLP-32C, by its data sheet (Velodyne 63-9378); both are of this type (Wilson et al., 2021)
 LIDAR, MOUNT = "lidar", "up_lidar"  # our name of both LiDARs, where they are taken to be
+TIME = re.compile(r"[0-9]{1,18}")  # [ns], the name of a sweep or picture
 LATE_NS = 50_000_000  # most time between a sweep and the picture of a camera that goes with it: it runs at 20 Hz
 TEXT = ("sensor_name", "track_uuid", "category")  # columns, of which all others are numbers
 PLACED = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
@@ -103,7 +106,7 @@ class Argoverse2Source(LogSource):
         bare = [log.folder.name for log in self._logs.values() if not log.labelled]
         lost, dark = (sum(column) for column in zip(*((log.lost, log.dark) for log in self._logs.values())))
         self.notes = (
-            *((f"no annotations.feather in {len(bare)} of {len(self._logs)} logs, so no boxes",) if bare else ()),
+            *((f"no annotations in {len(bare)} of {len(self._logs)} logs, so no boxes",) if bare else ()),
             *((f"no sweep at {lost} annotated times, so no frames there",) if lost else ()),
             *((f"no picture within {LATE_NS // 10**6} ms of a sweep, of cameras with others: {dark}",) if dark else ()),
         )
@@ -171,7 +174,7 @@ class Poses:
 
     def __init__(self, path: Path) -> None:
         table = _read_feather(path, ("timestamp_ns", *PLACED))
-        self._path, self._transforms = path, _transforms(table)
+        self._path, self._transforms = path, _transforms(table, path)
         self._row = {time: row for row, time in enumerate(table["timestamp_ns"].to_pylist())}
 
     def at(self, time_ns: int) -> Array:
@@ -206,17 +209,20 @@ def _open_log(folder: Path, names: AgentNames) -> Log:
     if not len(sweeps):
         raise InputError(f"{folder / 'sensors' / 'lidar'}: no sweeps in it")
     annotations = folder / "annotations.feather"
-    labelled = annotations.is_file()
-    annotated = _read_feather(annotations, ("timestamp_ns",))["timestamp_ns"].unique().to_pylist() if labelled else ()
+    known = annotations.is_file()
+    annotated = _read_feather(annotations, ("timestamp_ns",))["timestamp_ns"].unique().to_pylist() if known else ()
     lost = len(set(annotated) - set(sweeps.tolist()))
     times = (_list_times(folder / "sensors" / "cameras" / name, "jpg") for name in lenses)
     dark = sum(_nearest(own, sweep) is None for own in times if len(own) for sweep in sweeps.tolist())
-    return Log(folder, _split_of(folder), names.of("ego", calibration), tuple(sweeps.tolist()), labelled, lost, dark)
+    return Log(
+        folder, _split_of(folder), names.of("ego", calibration), tuple(sweeps.tolist()), bool(annotated), lost, dark
+    )
 
 
 def _list_times(folder: Path, suffix: str) -> NDArray[np.int64]:
     """Return the times [ns] that name the files of a folder, in order; none where there is no such folder."""
-    return np.array(sorted(int(path.stem) for path in folder.glob(f"*.{suffix}") if path.stem.isdigit()), np.int64)
+    times = (int(path.stem) for path in folder.glob(f"*.{suffix}") if TIME.fullmatch(path.stem))
+    return np.array(sorted(times), np.int64)
 
 
 def _nearest(times: NDArray[np.int64], sweep: int) -> int | None:
@@ -227,13 +233,13 @@ def _nearest(times: NDArray[np.int64], sweep: int) -> int | None:
 def _read_sweep(path: Path, origin: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return (N, 4) x, y, z [m] from `origin` in the ego frame, intensity [0, 1], and (N,) times after the sweep's [s].
 
-    Raises `InputError` where a point is not finite, or was measured LONGEST_SPIN_S or more before or after.
+    Raises `InputError` where a point was measured LONGEST_SPIN_S or more before or after.
     """
     names = ("x", "y", "z", "intensity")
     table = _read_feather(path, (*names, "offset_ns"))
     x, y, z, intensity = (table[name].to_numpy().astype(np.float32) for name in names)
     xyz = np.column_stack((x, y, z)) - origin.astype(np.float32)
-    points = check_finite(np.column_stack((xyz, intensity / np.float32(255))), path)
+    points = np.column_stack((xyz, intensity / np.float32(255)))
     times_s = (table["offset_ns"].to_numpy() / 1e9).astype(np.float32)
     if not (np.abs(times_s) < LONGEST_SPIN_S).all():
         raise InputError(f"{path}: a point's 'offset_ns' is no time within the spin")
@@ -242,40 +248,45 @@ def _read_sweep(path: Path, origin: Array) -> tuple[NDArray[np.float32], NDArray
 
 def _read_mounts(folder: Path) -> dict[str, Array]:
     """Return sensor -> (4, 4) pose in the ego frame."""
-    table = _read_feather(folder / "calibration" / "egovehicle_SE3_sensor.feather", ("sensor_name", *PLACED))
-    return dict(zip(table["sensor_name"].to_pylist(), _transforms(table)))
+    path = folder / "calibration" / "egovehicle_SE3_sensor.feather"
+    table = _read_feather(path, ("sensor_name", *PLACED))
+    return dict(zip(table["sensor_name"].to_pylist(), _transforms(table, path)))
 
 
 def _read_lenses(folder: Path) -> dict[str, Lens]:
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
-    table = _read_feather(folder / "calibration" / "intrinsics.feather", ("sensor_name", *names))
-    lenses = {}
+    path, lenses = folder / "calibration" / "intrinsics.feather", {}
+    table = _read_feather(path, ("sensor_name", *names))
     for row in table.to_pylist():
         matrix = np.array([[row["fx_px"], 0, row["cx_px"]], [0, row["fy_px"], row["cy_px"]], [0, 0, 1.0]])
-        lenses[row["sensor_name"]] = pinhole(matrix, row["width_px"], row["height_px"])
+        lenses[row["sensor_name"]] = pinhole(matrix, row["width_px"], row["height_px"], path)
     return lenses
 
 
 def _read_labels(folder: Path, poses: Poses) -> Labels:
     """Return the annotations of a log, of its sweeps that are not here, too: velocities are differences of them."""
-    size = ("length_m", "width_m", "height_m")
-    table = _read_feather(folder / "annotations.feather", ("timestamp_ns", "track_uuid", "category", *size, *PLACED))
+    path, sides = folder / "annotations.feather", ("length_m", "width_m", "height_m")
+    table = _read_feather(path, ("timestamp_ns", "track_uuid", "category", *sides, *PLACED))
+    size = np.column_stack([table[name].to_numpy() for name in sides])
+    check_sizes(size, path)
     sweep, track = table["timestamp_ns"].to_numpy(), np.array(table["track_uuid"].to_pylist(), np.str_)
-    in_ego = _transforms(table)
+    in_ego = _transforms(table, path)
     center, rotation = np.zeros((len(table), 3)), np.zeros((len(table), 3, 3))
     for time in np.unique(sweep).tolist():
         city_from_ego, own = poses.at(time), np.flatnonzero(sweep == time)
         center[own] = transform_points(city_from_ego, in_ego[own, :3, 3])
         rotation[own] = city_from_ego[:3, :3] @ in_ego[own, :3, :3]
     label = np.array([CATEGORIES.get(name, name) for name in table["category"].to_pylist()], np.str_)
-    boxes = turned_boxes(center, np.column_stack([table[name].to_numpy() for name in size]), rotation, label)
-    return Labels(sweep, track, boxes, difference_tracks(track, (sweep - sweep.min(initial=sweep[0])) / 1e9, center))
+    boxes = turned_boxes(center, size, rotation, label)
+    return Labels(sweep, track, boxes, difference_tracks(track, (sweep - sweep[:1]) / 1e9, center))
 
 
-def _transforms(table: pa.Table) -> Array:
-    """Return (N, 4, 4) transforms of the quaternions and translations in PLACED."""
+def _transforms(table: pa.Table, path: Path) -> Array:
+    """Return (N, 4, 4) transforms of the quaternions and translations in PLACED, which the file at `path` has."""
     w, x, y, z, *translation = (table[name].to_numpy() for name in PLACED)
     transforms = np.tile(np.eye(4), (len(table), 1, 1))
+    if not np.any((w, x, y, z), axis=0).all():
+        raise InputError(f"{path}: a rotation is a quaternion of length 0")
     if len(table):
         transforms[:, :3, :3] = Rotation.from_quat(np.column_stack((x, y, z, w))).as_matrix()
         transforms[:, :3, 3] = np.column_stack(translation)
@@ -297,6 +308,8 @@ def _read_feather(path: Path, columns: tuple[str, ...]) -> pa.Table:
         text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
         if table[name].null_count or text != (name in TEXT) or not (text or _is_number(kind)):
             raise InputError(f"{path}: the column '{name}' is not of {'texts' if name in TEXT else 'numbers'}")
+        if pa.types.is_floating(kind) and not (near := np.abs(table[name].to_numpy().astype(float)) < FARTHEST).all():
+            raise InputError(f"{path}: the column '{name}' has no number in row {int(near.argmin())}, or one too large")
     return table.select(list(columns)).combine_chunks()
 
 

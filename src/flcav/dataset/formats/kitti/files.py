@@ -20,6 +20,7 @@ LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
 MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
 SUFFIXES = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}
+LEVELS = (0, 1, 2, 3)  # of occlusion
 MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
 
 
@@ -79,7 +80,7 @@ class Objects:
 
     boxes: Boxes  # (N,) LiDAR frame, KITTI's class names
     truncation: NDArray[np.float64]  # (N,) share outside the image
-    occlusion: NDArray[np.int64]  # (N,) 0 fully visible, 1 partly and 2 largely occluded, 3 unknown
+    occlusion: NDArray[np.int64]  # (N,) 0 fully visible, 1 partly and 2 largely occluded, 3 unknown, -1 none of these
     alpha: NDArray[np.float64]  # (N,) observation angle [rad]
     rectangle: NDArray[np.float64]  # (N, 4) left, top, right, bottom [px]
     unlabelled: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4)))  # (K, 4) of DontCare regions [px]
@@ -124,7 +125,7 @@ def read_objects(path: Path, calibration: Calibration) -> Objects:
     return Objects(
         Boxes(center, size, yaw, np.array(label, dtype=np.str_), scores),
         truncation=numbers[:, 0],
-        occlusion=numbers[:, 1].astype(np.int64),
+        occlusion=np.where(np.isin(numbers[:, 1], LEVELS), numbers[:, 1], -1).astype(np.int64),
         alpha=numbers[:, 2],
         rectangle=numbers[:, 3:7],
         unlabelled=np.array(unlabelled).reshape(-1, 4),
@@ -202,7 +203,7 @@ def check_objects(objects: Objects, width: int, height: int, path: Path) -> None
         "a size that is not positive": (objects.boxes.size > 0).all(axis=1),
         f"a rectangle that is not within the image of {width} x {height}": inside & (left < right) & (top < bottom),
         "a truncation outside 0 to 1": (objects.truncation >= 0) & (objects.truncation <= 1),
-        "an occlusion that is none of 0, 1, 2, 3": np.isin(objects.occlusion, range(4)),
+        "an occlusion that is none of 0, 1, 2, 3": np.isin(objects.occlusion, LEVELS),
     }
     for what, good in checks.items():
         if not good.all():
@@ -215,6 +216,8 @@ def read_split(path: Path) -> list[str]:
         names = path.read_text(encoding="utf-8").split()
     except FileNotFoundError:
         raise InputError(f"{path}: no such list of frames") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file") from None
     if len(set(names)) != len(names):
         raise InputError(f"{path}: names a frame twice")
     return names

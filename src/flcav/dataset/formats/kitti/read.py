@@ -159,7 +159,9 @@ def _find_shots(folder: Path) -> list[Shot]:
     for name in LISTS:
         path = folder / "ImageSets" / f"{name}.txt"
         for number in read_split(path) if path.is_file() else ():
-            listed["testing" if name == "test" else "training", number] = name
+            frame = "testing" if name == "test" else "training", number
+            if listed.setdefault(frame, name) != name:
+                raise InputError(f"{path}: lists the frame {number}, which '{listed[frame]}' lists, too")
     origin = _read_origins(folder / FRAMES)
     shots = []
     for part in FOLDERS:

@@ -25,6 +25,7 @@ from flcav.dataset.formats.reading import (
     Picture,
     annotate,
     check_finite,
+    check_sizes,
     choose_split,
     difference_tracks,
     pinhole,
@@ -60,7 +61,7 @@ OCCLUSION = {
     "3": 0.3,
     "4": 0.1,
 }  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
-TOP = "LIDAR_TOP"
+TOP, MOUNTED = "LIDAR_TOP", "calibrated_sensor.json"
 BEAMS, RANGE_M = 32, 70.0  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders do not say
 VERSIONS = ("v1.0-mini", "v1.0-trainval", "v1.0-test")  # nuScenes' own tables
 POINT = 5  # float32 of a point: x, y, z, intensity 0 to 255, ring
@@ -104,8 +105,11 @@ class NuscenesSource(LogSource):
 
     def _at(self, table: Mapping[str, Row], token: str) -> Row:
         if token not in table:
-            raise InputError(f"{self._tables}: its tables do not fit together, nothing has the token '{token}'")
+            raise self._unknown(token)
         return table[token]
+
+    def _unknown(self, token: str) -> InputError:
+        return InputError(f"{self._tables}: its tables do not fit together, nothing has the token '{token}'")
 
     def _kind(self, row: Row) -> str:
         """Return the modality of a row of sample_data: "lidar", "camera" or "radar"."""
@@ -115,7 +119,7 @@ class NuscenesSource(LogSource):
 
     def _pixels(self, row: Row) -> tuple[int, int]:
         """Return width and height of a picture, of its row of sample_data."""
-        if row.get("width") is None or row.get("height") is None:
+        if not row.get("width") or not row.get("height"):
             raise InputError(f"{self._tables / 'sample_data.json'}: no width and height of '{row['filename']}'")
         return row["width"], row["height"]
 
@@ -166,8 +170,10 @@ class NuscenesSource(LogSource):
             if first and agent not in self._calibration:
                 spin = self._data[of_scene[token][0]][TOP]["timestamp"]
                 self._calibration[agent] = self._calibrate(first, spin)
-            late = int(name.rpartition("-")[2]) if ours else 0  # see `Drive._micros`
-            times[own] += [((samples[s]["timestamp"] - late) / 1e6, agent, s) for s in of_scene[token]]
+            late = name.rpartition("-")[2] if ours else "0"  # [microseconds], see `Drive._micros`
+            if not late.isdecimal():
+                raise InputError(f"{self._tables / 'scene.json'}: the scene '{name}' is none of an export by flcav")
+            times[own] += [((samples[s]["timestamp"] - int(late)) / 1e6, agent, s) for s in of_scene[token]]
             split_of[own] = split_by_name.get(name, "test" if self._tables.name.endswith("-test") else None)
         spins = {}
         for scene, found in times.items():
@@ -189,11 +195,13 @@ class NuscenesSource(LogSource):
             track.append(row["instance_token"])
             time_s.append(self._at(table["sample"], row["sample_token"])["timestamp"] / 1e6)
             numbers.extend((*row["translation"], *row["size"], *row["rotation"]))
-            name = category.get(row["instance_token"], "")
+            if (name := category.get(row["instance_token"])) is None:
+                raise self._unknown(row["instance_token"])
             ridden = RIDER in (attribute.get(token) for token in row.get("attribute_tokens", ()))
             label.append(RIDDEN.get(name, name) if ridden else CATEGORIES.get(name, name))
             occlusion.append(OCCLUSION.get(row.get("visibility_token", ""), np.nan))
         center, size, quaternion = np.split(np.reshape(numbers, (-1, 10)), (3, 6), axis=1)
+        check_sizes(size, self._tables / "sample_annotation.json")
         turned = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_matrix()
         self._track, self._occlusion = np.array(track, np.str_), np.array(occlusion)
         self._velocity = difference_tracks(self._track, np.array(time_s), center)
@@ -223,7 +231,7 @@ class NuscenesSource(LogSource):
         pictures = {
             name: Picture(
                 path[name],
-                pinhole(calibration.intrinsics[name], *self._pixels(data[name])),
+                pinhole(calibration.intrinsics[name], *self._pixels(data[name]), self._tables / MOUNTED),
                 poses[name] @ mounts[name],
             )
             for name in cameras

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from flcav.config import InputError, read_json, shorten
+from flcav.dataset.formats.reading import FARTHEST
 
 Row = Mapping[str, Any]  # column -> value
 
@@ -33,7 +34,7 @@ COLUMNS = {  # what is read of each table
 }
 OPTIONAL = {"sample_data": ("width", "height"), "sample_annotation": ("attribute_tokens", "visibility_token")}
 NUMBERS = {"translation": 3, "size": 3, "rotation": 4}  # columns of so many numbers
-FARTHEST = 1e9
+MODALITIES = ("lidar", "camera", "radar")
 BLANKS = " \t\n\r"
 
 
@@ -130,6 +131,8 @@ def _fits(column: str, value: object) -> bool:
         return _are_numbers(value, NUMBERS[column]) and (column != "rotation" or any(value))  # type: ignore[arg-type]
     if column == "camera_intrinsic":
         return value == [] or (isinstance(value, list) and len(value) == 3 and all(_are_numbers(r, 3) for r in value))
+    if column == "modality":
+        return value in MODALITIES
     if column == "timestamp":
         return isinstance(value, int)
     if column in ("width", "height"):

@@ -16,11 +16,13 @@ from flcav.config import InputError
 from flcav.dataset.formats.opv2v.write import CAMERAS, FOLDERS, KMH, from_carla
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
+    FARTHEST,
     AgentNames,
     LogSource,
     Picture,
     annotate,
     check_finite,
+    check_sizes,
     choose_split,
     measure_picture,
     pinhole,
@@ -103,11 +105,16 @@ class Opv2vSource(LogSource):
         world_from_lidar = from_carla(about["lidar_pose"])
         world_from_agent = world_from_lidar @ inverse(mounts[LIDAR])
         boxes, velocity = _read_vehicles(about)
+        check_sizes(boxes.size, shot.stem.with_suffix(".yaml"))
         points = read_cloud(shot.stem.with_suffix(".pcd"))
         files = {name: file for name in mounts if (file := _picture(shot.stem, name)).is_file() and name in about}
         placed = {name: from_carla(about[name]["cords"]) @ BODY_FROM_OPTICAL for name in files}
         pictures = {
-            name: Picture(file, pinhole(calibration.intrinsics[name], *measure_picture(file)), placed[name])
+            name: Picture(
+                file,
+                pinhole(calibration.intrinsics[name], *measure_picture(file), shot.stem.with_suffix(".yaml")),
+                placed[name],
+            )
             for name, file in files.items()
         }
         names = self._track[scene]
@@ -185,21 +192,27 @@ def _read_about(stem: Path) -> About:
         for row in about["vehicles"].values():
             for name in ("location", "center", "extent", "angle"):
                 _check_numbers(row[name], 3)
+            _check_numbers(row.get("speed", 0.0))
         for name in ("lidar_pose", "true_ego_pos"):
             _check_numbers(about[name], 6)
         for name in CAMERAS:
             if name in about:
                 _check_numbers(about[name]["cords"], 6)
                 _check_numbers(np.ravel(about[name]["intrinsic"]), 9)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: not a frame of OPV2V ({type(error).__name__}: {error})") from None
+    except KeyError as lost:
+        raise InputError(f"{path}: not a frame of OPV2V, it has no {lost}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: not a frame of OPV2V, {error}") from None
+    except (TypeError, AttributeError):
+        raise InputError(f"{path}: not a frame of OPV2V, its entries are of other kinds") from None
     return about
 
 
-def _check_numbers(values: Any, count: int) -> None:
-    numbers = np.array(values, np.float64)
-    if numbers.shape != (count,) or not np.isfinite(numbers).all():
-        raise ValueError(f"{count} numbers are wanted")
+def _check_numbers(values: Any, *shape: int) -> None:
+    """Raise `ValueError` where values are not numbers of that shape, one number for ()."""
+    numbers = np.array(values)
+    if numbers.shape != shape or numbers.dtype.kind not in "iuf" or not (np.abs(numbers) < FARTHEST).all():
+        raise ValueError(f"{shape[0]} numbers are wanted" if shape else "a number is wanted")
 
 
 def _read_names(path: Path) -> dict[str, str]:
