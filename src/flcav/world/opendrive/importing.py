@@ -74,9 +74,7 @@ def split_map(root: ElementTree.Element, prefix: Path, origin: Path, *, left_han
         for objects in road.findall("objects"):
             road.remove(objects)
     for header in plan.iterfind("header"):
-        for reference in header.findall(
-            "geoReference"
-        ):  # `locate_origin` reads it; netconvert wants one that PROJ knows
+        for reference in header.findall("geoReference"):  # netconvert refuses one that PROJ does not know
             header.remove(reference)
     if left_hand:
         mirror_map(plan)
