@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import curve_fit
+from scipy.optimize import approx_fprime, curve_fit
 
 from flcav.config import InputError
 from flcav.optimization.curves.bands import bootstrap_bands, fit_upper_curve
 from flcav.optimization.curves.fitting import explain_exponent, fit_additive, fit_effective
+from flcav.optimization.curves.forms import additive_forms, effective_forms, federated_forms
 from flcav.optimization.curves.history import accumulate_resources, article_histories, parse_histories
 
 PRINTED = {"weather": (11.84, 1.23), "signs": (8.15, 0.62), "objects": (0.51, 0.10)}  # a and b of the article
@@ -202,3 +203,20 @@ def test_bands_are_infinite_where_the_error_is():
 def test_an_exponent_at_a_bound_of_the_search_is_not_identified(b: float, said: str | None) -> None:
     found = explain_exponent("cloud", b)
     assert found is None if said is None else found is not None and said in found
+
+
+def test_derivatives_of_every_form_are_those_of_differences():
+    resources = np.array([[s, e, c] for s in (20.0, 90.0, 400.0) for e in (0.0, 2.0, 5.0) for c in (0.0, 1.0, 3.0)])
+    forms = (
+        *additive_forms(resources),
+        *effective_forms(resources, 0.1, None, 800.0, 2),
+        *effective_forms(resources, 0.1, 0.4, 800.0, 2),
+        *federated_forms(resources, 0.1, None, (30.0, 50.0), 2),
+        *federated_forms(resources, 0.1, 0.4, (30.0, 50.0), 2),
+    )
+    assert len(forms) == 16 + 2 + 2 + 8 + 8
+    for form in forms:
+        for start in form.starts(0.4):
+            p = 1.1 * np.array(start)
+            differences = approx_fprime(p, lambda p, form=form: form.predict(p, resources), 1e-7)
+            assert form.derivative(p, resources) == pytest.approx(differences, rel=1e-5, abs=1e-6), form

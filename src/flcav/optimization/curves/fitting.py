@@ -267,6 +267,7 @@ def _least(
         least_squares(
             lambda p: (form.predict(p, spent) - error) * root,
             start,
+            lambda p: form.derivative(p, spent) * root[:, None],
             bounds=form.bounds(),
             xtol=tolerance,
             ftol=tolerance,

@@ -27,6 +27,7 @@ from flcav.optimization.curves.curves import (
 
 Array = NDArray[np.float64]
 CurveT = TypeVar("CurveT", Additive, Effective, Federated, covariant=True)
+ValueT = TypeVar("ValueT", float, Array)  # of a parameter, or its column of a Jacobian
 
 FLATTEST, STEEPEST = 1e-6, 10.0  # least and largest exponent tried
 STARTS = (0.1, 0.5, 1.5)  # exponents at the starts of the search
@@ -55,6 +56,10 @@ class Form(Protocol[CurveT]):
 
     def predict(self, p: Array, resources: Array) -> Array:
         """Return the errors (n,) at `resources` (n, 3)."""
+        ...
+
+    def derivative(self, p: Array, resources: Array) -> Array:
+        """Return the Jacobian (n, P) of the errors at `resources` (n, 3) with respect to the parameters."""
         ...
 
     def curve(self, p: Array) -> CurveT:
@@ -99,6 +104,18 @@ class AdditiveForm:
             h, b, x0 = self._decay(p, i)
             total = total + h * ((resources[:, stage] + x0) / (m + x0)) ** -b
         return total
+
+    def derivative(self, p: Array, resources: Array) -> Array:
+        """Return the Jacobian (n, P) of the errors at `resources` (n, 3) with respect to the parameters."""
+        n = len(self.stages)
+        columns = np.ones((len(p), len(resources)))  # that of the floor is 1
+        for i, (stage, m) in enumerate(zip(self.stages, self.middle)):
+            h, b, x0 = self._decay(p, i)
+            shifted = resources[:, stage] + x0
+            columns[i], columns[n + i], slope = _power_derivatives(h, b, shifted, m + x0)
+            if stage in self.shifted:  # x0 is in numerator and denominator
+                columns[2 * n + self.floor + self.shifted.index(stage)] = slope * (1 - shifted / (m + x0))
+        return columns.T
 
     def curve(self, p: Array) -> Additive:
         """Return the curve of parameters p."""
@@ -174,6 +191,16 @@ class EffectiveForm:
         effective = effective_samples(resources[:, 0], t, self.alpha, self._beta(p) * self.group_samples)
         return p[0] * (effective / self.middle) ** -p[1] + (p[2] if self.floor else 0.0)
 
+    def derivative(self, p: Array, resources: Array) -> Array:
+        """Return the Jacobian (n, P) of the errors at `resources` (n, 3) with respect to the parameters."""
+        t = resources[:, 1] + self.k * resources[:, 2]
+        held = effective_samples(0.0, t, 0.0, self.group_samples)
+        by_h, by_b, slope = _power_derivatives(
+            p[0], p[1], self.alpha * resources[:, 0] + self._beta(p) * held, self.middle
+        )
+        floor, beta = [np.ones(len(t))] * self.floor, [slope * held] * (self.beta is None)
+        return np.stack([by_h, by_b, *floor, *beta], axis=1)
+
     def curve(self, p: Array) -> Effective:
         """Return the curve of parameters p."""
         values = {
@@ -189,6 +216,12 @@ class EffectiveForm:
 
     def _beta(self, p: Array) -> float:
         return _share(p[-1]) if self.beta is None else self.beta
+
+
+def _power_derivatives(h: float, b: float, x: Array, middle: float) -> tuple[Array, Array, Array]:
+    """Return the derivatives (n,) of h (x / middle)^(-b) at x (n,) with respect to h, b and x."""
+    power = (x / middle) ** -b
+    return power, -h * power * np.log(x / middle), -b * h * power / x
 
 
 def _share(fitted: float) -> float:
@@ -262,6 +295,18 @@ class FederatedForm:
         effective = effective_samples(effective, cloud_rounds, 1.0, beta * gamma * others)
         return p[0] * (effective / self.middle) ** -p[1] + floor + drift_part(cloud_rounds, drift)
 
+    def derivative(self, p: Array, resources: Array) -> Array:
+        """Return the Jacobian (n, P) of the errors at `resources` (n, 3) with respect to the parameters."""
+        _, gamma, drift, beta = self._named(p)
+        samples, edge_rounds, cloud_rounds = resources.T
+        own, others = split_regions(self.group_samples)
+        others_held = effective_samples(0.0, cloud_rounds, 0.0, others)
+        held = effective_samples(0.0, edge_rounds + self.k * cloud_rounds, 0.0, own) + gamma * others_held
+        by_h, by_b, slope = _power_derivatives(p[0], p[1], self.alpha * samples + beta * held, self.middle)
+        by_floor, by_drift = np.ones(len(samples)), float(drift > 0) - 1 / (cloud_rounds + 1)
+        fitted = self._fitted(by_floor, slope * beta * others_held, by_drift, slope * held)
+        return np.stack([by_h, by_b, *fitted], axis=1)
+
     def curve(self, p: Array) -> Federated:
         """Return the curve of parameters p."""
         floor, gamma, drift, beta = map(float, self._named(p))
@@ -272,7 +317,7 @@ class FederatedForm:
         }
         return parse_config(Federated, values, FITTED)
 
-    def _fitted(self, floor: float, gamma: float, drift: float, beta: float) -> list[float]:
+    def _fitted(self, floor: ValueT, gamma: ValueT, drift: ValueT, beta: ValueT) -> list[ValueT]:
         """Return those of the values whose parameters are fitted."""
         fitted = (self.floor, self.gamma, self.drift, self.beta is None)
         return [value for value, wanted in zip((floor, gamma, drift, beta), fitted) if wanted]

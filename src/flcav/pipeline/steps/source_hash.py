@@ -41,6 +41,7 @@ class Sources:
         self._packages = packages
         self._modules: dict[str, _Module | None] = {}
         self._hashes: dict[frozenset[Place], dict[str, str]] = {}
+        self._reaches: dict[_Statement, tuple[list[Place], list[str]]] = {}
 
     def hashes(self, starts: Iterable[Place]) -> dict[str, str]:
         """Return, by module, a hash of the definitions in it that are reachable from `starts`."""
@@ -70,16 +71,27 @@ class Sources:
                 seen.add((package, ""))
             for statement in {*module.always, *module.binding(wanted)} - found.setdefault(name, set()):
                 found[name].add(statement)
-                for target, as_written in statement.mentions:
-                    places = list(self._resolve(target))
-                    if as_written and not places:
-                        others.setdefault(name, set()).add(f"{as_written}: {target}")
-                    left += [place for place in places if place not in seen]
-                    seen.update(places)
+                places, foreign = self._reach(statement)
+                others.setdefault(name, set()).update(foreign)
+                left += [place for place in places if place not in seen]
+                seen.update(places)
         return {
             name: [s.text for s in sorted(statements, key=lambda s: s.line)] + sorted(others.get(name, ()))
             for name, statements in found.items()
         }
+
+    def _reach(self, statement: "_Statement") -> tuple[list[Place], list[str]]:
+        """Return the definitions that a statement mentions, and what it mentions outside these sources."""
+        if statement not in self._reaches:
+            places: dict[Place, None] = {}
+            foreign = []
+            for target, as_written in statement.mentions:
+                found = list(self._resolve(target))
+                if as_written and not found:
+                    foreign.append(f"{as_written}: {target}")
+                places.update(dict.fromkeys(found))
+            self._reaches[statement] = [*places], foreign
+        return self._reaches[statement]
 
     def _resolve(self, target: Target) -> Iterator[Place]:
         """Yield the definitions that an import or mention names; none where they are outside these sources."""
