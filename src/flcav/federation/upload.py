@@ -5,11 +5,11 @@ Nothing but arrays crosses the link, so that an update's bytes in the ledger are
 
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flcav.config import Config, InputError
 from flcav.federation.trainable import Weights, learned_names
@@ -41,6 +41,13 @@ class Upload(Config):
     fraction: float = Field(default=0.01, gt=0, le=1)  # of top-k
     error_feedback: bool = True  # of top-k: what was left out is kept for the next round
     kept: Patterns = ()  # arrays that are not sent, whatever `layers` are; set by `Rules.of_servers`
+
+    @model_validator(mode="after")
+    def _fields_of_the_compression(self) -> Self:
+        for name in ("fraction", "error_feedback"):
+            if self.compression != "top-k" and getattr(self, name) != Upload.model_fields[name].default:
+                raise ValueError(f"the compression {self.compression} takes no '{name}'")
+        return self
 
     def check_layers(self, weights: Weights) -> None:
         """Raise `InputError` where a pattern matches no array, or all of them together none that is learned."""

@@ -193,7 +193,7 @@ def test_a_change_that_is_not_finite_is_refused_in_every_form(kind: str, value: 
     weights["body.weight"][3, 4] = value
     rules = Rules(upload=Upload(**KINDS[kind]))
     sent, _ = encode(LocalUpdate(weights, 2, 1.0), START, rules, {}, 1)
-    with pytest.raises(UpdateRefused, match="'body.weight' has values that are not finite"):
+    with pytest.raises(UpdateRefused, match=r"'body.weight' has values that are not finite"):
         read_update(sent, START, rules, {})
 
 
