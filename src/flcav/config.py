@@ -1,11 +1,13 @@
 """Validation of user-facing configuration: YAML and JSON files to frozen records, with one-sentence error messages."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic_core import ErrorDetails
 
 from flcav.files import Json
 
@@ -91,12 +93,12 @@ def describe_error(error: ValidationError, model: type[BaseModel]) -> str:
     """Return a validation error of `model` as a clause for an error message.
 
     It tells the first of the most deeply nested faults and counts the others: an outer field is reported as wrong
-    whenever an inner one is.
+    whenever an inner one is, and a mapping as a text or a list where a field may be either and the fault is in it.
     """
     errors = error.errors()
-    deepest = [each for each in errors if not any(_inside(other["loc"], each["loc"]) for other in errors)]
+    deepest = [each for each in errors if not any(_is_deeper(other, each) for other in errors)]
     first = deepest[0]
-    field = ".".join(str(part) for part in first["loc"]) or "(whole)"
+    field = ".".join(str(part) for part in first["loc"] if "[" not in str(part)) or "(whole)"  # tags of unions
     more = f" (and {len(deepest) - 1} more)" if len(deepest) > 1 else ""
     if first["type"] == "extra_forbidden":
         known = sorted({name for owner in _models_at(model, first["loc"][:-1]) for name in owner.model_fields})
@@ -111,6 +113,14 @@ def describe_error(error: ValidationError, model: type[BaseModel]) -> str:
         known = sorted({name for owner in models for name in owner.model_fields} if models != [model] else ())
         message = f"must be a mapping{' of the fields ' + ', '.join(known) if known else ''}"
     return f"field '{field}' = {shorten(first['input'])}: {message}{more}"
+
+
+def _is_deeper(one: ErrorDetails, other: ErrorDetails) -> bool:
+    """Return whether `one` is nested within `other`, or within a mapping that `other` wants to be a text or a list."""
+    place, outer = one["loc"], other["loc"]
+    if other["type"] in ("string_type", "tuple_type") and isinstance(other["input"], Mapping):
+        return len(place) > len(outer) and _inside(place, outer[:-1])
+    return _inside(place, outer)
 
 
 def _inside(place: Place, outer: Place) -> bool:

@@ -35,6 +35,9 @@ RECIPE = {
         ({"selection": {"rule": "uniform", "clients": 5}}, "5 clients are wanted in a round, and there are 4"),
         ({"least_clients": 5}, "least_clients: 5 are wanted in a round, and 4 take part"),
         ({"least_clients": "half"}, "'federation.least_clients' = 'half': expected 'all' or a whole number from 1 to"),
+        ({"strategy": {"fedprox": None}}, "field 'federation.strategy.fedprox' is empty"),
+        ({"personal": {"pull": -1}}, "'federation.personal.RegionalModels.pull' = -1: Input should be greater than or"),
+        ({"upload": {"compression": "int8", "fraction": 0.5}}, "the compression int8 takes no 'fraction'"),
         ({"least_clients": 0}, "'federation.least_clients' = 0: expected 'all' or a whole number from 1 to 1000000"),
     ],
 )

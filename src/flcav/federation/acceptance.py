@@ -51,6 +51,11 @@ def find_fault(update: LocalUpdate, start: Weights, extra: Weights) -> str | Non
                 return f"'{name}' is {array.dtype} {array.shape} instead of {like[name].dtype} {like[name].shape}"
             if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
                 return f"'{name}' has values that are not finite"
-    if update.samples < 0 or not np.isfinite(update.loss):
+    return find_fault_of_numbers(update)
+
+
+def find_fault_of_numbers(update: LocalUpdate) -> str | None:
+    """Return what makes an update unusable whatever its arrays are: no samples, or a loss that is not finite."""
+    if update.samples < 1 or not np.isfinite(update.loss):
         return f"{update.samples} samples and a loss of {update.loss}"
     return None

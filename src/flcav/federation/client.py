@@ -32,6 +32,7 @@ from flcav.federation.records import (
     reply,
     reply_norm,
     to_arrays,
+    to_metrics,
 )
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.secure.masks import to_integers
@@ -145,7 +146,7 @@ def _record(context: Context, key: str, arrays: Weights) -> None:
 
 def _keep(context: Context, start: Weights, update: Update) -> None:
     context.state[KEPT], context.state[KEPT_START] = to_arrays(update.weights), to_arrays(start)
-    context.state[f"{KEPT}-{SAMPLES}"] = MetricRecord({SAMPLES: update.samples, LOSS: update.loss})
+    context.state[f"{KEPT}-{SAMPLES}"] = to_metrics(update)
 
 
 def _recall(context: Context) -> tuple[Weights, Update]:

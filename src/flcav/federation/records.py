@@ -102,11 +102,15 @@ def read_arrays(content: RecordDict, key: str) -> dict[str, np.ndarray]:
 def reply(message: Message, update: Update, extra: Weights) -> Message:
     """Return the reply to a training message: the weights, a strategy's `extra` arrays, samples and loss.
 
-    Without extra arrays there is no record of them.
+    Without extra arrays there is no record of them. Raises as `to_metrics`.
     """
     records = {ARRAYS: to_arrays(update.weights)} | ({EXTRA: to_arrays(extra)} if extra else {})
-    metrics = MetricRecord({SAMPLES: update.samples, LOSS: update.loss})
-    return Message(RecordDict({**records, METRICS: metrics}), reply_to=message)
+    return Message(RecordDict({**records, METRICS: to_metrics(update)}), reply_to=message)
+
+
+def to_metrics(update: Update) -> MetricRecord:
+    """Return samples and loss of an update as metrics; raises ValueError for samples that no message can hold."""
+    return MetricRecord({SAMPLES: _count(update.samples), LOSS: float(update.loss)})
 
 
 def to_update(answer: Message) -> LocalUpdate:
@@ -119,9 +123,17 @@ def to_update(answer: Message) -> LocalUpdate:
 def reply_norm(message: Message, norm: float, samples: int) -> Message:
     """Return the reply to a request for an update's norm: the norm and the number of samples, as metrics.
 
-    Before training, where the number alone is asked for, the norm is 0.
+    Before training, where the number alone is asked for, the norm is 0. Raises as `to_metrics`.
     """
-    return Message(RecordDict({METRICS: MetricRecord({NORM: norm, SAMPLES: samples})}), reply_to=message)
+    metrics = MetricRecord({NORM: float(norm), SAMPLES: _count(samples)})
+    return Message(RecordDict({METRICS: metrics}), reply_to=message)
+
+
+def _count(samples: float) -> int:
+    """Return a number of samples as a plain integer."""
+    if not abs(samples) < 2**63 or samples != int(samples):
+        raise ValueError(f"{samples} samples")
+    return int(samples)
 
 
 def to_norm(answer: Message) -> tuple[float, int]:

@@ -15,7 +15,7 @@ from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
 from numpy.typing import NDArray
 
-from flcav.federation.acceptance import UpdateRefused, read_update
+from flcav.federation.acceptance import UpdateRefused, find_fault_of_numbers, read_update
 from flcav.federation.attendance import Attendance, ClientFailed
 from flcav.federation.encoding import count_coordinates, unflatten
 from flcav.federation.noise import derive_key
@@ -242,7 +242,7 @@ class Rounds(FlowerStrategy):
         told: dict[str, tuple[float, int]] = {}
         for name, message in self._in_order(asked, replies):
             norm, samples = to_norm(message)
-            if np.isfinite(norm) and norm >= 0 and samples >= 0:
+            if np.isfinite(norm) and norm >= 0 and samples >= 1:
                 told[name] = norm, samples
             else:
                 self._here.failed[name] = f"a norm of {norm} and {samples} samples"
@@ -293,10 +293,15 @@ class Rounds(FlowerStrategy):
         return received
 
     def _check_masked(self, sent: LocalUpdate) -> LocalUpdate:
-        """Return a masked update; raises ValueError where it is none. Its values cannot be told from others."""
+        """Return a masked update, whose values cannot be told from others.
+
+        Raises `UpdateRefused` for no samples or a loss that is not finite, ValueError where it is no masked update.
+        """
         size, vector = count_coordinates(self._start, self._rules), sent.weights[VECTOR]
-        if (vector.shape, vector.dtype) != ((size,), np.dtype(np.uint32)) or not np.isfinite(sent.loss):
-            raise ValueError(f"{vector.dtype} {vector.shape} instead of uint32 ({size},), or a loss of {sent.loss}")
+        if (vector.shape, vector.dtype) != ((size,), np.dtype(np.uint32)):
+            raise ValueError(f"{vector.dtype} {vector.shape} instead of uint32 ({size},)")
+        if (fault := find_fault_of_numbers(sent)) is not None:
+            raise UpdateRefused(fault)
         return sent
 
     def _average_securely(self, updates: Mapping[str, LocalUpdate], how: SecureAggregation) -> Weights:

@@ -5,11 +5,11 @@ Nothing but arrays crosses the link, so that an update's bytes in the ledger are
 
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flcav.config import Config, InputError
 from flcav.federation.trainable import Weights, learned_names
@@ -42,6 +42,13 @@ class Upload(Config):
     error_feedback: bool = True  # of top-k: what was left out is kept for the next round
     kept: Patterns = ()  # arrays that are not sent, whatever `layers` are; set by `Rules.of_servers`
 
+    @model_validator(mode="after")
+    def _fields_of_the_compression(self) -> Self:
+        for name in ("fraction", "error_feedback"):
+            if self.compression != "top-k" and getattr(self, name) != Upload.model_fields[name].default:
+                raise ValueError(f"the compression {self.compression} takes no '{name}'")
+        return self
+
     def check_layers(self, weights: Weights) -> None:
         """Raise `InputError` where a pattern matches no array, or all of them together none that is learned."""
         for layer in self.layers:
@@ -50,7 +57,8 @@ class Upload(Config):
                     f"layers: '{layer}' matches none of {len(weights)} arrays, such as '{next(iter(weights))}'"
                 )
         if not {*learned_names(weights)} & {*self.exchanged(weights)}:
-            raise InputError(f"layers {', '.join(self.layers)}: match no array that is learned")
+            told = f"layers {', '.join(self.layers)}: match" if self.layers else "a federation of weights with"
+            raise InputError(f"{told} no array that is learned")
 
     def exchanged(self, weights: Weights) -> list[str]:
         """Return the names of the arrays that are sent."""
@@ -67,13 +75,18 @@ def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | Non
     match upload.compression:
         case "fp16":
             limit = float(np.finfo(np.float16).max)
-            return {name: np.clip(array, -limit, limit).astype(np.float16) for name, array in change.items()}, {}
+            sent = {
+                name: np.where(np.isinf(array), array, np.clip(array, -limit, limit))  # infinite ones are refused
+                for name, array in change.items()
+            }
+            return {name: array.astype(np.float16) for name, array in sent.items()}, {}
         case "int8":
             rng, sent, scales = np.random.default_rng(seed), {}, []
             for name, array in change.items():
                 scale = np.float32(np.abs(array).max(initial=0.0) / LEVELS)
-                levels = array / (scale or 1.0) + rng.random(array.shape)
-                sent[name] = np.clip(np.floor(levels), -LEVELS, LEVELS).astype(np.int8)
+                with np.errstate(invalid="ignore"):  # of a scale that is not finite, which is refused
+                    levels = array / (scale or 1.0) + rng.random(array.shape)
+                    sent[name] = np.clip(np.floor(levels), -LEVELS, LEVELS).astype(np.int8)
                 scales.append(scale)
             return {**sent, SCALES: np.array(scales, np.float32)}, {}
         case "top-k":
@@ -102,7 +115,8 @@ def decompress(upload: Upload, sent: Weights, like: Weights) -> Arrays:
     match upload.compression:
         case "int8":
             scales = dict(zip(like, sent[SCALES], strict=True))
-            return {name: (sent[name] * scales[name]).astype(array.dtype) for name, array in like.items()}
+            with np.errstate(invalid="ignore"):
+                return {name: (sent[name] * scales[name]).astype(array.dtype) for name, array in like.items()}
         case "top-k":
             flat = np.zeros(sum(array.size for array in like.values()), np.float32)
             flat[sent[INDICES].astype(np.int64, casting="safe")] = sent[VALUES]

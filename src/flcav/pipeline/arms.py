@@ -150,33 +150,46 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
     before their frames are dealt.
     """
     for setting in settings:
-        edge, cloud = find_strategies(setting.federation)
-        selection, privacy = setting.federation.selection, setting.federation.privacy
-        if setting.federation.network is not None and selection.rule == "importance":
-            raise InputError("federation.network: importance selection draws the clients after they have trained")
-        if setting.federation.network is not None and selection.unbiased:
-            raise InputError("federation.network: unbiased weights need known probabilities, and the radio loses any")
-        if setting.federation.network is not None and privacy is not None and privacy.hides_draws(selection):
-            raise InputError(
-                f"federation.network: rounds are timed before they are run, and {selection.rule} selection under "
-                "central noise draws in secret; 'privacy.seeded' simulates both"
-            )
-        _check_numbers(recipe, setting, edge)
-        if isinstance(edge, FedMD) and setting.central is None:
-            _check_outputs(recipe, setting)
-        if setting.distillation.pose_graph and setting.central is None:
-            check_gtsam()
-        for region in setting.regions:
-            if recipe.regions[region].data is None:
-                names = [f"{region}/cav{i}" for i in range(recipe.vehicles(region))]
-                check_rules(edge, setting.federation, names)
-                if privacy is not None:
-                    affordable_rounds(privacy, selection, names, 1, 0)
-        if CLOUD in setting.stages:
-            check_rules(cloud, setting.federation.of_servers(), setting.regions)
-        how = setting.federation
-        for task in recipe.tasks if how.personal or how.upload.layers or how.score_statistics else ():
-            _check_arrays(task, recipe.tasks[task].network, setting)
+        try:
+            _check_federation(recipe, setting)
+        except InputError as error:
+            if setting.name == MAIN:
+                raise
+            raise InputError(f"arm '{setting.name}': {error}") from None
+
+
+def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
+    how = setting.federation
+    edge, cloud = find_strategies(how)
+    selection, privacy = how.selection, how.privacy
+    if how.network is not None and selection.rule == "importance":
+        raise InputError("federation.network: importance selection draws the clients after they have trained")
+    if how.network is not None and selection.unbiased:
+        raise InputError("federation.network: unbiased weights need known probabilities, and the radio loses any")
+    if how.network is not None and privacy is not None and privacy.hides_draws(selection):
+        raise InputError(
+            f"federation.network: rounds are timed before they are run, and {selection.rule} selection under "
+            "central noise draws in secret; 'privacy.seeded' simulates both"
+        )
+    _check_numbers(recipe, setting, edge)
+    if isinstance(edge, FedMD) and setting.central is None:
+        _check_outputs(recipe, setting)
+    if setting.distillation.pose_graph and setting.central is None:
+        check_gtsam()
+    for region in setting.regions:
+        if recipe.regions[region].data is None:
+            names = [f"{region}/cav{i}" for i in range(recipe.vehicles(region))]
+            check_rules(edge, how, names)
+            if privacy is not None:
+                affordable_rounds(privacy, selection, names, 1, 0)
+    if CLOUD in setting.stages:
+        try:
+            check_rules(cloud, how.of_servers(), setting.regions)
+        except InputError as error:
+            given = "" if how.cloud_strategy else " (that of 'strategy', as none is given)"
+            raise InputError(f"cloud_strategy{given}, among edge servers: {error}") from None
+    for task in recipe.tasks if how.personal or how.upload.layers or how.score_statistics else ():
+        _check_arrays(task, recipe.tasks[task].network, setting)
 
 
 def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:

@@ -16,10 +16,10 @@ from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
 from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import FederationState
-from flcav.federation.strategies import Strategy
+from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.median import Median
-from flcav.federation.trainable import Trainable
+from flcav.federation.trainable import LocalUpdate, Trainable
 
 SCHEDULE = Schedule(rounds=2, steps=5, learning_rate=0.05, final_learning_rate=0.01, seed=3)
 
@@ -109,6 +109,51 @@ def test_a_round_in_which_no_client_reports_is_no_chance_and_ends_the_federation
     with pytest.raises(ClientFailed, match=r"^round 1: .* wanted.*\(grid/cav0: .*no power"):
         federate(clients, START, SCHEDULE, edge(), rules=rules, state=state)
     assert not state.records
+
+
+@pytest.mark.parametrize("samples", [0, -1, 2.5, 10**30, np.nan, np.inf])
+@pytest.mark.parametrize(
+    "rules",
+    [
+        {},
+        {"secure": {}},
+        {"selection": {"rule": "uniform", "clients": 5, "unbiased": True}},
+        {"selection": {"rule": "importance", "clients": 5}},
+    ],
+    ids=["open", "secure", "unbiased", "importance"],
+)
+def test_a_client_of_no_number_of_samples_is_named_and_the_others_go_on(samples: Any, rules: dict[str, Any]):
+    class Odd(Regression):
+        def train(self, *weights: Any, **how: Any) -> LocalUpdate:
+            return replace(super().train(*weights, **how), samples=samples)
+
+        def count_samples(self, steps: int) -> int:
+            return samples
+
+    honest, state = vehicles("grid", 5), FederationState()
+    odd = Odd(honest["grid/cav1"].inputs, honest["grid/cav1"].targets)
+    how = {"rules": Rules.model_validate(rules), "strategy": FEDAVG if rules else Krum(byzantine=0)}
+    federate(honest | {"grid/cav1": odd}, START, SCHEDULE, edge(), state=state, **how)
+    for record in state.records:
+        assert record.failed.keys() == {"grid/cav1"}
+        assert "samples" in record.failed["grid/cav1"]
+
+
+def test_samples_and_loss_may_be_numbers_of_numpy():
+    class Scalars(Regression):
+        def train(self, *weights: Any, **how: Any) -> LocalUpdate:
+            found = super().train(*weights, **how)
+            return replace(found, samples=np.int64(found.samples), loss=np.float32(0.5))
+
+        def count_samples(self, steps: int) -> int:
+            return np.int64(3)  # type: ignore[return-value]
+
+    clients = {name: Scalars(each.inputs, each.targets) for name, each in vehicles("grid", 3).items()}
+    for selection in ({"rule": "importance", "clients": 3}, {"rule": "uniform", "clients": 3, "unbiased": True}):
+        state = FederationState()
+        rules = Rules.model_validate({"selection": selection})
+        federate(clients, START, SCHEDULE, edge(), rules=rules, state=state)
+        assert [(record.failed, record.loss) for record in state.records] == [({}, 0.5)] * SCHEDULE.rounds
 
 
 def test_one_client_that_fails_to_report_does_not_pass_for_a_small_draw():

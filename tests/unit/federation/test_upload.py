@@ -10,6 +10,7 @@ from regression import ledger
 from safetensors.numpy import load, save
 
 from flcav.config import InputError
+from flcav.federation.acceptance import UpdateRefused, read_update
 from flcav.federation.encoding import decode, encode
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import update_bytes
@@ -182,6 +183,18 @@ def test_messages_that_are_no_update_are_told():
         decode(sent, START, rules)
         with pytest.raises((ValueError, IndexError, KeyError)):
             decode({**sent, **wrong}, START, rules)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", ["fp16", "int8", "top-k"])
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
+def test_a_change_that_is_not_finite_is_refused_in_every_form(kind: str, value: float):
+    weights = START | {"body.weight": START["body.weight"].copy()}
+    weights["body.weight"][3, 4] = value
+    rules = Rules(upload=Upload(**KINDS[kind]))
+    sent, _ = encode(LocalUpdate(weights, 2, 1.0), START, rules, {}, 1)
+    with pytest.raises(UpdateRefused, match=r"'body.weight' has values that are not finite"):
+        read_update(sent, START, rules, {})
 
 
 def test_layers_of_another_network_are_one_sentence():

@@ -20,7 +20,14 @@ from flcav.pipeline.recipe import Arm
     [
         ({"strategy": "fedprose"}, "strategy 'fedprose': choose one of fedavg, "),
         ({"strategy": "krum"}, "krum: 5 clients or more are wanted .* and there are 4"),
-        ({"strategy": {"median": {}}, "cloud_strategy": "krum"}, "krum: .* and there are 2"),
+        (
+            {"strategy": {"median": {}}, "cloud_strategy": "krum"},
+            "cloud_strategy, among edge servers: krum: .* and there are 2",
+        ),
+        (
+            {"strategy": {"krum": {"byzantine": 0}}},
+            r"cloud_strategy \(that of 'strategy', as none is given\), among edge servers: krum: .* and there are 2",
+        ),
         ({"cloud_strategy": "fedprox"}, "cloud_strategy: FedProx corrects local steps, and edge servers take none"),
         (
             {"selection": {"rule": "uniform", "clients": 5}},
@@ -41,8 +48,11 @@ from flcav.pipeline.recipe import Arm
     ],
 )
 def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any, said: str) -> None:
-    for recipe, arms in (settings({}, **federation), settings({"other": federation})):
-        with pytest.raises(InputError, match=said):
+    for arm, (recipe, arms) in {
+        "": settings({}, **federation),
+        "arm 'other': ": settings({"other": federation}),
+    }.items():
+        with pytest.raises(InputError, match=f"^{arm}{said}"):
             check_federations(recipe, arms)
 
 
