@@ -141,11 +141,9 @@ def test_a_truncated_point_cloud_in_a_dataset(
     assert not out.exists()
 
 
-def test_a_truncated_cloud_from_the_shell(weights: Path, tmp_path: Path) -> None:
+def test_a_truncated_cloud(weights: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
     (tmp_path / "cloud.bin").write_bytes(bytes(33))
-    done = shell("infer", "objects", tmp_path / "cloud.bin", "--weights", weights, "--json")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "truncated" in one_sentence(done.stderr)
+    assert "truncated" in refused("infer", "objects", tmp_path / "cloud.bin", "--weights", weights, "--json")
 
 
 def test_an_empty_dataset(data: Path, weights: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
@@ -292,12 +290,14 @@ def test_weights_of_another_network(data: Path, weights: Path, tmp_path: Path, r
             assert str(path) in sentence
 
 
-def test_a_plan_over_budget_from_the_shell(tmp_path: Path) -> None:
+def test_a_plan_over_budget(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "problem.yaml").write_text(yaml.safe_dump(PROBLEM))
-    done = shell("allocate", tmp_path / "problem.yaml", "--json")
-    assert done.returncode == 2
-    sentence = one_sentence(done.stderr)
-    assert json.loads(done.stdout) == {"status": "infeasible", "message": sentence}
+    with pytest.raises(SystemExit) as ended:
+        run(["allocate", str(tmp_path / "problem.yaml"), "--json"])
+    assert ended.value.code == 2
+    told = capsys.readouterr()
+    sentence = one_sentence(told.err)
+    assert json.loads(told.out) == {"status": "infeasible", "message": sentence}
     assert "costs 80 MB of wireless uplink" in sentence  # 40 samples, 2 rounds of 4 vehicles
     assert "budgets_mb.wireless = 50" in sentence
 

@@ -1,14 +1,18 @@
 """`flcav place` from files to JSON."""
 
 import json
+from datetime import date
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 
 from flcav.cli.main import run
+from flcav.cli.planning import place_inputs
+from flcav.world.map.town import Town, load_town
 
 ERRORS = "x,y,z,weight\n0,0,0,1\n1,0,0,1\n50,0,0,5\n"
 POLES = "id,x,y,z\n3,0,0,3\n8,50,0,3\n"
@@ -63,6 +67,8 @@ def test_place_chooses_by_weight(files, method, parquet, capsys):
         (ERRORS, {"reach": 0}, "range = 0"),
         (ERRORS.replace("weight", "gravity"), {}, "unknown column 'gravity'"),
         (ERRORS, {"count": 3}, "count = 3"),
+        ("x,y,z,weight\n0,0,0,0\n1,0,0,0\n", {}, "every weight is 0"),
+        ("x,y,z,severity,exposure\n0,0,0,1,1\n1,0,0,-1,-2\n", {}, "row 2: severity = -1 is below 0"),
     ],
 )
 def test_bad_input_is_one_sentence(errors, change, named, files, capsys):
@@ -71,6 +77,39 @@ def test_bad_input_is_one_sentence(errors, change, named, files, capsys):
     err = capsys.readouterr().err
     assert named in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("ids", [[True, False], [1.5, 2.0], [[1], [2]], [b"a", b"b"], [date(2026, 1, 1)] * 2])
+def test_ids_that_are_neither_text_nor_whole_are_one_sentence(ids, files, capsys):
+    poles = files[1].with_suffix(".parquet")
+    pq.write_table(pa.table({"id": ids, "x": [0.0, 50.0], "y": [0.0, 0.0], "z": [3.0, 3.0]}), poles)
+    assert asked((files[0], poles), "--json") == 2
+    err = capsys.readouterr().err
+    assert "row 1: id = " in err
+    assert "is neither text nor a whole number" in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("written", "read"), [(("1", "02"), "02"), (("01", "1"), "1"), (("1", "8"), 8), (("1.0", "8.0"), "8.0")]
+)
+def test_ids_and_columns_of_a_csv_are_read_as_they_are_meant(written, read, files, capsys):
+    files[1].write_text("\ufeffid, x, y, z\n{}, 0, 0, 3\n{}, 50, 0, 3\n".format(*written), encoding="utf-8")
+    assert asked(files, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["chosen"] == [{"pole": read, "sensor": None}]
+
+
+def test_traffic_of_another_town_is_refused(files, monkeypatch, capsys):
+    class OfGrid:
+        keys = ()
+
+        def town(self) -> Town:
+            return load_town("grid")
+
+    monkeypatch.setattr(place_inputs.Dataset, "open", lambda folder: OfGrid())
+    assert asked(files, "--data", "drive", "--town", "ring") == 2
+    assert capsys.readouterr().err == "flcav: --town ring: the traffic of drive is that of grid\n"
+    assert asked(files, "--data", "drive", "--town", "grid") == 0
 
 
 SENSORS = "name,range_m,cost\nlong,100,9\nshort,10,2\n"

@@ -11,9 +11,12 @@ from flcav.config import InputError, shorten
 from flcav.parquet import read_parquet
 
 
-def read_table(path: Path, columns: Sequence[str]) -> pa.Table:
-    """Return the CSV or Parquet table at `path`; raises `InputError` if it is no table, empty, or lacks a column."""
-    table = read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
+def read_table(path: Path, columns: Sequence[str], names: Sequence[str] = ()) -> pa.Table:
+    """Return the CSV or Parquet table at `path`; raises `InputError` if it is no table, empty, or lacks a column.
+
+    names: columns that a CSV has as they are written, "007" not as 7; whole numbers without such zeros are numbers.
+    """
+    table = read_parquet(path) if path.suffix.lower() == ".parquet" else _read_csv(path, names)
     for column in columns:
         if table.column_names.count(column) != 1:
             found = "is missing" if column not in table.column_names else "is there twice"
@@ -23,14 +26,23 @@ def read_table(path: Path, columns: Sequence[str]) -> pa.Table:
     return table
 
 
-def _read_csv(path: Path) -> pa.Table:
+def _read_csv(path: Path, names: Sequence[str]) -> pa.Table:
+    written = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(names, pa.string()))
     try:
-        table = pyarrow.csv.read_csv(path)
-        _ = table.column_names  # decodes them
+        table = pyarrow.csv.read_csv(path, convert_options=written)
+        table = table.rename_columns([column.strip() for column in table.column_names])
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not a table ({error})") from None
+    for name in {*names}.intersection(table.column_names):
+        text = table[name]
+        try:
+            whole = text.cast(pa.int64())
+        except pa.ArrowInvalid:
+            continue
+        if whole.cast(pa.string()).equals(text):
+            table = table.set_column(table.column_names.index(name), name, whole)
     return table
 
 

@@ -1,6 +1,6 @@
 """The inputs of `flcav place`: tables of errors, poles and sensors, and the world in which they stand."""
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from flcav.cli.tables import numbers, read_table
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.dataset.store import Dataset
 from flcav.optimization.placement.instance import find_covered
 from flcav.optimization.placement.solve import Candidates, Placement, find_candidates
@@ -26,6 +26,7 @@ FACTORS = ("weight", "severity", "exposure")  # columns of errors whose product 
 ERRORS = (*AXES, *FACTORS, CLASS, "kind", "returns", "occlusion", "scene", "track")
 POLES = ("id", *AXES, "cost", "yaw_deg", "kind")
 SENSORS = ("name", "range_m", "cost")
+NAMES = ("id", "name")  # columns that are kept as they are written
 FAR = 10  # times the size of a town: errors beyond are on no map of it
 
 
@@ -56,14 +57,13 @@ def read_given(
 ) -> Given:
     """Return the tables; raises `InputError` for files, columns, numbers, ids and factors that are wrong."""
     mistakes, sites = _read(errors, AXES, ERRORS), _read(poles, ("id", *AXES), POLES)
-    ids = tuple(sites["id"].to_pylist())
-    _check_unique(ids, poles, "poles", "id")
+    ids = _identify(sites["id"].to_pylist(), poles, "poles", "id")
     pole_cost = _costs(sites, poles)
     names, ranges, sensor_cost = (None,), np.array([range_m], np.float64), np.zeros(1)
     if sensors is not None:
         kinds = _read(sensors, SENSORS, SENSORS)
-        _check_unique(kinds["name"].to_pylist(), sensors, "sensors", "name")
-        names, sensor_cost = tuple(map(str, kinds["name"].to_pylist())), _costs(kinds, sensors)
+        names = tuple(map(str, _identify(kinds["name"].to_pylist(), sensors, "sensors", "name")))
+        sensor_cost = _costs(kinds, sensors)
         ranges = numbers(kinds, ("range_m",), sensors)[:, 0]
     kind = mistakes["kind"].to_pylist() if "kind" in mistakes.column_names else ["error"] * mistakes.num_rows
     return Given(
@@ -81,13 +81,22 @@ def read_given(
 
 
 def read_world(data: Path | None, town: str | None) -> tuple[Town | None, list[Trace]]:
-    """Return the town that is named, or else the dataset's, and the traffic of the dataset's scenes."""
+    """Return the town that is named, or else the dataset's, and the traffic of the dataset's scenes.
+
+    Raises `InputError` where the dataset is of another town than the one that is named.
+    """
     if data is None:
         return (None if town is None else load_town(town)), []
     dataset = Dataset.open(data)
     scenes = sorted({key.scene for key in dataset.keys})
     traces = [trace for scene in scenes if (trace := dataset.trace(scene)) is not None]
-    return (dataset.town() if town is None else load_town(town)), traces
+    own = dataset.town()
+    if town is None:
+        return own, traces
+    here = load_town(town)
+    if own is not None and own.name != here.name:
+        raise InputError(f"--town {town}: the traffic of {data} is that of {own.name}")
+    return here, traces
 
 
 def check_inside(town: Town, given: Given, errors: Path, poles: Path) -> None:
@@ -125,20 +134,24 @@ def build_candidates(given: Given, town: Town | None, traces: Sequence[Trace]) -
 
 
 def _read(path: Path, needed: Sequence[str], known: Sequence[str]) -> pa.Table:
-    table = read_table(path, needed)
+    table = read_table(path, needed, NAMES)
     if unknown := [name for name in table.column_names if name not in known]:
         raise InputError(f"{path}: unknown column '{unknown[0]}'; known are {', '.join(known)}")
     return table
 
 
-def _check_unique(names: Sequence[Hashable], path: Path, what: str, column: str) -> None:
-    first: dict[Hashable, int] = {}
+def _identify(names: Sequence[object], path: Path, what: str, column: str) -> tuple[int | str, ...]:
+    """Return the names of rows; raises `InputError` for one that lacks, is no text or number, or is there twice."""
+    first: dict[int | str, int] = {}
     for row, name in enumerate(names):
         if name is None or name == "" or name != name:  # the last of a NaN
             raise InputError(f"{path}: row {row + 1} has no {column}")
+        if isinstance(name, bool) or not isinstance(name, int | str):
+            raise InputError(f"{path}: row {row + 1}: {column} = {shorten(name)} is neither text nor a whole number")
         if name in first:
             raise InputError(f"{path}: rows {first[name] + 1} and {row + 1} are two {what} of the {column} {name!r}")
         first[name] = row
+    return tuple(first)
 
 
 def _costs(table: pa.Table, path: Path) -> Array:
@@ -148,7 +161,11 @@ def _costs(table: pa.Table, path: Path) -> Array:
 def _weigh(mistakes: pa.Table, path: Path, class_weights: Sequence[str]) -> Array:
     """Return the weights of errors (E,): the product of their FACTORS and the factor of their class."""
     given = [name for name in FACTORS if name in mistakes.column_names]
-    weight = numbers(mistakes, given, path).prod(axis=1)
+    factor = numbers(mistakes, given, path)
+    if len(below := np.argwhere(factor < 0)):
+        row, column = below[0]
+        raise InputError(f"{path}: row {row + 1}: {given[column]} = {factor[row, column]:g} is below 0")
+    weight = factor.prod(axis=1)
     factors = _parse_factors(class_weights)
     if not factors:
         return weight

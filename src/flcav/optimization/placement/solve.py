@@ -125,6 +125,8 @@ def find_candidates(
     weights = np.ones(len(places)) if weight is None else np.asarray(weight, dtype=np.float64)
     if weights.shape != (len(places),) or not np.all((weights == 0) | (weights >= 1e-9) & (weights <= 1e9)):
         raise InputError("errors: every weight must be 0, or a number from 1e-09 to 1e+09")
+    if not weights.any():
+        raise InputError("errors: every weight is 0")
     ranges = np.asarray(ranges_m, dtype=np.float64)
     for range_m in ranges.tolist():
         if not 0 < range_m <= FARTHEST_M:
