@@ -263,11 +263,16 @@ def _least(
 ) -> tuple[float, Array]:
     """Return the least cost over the local optima from all `starts`, and its parameters (P,)."""
     root = np.sqrt(weight)
+
+    def jacobian(p: Array) -> Array:
+        return form.derivative(p, spent) * root[:, None]
+
+    derivative: Any = jacobian  # SciPy's stub knows the names of methods alone
     results = [
         least_squares(
             lambda p: (form.predict(p, spent) - error) * root,
             start,
-            lambda p: form.derivative(p, spent) * root[:, None],
+            derivative,
             bounds=form.bounds(),
             xtol=tolerance,
             ftol=tolerance,
