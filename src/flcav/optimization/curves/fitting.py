@@ -267,12 +267,11 @@ def _least(
     def jacobian(p: Array) -> Array:
         return form.derivative(p, spent) * root[:, None]
 
-    derivative: Any = jacobian  # SciPy's stub knows the names of methods alone
     results = [
         least_squares(
             lambda p: (form.predict(p, spent) - error) * root,
             start,
-            derivative,
+            jacobian,  # pyright: ignore[reportArgumentType]  # its stub has the names of methods alone
             bounds=form.bounds(),
             xtol=tolerance,
             ftol=tolerance,

@@ -1,4 +1,4 @@
-"""What vehicles know and tell of a frame: their poses and clocks by their own navigation, and what they detect."""
+"""Sightings of vehicles: their poses and clocks by their own navigation, and the boxes that they detect."""
 
 import numpy as np
 from numpy.typing import NDArray
