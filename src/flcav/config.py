@@ -129,14 +129,14 @@ def _inside(place: Place, outer: Place) -> bool:
 
 
 def _models_at(model: type[BaseModel], place: Place) -> list[type[BaseModel]]:
-    """Return the models that the type annotations allow at `place`.
+    """Return the models that the type annotations allow at `place`; none where they want something else.
 
     Indices, keys and tags of unions in the path do not change the model.
     """
     found = [model]
     for part in place:
-        within = [owner.model_fields[part].annotation for owner in found if part in owner.model_fields]
-        found = [each for annotation in within for each in _models_in(annotation)] or found
+        if within := [owner.model_fields[part].annotation for owner in found if part in owner.model_fields]:
+            found = [each for annotation in within for each in _models_in(annotation)]
     return found
 
 

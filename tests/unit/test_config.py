@@ -22,6 +22,7 @@ class Picture(Config):
     shapes: Annotated[tuple[Annotated[Circle | Square, Field(discriminator="kind")], ...], Field(min_length=1)]
     frame: Square | None = None
     by_name: Mapping[str, Circle] = {}
+    paint: str | Mapping[str, Mapping[str, float]] = "white"
 
 
 @pytest.mark.parametrize(
@@ -38,7 +39,10 @@ class Picture(Config):
             {"shapes": [{"kind": "square", "side_m": 1}], "frame": {"sides": 1}},
             r"'frame.side_m' is missing \(and 1 mor",
         ),
-        ({"shapes": [{"kind": "square", "side_m": 1}], "colour": 1}, "'colour'; known fields: by_name, frame, shapes$"),
+        (
+            {"shapes": [{"kind": "square", "side_m": 1}], "colour": 1},
+            "'colour'; known fields: by_name, frame, paint, shapes$",
+        ),
         (
             {"shapes": [{"kind": "square", "side_m": 1}], "by_name": {"a": {"radius_m": 1, "r": 2}}},
             "'by_name.a.r'; known fields: kind, radius_m$",
@@ -60,6 +64,8 @@ def test_numbers_that_nobody_can_mean_are_refused(number: float) -> None:
 def test_a_record_in_the_place_of_which_something_else_stands() -> None:
     with pytest.raises(InputError, match=r"'frame' = 3: must be a mapping of the fields kind, side_m$"):
         parse_config(Picture, {"shapes": [{"kind": "square", "side_m": 1}], "frame": 3}, "p.yaml")
+    with pytest.raises(InputError, match=r"'paint.red' = 3: must be a mapping$"):
+        parse_config(Picture, {"shapes": [{"kind": "square", "side_m": 1}], "paint": {"red": 3}}, "p.yaml")
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "{", "\xff", '{"a": 1' + "0" * 5000 + "}"])

@@ -4,7 +4,7 @@ Each round draws from a stream of its own, so that a resumed federation draws as
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ class Selection(Config):
     probability: float | None = Field(default=None, gt=0, le=1)  # that a client takes part in a round
     unbiased: bool = False  # weigh by the inverse of the probability of taking part, of uniform and poisson
     deadline_s: float | None = Field(default=None, gt=0)
-    seconds: Mapping[str, float] = {}  # predicted time of a round, by client
+    seconds: Mapping[str, Annotated[float, Field(ge=0)]] = {}  # predicted time of a round, by client
     joins: Mapping[str, tuple[int, ...]] = {}  # rounds of a plan, by client
 
     @model_validator(mode="after")

@@ -203,6 +203,7 @@ def test_what_makes_no_sense_is_one_sentence():
         ({"unbiased": True}, "the rule all takes no 'unbiased'"),
         ({**RULES["importance"], "unbiased": True}, "the rule importance takes no 'unbiased'"),
         ({"rule": "poisson", "probability": 0}, "greater than 0"),
+        ({"rule": "deadline", "deadline_s": 1, "seconds": {"cav0": -1.0}}, "greater than or equal to 0"),
         ({"rule": "uniform", "clients": 1, "seconds": SECONDS}, "the rule uniform takes no 'seconds'"),
     )
     for fields, said in wrong:
