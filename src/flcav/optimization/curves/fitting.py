@@ -228,24 +228,29 @@ def _columns(*columns: ArrayLike) -> Array:
 
 
 def _chosen(forms: Sequence[Form[CurveT]], spent: Array, accuracy: ArrayLike, weight: ArrayLike | None) -> Fit[CurveT]:
-    """Return the fit of least AICc: all forms are fitted to a rough tolerance, then the best one exactly."""
+    """Return the fit of least AICc: all forms are fitted roughly, then the best one exactly from where it ended."""
     error = 1 - np.asarray(accuracy, dtype=np.float64)
     weights = np.ones(len(error)) if weight is None else np.asarray(weight, dtype=np.float64)
     if not weights.sum() > 0:
         raise InputError("the weights of the history are all 0")
-    robust = len(error) >= ROBUST_FROM
-    rough = [_measured(_solved(form, spent, error, weights, robust, ROUGH)).aicc for form in forms]
-    return _measured(_solved(forms[int(np.argmin(rough))], spent, error, weights, robust))
+    rough = [_solved(form, spent, error, weights) for form in forms]
+    best = min(rough, key=lambda fitted: _measured(fitted).aicc)
+    return _measured(_solved(best.form, spent, error, weights, [best.parameters], EXACT))
 
 
 def _solved(
-    form: Form[CurveT], spent: Array, error: Array, weight: Array, robust: bool, tolerance: float = EXACT
+    form: Form[CurveT],
+    spent: Array,
+    error: Array,
+    weight: Array,
+    starts: Sequence[ArrayLike] = (),
+    tolerance: float = ROUGH,
 ) -> FitState[CurveT]:
-    """Return the least-squares fit from several starts; if `robust`, refined under the soft L1 loss."""
-    starts = form.starts(max(float(np.median(error)), 1e-3))
+    """Return the least-squares fit from `starts`, by default the form's; with many points refined under soft L1."""
+    starts = starts or form.starts(max(float(np.median(error)), 1e-3))
     _, p = _least(form, spent, error, weight, starts, None, tolerance)
     scale = None
-    if robust:
+    if len(error) >= ROBUST_FROM:
         residuals = (form.predict(p, spent) - error) * np.sqrt(weight)
         scale = max(3 * 1.4826 * float(np.median(np.abs(residuals))), 1e-6)
         _, p = _least(form, spent, error, weight, [p], scale, tolerance)
