@@ -99,6 +99,16 @@ def apply_error(camera_from_lidar: Array, error: Array) -> Array:
     return moved @ camera_from_lidar
 
 
+def measure_error(true: Array, view: View) -> float:
+    """Return the squared error of a view's extrinsics in its standard deviations: 6 in the mean, if those are right.
+
+    `true`: the camera's (4, 4) pose of the LiDAR. The error is what `apply_error` takes to the true extrinsics.
+    """
+    moved = true @ np.linalg.inv(view.camera_from_lidar)
+    error = np.concatenate((Rotation.from_matrix(moved[:3, :3]).as_rotvec(), moved[:3, 3]))
+    return float(error @ np.linalg.solve(view.covariance, error))
+
+
 def correct_extrinsics(shots: Sequence[Shot], calibrated: View, rounds: int = ROUNDS) -> Association:
     """Return the pairs of all shots of one camera, and its view with corrected extrinsics and their covariance.
 
@@ -162,7 +172,8 @@ def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: Vi
 
     By least squares of the sides' offsets in standard deviations, under a Cauchy loss, and of the error of `calibrated`
     in its own: rotation and translation are corrected as far as the pairs show them. A car that stands at one place in
-    several pictures counts as much as one in a single picture, since its offsets are alike in all of them.
+    several pictures counts as much as one in a single picture, since its offsets are alike in all of them. In
+    the covariance the sides of one car inside the picture count as one together, since they do not err by themselves.
     """
     cars = [shot.cars[own.car] for shot, own in zip(shots, pairs, strict=True)]
     boxes = np.concatenate([shot.boxes[own.box] for shot, own in zip(shots, pairs, strict=True)])
@@ -182,7 +193,9 @@ def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: Vi
         return np.concatenate((robust.ravel(), whiten @ error))
 
     found = least_squares(residuals, np.zeros(6), x_scale=np.sqrt(np.diag(calibrated.covariance)))
-    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    slope, prior = found.jac[:-6].reshape(-1, 4, 6), found.jac[-6:]
+    sides = np.maximum(slope.any(axis=2).sum(axis=1), 1)[:, None, None]
+    covariance = np.linalg.inv(np.tensordot(slope / sides, slope, ((0, 1), (0, 1))) + prior.T @ prior)
     return replace(
         calibrated, camera_from_lidar=apply_error(calibrated.camera_from_lidar, found.x), covariance=covariance
     )

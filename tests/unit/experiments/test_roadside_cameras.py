@@ -81,14 +81,15 @@ def test_a_pair_is_right_if_both_are_one_actor() -> None:
 
 
 def test_a_camera_has_a_row_for_each_choice_of_extrinsics() -> None:
-    told = Associated(Offset(30.0, 2.5), pairs=8, right=6, found=5, lone_cars=2, lone_boxes=1, residual_px=12.34)
+    off = Offset(30.0, 2.5)
+    told = Associated(off, 4.25, pairs=8, right=6, found=5, lone_cars=2, lone_boxes=1, residual_px=12.34)
     camera = CameraResult("left", 20, 10, 9, dict.fromkeys((CALIBRATED, CORRECTED, EXACT), told), True)
     intervals = 9
     arms = ("first suite alone", "three suites as calibrated", "three suites registered")
     result = Fig4((), (0,) * intervals, dict.fromkeys(arms, (0,) * intervals), dict.fromkeys(arms, 0.0), (camera,))
     rows = fig4_tables(result)["cameras"].splitlines()
     assert len(rows) == 2 + 3
-    assert rows[2] == "| left | as calibrated | 30 cm, 2.50° | 10 | 9 | 5 (0.50) | 8 | 6 (0.75) | 2 | 1 | 12.3 |"
+    assert rows[2] == "| left | as calibrated | 30 cm, 2.50° | 4.2 | 10 | 9 | 5 (0.50) | 8 | 6 (0.75) | 2 | 1 | 12.3 |"
     assert "of 10 cars 5 are rightly associated as calibrated, off by 2.50 degrees" in result.sentences()[-1]
     assert Fig4.from_json(result.as_json(), "x") == result
     moving = replace(result, cameras=(replace(camera, settled=False),))

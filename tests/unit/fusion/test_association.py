@@ -15,6 +15,7 @@ from flcav.fusion.association import (
     apply_error,
     correct_extrinsics,
     fit_extrinsics,
+    measure_error,
     outline,
     pair,
     project_cars,
@@ -204,6 +205,22 @@ def test_a_pair_less_likely_than_staying_alone_is_made_of_what_stays_alone():
     aside = boxes[:1] + np.array((45.0, 0.0, 45.0, 0.0))
     assert len(pair(Shot(cars[:1], aside), LARGE)) == 1
     assert pair(Shot(cars[:1], np.concatenate((aside, boxes[:1]))), LARGE).box.tolist() == [1]
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["each by itself", "all four of a car together"])
+def test_extrinsics_are_as_sure_as_they_are_right_however_sides_err(together: bool):
+    squared = []
+    for seed in range(24):
+        rng, cars = np.random.default_rng(seed), street(seed)
+        boxes = pinhole(cars, EXACT)
+        whole = np.array([association.side_px(box) for box in boxes])[:, None]
+        drawn = rng.normal(0, 1, (len(cars), 1)) * (1, 1, 1, 1) if together else rng.normal(0, 1, (len(cars), 4))
+        off = np.linalg.cholesky(SPREAD) @ rng.normal(0, 1, 6)
+        calibrated = replace(TRUE, camera_from_lidar=apply_error(EXACT, off))
+        shot = Shot(cars, boxes + whole * drawn)
+        pairs = replace(pair(shot, TRUE), car=np.arange(len(cars)), box=np.arange(len(cars)))
+        squared.append(measure_error(EXACT, fit_extrinsics([shot], [pairs], calibrated)))
+    assert 2 < np.mean(squared) < 7.5
 
 
 def test_a_car_that_stands_counts_as_often_as_one_that_is_seen_once():

@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 
 from flcav.dataset.rectangles import HALF_PX
 from flcav.dataset.store import Dataset
-from flcav.fusion.association import Pairs, Shot, View, correct_extrinsics, pair, spread_of_calibration
+from flcav.fusion.association import (
+    Pairs,
+    Shot,
+    View,
+    correct_extrinsics,
+    measure_error,
+    pair,
+    spread_of_calibration,
+)
 from flcav.fusion.detector import PICTURE_THRESHOLD, load_picture_network
 from flcav.fusion.registration import Offset, measure_offset
 from flcav.geometry import Boxes, inverse
@@ -38,6 +46,7 @@ class Associated:
     """The pairs of all pictures of one camera, by one choice of its extrinsics."""
 
     off: Offset  # of the extrinsics from the true ones
+    squared_error: float | None  # in their own standard deviations, 6 in the mean if those are right; None: exact
     pairs: int
     right: int  # of the pairs, both of one actor
     found: int  # of the pictures' cars, in a right pair
@@ -90,7 +99,8 @@ def associate_camera(
     corrected = correct_extrinsics(shots, calibrated)
 
     def judge(pairs: Sequence[Pairs], view: View) -> Associated:
-        return judge_pairs(pairs, known, measure_offset(true.camera_from_lidar, view.camera_from_lidar))
+        off = measure_offset(true.camera_from_lidar, view.camera_from_lidar)
+        return judge_pairs(pairs, known, off, None if view is true else measure_error(true.camera_from_lidar, view))
 
     return CameraResult(
         name,
@@ -120,8 +130,10 @@ def make_view(
     )
 
 
-def judge_pairs(pairs: Sequence[Pairs], known: Sequence[Known], off: Offset) -> Associated:
-    """Return the counts over all shots of one camera."""
+def judge_pairs(
+    pairs: Sequence[Pairs], known: Sequence[Known], off: Offset, squared_error: float | None = None
+) -> Associated:
+    """Return the counts over all shots of one camera, whose extrinsics are off by `off`."""
     right = [
         (own.cars[each.car] >= 0) & (own.cars[each.car] == own.boxes[each.box])
         for each, own in zip(pairs, known, strict=True)
@@ -130,6 +142,7 @@ def judge_pairs(pairs: Sequence[Pairs], known: Sequence[Known], off: Offset) -> 
     residual_px = np.concatenate([each.residual_px for each in pairs])
     return Associated(
         off,
+        squared_error,
         len(residual_px),
         sum(int(ok.sum()) for ok in right),
         sum(int(ok.sum()) for ok in found),

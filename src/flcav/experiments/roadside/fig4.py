@@ -51,7 +51,7 @@ CAMERAS = {
 LIDAR = RIGS["lidar_pole"].lidars["lidar"].model_dump(mode="json")
 RECIPE: dict[str, Any] = {
     "town": "grid",
-    "seed": 8401,
+    "seed": 8402,
     "split": "test",
     "scenes": 10,
     "spins_per_scene": 2,
