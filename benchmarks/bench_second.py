@@ -25,7 +25,7 @@ from flcav.perception.objects import Sample, Second, detect, sample_from_frame
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network
-from flcav.perception.training import adamw, step
+from flcav.perception.training import AdamW, step
 from flcav.seeds import stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
@@ -72,7 +72,7 @@ def time_on_gpu() -> None:
 
 def _time_on_gpu(network: Second, device: torch.device) -> None:
     batch = (_sweeps(network, RIGS["paper"]) * GPU_BATCH)[:GPU_BATCH]
-    optimizer = adamw(network, 1e-3)
+    optimizer = AdamW(network, 1e-3)
     trained = GPU_BATCH / _median_seconds(lambda: step(OBJECTS, network, optimizer, batch))
     seen = GPU_BATCH / _median_seconds(lambda: predict(network, [sample.points for sample in batch]))
     points, sample = (tensor.to(device) for tensor in _alone(batch[0]))
@@ -115,7 +115,7 @@ def _sweeps(network: Second, rig: str) -> list[Sample]:
 def _time(network: Second, title: str, samples: list[Sample], steps: int) -> None:
     voxels = statistics.mean(len(network.voxels(*_alone(sample), 1).keys) for sample in samples)
     network.train()
-    optimizer = adamw(network, 1e-3)
+    optimizer = AdamW(network, 1e-3)
     training = _median_ms(lambda i: _step(network, optimizer, samples, i), steps) / BATCH
     inference = _median_ms(lambda i: detect(network, samples[i % FRAMES].points), steps)
     print(f"  {title:<18} {voxels:6.0f} voxels, training step {training:7.1f}, inference {inference:7.1f}", flush=True)
@@ -125,7 +125,7 @@ def _alone(sample: Sample) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(sample.points), torch.zeros(len(sample.points), dtype=torch.int64)
 
 
-def _step(network: Second, optimizer: torch.optim.Optimizer, samples: list[Sample], number: int) -> None:
+def _step(network: Second, optimizer: AdamW, samples: list[Sample], number: int) -> None:
     places = range(BATCH * number, BATCH * (number + 1))
     drawn = [
         OBJECTS.draw(samples, place % FRAMES, network.config, stream(0, "augment", number, place)) for place in places

@@ -18,7 +18,7 @@ from flcav.perception.signs.predict import detect
 from flcav.perception.signs.samples import Sample, sample_from_frame
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import build_network
-from flcav.perception.training import adamw, step
+from flcav.perception.training import AdamW, step
 from flcav.seeds import stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
@@ -52,7 +52,7 @@ def main() -> None:
 
 def training(network: SignDetector, samples: list[Sample], batch: int) -> Callable[[], object]:
     """Return a function that takes one optimiser step of the network."""
-    optimizer = adamw(network.train(), SIGNS.practice.learning_rate)
+    optimizer = AdamW(network.train(), SIGNS.practice.learning_rate)
 
     def work() -> float:
         drawn = [SIGNS.draw(samples, place, network.config, stream(0, "augment", place)) for place in range(batch)]

@@ -19,7 +19,7 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.task import Task, build_network
 from flcav.perception.tasks import TASKS, task_named
-from flcav.perception.training import adamw, step
+from flcav.perception.training import AdamW, step
 from flcav.seeds import stream
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
@@ -66,7 +66,7 @@ def time_network(task: Task, name: str, config: Any, data: Dataset) -> None:
 
 
 def training(task: Task, network: Any, samples: Any, batch: int) -> Callable[[], float]:
-    optimizer = adamw(network.train(), task.practice.learning_rate)
+    optimizer = AdamW(network.train(), task.practice.learning_rate)
 
     def work() -> float:
         drawn = [task.draw(samples, i, network.config, stream(0, "augment", i)) for i in range(batch)]

@@ -11,7 +11,7 @@ from cpu_time import cpu_ms
 
 from flcav.dataset.layout import FrameKey
 from flcav.perception.task import build_network
-from flcav.perception.training import adamw, step
+from flcav.perception.training import AdamW, step
 from flcav.perception.trajectory.config import CONFIGURATIONS, FUTURE, PAST, TrajectoryConfig
 from flcav.perception.trajectory.predict import predict
 from flcav.perception.trajectory.rasters import LAYERS
@@ -34,7 +34,7 @@ def main() -> None:
         network = build_network(TRAJECTORY, config, 0)
         batch = 1 if name == "paper-cameras" else BATCH  # a gigabyte of attention for 16
         samples = [made_sample(config)] * batch
-        optimizer = adamw(network, 1e-3)
+        optimizer = AdamW(network, 1e-3)
         repeats = REPEATS if name.startswith("tiny") else 2
         training, inference = cpu_ms(
             (lambda: step(TRAJECTORY, network, optimizer, samples), lambda: predict(network, samples)),  # noqa: B023

@@ -24,13 +24,13 @@ STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and p
 def start_server() -> BaseContext:
     """Start the fork server of this process, if there is none, and return the context that makes workers of it.
 
-    The server is a process of one thread that imports the modules of flcav that this process has now, and with
-    PyTorch what its optimisers import when they are made; a worker is a fork of it, so that many workers import them
-    once. Where it cannot start, each worker is a process that imports them itself (spawn).
+    The server is a process of one thread that imports the modules of flcav that this process has now; a worker is a
+    fork of it, so that many workers import them once. Where it cannot start, each worker is a process that imports them
+    itself (spawn).
     """
     modules = [name for name in [*sys.modules] if name.partition(".")[0] == "flcav"]
     with _STARTING, threads_of_children(1):
-        multiprocessing.set_forkserver_preload([*modules, *(["torch._dynamo"] if "torch" in sys.modules else [])])
+        multiprocessing.set_forkserver_preload(modules)
         try:
             forkserver.ensure_running()
         except OSError:  # its socket is in the folder of temporary files, whose path may be too long for one

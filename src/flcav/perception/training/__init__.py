@@ -1,11 +1,11 @@
 """Training of any task's networks: mini-batches, learning-rate schedules, checkpoints, early stopping."""
 
+from flcav.perception.training.adamw import AdamW
 from flcav.perception.training.loop import (
     SCHEDULES,
     Checkpointing,
     TrainingHistory,
     Validation,
-    adamw,
     batches,
     step,
     train,
@@ -14,10 +14,10 @@ from flcav.perception.training.loop import (
 
 __all__ = [
     "SCHEDULES",
+    "AdamW",
     "Checkpointing",
     "TrainingHistory",
     "Validation",
-    "adamw",
     "batches",
     "step",
     "train",

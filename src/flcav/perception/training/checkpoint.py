@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from flcav.config import Config, InputError
 from flcav.files import write_bytes
 from flcav.perception.card import Card, DataEntry
+from flcav.perception.training.adamw import AdamW
 from flcav.perception.weights import read_card
 
 TRAINED = ("device", "epochs", "patience", "batch", "learning_rate", "schedule")  # settings in `Card.training`
@@ -89,9 +90,7 @@ class RunState:
     best: dict[str, Tensor] | None = None  # weights of the best validation; None before the first
 
 
-def save_checkpoint(
-    path: Path, identity: str, progress: RunState, network: nn.Module, optimizer: torch.optim.Optimizer
-) -> None:
+def save_checkpoint(path: Path, identity: str, progress: RunState, network: nn.Module, optimizer: AdamW) -> None:
     """Write a checkpoint of the run `identity`, atomically: progress, network and optimiser."""
     state = {
         "identity": identity,
@@ -99,14 +98,14 @@ def save_checkpoint(
         "scores": torch.tensor(progress.scores, dtype=torch.float64),
         "best": progress.best,
         "network": network.state_dict(),
-        "optimizer": optimizer.state_dict(),
+        "optimizer": optimizer.state(),
     }
     data = io.BytesIO()
     torch.save(state, data)
     write_bytes(path, data.getvalue())
 
 
-def load_checkpoint(path: Path, identity: str, network: nn.Module, optimizer: torch.optim.Optimizer) -> RunState:
+def load_checkpoint(path: Path, identity: str, network: nn.Module, optimizer: AdamW) -> RunState:
     """Restore network and optimiser in place and return the progress; without a file, an empty progress.
 
     Raises `InputError` if the file is not a checkpoint, or one of another run. No code in the file is executed.
@@ -122,5 +121,5 @@ def load_checkpoint(path: Path, identity: str, network: nn.Module, optimizer: to
     if found != identity:
         raise InputError(f"{path}: the checkpoint of a run with other settings or data; remove it to start afresh")
     network.load_state_dict(state["network"])
-    optimizer.load_state_dict(state["optimizer"])
+    optimizer.restore(state["optimizer"])
     return progress

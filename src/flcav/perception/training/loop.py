@@ -17,6 +17,7 @@ from torch import nn
 
 from flcav.config import InputError
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
+from flcav.perception.training.adamw import AdamW
 from flcav.perception.training.checkpoint import RunState, load_checkpoint, save_checkpoint
 from flcav.progress import Report, ignore_progress
 from flcav.seeds import stream
@@ -116,7 +117,7 @@ def train(
     if schedule not in SCHEDULES:
         raise InputError(f"schedule '{schedule}': choose one of {', '.join(SCHEDULES)}")
     network.train()
-    optimizer = adamw(network, learning_rate)
+    optimizer = AdamW(network, learning_rate)
     waits = None if validation is None else (validation.every, validation.patience)
     settings = [task.name, repr(network.config), steps, batch, learning_rate, schedule, seed, waits]
     identity = f"{json.dumps(settings)} on {len(samples)} samples {checkpointing.of if checkpointing else ''}"
@@ -127,8 +128,7 @@ def train(
         if validation and validation.is_over(done.scores):
             break
         rate = learning_rate * SCHEDULES[schedule](number / steps)
-        for group in optimizer.param_groups:
-            group["lr"] = rate
+        optimizer.learning_rate = rate
         drawn = [
             task.draw(samples, int(index), config, stream(seed, "augment", number, place))
             for place, index in enumerate(order[number])
@@ -177,15 +177,10 @@ def train_steps(
     return float(history.losses.mean()) if steps else 0.0
 
 
-def adamw(network: nn.Module, learning_rate: float) -> torch.optim.AdamW:
-    """Return the AdamW optimiser that all tasks are trained with."""
-    return torch.optim.AdamW(network.parameters(), learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True)
-
-
 def step(
     task: Task[ConfigT, NetworkT, SampleT],
     network: NetworkT,
-    optimizer: torch.optim.Optimizer,
+    optimizer: AdamW,
     samples: Sequence[SampleT],
     correct: Correct | None = None,
 ) -> float:
@@ -194,7 +189,7 @@ def step(
     `correct` changes the gradient before it is clipped.
     """
     loss = task.loss(network, samples)
-    optimizer.zero_grad()
+    network.zero_grad()
     loss.backward()
     if correct is not None:
         correct(network)
