@@ -1,7 +1,8 @@
 """The cheapest roadside sensors that cover a share of the errors: the converse of budgeted maximum coverage.
 
 Small instances are mixed-integer programs. Of large ones a choice is grown greedily, and reduced; the dual of the
-relaxation bounds the cost from below: covered weight <= spare + price * cost, so that cost >= (target - spare) / price.
+relaxation bounds the cost from below: covered weight <= spare + price * cost, so that cost >= (target - spare) / price;
+and so does the candidate that covers most weight per cost, since no choice covers more.
 """
 
 from collections.abc import Sequence
@@ -66,10 +67,12 @@ def minimise(instance: Instance, target: float, method: Method) -> tuple[list[in
             cost = float(instance.cost[chosen].sum())
         relaxed = relax(instance, cost)
     price = max(relaxed.price, 1e-300)
-    least = max((target - relaxed.spare) / price, 0.0)
+    each = instance.covers @ instance.weight / np.maximum(instance.cost, 1e-300)  # most weight per cost, by itself
+    by_dual = (target - relaxed.spare) / price
+    least = max(by_dual, target / float(each.max()))
     if method == "greedy" or cost <= least * (1 + TIE):
         return chosen, least
-    rest = keep_candidates(instance, least + relaxed.loss / price < cost * (1 - TIE))
+    rest = keep_candidates(instance, by_dual + relaxed.loss / price < cost * (1 - TIE))
     if rest.covers.nnz > SEARCHED or rest.weight.sum() < target:
         return chosen, cost if rest.weight.sum() < target else least
     best, bound = minimise_cost(rest, target, limited=True)
