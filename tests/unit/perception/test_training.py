@@ -74,6 +74,10 @@ def test_a_checkpoint_of_another_run_is_refused(samples, tmp_path):
     train(OBJECTS, tiny(), samples, steps=1, seed=0, checkpointing=checkpointing)
     with pytest.raises(InputError, match="other settings"):
         train(OBJECTS, tiny(), samples, steps=1, seed=1, checkpointing=checkpointing)
+    state = torch.load(checkpointing.path, weights_only=True)
+    torch.save(state | {"optimizer": {"state": {}, "param_groups": []}}, checkpointing.path)
+    with pytest.raises(InputError, match="not a checkpoint"):
+        train(OBJECTS, tiny(), samples, steps=1, seed=0, checkpointing=checkpointing)
     checkpointing.path.write_bytes(b"garbage")
     with pytest.raises(InputError, match="not a checkpoint"):
         train(OBJECTS, tiny(), samples, steps=1, seed=0, checkpointing=checkpointing)

@@ -112,14 +112,18 @@ def load_checkpoint(path: Path, identity: str, network: nn.Module, optimizer: Ad
     """
     if not path.exists():
         return RunState()
+    broken = InputError(f"{path}: not a checkpoint; remove it to start afresh")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
         found = str(state["identity"])
         progress = RunState(state["losses"].tolist(), state["scores"].tolist(), state["best"])
     except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError, AttributeError):
-        raise InputError(f"{path}: not a checkpoint; remove it to start afresh") from None
+        raise broken from None
     if found != identity:
         raise InputError(f"{path}: the checkpoint of a run with other settings or data; remove it to start afresh")
-    network.load_state_dict(state["network"])
-    optimizer.restore(state["optimizer"])
+    try:
+        network.load_state_dict(state["network"])
+        optimizer.restore(state["optimizer"])
+    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError):
+        raise broken from None
     return progress
