@@ -67,9 +67,9 @@ def minimise(instance: Instance, target: float, method: Method) -> tuple[list[in
             cost = float(instance.cost[chosen].sum())
         relaxed = relax(instance, cost)
     price = max(relaxed.price, 1e-300)
-    each = instance.covers @ instance.weight / np.maximum(instance.cost, 1e-300)  # most weight per cost, by itself
+    densest = float((instance.covers @ instance.weight / np.maximum(instance.cost, 1e-300)).max())  # weight per cost
     by_dual = (target - relaxed.spare) / price
-    least = max(by_dual, target / float(each.max()))
+    least = max(by_dual, target / densest)
     if method == "greedy" or cost <= least * (1 + TIE):
         return chosen, least
     rest = keep_candidates(instance, by_dual + relaxed.loss / price < cost * (1 - TIE))
