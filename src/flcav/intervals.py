@@ -81,6 +81,10 @@ class MeanOverSeeds(Estimate):
         """Return whether the spread over seeds and scenes is known, so that there are intervals and tests."""
         return self.seeds > 1 and self.shared is not None and (0 < self.mean < 1 or not self.share)
 
+    def as_estimate(self) -> Estimate:
+        """Return the mean and its interval alone."""
+        return Estimate(self.mean, self.low, self.high)
+
     @property
     def slope(self) -> float:
         """Return the derivative of the tests' scale: that of the log-odds for a share, 1 for other numbers."""

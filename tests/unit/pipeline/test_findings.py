@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from flcav.intervals import Estimate, Spread
+from flcav.intervals import Estimate, SharedScenes, Spread, mean_over_seeds
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.collecting.findings import findings
 from flcav.pipeline.collecting.history import gap_closed, gaps_closed
@@ -93,6 +93,20 @@ def test_without_a_spread_of_retraining_no_claim_has_held() -> None:
     (edge,) = told(alone)
     assert edge.verdict == UNDECIDED
     assert "is not known, so this run does not decide" in edge.sentence
+
+
+def test_a_run_with_retrainings_is_judged_by_the_mean_of_its_trainings() -> None:
+    """The first training alone says the opposite; with as much spread from a table it would decide nothing."""
+    values = [-0.01, 0.05, 0.04, 0.06, 0.05, 0.03, 0.04, 0.06]
+    mean = mean_over_seeds(values, shared=SharedScenes(0.006, 30))
+    first = difference(EDGE, (MAIN, PRETRAIN), values[0], -0.022, 0.002)
+    (edge,) = told(replace(first, estimate=mean.as_estimate(), retrained=tuple(values[1:]), over_trainings=mean))
+    assert edge.verdict == HELD
+    assert "(edge FL) in the mean of 8 trainings: +0.040, 95 % interval +0.0" in edge.sentence
+    p_value = mean.p_value()
+    assert p_value is not None
+    assert f"p {p_value:.3f}: the claim held" in edge.sentence
+    assert [each.verdict for each in told(first)] == [UNDECIDED]
 
 
 def test_a_densest_pole_that_was_chosen_leaves_nothing_to_compare() -> None:

@@ -8,7 +8,7 @@ from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import name_repeat
 from flcav.pipeline.collecting.findings import name_stage
-from flcav.pipeline.collecting.tests import number_retrainings, test_folder
+from flcav.pipeline.collecting.tests import mean_over_trainings, number_retrainings, test_folder
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results.saved import OUTCOMES
@@ -49,11 +49,15 @@ def _difference(
 
     over_scenes = compare_tests(task, folder(before, 0), folder(after, 0), graph.recipe.seed)
     retrained = tuple(mean(after, n) - mean(before, n) for n in number_retrainings(graph))
-    spread = measure_spread((over_scenes.mean, *retrained))
+    values = (over_scenes.mean, *retrained)
+    folders = [(folder(after, n), folder(before, n)) for n in range(len(values))]
+    trained = mean_over_trainings(task, over_scenes, values, folders, graph.recipe.seed, share=False)
     told = [name_stage(_owner(graph, *each, region, task), each[1]) for each in (after, before)]
     name = f"{region}, {task}: {' - '.join(told)}"
-    found = Difference(name, *after, *before, region, task, over_scenes, over_scenes, spread, retrained)
-    spread = spread or graph.spreads.get(difference_key(found))
+    found = Difference(name, *after, *before, region, task, over_scenes, over_scenes, measure_spread(values), retrained)
+    if trained is not None:
+        return replace(found, estimate=trained.as_estimate(), over_trainings=trained)
+    spread = found.spread or graph.spreads.get(difference_key(found))
     return found if spread is None else replace(found, estimate=widen(over_scenes, spread), spread=spread)
 
 

@@ -1,14 +1,15 @@
 """Findings of a run: verdicts on the claims of the method, as sentences with the numbers behind them.
 
-A claim says that a difference of a measure is positive. Its 95 % interval is a paired bootstrap over scenes, widened by
-the spread of retraining, and its p-value is that of this interval. P-values of a run are corrected together (Holm).
+A claim says that a difference of a measure is positive. Of a run with retrainings it is judged by the mean over its
+trainings, which share their test scenes. Of one training the 95 % interval is a paired bootstrap over scenes, widened
+by the spread of retraining, and the p-value is that of this interval. P-values of a run are corrected together (Holm).
 A claim held, or did not hold, if its corrected p-value is at most 0.05. It is undecided else, and where the spread is
 not known: another training on the same frames might say otherwise.
 """
 
 from collections.abc import Mapping, Sequence
 
-from flcav.intervals import OneTraining, of_one_training
+from flcav.intervals import MeanOverSeeds, of_one_training
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results.run import ArmResult
@@ -59,12 +60,18 @@ def _judge(
 
     `same`: what is said of each difference where nothing differs, which is not judged.
     """
-    means: list[OneTraining | None] = []
-    for each, none_differs in zip(differences, same, strict=True):
-        scenes = values[each.arm, each.stage, each.region, each.task].result.scenes
-        spread = each.spread if none_differs is None else None
-        means.append(None if spread is None else of_one_training(each.over_scenes, scenes, spread))
+    means = [
+        None if none_differs else _mean(each, values[each.arm, each.stage, each.region, each.task].result.scenes)
+        for each, none_differs in zip(differences, same, strict=True)
+    ]
     return judge_known([None if mean is None else Claim(mean) for mean in means])
+
+
+def _mean(each: Difference, scenes: int) -> MeanOverSeeds | None:
+    """Return the number that is judged: the mean over the run's trainings, or one training of known spread."""
+    if each.over_trainings is not None or each.spread is None:
+        return each.over_trainings
+    return of_one_training(each.over_scenes, scenes, each.spread)
 
 
 def _finding(
@@ -76,16 +83,16 @@ def _finding(
     caveats: Mapping[str, str],
 ) -> Finding:
     """Return the finding of a difference; `same`: what is said where nothing differs."""
-    after = values[each.arm, each.stage, each.region, each.task].result
-    before = _before(each, values).result
+    test, before = values[each.arm, each.stage, each.region, each.task], _before(each, values)
+    after = test.result
     place = f"{each.region}, {each.task}"
     if same is not None:
         return Finding(place, question, UNDECIDED, f"{same}: there is nothing to compare, so this run does not decide.")
     mean, low, high = each.estimate.mean, each.estimate.low, each.estimate.high
     told = (
         f"On {each.region}, {after.measure} of {each.task} was {before.estimate.mean:.3f} "
-        f"({name_stage(each.before_arm, each.before_stage)}) and {after.estimate.mean:.3f} "
-        f"({name_stage(each.arm, each.stage)}): {signed(mean)}"
+        f"({name_stage(each.before_arm, each.before_stage)}) and {test.estimate.mean:.3f} "
+        f"({name_stage(each.arm, each.stage)}){_tell_trainings(each)}: {signed(mean)}"
     )
     over = f"{after.frames} test frames of {after.scenes} scenes"
     if low is None or high is None:
@@ -99,6 +106,10 @@ def _finding(
     said = f"{judged.describe('trainings on these scenes')}: {explain_verdict(judged.verdict)}"
     sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {of}; {said}{rests}."
     return Finding(place, question, judged.verdict, sentence)
+
+
+def _tell_trainings(each: Difference) -> str:
+    return "" if each.over_trainings is None else f" in the mean of {each.over_trainings.seeds} trainings"
 
 
 def _before(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) -> Test:

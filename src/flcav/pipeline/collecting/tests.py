@@ -1,10 +1,16 @@
 """Tests of a run's networks, collected from their steps: intervals over scenes and over retrainings."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from flcav.intervals import measure_spread, widen_share
+import numpy as np
+
+from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds, measure_spread, widen_share
+from flcav.perception.outcomes import Outcomes, Values, share_test_scenes
+from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting, name_repeat
 from flcav.pipeline.graph.graph import Graph
+from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import RegionalTest, Test, Tested
 from flcav.pipeline.seeds.spread import test_key
 
@@ -15,9 +21,44 @@ def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, ta
     result = Tested.load(work / step)
     again = [test_folder(graph, name_repeat(arm, n), stage, region, task) for n in number_retrainings(graph)]
     retrained = tuple(Tested.load(work / each).estimate.mean for each in again)
-    spread = measure_spread((result.estimate.mean, *retrained)) or graph.spreads.get(test_key(task, region, arm, stage))
+    values = (result.estimate.mean, *retrained)
+    spread = measure_spread(values) or graph.spreads.get(test_key(task, region, arm, stage))
+    folders = [(work / each,) for each in (step, *again)]
+    mean = mean_over_trainings(task, result.estimate, values, folders, graph.recipe.seed, share=True)
     estimate = result.estimate if spread is None else widen_share(result.estimate, spread)
-    return Test(arm, stage, region, task, step, result, estimate, spread, retrained)
+    return Test(
+        *(arm, stage, region, task, step, result),
+        *(estimate if mean is None else mean.as_estimate(), spread, retrained, mean),
+    )
+
+
+def mean_over_trainings(
+    task: str, first: Estimate, values: Sequence[float], tests: Sequence[Sequence[Path]], seed: int, *, share: bool
+) -> MeanOverSeeds | None:
+    """Return `mean_of_tests` of a run's own trainings, which share all test scenes.
+
+    `first`: that of the first training over its scenes. None for one training, and where scenes give no interval.
+    """
+    if len(values) < 2 or first.low is None:
+        return None
+    return mean_of_tests(task, values, tests, seed, share=share)
+
+
+def mean_of_tests(
+    task: str, values: Sequence[float], tests: Sequence[Sequence[Path]], seed: int = 0, *, share: bool = False
+) -> MeanOverSeeds:
+    """Return the mean over trainings of a measure, or of the difference of two: over seeds, or of one run.
+
+    `tests`: for each training the folder of the test, or of the later and the earlier one. `seed`: of the draws of
+    scenes. `share`: a number in [0, 1].
+    """
+    outcomes = [[Outcomes.load(folder / OUTCOMES) for folder in own] for own in tests]
+    shared = share_test_scenes(task_named(task), outcomes, _subtract, seed)
+    return mean_over_seeds(values, shared=shared, share=share)
+
+
+def _subtract(measures: Sequence[Values]) -> Values:
+    return np.subtract(*measures) if len(measures) > 1 else measures[0]
 
 
 def number_retrainings(graph: Graph) -> range:

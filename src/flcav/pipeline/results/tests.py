@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
-from flcav.intervals import Estimate, Spread
+from flcav.intervals import Estimate, MeanOverSeeds, Spread
 from flcav.pipeline.results.saved import Saved
+from flcav.records import LEFT_OUT
 
 
 @dataclass(frozen=True)
@@ -30,9 +32,10 @@ class Test:
     task: str
     step: str  # its folder holds the outcomes
     result: Tested  # its interval is over scenes alone
-    estimate: Estimate  # the interval is over scenes and, where the spread is known, over retrainings
+    estimate: Estimate  # of `over_trainings`; else of one training, with the spread of retraining where it is known
     spread: Spread | None  # over retrainings: of this run's own, or of the recipe's table; None: not known
     retrained: tuple[float, ...] = ()  # the measure of each retraining of the arm, on the same frames
+    over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # the run's own trainings, on these scenes
 
 
 @dataclass(frozen=True)
@@ -57,10 +60,11 @@ class Difference:
     before_stage: str
     region: str
     task: str
-    estimate: Estimate  # the interval is over scenes and, where the spread is known, over retrainings
-    over_scenes: Estimate  # the interval is over scenes alone
+    estimate: Estimate  # as in `Test`
+    over_scenes: Estimate  # of the first training; the interval is over scenes alone
     spread: Spread | None  # as in `Test`
     retrained: tuple[float, ...] = ()  # the difference in each retraining
+    over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # as in `Test`
 
 
 @dataclass(frozen=True)

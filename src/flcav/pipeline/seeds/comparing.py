@@ -10,11 +10,11 @@ from flcav.config import InputError
 from flcav.intervals import Estimate, OneTraining, combine_spreads, of_one_training, widen
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
+from flcav.pipeline.collecting.tests import mean_of_tests
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import Test
 from flcav.pipeline.running import RESULTS, WORK, seed_folders
-from flcav.pipeline.seeds.summary import mean_of_tests
 from flcav.verdicts import UNDECIDED, Claim, judge, judge_known
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task

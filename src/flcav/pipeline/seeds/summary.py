@@ -4,15 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from flcav.intervals import MeanOverSeeds, mean_over_seeds
-from flcav.perception.outcomes import Outcomes, Values, share_test_scenes
-from flcav.perception.tasks import task_named
 from flcav.pipeline.collecting.findings import name_stage
+from flcav.pipeline.collecting.tests import mean_of_tests
 from flcav.pipeline.recipe import MAIN
 from flcav.pipeline.results.run import Mean, Run, Summary
-from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import Difference, Test
 from flcav.verdicts import Claim, judge
 
@@ -44,21 +40,6 @@ def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
     )
 
 
-def mean_of_tests(
-    task: str, values: Sequence[float], tests: Sequence[Sequence[Path]], *, share: bool = False
-) -> MeanOverSeeds:
-    """Return the mean over seeds of a measure, or of the difference of two.
-
-    `tests`: for each seed the folder of the test, or of the later and the earlier one. `share`: a number in [0, 1].
-    """
-    outcomes = [[Outcomes.load(folder / OUTCOMES) for folder in own] for own in tests]
-    return mean_over_seeds(values, shared=share_test_scenes(task_named(task), outcomes, _subtract), share=share)
-
-
-def _subtract(measures: Sequence[Values]) -> Values:
-    return np.subtract(*measures) if len(measures) > 1 else measures[0]
-
-
 def _key(test: Test) -> tuple[str, str, str, str]:
     return test.arm, test.stage, test.region, test.task
 
@@ -80,4 +61,4 @@ def _mean_difference(
         pair = ((one.arm, one.stage), (one.before_arm, one.before_stage))
         tested = [own.get((*each, one.region, one.task)) or own[MAIN, each[1], one.region, one.task] for each in pair]
         folders.append([work / test.step for test in tested])
-    return mean_of_tests(one.task, [row.estimate.mean for row in rows], folders)
+    return mean_of_tests(one.task, [row.over_scenes.mean for row in rows], folders)
