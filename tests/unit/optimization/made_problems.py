@@ -60,7 +60,8 @@ def _error(curve: dict, x: NDArray, y: NDArray, z: NDArray, k: int) -> list[tupl
         return [(m["weight"] / total, _error(m["curve"], x, y, z, k)[0][1]) for m in curve["members"]]
     if curve["model"] == "additive":
         powers = ((curve["pretrain"], x), (curve["edge"], y), (curve["cloud"], z))
-        return [(1.0, curve.get("floor", 0) + sum(p["a"] * (v + p["x0"]) ** -p["b"] for p, v in powers))]
+        error = curve.get("floor", 0) + sum(p["a"] * (v + p["x0"]) ** -p["b"] for p, v in powers)
+        return [(1.0, error + np.where(z > 0, curve.get("merge", 0), 0))]
     if curve["model"] == "federated":
         groups, drift = curve["group_samples"], curve["drift"]
         own = sum(groups) / len(groups)

@@ -214,7 +214,7 @@ def test_derivatives_of_every_form_are_those_of_differences():
         *federated_forms(resources, 0.1, None, (30.0, 50.0), 2),
         *federated_forms(resources, 0.1, 0.4, (30.0, 50.0), 2),
     )
-    assert len(forms) == 16 + 2 + 2 + 8 + 8
+    assert len(forms) == 32 + 2 + 2 + 8 + 8
     for form in forms:
         for start in form.starts(0.4):
             p = 1.1 * np.array(start)

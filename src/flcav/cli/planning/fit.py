@@ -25,6 +25,7 @@ class Model(StrEnum):
     additive = "additive"
     effective = "effective"
     federated = "federated"
+    best = "best"
 
 
 ROUNDS = {  # by model: the letters of its formula
@@ -49,7 +50,8 @@ def fit(
         "file, write one with the rest to fill in."
     ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
-    model: Model = typer.Option(Model.additive, "--model", help="How the stages add up."),
+    model: Model = typer.Option(Model.additive, "--model", help="How the stages add up; best: additive or "
+        "federated, whichever has the smaller AICc, as runs are planned."),
     at: list[str] = typer.Option(
         [], "--at", metavar="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]]", help="Where to predict the error; may be given "
         "several times."
@@ -212,7 +214,8 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
     from flcav.cli.terminal import plain_console
 
     console = plain_console()
-    table = Table("task", f"error after x samples, {ROUNDS[fits[0].curve.model]}", "rmse", "R²", "points")
+    rounds = dict.fromkeys(ROUNDS[fit.curve.model] for fit in fits)
+    table = Table("task", f"error after x samples, {' or '.join(rounds)}", "rmse", "R²", "points")
     for answer, fit in zip(answers, fits):
         explained = "–" if fit.r_squared is None else f"{fit.r_squared:.3f}"
         table.add_row(answer["task"], str(fit.curve), f"{fit.rmse:.4f}", explained, str(fit.points))

@@ -15,6 +15,7 @@ from flcav.network.plan import Price
 from flcav.optimization.curves.curves import Curve, Shared
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.area import area, maximise_area
+from flcav.optimization.solvers.branches import solve_branches
 from flcav.optimization.solvers.fairness import minimise_largest_error
 from flcav.optimization.solvers.instance import Clock, Instance, build_instance, price_counts, shared_clock
 from flcav.optimization.solvers.weighted import minimise_weighted_error
@@ -94,9 +95,12 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
     """
     asked = resolve_problem(problem)
     sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
-    best = _METHODS[problem.objective](asked, build_instance(asked, clocks), sought, clocks)
+    method = _METHODS[problem.objective]
+    found = solve_branches(asked, lambda branch: method(branch, build_instance(branch, clocks), sought, clocks))
+    best = (max if problem.objective == "area" else min)(found, key=lambda each: each.objective)
     plans = build_task_plans(problem, best.x)
-    lower = None if best.lower is None else min(best.lower, best.objective)
+    bounds = [each.lower for each in found if each.lower is not None]
+    lower = min(*bounds, best.objective) if bounds else None
     achieved = None if lower is None else relative_gap(best.objective, lower)
     return Allocation(
         status="optimal" if achieved is not None and achieved <= gap else "feasible",

@@ -3,7 +3,7 @@
 Plans are in whole numbers and within both budgets.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from flcav.optimization.allocation.allocate import (
 )
 from flcav.optimization.allocation.vehicles import split_plan, trains
 from flcav.optimization.problem import Problem
+from flcav.optimization.solvers.branches import solve_branches
 from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
 from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance, price_once
 from flcav.optimization.solvers.rounding import trim
@@ -78,7 +79,7 @@ def equal_stages(problem: Problem, made: Instance) -> Array:
         most = np.where(np.arange(3) == stage, high, x)
         budget = x.ravel() @ made.cost + np.where(uses[stage, :], share, 0.0)
         limited = _limited(problem, x, most, budget)
-        x = minimise_weighted_error(build_instance(limited), GAP).x.reshape(-1, 3)
+        x = _minimise(limited).reshape(-1, 3)
     return x.ravel()
 
 
@@ -95,8 +96,24 @@ def equal_tasks(problem: Problem, made: Instance) -> Array:
         alone = problem.model_copy(update={"tasks": (task,)})
         own = slice(number, number + 1)
         limited = _limited(alone, low[own], high[own], low[number] @ cost[number] + share)
-        x[number] = minimise_weighted_error(build_instance(limited), GAP).x
+        x[number] = _minimise(limited)
     return x.ravel()
+
+
+def _minimise(problem: Problem) -> Array:
+    """Return the plan (3N,) of least weighted error."""
+
+    def solve(branch: Problem) -> tuple[float, Array]:
+        made = build_instance(branch)
+        found = minimise_weighted_error(made, GAP)
+        return found.error + made.floor, found.x
+
+    return _least(solve_branches(problem, solve))
+
+
+def _least(plans: Sequence[tuple[float, Array]]) -> Array:
+    """Return the plan of least error among pairs of error and plan."""
+    return min(plans, key=lambda plan: plan[0])[1]
 
 
 def max_throughput(problem: Problem, made: Instance) -> Array:
@@ -115,18 +132,25 @@ def max_throughput(problem: Problem, made: Instance) -> Array:
     return trim(made, x, messages)
 
 
-def round_down_optimum(problem: Problem, made: Instance) -> Array:
+def round_down_optimum(problem: Problem, _made: Instance) -> Array:
     """Return the continuous optimum rounded down (3N,), the last step of the article's allocator.
 
-    Where cloud rounds cost accuracy, it is that of the error's convex envelope.
+    Where each cloud round costs accuracy, it is that of the error's convex envelope.
     """
+    return _least(solve_branches(problem, _round_down))
+
+
+def _round_down(branch: Problem) -> tuple[float, Array]:
+    """Return the rounded optimum of a branch, with its weighted error."""
+    made = build_instance(branch)
     if made.effective is None and len(made.budget) == 2:
         x = relax(made.separable).x
     else:
         program = Program(list_terms(made), made.low, made.high, made.cost, made.budget, list_drifts(made))
         starts = [made.low + (made.high - made.low) * share for share in np.linspace(0, 1, 6) ** 3]
         x, _, _ = continuous_optimum(program, starts, GAP)
-    return trim(made, np.clip(np.floor(x + 1e-9), made.low, made.high), np.ones(len(x)))
+    x = trim(made, np.clip(np.floor(x + 1e-9), made.low, made.high), np.ones(len(x)))
+    return made.error(x) + made.floor, x
 
 
 def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Problem:

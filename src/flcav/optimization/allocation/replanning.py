@@ -101,7 +101,7 @@ def _continued(problem: Problem, task: AllocationTask, spent: TaskState) -> Allo
 def _scaled(curve: Curve, factor: float) -> Curve:
     if isinstance(curve, Additive):
         decays = {name: _smaller(getattr(curve, name), factor) for name in ("pretrain", "edge", "cloud")}
-        return curve.model_copy(update={"floor": curve.floor * factor, **decays})
+        return curve.model_copy(update={"floor": curve.floor * factor, "merge": curve.merge * factor, **decays})
     if isinstance(curve, Effective):
         return curve.model_copy(update={"floor": curve.floor * factor, "a": curve.a * factor})
     if isinstance(curve, Federated):

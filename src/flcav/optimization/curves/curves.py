@@ -1,8 +1,8 @@
 """Learning curves: models of the error as a function of samples, edge rounds and cloud rounds.
 
-`Additive` sums an inverse power law per stage; `Effective` is one inverse power law of effective samples; `Federated`
-is one, too, in which cloud rounds bring the samples of the other regions and may cost accuracy; `Shared` is the
-weighted mean of the curves of tasks with the same network.
+`Additive` sums an inverse power law per stage, and what the first cloud round costs; `Effective` is one inverse power
+law of effective samples; `Federated` is one, too, in which cloud rounds bring the samples of the other regions and may
+cost accuracy; `Shared` is the weighted mean of the curves of tasks with the same network.
 """
 
 from collections.abc import Sequence
@@ -70,10 +70,15 @@ class Decay(CurveConfig):
 
 
 class Additive(CurveConfig):
-    """Additive learning curve: error = floor + the sum of an inverse power law per stage."""
+    """Additive learning curve: error = floor + the sum of an inverse power law per stage + merge from z = 1 on.
+
+    `merge` is what the first cloud round costs, beside what cloud rounds bring: it averages networks that drifted apart
+    in different regions (client drift; Karimireddy et al., 2020, "SCAFFOLD", ICML), and later ones start from the mean.
+    """
 
     model: Literal["additive"] = "additive"
     floor: NonNegative = 0.0
+    merge: NonNegative = 0.0  # added to the error after one cloud round or more
     pretrain: Decay = Decay()
     edge: Decay = Decay()
     cloud: Decay = Decay()
@@ -81,7 +86,8 @@ class Additive(CurveConfig):
     def __str__(self) -> str:
         """Return the formula in x samples, y edge rounds and z cloud rounds."""
         parts = [str(decay).replace("x", name) for name, decay in zip("xyz", self.decays()) if decay.a > 0]
-        return " + ".join([f"{self.floor:.4g}"] * (self.floor > 0) + parts) or "0"
+        merge = [f"{self.merge:.4g} [z > 0]"] * (self.merge > 0)
+        return " + ".join([f"{self.floor:.4g}"] * (self.floor > 0) + parts + merge) or "0"
 
     def decays(self) -> tuple[Decay, Decay, Decay]:
         """Return the decays in the order of `STAGES`."""
@@ -89,7 +95,8 @@ class Additive(CurveConfig):
 
     def error(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int = 1) -> Array:
         """Return the error after the samples and rounds given, elementwise; this model does not depend on `k`."""
-        return self.floor + self.pretrain.at(samples) + self.edge.at(edge_rounds) + self.cloud.at(cloud_rounds)
+        decays = self.pretrain.at(samples) + self.edge.at(edge_rounds) + self.cloud.at(cloud_rounds)
+        return self.floor + decays + self.merge * (np.asarray(cloud_rounds) > 0)
 
 
 class Effective(CurveConfig):

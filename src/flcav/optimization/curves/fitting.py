@@ -121,7 +121,7 @@ class FitState(Generic[CurveT]):
 def fit(
     history: History,
     *,
-    model: Literal["additive", "effective", "federated"] = "additive",
+    model: Literal["additive", "effective", "federated", "best"] = "additive",
     group_samples: float | Sequence[float] = 0.0,
     k: int = 1,
     alpha: float = 0.1,
@@ -130,9 +130,11 @@ def fit(
     """Return the learning curve fitted to the history of one task: the error by samples, edge rounds and cloud rounds.
 
     `model` is `Additive`, `Effective` or `Federated`; the other settings belong to the last two, see `fit_effective`
-    and `fit_federated`. `group_samples` are those of all regions, or of each. Where runs of several seeds are in the
-    history, the curve is that of a mean seed (`level_seeds`). Raises `InputError` where there are too
-    few points, where the effective model lacks `group_samples` for a history with rounds, and as `fit_federated` does.
+    and `fit_federated`. The best one is the additive or, where there are several regions and cloud rounds vary, the
+    federated one, whichever has the smaller AICc; runs are planned by it. `group_samples` are those of all regions, or
+    of each. Where runs of several seeds are in the history, the curve is that of a mean seed (`level_seeds`). Raises
+    `InputError` where there are too few points, where the effective model lacks `group_samples` for a history with
+    rounds, and as `fit_federated` does.
 
     >>> from flcav import fit
     >>> from flcav.optimization import article_histories  # the points of Wang et al., Fig. 3a
@@ -146,6 +148,11 @@ def fit(
     if model == "additive":
         return fit_additive(*columns)
     held = (group_samples,) if isinstance(group_samples, int | float) else tuple(group_samples)
+    if model == "best":
+        fits: list[CurveFit] = [fit_additive(*columns)]
+        if len(held) > 1 and np.ptp(cloud_rounds) > 0:
+            fits.append(fit_federated(*columns, group_samples=held, k=k, alpha=alpha, beta=beta))
+        return min(fits, key=lambda found: found.aicc)
     if model == "federated":
         return fit_federated(*columns, group_samples=held, k=k, alpha=alpha, beta=beta)
     if sum(held) == 0 and history.resources[:, 1:].any():

@@ -2,7 +2,7 @@
 
 A decay a (x + x0)^(-b) is fitted as h ((x + x0) / (m + x0))^(-b), where m is the geometric mean of the resources. h is
 the error in the middle of the data, of order 1 and almost independent of b, whereas a varies by orders of magnitude
-with b. Parameters but the drift are bounded to be >= 0, so every curve without drift falls with every resource.
+with b. Parameters but the drift are bounded to be >= 0, so curves without drift or merge fall with every resource.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ STARTS = (0.1, 0.5, 1.5)  # exponents at the starts of the search
 LARGEST_BETA = 1e3  # relative to alpha
 DEFAULT_BETA = 0.5  # of the article
 LARGEST_GAMMA = 1e2
-START_GAMMA, START_DRIFT = 0.5, 0.02  # starts of the search; of the drift with either sign
+START_GAMMA, START_DRIFT = 0.5, 0.02  # starts of the search; of a curve's drift with either sign
 FITTED = "the fitted curve"  # origin in error messages
 
 
@@ -69,9 +69,10 @@ class Form(Protocol[CurveT]):
 
 @dataclass(frozen=True)
 class AdditiveForm:
-    """Form of an additive curve: floor + a decay per stage that varies.
+    """Form of an additive curve: floor + a decay per stage that varies + the cost of the first cloud round.
 
-    The parameters p are h of each stage, b of each stage, the floor if it is fitted, and the fitted x0.
+    The parameters p are h of each stage, b of each stage, the floor if it is fitted, the fitted x0, and the cost if it
+    is fitted.
     """
 
     stages: tuple[int, ...]  # those that vary, as indices into `STAGES`
@@ -79,23 +80,26 @@ class AdditiveForm:
     shifted: tuple[int, ...]  # stages whose x0 is fitted; else it is 0, or 1 where the stage has a row at 0
     middle: tuple[float, ...]  # per stage that varies: the geometric mean m of the resources
     rest: tuple[float, ...]  # per stage of all three: x0 where it is not fitted
+    merge: bool  # whether the cost of the first cloud round is fitted; else it is 0
 
     @property
     def simplest(self) -> bool:
-        """True where neither the floor nor any x0 is fitted."""
-        return not self.floor and not self.shifted
+        """True where neither the floor nor any x0 nor the cost of the first cloud round is fitted."""
+        return not (self.floor or self.shifted or self.merge)
 
     def bounds(self) -> tuple[list[float], list[float]]:
         """Return the least and most of each parameter."""
         n, shifts = len(self.stages), self._middle_shifts()
         least = [1e-9] * n + [FLATTEST] * n + [0.0] * self.floor + [1e-3 * shift for shift in shifts]
+        least += [0.0] * self.merge
         most = [np.inf] * n + [STEEPEST] * n + [1.0] * self.floor + [1e3 * shift for shift in shifts]
-        return least, most
+        return least, most + [1.0] * self.merge
 
     def starts(self, level: float) -> list[list[float]]:
-        """Return one start per exponent of `STARTS`."""
-        n, shifts = len(self.stages), self._middle_shifts()
-        return [[level / n] * n + [b] * n + [level / 10] * self.floor + shifts for b in STARTS]
+        """Return one start per exponent of `STARTS`; with a `merge` one of the middle exponent."""
+        n, rest = len(self.stages), self._middle_shifts() + [START_DRIFT] * self.merge
+        exponents = STARTS[1:2] if self.merge else STARTS
+        return [[level / n] * n + [b] * n + [level / 10] * self.floor + rest for b in exponents]
 
     def predict(self, p: Array, resources: Array) -> Array:
         """Return the errors (n,) at `resources` (n, 3)."""
@@ -103,7 +107,7 @@ class AdditiveForm:
         for i, (stage, m) in enumerate(zip(self.stages, self.middle)):
             h, b, x0 = self._decay(p, i)
             total = total + h * ((resources[:, stage] + x0) / (m + x0)) ** -b
-        return total
+        return total + p[-1] * (resources[:, 2] > 0) if self.merge else total
 
     def derivative(self, p: Array, resources: Array) -> Array:
         """Return the Jacobian (n, P) of the errors at `resources` (n, 3) with respect to the parameters."""
@@ -115,6 +119,8 @@ class AdditiveForm:
             columns[i], columns[n + i], slope = _power_derivatives(h, b, shifted, m + x0)
             if stage in self.shifted:  # x0 is in numerator and denominator
                 columns[2 * n + self.floor + self.shifted.index(stage)] = slope * (1 - shifted / (m + x0))
+        if self.merge:
+            columns[-1] = resources[:, 2] > 0
         return columns.T
 
     def curve(self, p: Array) -> Additive:
@@ -124,7 +130,8 @@ class AdditiveForm:
             h, b, x0 = self._decay(p, i)
             decays[STAGES[stage]] = {"a": float(h * (m + x0) ** b), "b": b, "x0": x0}
         floor = _share(p[2 * len(self.stages)]) if self.floor else 0.0
-        return parse_config(Additive, {"floor": floor, **decays}, FITTED)
+        merge = _share(p[-1]) if self.merge else 0.0
+        return parse_config(Additive, {"floor": floor, "merge": merge, **decays}, FITTED)
 
     def _decay(self, p: Array, i: int) -> tuple[float, float, float]:
         stage = self.stages[i]
@@ -137,9 +144,10 @@ class AdditiveForm:
 
 
 def additive_forms(resources: Array) -> list[AdditiveForm]:
-    """Return the candidate forms for `resources` (n, 3): with and without a fitted floor and each fitted x0.
+    """Return the candidate forms for `resources` (n, 3): with and without a fitted floor, each fitted x0 and a `merge`.
 
-    A stage that never varies is left out. Raises `InputError` where there are too few points.
+    A stage that never varies is left out, and the cost of the first cloud round where there are not several cloud
+    rounds beside none: it would be the decay of the first. Raises `InputError` where there are too few points.
     """
     stages = tuple(stage for stage in range(3) if len(np.unique(resources[:, stage])) > 1)
     if not stages or len(resources) < 2 * len(stages):
@@ -149,8 +157,10 @@ def additive_forms(resources: Array) -> list[AdditiveForm]:
         )
     middle = tuple(float(np.exp(np.log(np.maximum(resources[:, stage], 1)).mean())) for stage in stages)
     rest = tuple(np.where(resources.min(axis=0) == 0, 1.0, 0.0).tolist())
+    merges = (False, True) if rest[2] and len(np.unique(resources[:, 2])) > 2 else (False,)
     return [
-        AdditiveForm(stages, floor, tuple(s for s, fitted in zip(stages, shifts) if fitted), middle, rest)
+        AdditiveForm(stages, floor, tuple(s for s, fitted in zip(stages, shifts) if fitted), middle, rest, merge)
+        for merge in merges
         for floor, *shifts in product((False, True), repeat=1 + len(stages))
     ]
 
@@ -279,11 +289,11 @@ class FederatedForm:
         return [1e-9, FLATTEST, *self._fitted(0.0, 0.0, -1.0, 0.0)], [np.inf, STEEPEST, *most]
 
     def starts(self, level: float) -> list[list[float]]:
-        """Return one start per exponent of `STARTS`, and sign of the drift if that is fitted."""
-        drifts = (START_DRIFT, -START_DRIFT) if self.drift else (0.0,)
+        """Return one start per exponent of `STARTS`; where the drift is fitted, of the middle one with either sign."""
+        exponents, drifts = (STARTS[1:2], (START_DRIFT, -START_DRIFT)) if self.drift else (STARTS, (0.0,))
         return [
             [level, b, *self._fitted(level / 10, START_GAMMA, drift, DEFAULT_BETA)]
-            for b, drift in product(STARTS, drifts)
+            for b, drift in product(exponents, drifts)
         ]
 
     def predict(self, p: Array, resources: Array) -> Array:

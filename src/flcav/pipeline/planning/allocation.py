@@ -12,7 +12,7 @@ from flcav.optimization.allocation.allocate import TaskPlan as Allotted
 from flcav.optimization.allocation.baselines import baseline
 from flcav.optimization.allocation.fleet import allocate_fleet
 from flcav.optimization.allocation.vehicles import Shares
-from flcav.optimization.curves.fitting import CurveFit, fit
+from flcav.optimization.curves.fitting import fit
 from flcav.optimization.curves.history import History
 from flcav.optimization.problem import Problem
 from flcav.pipeline.arms import PlanRule
@@ -84,17 +84,6 @@ def allocate_tasks(problem: Problem) -> tuple[Sequence[Allotted], Shares]:
     return plan.tasks, shares
 
 
-def fit_curve(history: History, group_samples: tuple[int, ...], k: int) -> CurveFit:
-    """Return the learning curve of least AICc: additive or, where cloud rounds vary between regions, federated.
-
-    `group_samples` are the samples held in each region, `k` the edge rounds per cloud round.
-    """
-    fits: list[CurveFit] = [fit(history)]
-    if len(group_samples) > 1 and np.ptp(history.resources[:, 2]) > 0:
-        fits.append(fit(history, model="federated", group_samples=group_samples, k=k))
-    return min(fits, key=lambda found: found.aicc)
-
-
 def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarray) -> Problem:
     """Return the allocation problem, as `flcav allocate` reads it."""
     wireless, wireline = budgets_mb.tolist()
@@ -109,7 +98,8 @@ def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarr
 
 def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
     assert task.history is not None
-    found = fit_curve(task.history, frame.group_samples, frame.edge_rounds_per_cloud_round)
+    k = frame.edge_rounds_per_cloud_round
+    found = fit(task.history, model="best", group_samples=frame.group_samples, k=k)
     least, most = frame.limits.samples
     most = task.pool if most is None else min(most, task.pool)
     measured = task.history.resources.max(axis=0)
