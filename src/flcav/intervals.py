@@ -50,6 +50,16 @@ class Estimate:
         return f"{self.mean:{form}} ({self.low:{form}} to {self.high:{form}})"
 
 
+def average_estimates(estimates: Sequence[Estimate]) -> Estimate:
+    """Return the mean of independent estimates; half-widths add in quadrature. One without an interval gives none."""
+    n, mean = len(estimates), float(np.mean([each.mean for each in estimates]))
+    below = [each.mean - each.low for each in estimates if each.low is not None]
+    above = [each.high - each.mean for each in estimates if each.high is not None]
+    if min(len(below), len(above)) < n:
+        return Estimate(mean, None, None)
+    return Estimate(mean, mean - float(np.linalg.norm(below)) / n, mean + float(np.linalg.norm(above)) / n)
+
+
 @dataclass(frozen=True)
 class SharedScenes:
     """The part of the spread of a mean over seeds that more seeds do not reduce, since they share test scenes."""
@@ -321,8 +331,8 @@ def power_of_seeds(
     if error == 0:
         return float(effect != 0)
     beyond, limit = abs(effect) / error, stdtrit(freedom, 1 - level / 2)
-    wrong_side = np.nan_to_num(nctdtr(freedom, beyond, -limit))  # not a number where it is next to 0
-    return float(1 - nctdtr(freedom, beyond, limit) + wrong_side)
+    missed, wrong_side = np.nan_to_num(nctdtr(freedom, beyond, [limit, -limit]))  # not a number where next to 0
+    return float(1 - missed + wrong_side)
 
 
 def plan_seeds(

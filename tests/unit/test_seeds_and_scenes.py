@@ -195,6 +195,13 @@ def test_seeds_for_a_share_are_planned_on_the_scale_of_its_test() -> None:
         assert share >= plain
 
 
+def test_a_larger_effect_never_takes_more_seeds() -> None:
+    """Also where the noncentral t distribution is next to 0, which SciPy gives as not a number."""
+    for sd in (0.002, 0.0056, 0.01, 0.02):
+        seeds = [plan_seeds(effect, sd) or 10**6 for effect in np.arange(0.005, 0.08, 0.0025)]
+        assert seeds == sorted(seeds, reverse=True)
+
+
 def test_power_is_that_of_simulated_tests() -> None:
     rng = np.random.default_rng(4)
     for effect, seeds, level in ((0.9, 5, 0.05), (1.5, 8, 0.05 / 6), (6.0, 3, 0.05)):

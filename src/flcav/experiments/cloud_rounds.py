@@ -1,19 +1,20 @@
 """Cloud rounds over retrainings: weight divergence of the regions, and what their mean gains over stage II."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import cast
 
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.stats import permutation_test, rankdata
 
 from flcav.federation.divergence import RoundDivergence
 from flcav.markdown import format_table
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.training import FederatedRound, StageResult
+from flcav.seeds import stream
 
 PARTS = ("whole", "learned", "statistics")  # of `Divergence`
 CORRELATION = "rank correlation with the mean gain"
+PERMUTATIONS = 50_000  # more than those of 8 trainings
 
 
 def cloud_tables(run: Run) -> dict[str, str]:
@@ -88,16 +89,27 @@ def format_divergence(
     ]
     means = [f"{np.mean(own):.4f}" for own in columns.values()]
     rows.append(["mean", *means, *(f"{np.mean(own):+.3f}" for own in shown.values())])
-    rows.append([CORRELATION, *(_correlate(own, gain) for own in columns.values()), *("" for _ in shown)])
+    rows.append([CORRELATION, *(describe_correlation(own, gain) for own in columns.values()), *("" for _ in shown)])
     return format_table(("", *columns, *shown), rows)
 
 
-def _correlate(values: Sequence[float], gain: Sequence[float]) -> str:
-    """Return Spearman's rho with its p-value; nothing where one side is constant, or of fewer than 3 trainings."""
+def describe_correlation(values: Sequence[float], gain: Sequence[float]) -> str:
+    """Return Spearman's rho with its p-value by a permutation test, which is exact up to 8 trainings.
+
+    The text is empty where one side is constant, and for fewer than 3 trainings.
+    """
     if len(values) < 3 or len({*values}) == 1 or len({*gain}) == 1:
         return ""
-    rho, p = cast(tuple[float, float], spearmanr(values, gain))
-    return f"{rho:+.2f} (p {p:.2f})"
+    ranks, of_gain = rankdata(values), rankdata(gain)
+    centred = of_gain - of_gain.mean()
+    drawn = permutation_test(
+        (ranks,),
+        lambda order, axis: np.tensordot(order, centred, (axis, 0)),
+        permutation_type="pairings",
+        n_resamples=PERMUTATIONS,
+        rng=stream(0, "permutations"),
+    )
+    return f"{np.corrcoef(ranks, of_gain)[0, 1]:+.2f} (p {drawn.pvalue:.2f})"
 
 
 def _statistics(task: str, trainings: Sequence[StageResult]) -> str:
