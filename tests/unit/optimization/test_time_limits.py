@@ -171,3 +171,11 @@ def test_the_pareto_front_is_what_no_other_row_dominates(seed: int, columns: int
     rows = {tuple(row) for row in cost.tolist()}
     front = {row for row in rows if not any(o != row and all(a <= b for a, b in zip(o, row)) for o in rows)}
     assert sorted(map(tuple, cost[found].tolist())) == sorted(front)
+
+
+def test_a_horizon_in_which_nothing_takes_time_is_told() -> None:
+    values: dict[str, Any] = written(1, 1, "additive", SMALL, 300.0) | {"horizon_s": 10.0}
+    (warning,) = allocate(parsed(values)).warnings
+    assert warning == "horizon_s = 10 limits nothing: no task has train_s, vehicle_train_s or uplink_mbps"
+    values["tasks"][0]["train_s"] = 1.0
+    assert allocate(parsed(values)).warnings == ()

@@ -112,7 +112,7 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
         marginal_error_per_gb=Price(*(MB_PER_GB * max(float(rate), 0.0) for rate in best.rates[:2])),
         busy_s=_busy_s(asked, plans),
         note=NO_CERTIFICATE if lower is None else None,
-        warnings=_beyond(problem, plans),
+        warnings=(*_idle_horizon(problem), *_beyond(problem, plans)),
     )
 
 
@@ -186,6 +186,15 @@ def evaluate_objective(problem: Problem, plans: Sequence[TaskPlan]) -> float:
         float(learner.curve.error(*own, k=k)) for task, own in zip(problem.tasks, counts) for learner in task.learners
     ]
     return max(errors) if problem.objective == "max-min" else area(1 - np.array(errors))
+
+
+def _idle_horizon(problem: Problem) -> tuple[str, ...]:
+    """Return a warning where the problem has a horizon, and nothing in it takes time."""
+    if problem.horizon_s is None or any(
+        task.uplink_mbps or task.train_s or task.vehicle_train_s for task in problem.tasks
+    ):
+        return ()
+    return (f"horizon_s = {problem.horizon_s:g} limits nothing: no task has train_s, vehicle_train_s or uplink_mbps",)
 
 
 def _beyond(problem: Problem, plans: tuple[TaskPlan, ...]) -> tuple[str, ...]:
