@@ -7,7 +7,7 @@ which turns from squares to absolute values at three standard deviations (estima
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal
 
 import numpy as np
@@ -235,33 +235,43 @@ def _columns(*columns: ArrayLike) -> Array:
 
 
 def _chosen(forms: Sequence[Form[CurveT]], spent: Array, accuracy: ArrayLike, weight: ArrayLike | None) -> Fit[CurveT]:
-    """Return the fit of least AICc: all forms are fitted roughly, then the best one exactly from where it ended."""
+    """Return the fit of least AICc: forms are fitted roughly, then the best one exactly from where it ended.
+
+    Least squares have no larger AICc than the refined fit of the same form, so that forms are refined in the order of
+    their squares' AICc, until that of the next is no less than the best refined one.
+    """
     error = 1 - np.asarray(accuracy, dtype=np.float64)
     weights = np.ones(len(error)) if weight is None else np.asarray(weight, dtype=np.float64)
     if not weights.sum() > 0:
         raise InputError("the weights of the history are all 0")
-    rough = [_solved(form, spent, error, weights) for form in forms]
-    best = min(rough, key=lambda fitted: _measured(fitted).aicc)
-    return _measured(_solved(best.form, spent, error, weights, [best.parameters], EXACT))
+    level = max(float(np.median(error)), 1e-3)
+    squares = [_fit_squares(form, spent, error, weights, form.starts(level), ROUGH) for form in forms]
+    found: list[tuple[float, FitState[CurveT]]] = []
+    for aicc, rough in sorted(((_measured(each).aicc, each) for each in squares), key=lambda pair: pair[0]):
+        if found and aicc >= min(found, key=lambda pair: pair[0])[0]:
+            break
+        refined = _refine(rough, ROUGH)
+        found.append((_measured(refined).aicc, refined))
+    best = min(found, key=lambda pair: pair[0])[1]
+    return _measured(_refine(_fit_squares(best.form, spent, error, weights, [best.parameters], EXACT), EXACT))
 
 
-def _solved(
-    form: Form[CurveT],
-    spent: Array,
-    error: Array,
-    weight: Array,
-    starts: Sequence[ArrayLike] = (),
-    tolerance: float = ROUGH,
+def _fit_squares(
+    form: Form[CurveT], spent: Array, error: Array, weight: Array, starts: Sequence[ArrayLike], tolerance: float
 ) -> FitState[CurveT]:
-    """Return the least-squares fit from `starts`, by default the form's; with many points refined under soft L1."""
-    starts = starts or form.starts(max(float(np.median(error)), 1e-3))
-    _, p = _least(form, spent, error, weight, starts, None, tolerance)
-    scale = None
-    if len(error) >= ROBUST_FROM:
-        residuals = (form.predict(p, spent) - error) * np.sqrt(weight)
-        scale = max(3 * 1.4826 * float(np.median(np.abs(residuals))), 1e-6)
-        _, p = _least(form, spent, error, weight, [p], scale, tolerance)
-    return FitState(form, p, spent, error, weight, scale)
+    """Return the least-squares fit from `starts`."""
+    return FitState(form, _least(form, spent, error, weight, starts, None, tolerance)[1], spent, error, weight, None)
+
+
+def _refine(fitted: FitState[CurveT], tolerance: float) -> FitState[CurveT]:
+    """Return a least-squares fit refined under soft L1 where there are many points; else the fit itself."""
+    if len(fitted.error) < ROBUST_FROM:
+        return fitted
+    form, weight, p = fitted.form, fitted.weight, fitted.parameters
+    residuals = (form.predict(p, fitted.resources) - fitted.error) * np.sqrt(weight)
+    scale = max(3 * 1.4826 * float(np.median(np.abs(residuals))), 1e-6)
+    _, p = _least(form, fitted.resources, fitted.error, weight, [p], scale, tolerance)
+    return replace(fitted, parameters=p, scale=scale)
 
 
 def _least(
