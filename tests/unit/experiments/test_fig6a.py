@@ -5,7 +5,16 @@ import pytest
 
 from flcav.config import InputError
 from flcav.experiments.fig6a.findings import allocation_findings
-from flcav.experiments.fig6a.results import EQUAL, JOINT, AllocationResult, AllocationSeed, AtBudgets, Planned, Reached
+from flcav.experiments.fig6a.results import (
+    EQUAL,
+    JOINT,
+    MEAN,
+    AllocationResult,
+    AllocationSeed,
+    AtBudgets,
+    Planned,
+    Reached,
+)
 from flcav.experiments.fig6a.run import BUDGETS, PLANS, STAGES, _collect, budget_recipes, draw_allocation, summarise
 from flcav.experiments.fig6a.tables import tables
 from flcav.intervals import Estimate
@@ -15,7 +24,7 @@ from flcav.pipeline.results.run import LinkUse
 from flcav.report.charts.plans import predicted_and_realised
 from flcav.sources.recipe import recipe_path
 
-TOWNS = ("grid", "ring")
+TOWNS = (MEAN, "grid", "ring")
 PREDICTED = {EQUAL: (0.49, 0.60, 0.62), JOINT: (0.53, 0.63, 0.66)}
 HISTORY = {"samples": (80.0, 320.0), "edge_rounds": (0.0, 6.0), "cloud_rounds": (0.0, 3.0)}
 
@@ -70,7 +79,7 @@ def test_a_region_without_a_sensor_is_named() -> None:
 
 
 def test_differences_are_paired_by_seed() -> None:
-    found = RIGHT.summary.realised_difference["grid"]["cloud"]
+    found = RIGHT.summary.realised_difference[MEAN]["cloud"]
     assert found.mean == pytest.approx(np.mean([0.05, 0.06, 0.05]))
     assert found.low == pytest.approx(found.mean - 4.302653 * np.std([0.05, 0.06, 0.05], ddof=1) / np.sqrt(3))
     assert RIGHT.summary.predicted_difference["cloud"] == pytest.approx(0.04)
@@ -82,7 +91,8 @@ def test_a_prediction_that_came_true_is_said_to_have_held() -> None:
     assert "0.613 with equal stages and 0.667 with the joint plan: +0.053" in better
     assert "predicts +0.040 for the joint plan; 3 of 3 seeds agree in sign, and so does their mean" in ranking
     assert "edge FL of the joint plan (12 rounds) +0.107 (+0.092 to +0.121)" in stages
-    assert "off its prediction by 0.013 on average" in accuracy
+    assert "off its prediction by 0.013 (0.006 to 0.021) on average" in accuracy
+    assert "where 0.040 are predicted to lie between the plans; p 0." in accuracy
     assert "within its budgets, at 63% to 98%" in budgets
     assert "−0.50 to +1.00 MB" in budgets
 
@@ -100,7 +110,7 @@ def test_a_stage_that_costs_accuracy_is_said_beside_what_it_brought_elsewhere() 
     stages = results_of(*rows).findings[2]
     assert stages.verdict == "did not hold"
     assert "cloud FL of the joint plan (1 round) −0.035 (−0.047 to −0.023)" in stages.sentence
-    assert "foresees a loss" in stages.sentence
+    assert "The curve predicted +0.030 for cloud FL of the joint plan." in stages.sentence
     assert "on ring the same stage brought −0.035" in stages.sentence
     assert results_of(rows[0]).findings[2].verdict == "undecided"
 
@@ -109,10 +119,10 @@ def test_seeds_that_disagree_decide_nothing() -> None:
     mixed = results_of(((0.48, 0.58, 0.60), (0.5, 0.6, 0.65)), ((0.5, 0.6, 0.65), (0.5, 0.6, 0.63)))
     assert verdicts(mixed)[:2] == ["undecided", "undecided"]
     assert "1 of 2 seeds agree in sign, and so does their mean, but that is undecided" in mixed.findings[1].sentence
-    assert "corrected for 5 claims; to tell an effect of this size takes about 131 seeds" in (
+    assert "corrected for 6 claims; to tell an effect of this size takes about 136 seeds" in (
         mixed.findings[0].sentence
     )
-    assert "To tell the predicted difference of +0.040 takes 22 seeds" in mixed.findings[0].sentence
+    assert "To tell the predicted difference of +0.040 takes 23 seeds" in mixed.findings[0].sentence
 
 
 def test_one_seed_is_judged_by_its_scenes() -> None:
@@ -135,13 +145,13 @@ def test_a_budget_that_was_exceeded_is_said() -> None:
 def test_claims_under_several_budgets_are_corrected_together() -> None:
     both = allocation_findings([RIGHT, replace(WRONG, factor=4.0)], HISTORY)
     assert [own[0].verdict for own in both] == ["held", "did not hold"]
-    assert all("corrected for 10 claims" in own[2].sentence for own in both)
+    assert all("corrected for 12 claims" in own[2].sentence for own in both)
 
 
 def test_plans_that_coincide_are_told_and_not_judged() -> None:
     same = [replace(seed, plans=dict.fromkeys(PLANS, seed.plans[JOINT])) for seed in RIGHT.seeds]
     both = allocation_findings([WRONG, replace(RIGHT, factor=4.0, seeds=(same[0],))], HISTORY)
-    assert "corrected for 5 claims" in both[0][2].sentence
+    assert "corrected for 6 claims" in both[0][2].sentence
     told, budgets = both[1]
     assert told.verdict == "undecided"
     assert "the same, 118 samples, 12 edge rounds, 1 cloud rounds" in told.sentence
@@ -168,7 +178,7 @@ def test_tables_hold_a_row_per_run() -> None:
     assert found["plans"].count("\n") == 1 + 12
     assert "| x 1 | 1 | joint | 118 | 12 | 1 | 0.620 | 3 / 5 |" in found["plans"]
     assert "| x 1 | cloud FL | joint | 0.660 | 0.667 (" in found["accuracy"]
-    assert "| x 1 | grid | cloud FL | +0.040 | +0.053 (" in found["differences"]
+    assert "| x 1 | mean of towns | cloud FL | +0.040 | +0.053 (" in found["differences"]
     assert "| x 0.25 | 2 | joint | wireline | 110.0 | 70.0 | 69.5 | -0.50 |" in found["megabytes"]
     assert found["findings"].count("\n- ") == 9
 
@@ -177,5 +187,5 @@ def test_the_picture_has_a_row_per_budgets() -> None:
     results = AllocationResult(HISTORY, (replace(WRONG, factor=0.25), RIGHT))
     assert draw_allocation(results).startswith(b"\x89PNG")
     collected = {each.name: _collect(each) for each in results.budgets}
-    titles = [axes.get_title(loc="left") for axes in predicted_and_realised(collected, "grid").axes]
-    assert titles[::2] == ["budgets x 0.25: AP50 on grid", "budgets x 1: AP50 on grid"]
+    titles = [axes.get_title(loc="left") for axes in predicted_and_realised(collected, MEAN).axes]
+    assert titles[::2] == ["budgets x 0.25: AP50, mean of towns", "budgets x 1: AP50, mean of towns"]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from flcav.experiments.fig6a.results import EQUAL, JOINT, TOWN, AllocationSeed, AtBudgets, PlanFinding
+from flcav.experiments.fig6a.results import EQUAL, JOINT, MEAN, AllocationSeed, AtBudgets, PlanFinding
 from flcav.intervals import LEVEL, MOST_SEEDS, Estimate, MeanOverSeeds, mean_over_seeds, plan_seeds
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, Claim, Judged, judge, signed
@@ -18,59 +18,61 @@ COUNT_NAMES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds
 def allocation_findings(budgets: Sequence[AtBudgets], history: Ranges) -> tuple[tuple[PlanFinding, ...], ...]:
     """Return the findings under each pair of budgets: gain, ranking by prediction, gain of every stage, accuracy, use.
 
-    The claims that are tests over seeds, the joint plan's gain and those of the stages under all budgets, are judged
-    together. Where both plans are one, there is nothing to judge. `history`: least and most of each count in the
-    history that the plans are predicted from.
+    The claims that are tests over seeds, the joint plan's gain, those of the stages and the exactness of predictions,
+    are judged together, under all budgets. Where both plans are one, there is nothing to judge. `history`: least and
+    most of each count in the history that the plans are predicted from.
     """
-    claims = [
-        [] if each.coincide else [each.summary.realised_difference[TOWN][CLOUD], *_stage_gains(each).values()]
-        for each in budgets
-    ]
-    judged = iter(judge([Claim(mean) for own in claims for mean in own]))
+    claims = [[] if each.coincide else _claims(each) for each in budgets]
+    judged = iter(judge([claim for own in claims for claim in own]))
     return tuple(
         _told(each, history, [next(judged) for _ in own]) if own else (_one_plan(each), _budgets(each))
         for each, own in zip(budgets, claims, strict=True)
     )
 
 
+def _claims(results: AtBudgets) -> list[Claim]:
+    means = [results.summary.realised_difference[MEAN][CLOUD], *_stage_gains(results).values()]
+    return [*map(Claim, means), _claim_exact(results)]
+
+
 def _one_plan(results: AtBudgets) -> PlanFinding:
     """Return the finding where both plans are the same: no difference to judge."""
     counts = ", ".join(f"{count} {COUNT_NAMES[name]}" for name, count in results.seeds[0].plans[JOINT].counts.items())
-    realised, predicted = results.summary.realised[TOWN][JOINT], results.summary.predicted[JOINT]
+    realised, predicted = results.summary.realised[MEAN][JOINT], results.summary.predicted[JOINT]
     sentence = (
         f"Both plans are the same, {counts}: there is no difference to judge. "
-        f"On {TOWN}, AP50 was {realised[PRETRAIN].mean:.3f} pretrained, {realised[EDGE].mean:.3f} after edge FL and "
-        f"{realised[CLOUD].mean:.3f} after cloud FL (predicted: {predicted[CLOUD]:.3f})."
+        f"In the {MEAN}, AP50 was {realised[PRETRAIN].mean:.3f} pretrained, {realised[EDGE].mean:.3f} after edge FL "
+        f"and {realised[CLOUD].mean:.3f} after cloud FL (predicted: {predicted[CLOUD]:.3f})."
     )
     return _finding(BETTER, UNDECIDED, sentence)
 
 
 def _told(results: AtBudgets, history: Ranges, judged: Sequence[Judged]) -> tuple[PlanFinding, ...]:
     """Return the findings under one pair of budgets, from the verdicts on its claims."""
-    difference, gains = results.summary.realised_difference[TOWN][CLOUD], _stage_gains(results)
-    first, *others = judged
+    difference, gains = results.summary.realised_difference[MEAN][CLOUD], _stage_gains(results)
+    first, *others, exact = judged
     verdicts = {key: each.verdict for key, each in zip(gains, others, strict=True)}
     return (
         _better(results, difference, first),
         _ranking(results, history, difference, first),
         _every_stage(results, gains, verdicts, first.family),
-        _accuracy(results),
+        _accuracy(results, _claim_exact(results), exact),
         _budgets(results),
     )
 
 
 def _stage_gains(results: AtBudgets) -> dict[Gain, MeanOverSeeds]:
-    return {key: _gain(results, TOWN, *key) for key in GAINS}
+    return {key: _gain(results, MEAN, *key) for key in GAINS}
 
 
 def _better(results: AtBudgets, difference: MeanOverSeeds, judged: Judged) -> PlanFinding:
-    realised = results.summary.realised[TOWN]
+    realised = results.summary.realised[MEAN]
     sentence = (
-        f"On {TOWN}, AP50 after the last stage was {realised[EQUAL][CLOUD].mean:.3f} with equal stages and "
+        f"In the {MEAN}, AP50 after the last stage was {realised[EQUAL][CLOUD].mean:.3f} with equal stages and "
         f"{realised[JOINT][CLOUD].mean:.3f} with the joint plan: {_interval(difference)}"
     )
     if difference.seeds == 1:
-        own = results.seeds[0].differences[TOWN][CLOUD]
+        own = results.seeds[0].differences[MEAN][CLOUD]
         over_scenes = Estimate(own.mean, own.low, own.high).describe(sign=True)
         sentence += f"; {over_scenes} over test scenes of one seed, in which training does not vary."
     else:
@@ -107,7 +109,7 @@ def _why(results: AtBudgets, history: Ranges) -> str:
     """Return where prediction and training differ most, and which counts of the plans are outside the history."""
     summary = results.summary
     predicted = _gains(summary.predicted_difference)
-    realised = _gains({stage: each.mean for stage, each in summary.realised_difference[TOWN].items()})
+    realised = _gains({stage: each.mean for stage, each in summary.realised_difference[MEAN].items()})
     stage = max(STAGE_NAMES, key=lambda name: abs(predicted[name] - realised[name]))
     sentence = (
         f"They part most in {STAGE_NAMES[stage]}: of what that stage adds, the joint plan was to have "
@@ -126,7 +128,7 @@ def _why(results: AtBudgets, history: Ranges) -> str:
 def _every_stage(
     results: AtBudgets, gains: Mapping[Gain, MeanOverSeeds], verdicts: Mapping[Gain, str], family: int
 ) -> PlanFinding:
-    """Return the gain of each federated stage in each plan; the learning curves cannot predict a loss."""
+    """Return the gain of each federated stage in each plan, and of one that lost what the curve predicted."""
     plans = results.seeds[0].plans
     rounds = {(name, stage): plans[name].counts[f"{stage}_rounds"] for name, stage in gains}
     told = [
@@ -135,15 +137,18 @@ def _every_stage(
         for (name, stage), gain in gains.items()
     ]
     corrected = f", with verdicts corrected for {family} claims" if family else ""
-    sentences = [f"On {TOWN}, over the stage before it{corrected}: {'; '.join(told)}."]
+    sentences = [f"In the {MEAN}, over the stage before it{corrected}: {'; '.join(told)}."]
     lost = [key for key, each in verdicts.items() if each == NOT_HELD]
     if lost:
-        sentences.append("The curves fall with every round, so no plan made from them foresees a loss.")
+        foreseen = [
+            f"{signed(_foreseen(results, *key))} for {STAGE_NAMES[key[1]]} of the {key[0]} plan" for key in lost
+        ]
+        sentences.append(f"The curve predicted {'; '.join(foreseen)}.")
     for name, stage in (key for key in lost if key[1] == CLOUD):
         beside = "; ".join(
             f"on {town} the same stage brought {_interval(_gain(results, town, name, stage))}"
             for town in results.summary.realised
-            if town != TOWN
+            if town != MEAN
         )
         sentences.append(f"The cloud's average of all regions' networks serves them all: {beside}.")
     decided = NOT_HELD if lost else HELD if set(verdicts.values()) == {HELD} else UNDECIDED
@@ -163,24 +168,39 @@ def _interval(mean: MeanOverSeeds) -> str:
     return f"{signed(mean.mean)} ({signed(mean.low)} to {signed(mean.high)})"
 
 
+def _foreseen(results: AtBudgets, name: str, stage: str) -> float:
+    return _gains(results.summary.predicted[name])[stage]
+
+
 def _gains(after: Mapping[str, float]) -> dict[str, float]:
     """Return the gain of each stage over the stage before it."""
     before = {"pretrain": 0.0, "edge": after["pretrain"], "cloud": after["edge"]}
     return {stage: after[stage] - before[stage] for stage in STAGE_NAMES}
 
 
-def _accuracy(results: AtBudgets) -> PlanFinding:
-    errors = [_ap(seed, name, CLOUD) - seed.predicted[name][CLOUD] for seed in results.seeds for name in (EQUAL, JOINT)]
-    wide = sum(abs(error) for error in errors) / len(errors)
-    claimed = abs(results.summary.predicted_difference[CLOUD])
-    decided = HELD if wide < claimed else NOT_HELD
-    compared = "less" if wide < claimed else "no less"
+def _claim_exact(results: AtBudgets) -> Claim:
+    """Return the claim that runs are off their predictions by less than is predicted to lie between the plans."""
+    errors = [[abs(error) for error in own] for own in _errors(results)]
+    means = [sum(own) / len(own) for own in errors]
+    return Claim(mean_over_seeds(means), than=abs(results.summary.predicted_difference[CLOUD]), at_most=True)
+
+
+def _errors(results: AtBudgets) -> list[list[float]]:
+    """Return by how much both plans of each seed ended above their predictions."""
+    return [
+        [seed.realised[MEAN][name][CLOUD].ap50 - seed.predicted[name][CLOUD] for name in (EQUAL, JOINT)]
+        for seed in results.seeds
+    ]
+
+
+def _accuracy(results: AtBudgets, claim: Claim, judged: Judged) -> PlanFinding:
+    errors = [error for own in _errors(results) for error in own]
     sentence = (
-        f"Over {len(errors)} runs, AP50 after the last stage was off its prediction by {wide:.3f} on average (from "
-        f"{signed(min(errors))} to {signed(max(errors))}): {compared} than the {claimed:.3f} that are predicted to "
-        f"lie between the plans."
+        f"Over {len(errors)} runs, AP50 after the last stage was off its prediction by {claim.mean.describe()} on "
+        f"average (from {signed(min(errors))} to {signed(max(errors))}), where {claim.than:.3f} are predicted to lie "
+        f"between the plans; {judged.describe()}."
     )
-    return _finding("Is the prediction exact enough to tell the plans apart?", decided, sentence)
+    return _finding("Is the prediction exact enough to tell the plans apart?", judged.verdict, sentence)
 
 
 def _budgets(results: AtBudgets) -> PlanFinding:
@@ -196,7 +216,7 @@ def _budgets(results: AtBudgets) -> PlanFinding:
 
 
 def _ap(seed: AllocationSeed, name: str, stage: str) -> float:
-    return seed.realised[TOWN][name][stage].ap50
+    return seed.realised[MEAN][name][stage].ap50
 
 
 def _finding(question: str, decided: str, sentence: str) -> PlanFinding:

@@ -11,7 +11,7 @@ from flcav.pipeline.results.run import LinkUse
 from flcav.records import LEFT_OUT, Record
 
 EQUAL, JOINT = "equal-stages", "joint"  # the plans
-TOWN = "grid"  # of the accuracies in the planner's history
+MEAN = "mean of towns"  # place of what the planner's history measures: the mean of the federating towns
 COUNTS = ("samples", "edge_rounds", "cloud_rounds")
 
 
@@ -46,8 +46,8 @@ class AllocationSeed:
     seed: int
     plans: Mapping[str, Planned]
     predicted: Mapping[str, Mapping[str, float]]  # AP50 by plan and stage
-    realised: Mapping[str, Mapping[str, Mapping[str, Reached]]]  # by town, plan and stage
-    differences: Mapping[str, Mapping[str, Estimate]]  # joint - equal by town and stage, over test scenes
+    realised: Mapping[str, Mapping[str, Mapping[str, Reached]]]  # by `MEAN` or town, plan and stage
+    differences: Mapping[str, Mapping[str, Estimate]]  # joint - equal by `MEAN` or town, and stage, over test scenes
     poles: Mapping[str, Mapping[str, int]]  # by plan and town
     ledger: Mapping[str, Mapping[str, LinkUse]]  # by plan and link
 
@@ -62,9 +62,9 @@ class AllocationSummary:
     """Means over seeds; differences are joint minus equal stages, paired by seed."""
 
     predicted: Mapping[str, Mapping[str, float]]  # AP50 by plan and stage
-    realised: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by town, plan and stage
+    realised: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by `MEAN` or town, plan and stage
     predicted_difference: Mapping[str, float]  # by stage
-    realised_difference: Mapping[str, Mapping[str, MeanOverSeeds]]  # by town and stage
+    realised_difference: Mapping[str, Mapping[str, MeanOverSeeds]]  # by `MEAN` or town, and stage
 
 
 @dataclass(frozen=True)

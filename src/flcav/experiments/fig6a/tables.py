@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from flcav.experiments.fig6a.findings import STAGE_NAMES
-from flcav.experiments.fig6a.results import EQUAL, JOINT, TOWN, AllocationResult, AtBudgets
+from flcav.experiments.fig6a.results import EQUAL, JOINT, MEAN, AllocationResult, AtBudgets
 from flcav.markdown import format_bullets, format_signed, format_table
 
 Row = Sequence[str | float]
@@ -25,7 +25,7 @@ def tables(results: AllocationResult) -> dict[str, str]:
         ),
         "accuracy": _table(
             results,
-            ("after", "plan", f"predicted on {TOWN}", *(f"AP50 on {town}" for town in _towns(results))),
+            ("after", "plan", "predicted", *(f"AP50, {town}" for town in _towns(results))),
             _accuracy,
         ),
         "differences": _table(
@@ -72,7 +72,7 @@ def _differences(results: AtBudgets) -> list[Row]:
     rows: list[Row] = []
     for town, stages in summary.realised_difference.items():
         for key, stage in STAGE_NAMES.items():
-            predicted = format_signed(summary.predicted_difference[key]) if town == TOWN else ""
+            predicted = format_signed(summary.predicted_difference[key]) if town == MEAN else ""
             own = [seed.differences[town][key] for seed in results.seeds]
             per_seed = ", ".join(each.describe(sign=True) for each in own)
             rows.append([town, stage, predicted, stages[key].describe(sign=True), per_seed])

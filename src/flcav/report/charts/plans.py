@@ -107,15 +107,15 @@ class PlansReached:
 
 
 @style.styled
-def predicted_and_realised(budgets: Mapping[str, PlansReached], town: str) -> Figure:
-    """Return AP50 of both plans after each stage in `town`, predicted and trained, and their paired differences.
+def predicted_and_realised(budgets: Mapping[str, PlansReached], place: str) -> Figure:
+    """Return AP50 of both plans after each stage in `place`, predicted and trained, and their paired differences.
 
     A row of axes for each of the `budgets`, by name.
     """
     figure = style.canvas(9.0, 0.6 + 3.3 * len(budgets))
     rows = figure.subplots(len(budgets), 2, width_ratios=(3, 2), squeeze=False, sharey="col")
     for (name, own), (left, right) in zip(budgets.items(), rows, strict=True):
-        _draw_ap(left, own.ap, f"budgets {name}: AP50 on {town}")
+        _draw_ap(left, own.ap, f"budgets {name}: AP50, {place}")
         _draw_differences(right, own.differences)
     handles = [
         Line2D([], [], color=colour, marker="o", label=PLAN_NAMES[name]) for name, colour in PLAN_COLOURS.items()
