@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from flcav.experiments.studies.run import Study, StudyResult, describe_limits, list_counts, training_rows
 from flcav.markdown import format_bullets, format_table
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
@@ -63,11 +65,14 @@ def _precision(row: ClassPrecision | SizePrecision) -> float | None:
 
 
 def _draw(results: StudyResult[SignsEvaluation]) -> bytes:
-    """Return a PNG with a panel per test: AP50 by class and by size, and mAP50."""
+    """Return a PNG with a panel per test: AP50 by class and by size, with the mean number of targets, and mAP50."""
     panels = {}
     for test, means in results.summary.items():
         tested = results.tested(test)
-        targets = {row.name: row.targets for row in (*tested[0].classes, *tested[0].sizes)}
+        counts: dict[str, list[int]] = {}
+        for row in (row for each in tested for row in (*each.classes, *each.sizes)):
+            counts.setdefault(row.name, []).append(row.targets)
+        targets = {name: round(np.mean(own)) for name, own in counts.items()}
         numbers = [result.numbers() for result in tested]
         panels[test] = [
             Bar(name, means[name].mean, tuple(row[name] for row in numbers), targets.get(name))
