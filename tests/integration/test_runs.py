@@ -28,7 +28,7 @@ from flcav.cli.main import run as command
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.experiments.arms.run import ARMS, ArmsResult, compare_arms
-from flcav.experiments.fig6a.results import AllocationResult
+from flcav.experiments.fig6a.results import MEAN, AllocationResult
 from flcav.experiments.fig6a.run import compare_plans
 from flcav.experiments.placement.records import COVERAGE, NEAR, TOWN, TRAFFIC
 from flcav.experiments.placement.run import prove_placement
@@ -468,7 +468,9 @@ def test_the_proof_by_training_compares_two_plans(studied: Studied, result: Run)
     first, *made_anew = result.arms[MAIN].plans  # those made anew rest on scores of the run
     assert made_anew
     assert seed.predicted["joint"] == first.tasks["objects"].predicted
-    assert set(seed.realised) == set(seed.differences) == {"grid", "ring"}
+    assert set(seed.realised) == set(seed.differences) == {MEAN, "grid", "ring"}
+    towns = [seed.realised[town]["joint"][EDGE].ap50 for town in ("grid", "ring")]
+    assert seed.realised[MEAN]["joint"][EDGE].ap50 == pytest.approx(np.mean(towns))
     assert (joint.counts, at.coincide) == (equal.counts, True)  # the limits of the toy's rounds bind both
     assert ["the same" in finding.sentence for finding in at.findings] == [True, False]
 

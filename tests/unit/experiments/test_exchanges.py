@@ -195,8 +195,8 @@ def test_what_cloud_rounds_gain_stands_beside_how_far_the_regions_are_apart() ->
     assert shown[2].startswith("| seed 1 | 0.1000 | 0.0100 | 0.3000 | 0.4000 |")
     assert shown[2].endswith("| +0.010 |")
     assert shown[6].endswith("| +0.025 |")
-    assert "| +1.00 (p 0.00) |" in shown[7]
-    assert "| -1.00 (p 0.00) |" in shown[7]
+    assert "| +1.00 (p 0.08) |" in shown[7]
+    assert "| -1.00 (p 0.08) |" in shown[7]
 
 
 def test_differences_are_paired_and_judged_together() -> None:

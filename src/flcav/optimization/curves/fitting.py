@@ -31,6 +31,7 @@ from flcav.optimization.curves.levels import level_seeds
 Array = NDArray[np.float64]
 
 ROBUST_FROM = 10  # points: the spread of fewer residuals does not tell which of them are outliers
+SAME_COST = 1e-3  # relative difference of equal costs
 EXACT, ROUGH = 1e-14, 1e-6  # tolerances of the solver: for the curve that is returned; for comparisons and repeats
 QUANTITIES = ("samples", "edge_rounds", "cloud_rounds")
 
@@ -283,14 +284,18 @@ def _least(
     scale: float | None,
     tolerance: float,
 ) -> tuple[float, Array]:
-    """Return the least cost over the local optima from all `starts`, and its parameters (P,)."""
+    """Return the least cost over the local optima from `starts`, and its parameters (P,).
+
+    Where two starts come to the same cost, the others are left out.
+    """
     root = np.sqrt(weight)
 
     def jacobian(p: Array) -> Array:
         return form.derivative(p, spent) * root[:, None]
 
-    results = [
-        least_squares(
+    results: list[tuple[float, Array]] = []
+    for start in starts:
+        found = least_squares(
             lambda p: (form.predict(p, spent) - error) * root,
             start,
             jacobian,  # pyright: ignore[reportArgumentType]  # its stub has the names of methods alone
@@ -301,10 +306,11 @@ def _least(
             loss="linear" if scale is None else "soft_l1",
             f_scale=1.0 if scale is None else scale,
         )
-        for start in starts
-    ]
-    best = min(results, key=lambda result: result.cost)
-    return float(best.cost), best.x
+        results.append((float(found.cost), found.x))
+        costs = sorted(cost for cost, _ in results)
+        if len(costs) > 1 and costs[1] <= costs[0] * (1 + SAME_COST):
+            break
+    return min(results, key=lambda result: result[0])
 
 
 def _measured(fitted: FitState[CurveT]) -> Fit[CurveT]:
