@@ -172,9 +172,10 @@ def test_the_area_and_what_more_budget_saves_work_with_it() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_links_of_vehicles_limit_such_plans_too(seed: int) -> None:
+@pytest.mark.parametrize(("model", "more"), [("federated", {}), ("additive", {"merge": 0.05})])
+def test_links_of_vehicles_limit_such_plans_too(seed: int, model: str, more: dict[str, float]) -> None:
     rng = np.random.default_rng(seed)
-    curve = written(seed, 1, "federated")["tasks"][0]["curve"]
+    curve = written(seed, 1, model)["tasks"][0]["curve"] | more
     asked = problem([{"uplink_mbps": fleet(*rng.uniform(1, 6, 3)), "curve": curve}], horizon_s=25.0)
     plan, _ = allocate_fleet(asked)
     best = best_carried(asked)

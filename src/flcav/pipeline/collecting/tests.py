@@ -25,11 +25,12 @@ def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, ta
     spread = measure_spread(values) or graph.spreads.get(test_key(task, region, arm, stage))
     folders = [(work / each,) for each in (step, *again)]
     mean = mean_over_trainings(task, result.estimate, values, folders, graph.recipe.seed, share=True)
-    estimate = result.estimate if spread is None else widen_share(result.estimate, spread)
-    return Test(
-        *(arm, stage, region, task, step, result),
-        *(estimate if mean is None else mean.as_estimate(), spread, retrained, mean),
-    )
+    estimate = result.estimate
+    if mean is not None:
+        estimate = mean.as_estimate()
+    elif spread is not None:
+        estimate = widen_share(estimate, spread)
+    return Test(arm, stage, region, task, step, result, estimate, spread, retrained, mean)
 
 
 def mean_over_trainings(
