@@ -30,7 +30,7 @@ def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, ta
         estimate = mean.as_estimate()
     elif spread is not None:
         estimate = widen_share(estimate, spread)
-    return Test(arm, stage, region, task, step, result, estimate, spread, retrained, mean)
+    return Test(arm, stage, region, task, step, result, estimate, spread, retrained, mean, tuple(again) or None)
 
 
 def mean_over_trainings(

@@ -36,6 +36,17 @@ class Test:
     spread: Spread | None  # over retrainings: of this run's own, or of the recipe's table; None: not known
     retrained: tuple[float, ...] = ()  # the measure of each retraining of the arm, on the same frames
     over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # the run's own trainings, on these scenes
+    retrained_steps: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # their folders, in the order of `retrained`
+
+    @property
+    def steps(self) -> tuple[str, ...]:
+        """Return the folders of the tests of all trainings whose outcomes are known, the first training's first."""
+        return (self.step, *(self.retrained_steps or ()))
+
+    @property
+    def trainings(self) -> tuple[float, ...]:
+        """Return the measure of each training, the first training's first."""
+        return (self.result.estimate.mean, *self.retrained)
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,17 @@
 """Paired comparison of two runs, over all tests that both made on the same frames."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from flcav.config import InputError
-from flcav.intervals import Estimate, OneTraining, combine_spreads, of_one_training, widen
-from flcav.perception.outcomes import Outcomes, difference
-from flcav.perception.tasks import task_named
-from flcav.pipeline.collecting.tests import mean_of_tests
+from flcav.intervals import Estimate, MeanOverSeeds, OneTraining, combine_spreads, of_one_training, widen
+from flcav.pipeline.collecting.differences import compare_tests
+from flcav.pipeline.collecting.tests import mean_of_tests, mean_over_trainings
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import Test
 from flcav.pipeline.running import RESULTS, WORK, seed_folders
 from flcav.verdicts import UNDECIDED, Claim, judge, judge_known
@@ -38,8 +37,9 @@ class Compared:
 def compare(first: Path, second: Path) -> tuple[Compared, ...]:
     """Return the paired difference of every test that both runs made, over the seeds that both have.
 
-    Its interval (95 %) is a bootstrap over scenes for one common seed, widened by the spread of retraining in both
-    runs; where that is not known, one seed decides nothing. For several seeds it is over seeds and scenes. Raises
+    Its interval (95 %) for one common seed is over the trainings that both runs have; of one training a bootstrap over
+    scenes, widened by the spread of retraining in both, and where that is not known, one seed decides nothing. For
+    several seeds it is over seeds and scenes, of each seed's mean over its trainings. Raises
     `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
     """
     folders = [seed_folders(folder) for folder in (first, second)]
@@ -61,36 +61,41 @@ def compare(first: Path, second: Path) -> tuple[Compared, ...]:
 @dataclass(frozen=True)
 class _Pair:
     compared: Compared  # of one seed
-    folders: tuple[Path, Path]  # of the second run's test and of the first's
-    training: OneTraining | None  # the difference of one training each; None where the spread is not known
+    folders: tuple[Path, Path]  # of the first training's tests, the second run's and the first's
+    estimate: OneTraining | MeanOverSeeds | None  # what is judged; None for one training of unknown spread
 
 
 def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, _Pair]:
     runs = [Run.load(folder, RESULTS) for folder in (first, second)]
     tests: list[Mapping[Key, Test]] = [{_key(test): test for test in run.tested} for run in runs]
     found = {}
-    for key in tests[0].keys() & tests[1].keys():
-        places = [folder / WORK / own[key].step for folder, own in zip((first, second), tests, strict=True)]
-        try:
-            both = [Outcomes.load(path / OUTCOMES) for path in places]
-            mean, low, high = difference(task_named(key[3]), both[0], both[1], seed)
-        except InputError:
-            continue
-        before, after = (own[key].result for own in tests)
-        values = before.estimate.mean, after.estimate.mean
-        spread = combine_spreads(*(own[key].spread for own in tests))
-        over_scenes = Estimate(mean, low, high)
+    for key in (key for key in tests[0] if key in tests[1]):
+        before, after = (own[key] for own in tests)
+        with suppress(InputError):  # they were made on other frames
+            found[key] = _pair(key, before, after, (first / WORK, second / WORK), seed)
+    return found
+
+
+def _pair(key: Key, before: Test, after: Test, works: tuple[Path, Path], seed: int) -> _Pair:
+    """Return the difference of two tests: in the mean of the trainings that both runs have, or in one of each."""
+    folders = [(works[1] / new, works[0] / old) for new, old in zip(after.steps, before.steps, strict=False)]
+    over_scenes = compare_tests(key[3], folders[0][1], folders[0][0], seed)
+    measures = np.array([test.trainings[: len(folders)] for test in (before, after)])
+    values = (over_scenes.mean, *np.diff(measures, axis=0)[0, 1:])
+    mean = mean_over_trainings(key[3], over_scenes, values, folders, seed, share=False)
+    if mean is not None:
+        change, known = mean.as_estimate(), mean
+    else:
+        spread, measures = combine_spreads(before.spread, after.spread), measures[:, :1]
         change = over_scenes if spread is None else widen(over_scenes, spread)
-        training = None if spread is None else of_one_training(over_scenes, after.scenes, spread)
-        one = Compared(*key, after.measure, *values, change, UNDECIDED)
-        found[key] = _Pair(one, (places[1], places[0]), training)
-    order = list(tests[0])
-    return {key: found[key] for key in sorted(found, key=order.index)}
+        known = None if spread is None else of_one_training(over_scenes, after.result.scenes, spread)
+    first, second = measures.mean(axis=1).tolist()
+    return _Pair(Compared(*key, after.result.measure, first, second, change, UNDECIDED), folders[0], known)
 
 
 def _judge_trainings(pairs: Sequence[_Pair]) -> tuple[Compared, ...]:
     """Return the differences of one seed with their verdicts, judged together; unknown ones are undecided."""
-    judged = judge_known([None if pair.training is None else Claim(pair.training) for pair in pairs])
+    judged = judge_known([None if pair.estimate is None else Claim(pair.estimate) for pair in pairs])
     return tuple(
         pair.compared if one is None else replace(pair.compared, verdict=one.verdict)
         for pair, one in zip(pairs, judged, strict=True)

@@ -16,9 +16,9 @@ from flcav.verdicts import Claim, judge
 def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
     """Return means over the seeds of a recipe; `works`: the folder of each run's steps, with the outcomes of its tests.
 
-    The claims that the run itself is better, as in its findings, are judged together. Simulated towns have traffic of
-    their own for each seed. Where seeds are tested on the same recorded scenes, the intervals include what these scenes
-    vary by; those of closed gaps do not.
+    A seed's number is the mean over its trainings. The claims that the run itself is better, as in its findings, are
+    judged together. Simulated towns have traffic of their own for each seed. Where seeds are tested on the same
+    recorded scenes, the intervals include what these scenes vary by; those of closed gaps do not.
     """
     tests = [{_key(test): test for test in run.tested} for run in runs]
     measures = [
@@ -50,7 +50,7 @@ def _name(test: Test) -> str:
 
 def _mean_measure(tests: Sequence[Test], works: Sequence[Path]) -> MeanOverSeeds:
     folders = [[work / test.step] for test, work in zip(tests, works, strict=True)]
-    return mean_of_tests(tests[0].task, [test.result.estimate.mean for test in tests], folders, share=True)
+    return mean_of_tests(tests[0].task, [test.estimate.mean for test in tests], folders, share=True)
 
 
 def _mean_difference(
@@ -61,4 +61,4 @@ def _mean_difference(
         pair = ((one.arm, one.stage), (one.before_arm, one.before_stage))
         tested = [own.get((*each, one.region, one.task)) or own[MAIN, each[1], one.region, one.task] for each in pair]
         folders.append([work / test.step for test in tested])
-    return mean_of_tests(one.task, [row.over_scenes.mean for row in rows], folders)
+    return mean_of_tests(one.task, [row.estimate.mean for row in rows], folders)
