@@ -3,6 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 # One thread per process: parallel work is in processes, and threads that wait for each other on shared cores crawl.
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
+unexport PYTHONDONTWRITEBYTECODE # each of many processes would compile all modules anew
 STAMP := .venv/.installed
 BIN := .venv/bin
 

@@ -135,13 +135,19 @@ class Sources:
 
 @contextlib.contextmanager
 def _without_collector() -> Iterator[None]:
-    """Pause the collector of cyclic garbage: syntax trees are all kept, and it takes as long as reading them."""
+    """Pause the collector of cyclic garbage: syntax trees are all kept, and it takes as long as reading them.
+
+    Afterwards they are in its oldest generation, as if it had looked at them.
+    """
     enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
         if enabled:
+            if not gc.get_freeze_count():  # what others froze stays frozen
+                gc.freeze()
+                gc.unfreeze()
             gc.enable()
 
 
