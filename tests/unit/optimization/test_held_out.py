@@ -11,7 +11,12 @@ from scipy.stats import spearmanr
 from flcav.cli.main import run as command
 from flcav.config import InputError
 from flcav.optimization.curves.fitting import fit
-from flcav.optimization.curves.held_out import attainable_correlation, hold_out_runs, noise_of_runs
+from flcav.optimization.curves.held_out import (
+    attainable_correlation,
+    hold_out_runs,
+    measure_pure_error,
+    noise_of_runs,
+)
 from flcav.optimization.curves.history import History
 from flcav.optimization.curves.levels import Levelled, level_seeds
 
@@ -142,3 +147,20 @@ def test_noise_of_runs_and_what_it_leaves_attainable() -> None:
         6 / np.pi * np.arcsin(normal / 2), abs=0.02
     )
     assert attainable_correlation(expected, runs, 0, 0) == pytest.approx(1)
+
+
+def test_the_pure_error_is_what_the_true_curve_leaves_whatever_its_form() -> None:
+    """Points of seeds of one level that follow no curve; exact ones leave nothing, those of one seed do not tell."""
+    draw = np.random.default_rng(5)
+    points = np.array([(s, e, z) for s in range(40, 80) for e in range(5) for z in range(2)], dtype=float)
+    truth = draw.uniform(0.3, 0.7, len(points))
+    names = [f"n{samples:g}" for samples in points[:, 0]]
+    for seeds in ("12", "1234"):
+        noise = draw.normal(0, 0.02, (len(seeds), len(points)))
+        runs = tuple(f"{seed}-{name}" for seed in seeds for name in names)
+        of = tuple(seed for seed in seeds for _ in names)
+        told = History(np.tile(points, (len(seeds), 1)), (truth + noise).ravel(), np.ones(len(of)), runs, of)
+        assert measure_pure_error(told) == pytest.approx(np.abs(noise).mean(), rel=0.05)
+    assert measure_pure_error(several_seeds(0.0)) == pytest.approx(0, abs=1e-9)
+    assert measure_pure_error(history(0.02)) is None
+    assert measure_pure_error(told.select(np.array(told.runs) == told.runs[0])) is None

@@ -237,6 +237,11 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
                 f"runs differ by {checked['between_runs']:.4f}, their points by {checked['within_runs']:.4f} (standard"
                 f" deviations): the true curve would reach a rank correlation of {checked['attainable']:.3f}",
             )
+            if (least := checked["attainable_error"]) is not None:
+                told += (
+                    "seeds differ by so much at the same samples and rounds that the true curve would be off by "
+                    f"{least:.4f}",
+                )
             if new := checked["new_seeds"]:
                 told += (
                     f"seeds held out whole, {new['points']} points after pretraining: mean error "

@@ -3,8 +3,10 @@
 What no curve can foresee is how a run's training turned out. `noise_of_runs` splits the residuals of a history into
 the differences between runs and the scatter within them, a random effect of the run (one-way analysis of variance by
 the method of moments, Searle, Casella and McCulloch, "Variance Components", 1992, sec. 3.6), and the rank correlation
-that a true curve would reach with as much noise says how far a prediction can get. The level of a run's seed is known
-from the other runs of the seed; of a seed held out whole it is not, until its run has pretrained.
+that a true curve would reach with as much noise says how far a prediction can get. How near it can come to a point is
+told without any curve, by other seeds' points with the same numbers of samples and rounds (pure error; Draper and
+Smith, "Applied Regression Analysis", 1998, sec. 2.1). The level of a run's seed is known from the other runs of the
+seed; of a seed held out whole it is not, until its run has pretrained.
 """
 
 from collections.abc import Callable
@@ -35,6 +37,7 @@ class HeldOut:
     between_runs: float  # standard deviation of a run's deviation from the curve of all runs
     within_runs: float  # standard deviation of a point about its run's
     attainable: float  # mean rank correlation of that curve with itself under such noise
+    attainable_error: float | None  # mean error that the true curve would leave, by `measure_pure_error`
     new_seeds: "NewSeeds | None" = None  # None: the history has one seed
 
 
@@ -77,8 +80,36 @@ def hold_out_runs(history: History, fit: Callable[[History], CurveFit], k: int =
         between,
         within,
         attainable_correlation(expected, names, between, within),
+        measure_pure_error(history),
         _hold_out_seeds(history, fit, k),
     )
+
+
+def measure_pure_error(history: History) -> float | None:
+    """Return the mean absolute error that the true curve would leave, from points with the same resources; else None.
+
+    A run's point is compared with the mean of m points of other seeds, at its seed's level. Such a mean has 1 / m of a
+    point's variance, so that a curve without error would be off by sqrt(m / (m + 1)) of the difference. Points are left
+    out where no other run tells the level of their seed.
+    """
+    if len(set(history.seeds)) < 2:
+        return None
+    names, seeds = np.array(history.runs), np.array(history.seeds)
+    left: list[Array] = []
+    for run in np.unique(names):
+        held = names == run
+        levelled = level_seeds(history.select(~held))
+        others = levelled.history
+        same = (history.resources[held][:, None] == others.resources[None]).all(axis=2)  # (points, others)
+        same &= np.array(others.seeds) != seeds[held][:, None]
+        count = same.sum(axis=1)
+        found = (count > 0) & np.isin(seeds[held], list(levelled.factors))
+        mean = (same @ (1 - others.accuracy))[found] / count[found]
+        factor = np.array([levelled.of(seed) for seed in seeds[held][found]])
+        off = np.abs(1 - factor * mean - history.accuracy[held][found])
+        left.append(off * np.sqrt(count[found] / (count[found] + 1)))
+    differences = np.concatenate(left)
+    return float(differences.mean()) if len(differences) else None
 
 
 def _predict(curve: OwnCurve, levelled: Levelled, history: History, k: int) -> Array:
