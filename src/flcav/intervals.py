@@ -75,21 +75,20 @@ OWN_SCENES = SharedScenes()  # every seed has test scenes of its own
 class MeanOverSeeds(Estimate):
     """The mean over seeds with its 95 % confidence interval, over seeds and scenes.
 
-    There is no interval (None) of a single seed, none of a share that is 0, or 1, in all seeds, and none where seeds
-    share test scenes whose spread is not known. The standard error
+    There is no interval (None) of a single seed, and none of a share that is 0, or 1, in all seeds. The standard error
     is sqrt(sd^2 / n + shared.sd^2); its degrees of freedom are the harmonic mean of those of the seeds, n - 1, and of
     the shared scenes, weighted by their parts of the variance.
     """
 
     seeds: int = 1
     sd: float = 0.0  # standard deviation over seeds; 0 of a single seed
-    shared: SharedScenes | None = OWN_SCENES  # None: seeds share test scenes, and the spread of these is not known
+    shared: SharedScenes = OWN_SCENES
     share: bool = False  # a number in [0, 1]: its interval and tests are on the scale of log-odds
 
     @property
     def known(self) -> bool:
-        """Return whether the spread over seeds and scenes is known, so that there are intervals and tests."""
-        return self.seeds > 1 and self.shared is not None and (0 < self.mean < 1 or not self.share)
+        """Return whether the spread over seeds is known, so that there are intervals and tests."""
+        return self.seeds > 1 and (0 < self.mean < 1 or not self.share)
 
     def as_estimate(self) -> Estimate:
         """Return the mean and its interval alone."""
@@ -108,7 +107,7 @@ class MeanOverSeeds(Estimate):
 
     def p_value(self, hypothesis: float = 0.0) -> float | None:
         """Return the two-sided p-value of Student's t test that the mean is `hypothesis`; None without an interval."""
-        if not self.known or self.shared is None:
+        if not self.known:
             return None
         error, freedom = _standard_error(self.sd, self.seeds, self.shared)
         far = abs(self.distance(hypothesis))
@@ -118,7 +117,7 @@ class MeanOverSeeds(Estimate):
 
     def seeds_to_tell(self, hypothesis: float = 0.0, level: float = LEVEL) -> int | None:
         """Return `plan_seeds` for an effect as large as the distance from `hypothesis`, if the spread is known."""
-        if not self.known or self.shared is None:
+        if not self.known:
             return None
         shared = SharedScenes(self.slope * self.shared.sd, self.shared.scenes)
         return plan_seeds(self.distance(hypothesis), self.slope * self.sd, level, shared)
@@ -272,16 +271,6 @@ def share_scenes(
     return SharedScenes(float(np.sqrt(max(between, 0.0))), shared)
 
 
-def bound_shared_scenes(intervals: Sequence[tuple[float, float]], scenes: int) -> SharedScenes:
-    """Return an upper bound of `share_scenes` where of each seed only its 95 % interval over the scenes is known.
-
-    A covariance is at most the root of the product of both variances (Cauchy and Schwarz), and the mean of these roots
-    at most the mean variance. Half-widths are 1.96 standard deviations.
-    """
-    half = np.array([high - low for low, high in intervals]) / 2
-    return SharedScenes(float(np.sqrt(np.mean(half**2)) / ndtri(TAILS[1])), scenes)
-
-
 def score_interval(share: float, trials: int) -> Estimate:
     """Return a share of independent trials with Wilson's 95 % score interval (JASA 22, 1927), of 0 and 1, too."""
     z2 = float(ndtri(TAILS[1])) ** 2 / trials
@@ -291,17 +280,16 @@ def score_interval(share: float, trials: int) -> Estimate:
 
 
 def mean_over_seeds(
-    values: Sequence[float], *, shared: SharedScenes | None = OWN_SCENES, share: bool = False
+    values: Sequence[float], *, shared: SharedScenes = OWN_SCENES, share: bool = False
 ) -> MeanOverSeeds:
     """Return the mean of `values`, one per seed, and its 95 % interval: mean ± t · sqrt(sd^2 / n + shared.sd^2).
 
-    `shared` None: seeds share test scenes whose spread is not known, so that there is no interval.
     `share`: a number in [0, 1], whose interval is on the scale of log-odds by the delta method and stays inside [0, 1].
     """
     array = np.asarray(values, dtype=np.float64)
     sd = float(array.std(ddof=1)) if len(array) > 1 else 0.0
     found = MeanOverSeeds(float(array.mean()), None, None, len(array), sd, shared, share)
-    if not found.known or shared is None:
+    if not found.known:
         return found
     error, freedom = _standard_error(sd, len(array), shared)
     half = float(stdtrit(freedom, TAILS[1])) * error

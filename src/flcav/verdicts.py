@@ -81,7 +81,7 @@ def correct_p_values(p_values: Sequence[float]) -> list[float]:
 def judge(claims: Sequence[Claim]) -> list[Judged]:
     """Return the verdicts on all claims of a page, by p-values that are corrected for their number.
 
-    Claims whose spread over seeds or scenes is not known are undecided and do not count. The number of seeds is for the
+    Claims whose spread over seeds is not known are undecided and do not count. The number of seeds is for the
     level that a single claim has at worst, `LEVEL` divided by the number of claims, and a power of 0.8.
     """
     found = [claim.mean.p_value(claim.than) for claim in claims]
@@ -118,9 +118,7 @@ def _describe_aim(aim: str, mean: MeanOverSeeds, judged: Judged) -> str:
     over = f"{mean.describe()} over {mean.seeds} seeds of standard deviation {mean.sd:.3f}"
     if mean.seeds == 1:
         over = f"{mean.mean:.3f} of one seed"
-    elif mean.shared is None:
-        return f"*{aim}*: **{UNDECIDED}**, {over}; how it varies over their common test scenes is not known."
-    takes = "seeds on these test scenes" if mean.shared and mean.shared.scenes else "seeds"
+    takes = "seeds on these test scenes" if mean.shared.scenes else "seeds"
     return f"*{aim}*: **{REACHED[judged.verdict]}**, {over}; {judged.describe(takes)}."
 
 

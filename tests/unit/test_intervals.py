@@ -8,14 +8,11 @@ from flcav.intervals import (
     Estimate,
     Spread,
     bootstrap_over_scenes,
-    bound_shared_scenes,
     combine_spreads,
-    mean_over_seeds,
     measure_spread,
     of_one_training,
     pool_spreads,
     score_interval,
-    share_scenes,
     widen,
     widen_share,
 )
@@ -151,22 +148,3 @@ def test_the_score_interval_is_that_of_scipy(right: int, trials: int):
     theirs = stats.binomtest(right, trials).proportion_ci(method="wilson")
     found = score_interval(right / trials, trials)
     assert (found.low, found.high) == pytest.approx((theirs.low, theirs.high))
-
-
-def test_shared_scenes_are_bounded_by_what_one_seed_varies_over_them():
-    """Equal to it where seeds differ in nothing, above it where each also has scenes that are hard for it alone."""
-    rng = np.random.default_rng(0)
-    hard, own = rng.normal(0.8, 0.1, 40), rng.normal(0.0, 0.1, (3, 40))
-    for values, same in ((np.tile(hard, (3, 1)), True), (hard + own, False)):
-        measures = [lambda times, row=row: times @ row / np.maximum(times.sum(axis=1), 1) for row in values]
-        ends = [bootstrap_over_scenes(of, np.arange(40), 2000, rng=rng) for of in measures]
-        bound = bound_shared_scenes(ends, 40)
-        found = share_scenes(measures, [np.arange(40)] * 3, 2000, rng=rng)
-        assert bound.scenes == found.scenes == 40
-        assert bound.sd == pytest.approx(found.sd, rel=0.08) if same else bound.sd > 1.2 * found.sd
-
-
-def test_where_the_spread_of_shared_scenes_is_unknown_there_is_neither_interval_nor_test():
-    found = mean_over_seeds([0.7, 0.71, 0.72], shared=None)
-    assert (found.low, found.high, found.p_value(0.5), found.seeds_to_tell(0.5)) == (None, None, None, None)
-    assert found.sd == pytest.approx(0.01)

@@ -55,6 +55,7 @@ def study(aps):
                 "suburb": ObjectsEvaluation.from_json(result(ap), "suburb"),
                 "tracks": ObjectsEvaluation.from_json(tracked(ap), "tracks"),
             },
+            {"suburb": n, "tracks": n},
         )
         for n, ap in enumerate(aps)
     )

@@ -32,6 +32,7 @@ def results(*scores: float) -> StudyResult[SignsEvaluation]:
             seed,
             Card.model_validate({**facts, "training": {"steps": 20, "loss": 1.0, "scores": [0.1, score]}}),
             {names[0]: evaluation(score), names[1]: evaluation(score - 0.3, MISSING)},
+            dict.fromkeys(names, seed),
         )
         for seed, score in enumerate(scores, start=1)
     )

@@ -9,25 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from flcav.cli.main import run as command
 from flcav.config import InputError, parse_config
 from flcav.experiments.studies import STUDIES, study_named, weather
 from flcav.experiments.studies.run import (
-    SeedResult,
     list_counts,
     results_as_json,
     results_of_json,
     run_study,
     steps_of,
-    summarise,
 )
-from flcav.intervals import OWN_SCENES
-from flcav.perception.card import Card
 from flcav.perception.study import TEST_SEEDS
 from flcav.perception.training.run import CARD, EVENTS, WEIGHTS
-from flcav.perception.weather.evaluate import Classification, evaluate_classes
 from flcav.sources.recipe import Recipe
 
 each_study = pytest.mark.parametrize("study", [study_named(name) for name in STUDIES], ids=STUDIES)
@@ -83,27 +77,6 @@ def test_what_a_study_records_stays_what_its_committed_figures_are_of(name):
     recipe = study.recipe
     recipes = {"train": list(recipe.train), "validation": recipe.validation, "tests": dict(recipe.tests)}
     assert hashlib.sha256(json.dumps(recipes, sort_keys=True).encode()).hexdigest()[:16] == RECORDED[name]
-
-
-def test_the_variance_of_scenes_that_seeds_share_is_in_intervals_and_verdicts():
-    """Half-widths of 0.0196 are a standard deviation of 0.01: the error is the root of 0.01^2 + 0.002^2 / 3."""
-
-    def tested(accuracy: float) -> Classification:
-        found = evaluate_classes(np.zeros(2, np.int64), np.zeros(2, np.int64), ["a", "b"], ["clear"])
-        return replace(found, accuracy=accuracy, low=accuracy - 0.0196, high=accuracy + 0.0196, scenes=12)
-
-    facts = {"task": "weather", "network": "n", "parameters": 9, "seed": 1, "samples": 9, "data": [], "metrics": {}}
-    card = Card.model_validate({**facts, "training": {"steps": 7, "loss": 1.5}})
-    found = [tested(0.5 + off) for off in (-0.002, 0.0, 0.002)]
-    seeds = [SeedResult(seed, card, {"ring": each}) for seed, each in enumerate(found)]
-    mean = summarise(weather.STUDY, seeds)["ring"]["accuracy"]
-    assert mean.shared
-    assert (mean.shared.sd, mean.shared.scenes) == (pytest.approx(0.01, rel=1e-4), 12)
-    assert mean.low is not None
-    error, freedom = np.sqrt(0.01**2 + 0.002**2 / 3), 11  # next to: the scenes are most of the variance
-    assert 0.5 - mean.low == pytest.approx(stats.t.ppf(0.975, freedom) * error, rel=0.01)
-    alone = summarise(weather.STUDY, [replace(each, test_seeds={"ring": each.seed}) for each in seeds])["ring"]
-    assert alone["accuracy"].shared == OWN_SCENES
 
 
 def test_counts_are_said_once_where_all_seeds_have_the_same():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flcav.experiments.studies import study_named
-from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult, summarise
+from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
 from flcav.experiments.studies.trajectory import CAMERAS, STUDY, tables
 from flcav.intervals import mean_over_seeds
 from flcav.perception.card import Card
@@ -38,7 +38,7 @@ def results(*off_m: float) -> StudyResult[TrajectoryEvaluation]:
     for seed, off in enumerate(off_m):
         found = evaluated(off)
         card = Card.model_validate({**facts, "training": {"steps": 7, "loss": 1.5}, "metrics": found.as_json()})
-        runs.append(SeedResult(seed, card, {"held-out scenes": found}))
+        runs.append(SeedResult(seed, card, {"held-out scenes": found}, {"held-out scenes": seed}))
     rows = [evaluated(off).numbers() for off in off_m]
     means = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
     nothing = Recorded((), {}, {})
@@ -58,18 +58,6 @@ def test_cameras_are_measured_against_constant_velocity_too():
     found = tables(replace(results(7.0, 7.1), network="tiny-cameras"))["findings"].splitlines()
     assert [line.split("**")[1] for line in found[:2]] == ["reached", "not reached"]
     assert "seeds to tell 0.05 from an aim" in found[2]
-    assert "same scenes" not in "".join(found)
-
-
-def test_results_whose_seeds_share_scenes_of_unknown_spread_decide_nothing():
-    """As results of before, which do not say whose scenes they are."""
-    before = results(4.0, 4.1)
-    own = tuple(replace(seed, test_seeds={"held-out scenes": seed.seed}) for seed in before.seeds)
-    assert "**reached**" in tables(replace(before, summary=summarise(STUDY, own)))["findings"]
-    found = tables(replace(before, summary=summarise(STUDY, before.seeds)))
-    assert "**undecided**, 0.506 over 2 seeds" in found["findings"]
-    assert "How 1 of 1 figures vary over them was not stored" in found["findings"]
-    assert "(" not in next(line for line in found["errors"].splitlines() if "single path" in line).split("|")[5]
 
 
 def test_errors_have_a_row_for_each_slice_and_predictor():

@@ -7,7 +7,6 @@ import numpy as np
 
 from flcav.dataset.store import Dataset
 from flcav.experiments.studies.run import Study, StudyResult, describe_limits, list_counts, training_rows
-from flcav.intervals import Estimate
 from flcav.markdown import format_bullets, format_table
 from flcav.perception.objects.evaluate import BreakdownRow, ObjectsEvaluation, Score
 from flcav.perception.objects.model import Second
@@ -52,7 +51,7 @@ def _findings(results: StudyResult[ObjectsEvaluation]) -> list[str]:
         for town in towns
         for name, (wanted, claim) in WANTED.items()
     }
-    return [*describe_aims(aims), *describe_limits(results, aims.values(), EFFECT)]
+    return [*describe_aims(aims), *describe_limits(aims.values(), EFFECT)]
 
 
 def _classes(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
@@ -123,21 +122,11 @@ def _is_share(name: str) -> bool:
     return not name.endswith(" MOTA")  # which may be negative
 
 
-def _over_scenes(found: ObjectsEvaluation, name: str) -> Estimate | None:
-    """Return an AP with its interval over scenes; of other numbers the evaluation has none."""
-    for row in found.scores:
-        if name == f"{row.label} AP {row.kind} at {row.iou}" and row.ap is not None:
-            return Estimate(row.ap, row.low, row.high)
-    return None
-
-
 def _bar(name: str, rows: Sequence[Score | BreakdownRow]) -> Bar:
     """Return the bar of a mean over seeds, with the mean number of targets; `rows`: of each seed."""
     ap = [row.ap for row in rows if row.ap is not None]
     return Bar(name, float(np.mean(ap)), tuple(ap), round(np.mean([row.targets for row in rows])))
 
 
-STUDY = Study(
-    OBJECTS, OBJECTS.study(), draw=_draw, extra={TRACKS: add_tracks}, is_share=_is_share, over_scenes=_over_scenes
-)
+STUDY = Study(OBJECTS, OBJECTS.study(), draw=_draw, extra={TRACKS: add_tracks}, is_share=_is_share)
 STREETS = Study(OBJECTS, STREETS_STUDY, draw=_draw, is_share=_is_share)

@@ -10,8 +10,6 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar, cast, get_type_hints
 
-import numpy as np
-
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.experiments.splits import open_split, record_split
@@ -19,11 +17,7 @@ from flcav.files import Json
 from flcav.intervals import (
     LEVEL,
     MOST_SEEDS,
-    OWN_SCENES,
-    Estimate,
     MeanOverSeeds,
-    SharedScenes,
-    bound_shared_scenes,
     mean_over_seeds,
     plan_seeds,
 )
@@ -48,9 +42,7 @@ class SeedResult(Generic[EvaluationT]):
     seed: int
     card: Card
     tests: Mapping[str, EvaluationT]  # by name of the test
-    test_seeds: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
-        None  # of its test recordings; None: all seeds share them
-    )
+    test_seeds: Mapping[str, int]  # of its test recordings, by name of the test
 
 
 @dataclass(frozen=True)
@@ -85,10 +77,6 @@ def _never(name: str) -> bool:
     return False
 
 
-def _no_interval(result: Any, name: str) -> Estimate | None:
-    return None
-
-
 @dataclass(frozen=True)
 class Study(Generic[EvaluationT]):
     """A study: its task and recipe, and how its results are summarised and drawn.
@@ -102,8 +90,6 @@ class Study(Generic[EvaluationT]):
     draw: Callable[[StudyResult[EvaluationT]], bytes] = field(compare=False)  # PNG of the results
     extra: Mapping[str, Callable[[EvaluationT, Any, Dataset], EvaluationT]] = field(default_factory=dict)  # by test
     is_share: Callable[[str], bool] = field(default=_never, compare=False)  # whether a number, by name, lies in [0, 1]
-    over_scenes: Callable[[EvaluationT, str], Estimate | None] = field(default=_no_interval, compare=False)
-    # a number, by name, with its interval over the test's scenes; None where the evaluation has none
 
     @property
     def evaluation(self) -> type[EvaluationT]:
@@ -185,11 +171,8 @@ def results_of_json(study: Study[EvaluationT], values: Json, origin: str) -> Stu
 def summarise(
     study: Study[EvaluationT], seeds: Sequence[SeedResult[EvaluationT]]
 ) -> dict[str, dict[str, MeanOverSeeds]]:
-    """Return means over seeds by test, of the numbers that all seeds have.
-
-    Where seeds share test scenes, the variance of these is bounded by `bound_shared_scenes`, or not known.
-    """
-    return {test: _means(study, [seed.tests[test] for seed in seeds], _share(seeds, test)) for test in seeds[0].tests}
+    """Return means over seeds by test, of the numbers that all seeds have."""
+    return {test: _means(study, [seed.tests[test] for seed in seeds]) for test in seeds[0].tests}
 
 
 def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int, str]]:
@@ -201,30 +184,14 @@ def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int
     return rows
 
 
-def describe_limits(results: StudyResult[EvaluationT], aims: Collection[Claim], effect: float) -> list[str]:
-    """Return sentences on what the findings can tell: seeds for a deviation of `effect` from an aim, shared scenes."""
-    means = [aim.mean for aim in aims]
-    if len(results.seeds) < 2:
+def describe_limits(aims: Collection[Claim], effect: float) -> list[str]:
+    """Return a sentence on what the findings can tell: the seeds that tell a deviation of `effect` from an aim."""
+    widest = max(aim.mean.sd for aim in aims)
+    if not widest:  # one seed
         return []
-    unknown = sum(mean.shared is None for mean in means)
-    known = any(mean.shared and mean.shared.scenes for mean in means)  # of shared scenes
-    said = []
-    widest = max(float(np.hypot(mean.sd, mean.shared.sd if mean.shared else 0.0)) for mean in means)
-    if widest:
-        seeds = plan_seeds(effect, widest, LEVEL / len(aims))
-        count = f"{'at least ' if unknown else ''}{f'more than {MOST_SEEDS}' if seeds is None else seeds}"
-        tells = f"it takes {count} seeds to tell {effect} from an aim."
-        own = f"With test scenes of its own for each seed {tells}"
-        said.append(own if unknown or known else f"At the largest of these standard deviations {tells}")
-    if unknown or known:
-        said.append("All seeds were tested on the same scenes.")
-    if known:
-        said[-1] += " Their variance is in intervals and verdicts by an upper bound: that of one seed over its scenes."
-    if unknown:
-        said[-1] += (
-            f" How {unknown} of {len(means)} figures vary over them was not stored: these have no interval, no verdict."
-        )
-    return said
+    seeds = plan_seeds(effect, widest, LEVEL / len(aims))
+    count = f"more than {MOST_SEEDS}" if seeds is None else seeds
+    return [f"At the largest of these standard deviations it takes {count} seeds to tell {effect} from an aim."]
 
 
 def list_counts(counts: Sequence[int]) -> str:
@@ -273,28 +240,10 @@ def _seed_result(study: Study[EvaluationT], seed: int, values: Mapping[str, Any]
     return SeedResult(seed, Card.model_validate(values[_seed_step(seed)]), evaluations, recorded)
 
 
-def _share(seeds: Sequence[SeedResult[EvaluationT]], test: str) -> bool:
-    """Return whether several seeds have the same recordings of a test."""
-    recorded = [None if seed.test_seeds is None else seed.test_seeds[test] for seed in seeds]
-    return len(set(recorded)) < len(recorded)
-
-
-def _means(study: Study[EvaluationT], tested: Sequence[EvaluationT], shared: bool) -> dict[str, MeanOverSeeds]:
+def _means(study: Study[EvaluationT], tested: Sequence[EvaluationT]) -> dict[str, MeanOverSeeds]:
     rows = [each.numbers() for each in tested]
     common = [name for name in rows[0] if all(name in row for row in rows)]
-    scenes = {name: _bound_scenes(study, tested, name) if shared else OWN_SCENES for name in common}
-    return {
-        name: mean_over_seeds([row[name] for row in rows], shared=scenes[name], share=study.is_share(name))
-        for name in common
-    }
-
-
-def _bound_scenes(study: Study[EvaluationT], tested: Sequence[EvaluationT], name: str) -> SharedScenes | None:
-    """Return a bound of the spread of a number by the scenes that all seeds share; None where it is not known."""
-    found = [study.over_scenes(each, name) for each in tested]
-    ends = [(one.low, one.high) for one in found if one and one.low is not None and one.high is not None]
-    scenes = getattr(tested[0], "scenes", None)
-    return bound_shared_scenes(ends, scenes) if scenes and len(ends) == len(tested) else None
+    return {name: mean_over_seeds([row[name] for row in rows], share=study.is_share(name)) for name in common}
 
 
 def _kind(study: Study[EvaluationT]) -> type[StudyResult[EvaluationT]]:

@@ -40,7 +40,7 @@ def _findings(results: StudyResult[SignsEvaluation]) -> list[str]:
     aims = {f"mAP50 of {WANTED} on {test}": Claim(means["mAP50"], WANTED) for test, means in results.summary.items()}
     finer = (means["mAP50-95"].mean for means in results.summary.values())
     said = [f"{aim} mAP50-95 {mean:.3f}." for aim, mean in zip(describe_aims(aims), finer, strict=True)]
-    return [*said, *describe_limits(results, aims.values(), EFFECT)]
+    return [*said, *describe_limits(aims.values(), EFFECT)]
 
 
 def _heads(results: StudyResult[SignsEvaluation]) -> list[str]:

@@ -63,7 +63,7 @@ def _findings(results: StudyResult[TrajectoryEvaluation]) -> list[str]:
             aims[aim] = Claim(means[f"{SLICE}, ratio_single"], wanted, at_most=True)
             ends.append(f"Of six modes the best ends {best:.2f} m off, constant velocity {plain:.2f} m.")
     said = [f"{aim} {end}" for aim, end in zip(describe_aims(aims), ends, strict=True)]
-    return [*said, *describe_limits(results, aims.values(), EFFECT)]
+    return [*said, *describe_limits(aims.values(), EFFECT)]
 
 
 def _errors(test: str, means: Mapping[str, MeanOverSeeds]) -> list[list[str]]:

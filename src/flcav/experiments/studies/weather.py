@@ -36,7 +36,7 @@ def _findings(results: StudyResult[Classification]) -> list[str]:
         for name, mean in numbers.items():
             where = "within the classes' regions" if name == "accuracy" else "by the nearest class, everywhere"
             aims[f"Accuracy of {WANTED} on {test}, {where}"] = Claim(mean, WANTED)
-    return [*describe_aims(aims), *describe_limits(results, aims.values(), EFFECT)]
+    return [*describe_aims(aims), *describe_limits(aims.values(), EFFECT)]
 
 
 def _accuracy(results: StudyResult[Classification]) -> str:
@@ -58,11 +58,6 @@ def _with_interval(found: Classification) -> Estimate:
     if found.low == found.high and found.low is not None:
         return score_interval(found.accuracy, found.scenes)
     return Estimate(found.accuracy, found.low, found.high)
-
-
-def _over_scenes(found: Classification, name: str) -> Estimate:
-    one = found if name == "accuracy" else found.nearest or found
-    return Estimate(one.accuracy, one.low, one.high)
 
 
 def _recall(results: StudyResult[Classification]) -> str:
@@ -110,5 +105,4 @@ STUDY = Study(
     draw=_draw,
     extra={WHOLE_SPACE: add_nearest},
     is_share=_is_share,
-    over_scenes=_over_scenes,
 )
