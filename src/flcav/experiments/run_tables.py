@@ -1,6 +1,7 @@
 """Markdown tables of a run's results."""
 
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 
@@ -16,14 +17,18 @@ from flcav.pipeline.results.plans import RoundPlan
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Finding
 from flcav.pipeline.results.training import StageResult
+from flcav.pipeline.seeds.spread import read_spreads, widen_anew
 
 
 def tables(run: Run) -> dict[str, str]:
     """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, what cloud rounds do,
     rounds of vehicles on a network, spread of retraining.
 
-    Findings are judged anew, so that results of before a change of the judging are judged as others are.
+    Findings are judged anew, by the present table of the spread of retraining, so that results of before a change of
+    either are judged as others are.
     """
+    if run.recipe.spread is not None and not run.recipe.retrainings:
+        run = widen_anew(run, read_spreads(run.recipe.spread, Path()))
     judged = judge_anew(run)
     own = {
         "findings": format_bullets(f"*{each.question}* **{each.verdict}**. {each.sentence}" for each in judged),

@@ -1,15 +1,21 @@
 """Tables of the spread of retraining: written, read back, and refused where they are none."""
 
-from dataclasses import fields, replace
+import runpy
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from flcav.config import InputError
+from flcav.experiments.run_tables import tables
 from flcav.intervals import Spread
-from flcav.pipeline.seeds.spread import SpreadRow, read_spreads
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.seeds.spread import SpreadRow, difference_key, list_figures, list_spreads, read_spreads, widen_anew
 from flcav.pipeline.tables import append_records
 
+ROOT = Path(__file__).parents[3]
+RUNS = ROOT / "reproductions/runs"
 ROW = SpreadRow("objects", "grid", "main", "edge", "", "", sd=0.021, trainings=9, run="seed1")
 
 
@@ -46,3 +52,54 @@ def test_a_row_that_is_no_spread_is_named(tmp_path: Path, cells: str, said: str)
 def test_a_table_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"spread: 'none\.csv' is no spread of the package"):
         read_spreads("none.csv", tmp_path)
+
+
+def test_the_package_s_table_is_that_of_the_retrainings_and_of_the_run_on_another_processor() -> None:
+    tool = runpy.run_path(str(ROOT / "tools/ship_spreads.py"))
+    measured = tool["measure"]([RUNS / "retraining", RUNS / "demo_avx2"])
+    assert len(measured) == 19
+    assert read_spreads("demo", Path()) == {
+        (row.task, row.region, row.arm, row.stage, row.before_arm, row.before_stage): Spread(round(row.sd, 5), 9)
+        for row in measured
+    }
+
+
+def test_a_further_run_is_one_more_training_of_every_figure() -> None:
+    run, further = Run.load(RUNS / "retraining", "results.json"), Run.load(RUNS / "demo_avx2", "results.json")
+    own, more = list_spreads(run, "seed1"), list_spreads(run, "seed1", [further])
+    assert [row.trainings for row in (*own, *more)] == [8] * 19 + [9] * 19
+    gains = next(
+        (before, after)
+        for before, after in zip(own, more, strict=True)
+        if (before.region, before.stage, before.before_stage) == ("ring", "edge", "pretrain")
+    )
+    values = next(each for key, each in list_figures(run).items() if key == tuple(asdict(gains[0]).values())[:6])
+    (here,) = [each for each in further.differences if difference_key(each) == tuple(asdict(gains[0]).values())[:6]]
+    assert gains[0].sd == pytest.approx(np.std(values.trainings, ddof=1))
+    assert gains[1].sd == pytest.approx(np.std([*values.trainings, here.over_scenes.mean], ddof=1))
+    assert gains[1].sd > 2.5 * gains[0].sd
+
+
+def test_pages_judge_a_run_by_the_present_table() -> None:
+    run = Run.load(RUNS / "demo", "results.json")
+    spreads = read_spreads("demo", Path())
+    widened = widen_anew(run, spreads)
+    for before, after in zip(run.differences, widened.differences, strict=True):
+        assert after.spread == spreads[difference_key(after)]
+        assert after.estimate.mean == before.estimate.mean
+    for before, after in zip(run.tested, widened.tested, strict=True):
+        assert after.result == before.result
+        assert 0 < (after.estimate.low or 0) < after.estimate.mean < (after.estimate.high or 0) < 1
+    assert tables(run)["findings"] == tables(widened)["findings"]
+    without = widen_anew(run, {})
+    assert all(each.spread is None and each.estimate == each.over_scenes for each in without.differences)
+
+
+def test_the_page_of_another_processor_has_the_gains_by_its_own_pole_and_by_the_committed_run_s() -> None:
+    page = (RUNS / "demo_avx2" / "README.md").read_text(encoding="utf-8")
+    own, fixed = (Run.load(RUNS / "demo_avx2", name) for name in ("results.json", "results_pole4.json"))
+    for run, poles, said in ((own, (2,), "edge FL gains 0.021"), (fixed, (4,), "edge FL gains 0.045")):
+        (placed,) = [each for each in run.arms["main"].placed if each.region == "ring"]
+        gain = list_figures(run)["objects", "ring", "main", "edge", "main", "pretrain"].trainings[0]
+        assert (tuple(placed.chosen), f"edge FL gains {gain:.3f}") == (poles, said)
+        assert said in page

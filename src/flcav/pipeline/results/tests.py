@@ -77,6 +77,11 @@ class Difference:
     retrained: tuple[float, ...] = ()  # the difference in each retraining
     over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # as in `Test`
 
+    @property
+    def trainings(self) -> tuple[float, ...]:
+        """Return the difference in each training, the first training's first."""
+        return (self.over_scenes.mean, *self.retrained)
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -2,19 +2,20 @@
 
 Initial weights, the order of batches and augmentation are drawn anew; recordings, the plan, uploaded samples and
 roadside sensors stay. A run with `retrainings` measures the spread and writes it as a table (spread.csv), which the
-recipe of another run names (`spread`), or the package holds.
+recipe of another run names (`spread`), or the package holds. Runs of the same recipe on other kinds of processor are
+further trainings, whose sensors are placed by their own network's errors (tools/ship_spreads.py).
 """
 
 import csv
 import io
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from flcav.config import InputError
-from flcav.intervals import Spread, pool_spreads
+from flcav.intervals import Spread, measure_spread, pool_spreads, widen, widen_share
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.tests import Difference
+from flcav.pipeline.results.tests import Difference, Test
 from flcav.pipeline.tables import read_table
 
 Key = tuple[str, str, str, str, str, str]  # task, region, arm, stage, and of a difference the arm and stage before
@@ -37,7 +38,7 @@ class SpreadRow:
 
 
 def test_key(task: str, region: str, arm: str, stage: str) -> Key:
-    """Return the key of a test's measure."""
+    """Return the key of a measure."""
     return task, region, arm, stage, "", ""
 
 
@@ -46,11 +47,40 @@ def difference_key(each: Difference) -> Key:
     return each.task, each.region, each.arm, each.stage, each.before_arm, each.before_stage
 
 
-def list_spreads(run: Run, name: str) -> list[SpreadRow]:
-    """Return what a run with retrainings measured; `name` is the run's."""
-    tests = [(test_key(each.task, each.region, each.arm, each.stage), each.spread) for each in run.tested]
-    both = [*tests, *((difference_key(each), each.spread) for each in run.differences)]
-    return [SpreadRow(*key, spread.sd, spread.trainings, name) for key, spread in both if spread is not None]
+def list_spreads(run: Run, name: str, further: Sequence[Run] = ()) -> list[SpreadRow]:
+    """Return the spread of each figure of a run with retrainings; `name` is the run's.
+
+    `further`: runs of the same recipe, frames and test scenes, each one more training of every figure.
+    """
+    others = [list_figures(each) for each in further]
+    rows = []
+    for key, each in list_figures(run).items():
+        spread = measure_spread([*each.trainings, *(other[key].trainings[0] for other in others)])
+        if spread is not None:
+            rows.append(SpreadRow(*key, spread.sd, spread.trainings, name))
+    return rows
+
+
+def list_figures(run: Run) -> dict[Key, Test | Difference]:
+    """Return the tests and differences of a run by key, in this order."""
+    tests = {test_key(each.task, each.region, each.arm, each.stage): each for each in run.tested}
+    return {**tests, **{difference_key(each): each for each in run.differences}}
+
+
+def widen_anew(run: Run, spreads: Spreads) -> Run:
+    """Return a run of one training with intervals by `spreads`, which may be newer than those of its results."""
+
+    def of_test(test: Test) -> Test:
+        spread = spreads.get(test_key(test.task, test.region, test.arm, test.stage))
+        alone = test.result.estimate
+        return replace(test, estimate=alone if spread is None else widen_share(alone, spread), spread=spread)
+
+    def of_difference(each: Difference) -> Difference:
+        spread, alone = spreads.get(difference_key(each)), each.over_scenes
+        return replace(each, estimate=alone if spread is None else widen(alone, spread), spread=spread)
+
+    tested, differences = map(of_test, run.tested), map(of_difference, run.differences)
+    return replace(run, tested=tuple(tested), differences=tuple(differences))
 
 
 def read_spreads(name: str, beside: Path) -> Spreads:
