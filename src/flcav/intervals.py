@@ -187,7 +187,7 @@ class OneTraining(MeanOverSeeds):
 
     def p_value(self, hypothesis: float = 0.0) -> float:
         """Return the level at which the interval of `widen` ends at `hypothesis`."""
-        far, of_scenes = abs(self.distance(hypothesis)), self.shared.sd if self.shared else 0.0
+        far, of_scenes = abs(self.distance(hypothesis)), self.shared.sd
 
         def beyond(p: float) -> float:
             scenes, trainings = ndtri(1 - p / 2) * of_scenes, stdtrit(self.trainings - 1, 1 - p / 2) * self.sd
