@@ -101,7 +101,8 @@ def test_a_dataset_of_a_slope_is_tilted(tmp_path: Path):
 
 
 def test_a_folder_whose_name_no_file_can_have(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    flcav("towns", "import", CROSS, "--out", tmp_path / "my town")
+    flcav("towns", "import", CROSS, "--out", tmp_path / "town")
+    (tmp_path / "town").rename(tmp_path / "my town")
     (tmp_path / "recipe.yaml").write_text(yaml.safe_dump({**RECIPE, "town": str(tmp_path / "my town")}))
     with pytest.raises(SystemExit) as ended:
         run(["record", str(tmp_path / "recipe.yaml"), "--out", str(tmp_path / "data")])

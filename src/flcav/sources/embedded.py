@@ -1,7 +1,6 @@
 """The built-in simulator as a source: SUMO traffic in a town, observed by simulated sensors."""
 
 import hashlib
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,10 @@ from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
 from flcav.sources.randomisation import randomise_rig, randomise_sizes, randomise_town, town_files
 from flcav.sources.recipe import Recipe
-from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, load_town
+from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, check_town_name, load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
 from flcav.world.traffic.traffic import simulate
-
-_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")  # the town's name is the prefix of the names of scenes
 
 
 class EmbeddedSource:
@@ -39,8 +36,7 @@ class EmbeddedSource:
         self.town = load_town(recipe.town, beside)
         if recipe.randomise is not None:
             self.town = randomise_town(self.town, stream(recipe.seed, "streets", self.town.name))
-        if not _SAFE_NAME.fullmatch(self.town.name):
-            raise InputError(f"field 'town' = {recipe.town!r}: the folder's name must be letters, digits, - and _")
+        check_town_name(self.town.name)
         known = self.town.poles.id.tolist()
         self.poles = known if recipe.poles == "all" else list(recipe.poles)
         if unknown := [pole for pole in self.poles if pole not in known]:

@@ -31,9 +31,10 @@ def asked(folder: Path, steps: list[int], seed: int = 1) -> Path:
     """Return the folder of a job."""
     folder.mkdir()
     town = load_town("suburb")
-    demand = write_demand(read_net(town.net), town.parameters, seed=1, cavs=1, until_s=9.0, fill_s=5.0)
-    (folder / "routes.xml").write_text(demand)
-    job = {"net": str(town.net), "routes": str(folder / "routes.xml"), "seed": seed, "steps": steps, "scenarios": []}
+    demand = write_demand(read_net(town.net), town.parameters, seed=1, cavs=1, from_s=1.0, until_s=9.0, fill_s=5.0)
+    (folder / "routes.xml").write_text(demand.routes)
+    job = {"net": str(town.net), "routes": str(folder / "routes.xml"), "seed": seed, "steps": steps}
+    job |= {"scenarios": [], "followers": {}}
     (folder / "job.json").write_text(json.dumps(job))
     return folder
 

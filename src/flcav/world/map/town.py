@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -26,6 +27,7 @@ HILLY: dict[str, str] = {f"hilly_{name}": name for name in TOWNS}  # the same to
 PACKAGED: tuple[str, ...] = (*TOWNS, *HILLY)  # all that come with flcav
 HEIGHTS = "heights.parquet"  # file of a town's relief, beside its net
 HILLS = "hills.parquet"  # that of a town of `HILLY`, beside the net of the level one
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # of a town: the beginning of the names of its frames
 KERB_M = 0.12  # height of a sidewalk above the road
 BESIDE_BRIDGE_M = 3.0  # no pole, sign, signal, tree or furniture stands nearer to a bridge
 MARGIN_M = 5.0  # from the outermost surface or building to the bounds
@@ -87,6 +89,15 @@ class Town:
     def ground(self, x: float, y: float) -> float:
         """Return the height [m] of the road, or of the land beside it, at one place."""
         return 0.0 if self.relief is None else float(self.relief.heights(x, y))
+
+
+def check_town_name(name: str) -> None:
+    """Raise `InputError` unless scenes and frames can be named after a town of this name."""
+    if not NAME.fullmatch(name):
+        raise InputError(
+            f"town {shorten(name)}: the folder's name must be letters, digits, - and _, 64 at most, the first a letter "
+            "or digit"
+        )
 
 
 def load_town(name: str | Path, beside: Path | None = None) -> Town:

@@ -38,7 +38,8 @@ def read_map(path: Path) -> ElementTree.Element:
     Raises `InputError` where the file is missing, no map of version 1, or breaks a rule of `standard`.
     """
     try:
-        root = ElementTree.parse(path).getroot()
+        text = path.read_bytes()
+        root = ElementTree.fromstring(text[max(text.find(b"<?xml"), 0) :])  # comments stand before the declaration
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except IsADirectoryError:
@@ -47,16 +48,14 @@ def read_map(path: Path) -> ElementTree.Element:
         raise InputError(f"{path}: not an OpenDRIVE map ({error})") from None
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]  # version 1.8 has a namespace, earlier ones do not
+    if root.tag.lower() != "opendrive":
+        raise InputError(
+            f"{path}: not an OpenDRIVE map (its root is <{root.tag[:SHOWN]}>, expected <OpenDRIVE>: OpenDRIVE 1.8, 6.4)"
+        )
     header = root.find("header")
-    if root.tag.lower() != "opendrive" or header is None:
-        raise InputError(
-            f"{path}: not an OpenDRIVE map (its root is <{root.tag[:SHOWN]}>, "
-            "expected <OpenDRIVE> with a <header>: OpenDRIVE 1.8, 6.4)"
-        )
-    if header.get("revMajor") != "1":
-        raise InputError(
-            f"{path}: OpenDRIVE version {shorten(header.get('revMajor', ''))} is not supported; supported: 1.x"
-        )
+    version = "1" if header is None else header.get("revMajor", "")  # a map can do without a header
+    if version != "1":
+        raise InputError(f"{path}: OpenDRIVE version {shorten(version)} is not supported; supported: 1.x")
     if root.find("road") is None:
         raise InputError(f"{path}: has no <road> (OpenDRIVE 1.8, 10.1)")
     if root.find(".//include") is not None:

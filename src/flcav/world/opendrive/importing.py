@@ -25,7 +25,7 @@ from flcav.files import find_existing
 from flcav.world.map.parameters import GeoReference, MapSource
 from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet
-from flcav.world.map.town import HEIGHTS, Town, load_town
+from flcav.world.map.town import HEIGHTS, Town, check_town_name, load_town
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.furnishing import furnish
 from flcav.world.opendrive.georeference import locate_origin
@@ -173,6 +173,7 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
     Raises `InputError`, and makes no folder, where `out` exists already, where the file is no OpenDRIVE map that
     netconvert can read, and where the map has no driving lane.
     """
+    check_town_name(out.name)
     if out.exists():
         raise InputError(f"{out}: is there already; give a new folder")
     beside = find_existing(out.parent)
@@ -222,6 +223,9 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         values = parameters.model_dump(mode="json", exclude_defaults=True)
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
         (folder / "town.yaml").write_text(text, encoding="utf-8")
+        if not parameters.vehicles:
+            metres = sum(LineString(lane.shape).length for edge in net.streets for lane in edge.lanes_of("driving"))
+            notes.append(f"No vehicles: the map has {metres:.0f} m of lanes open to cars.")
         if len(heights.points):
             offset = np.array([dx, dy, 0.0])
             decks = [Deck([section + offset for section in sections]) for sections in heights.decks]

@@ -1,4 +1,8 @@
-"""Mending of OpenDRIVE maps: gaps over which netconvert stumbles, although a map can do without what is missing."""
+"""Mending of OpenDRIVE maps: completion of optional content that netconvert requires, and removal of broken content.
+
+netconvert requires more than ASAM OpenDRIVE 1.8 does: a type of the centre lane (11.3), the contact point of a
+connection (12.4), and restrictions of access as attributes, as in edition 1.7 (11.8.2).
+"""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -11,11 +15,14 @@ def mend_map(root: ElementTree.Element) -> tuple[str, ...]:
     """Mend the map below `root` in place; return a note on each kind of change.
 
     Signals get what they lack of `SIGNAL`; links and connections that lead nowhere, and infinite limits, are removed.
+    What netconvert requires beyond the standard is completed without a note.
     """
     roads = {row.get("id", "") for row in root.iterfind("road")}
     known = {"road": roads, "junction": {row.get("id", "") for row in root.iterfind("junction")}}
-    untyped = dangling = endless = 0  # signals, links, speed limits
+    untyped = dangling = endless = unknown = direct = 0  # signals, links, speed limits, lanes, connections
     for road in root.iterfind("road"):
+        unknown += _type_lanes(road)
+        _split_restrictions(road)
         for signal in road.iterfind("signals/signal"):
             untyped += not signal.get("type")
             for name, value in {"id": f"unnamed{untyped}", **SIGNAL}.items():
@@ -27,10 +34,17 @@ def mend_map(root: ElementTree.Element) -> tuple[str, ...]:
                 dangling += 1
         dangling += _clear_lane_links(road)
         endless += _clear_endless_limits(road)
+    before = {road.get("id", ""): _find_predecessor(road) for road in root.iterfind("road")}
     for junction in root.iterfind("junction"):
         for row in junction.findall("connection"):
+            if not row.get("contactPoint"):
+                begins = before.get(row.get("connectingRoad", "")) == row.get("incomingRoad")
+                row.set("contactPoint", "start" if begins else "end")
             ways = [lane for lane in row.iterfind("laneLink") if _is_integer(lane, "from") and _is_integer(lane, "to")]
-            if not {row.get("incomingRoad"), row.get("connectingRoad")} <= roads:
+            if {row.get("incomingRoad"), row.get("linkedRoad")} <= roads:
+                junction.remove(row)
+                direct += 1
+            elif not {row.get("incomingRoad"), row.get("connectingRoad")} <= roads:
                 junction.remove(row)
                 dangling += 1
             elif len(ways) < len(row.findall("laneLink")):
@@ -44,7 +58,41 @@ def mend_map(root: ElementTree.Element) -> tuple[str, ...]:
         notes.append(f"Links that lead to no road, junction or lane of the map, left out: {dangling}.")
     if endless:
         notes.append(f"Speed limits that are not finite, left out: {endless}.")
+    if direct:
+        notes.append(f"Connections of direct junctions: {direct}; their lanes are joined by where they lie.")
+    if unknown:
+        notes.append(f"Lanes without a type, closed to traffic: {unknown}.")
     return tuple(notes)
+
+
+def _type_lanes(road: ElementTree.Element) -> int:
+    """Give each lane without a type the type "none"; return how many of them are not the centre lane."""
+    unknown = 0
+    for side in road.iterfind("lanes/laneSection/*"):
+        for lane in side.iterfind("lane"):
+            if not lane.get("type"):
+                lane.set("type", "none")
+                unknown += side.tag != "center"
+    return unknown
+
+
+def _split_restrictions(road: ElementTree.Element) -> None:
+    """Rewrite each `<access>` of edition 1.8, with `<restriction>` elements, as one of edition 1.7 for each of them."""
+    for lane in road.iterfind("lanes/laneSection/*/lane"):
+        for access in lane.findall("access"):
+            if access.get("restriction"):
+                continue
+            at = list(lane).index(access)
+            lane.remove(access)
+            for restriction in access.iterfind("restriction"):
+                values = {**access.attrib, "restriction": restriction.get("type", "")}
+                lane.insert(at, ElementTree.Element("access", values))
+
+
+def _find_predecessor(road: ElementTree.Element) -> str | None:
+    """Return the id of the road that precedes a road, if any."""
+    before = road.find("link/predecessor[@elementType='road']")
+    return None if before is None else before.get("elementId")
 
 
 def _clear_lane_links(road: ElementTree.Element) -> int:

@@ -5,6 +5,7 @@ Vehicles and pedestrians are under way to the end of the run. Both parts are dra
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
@@ -19,6 +20,7 @@ from flcav.world.map.parameters import TownParameters
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
 from flcav.world.shapes import SHAPES
+from flcav.world.traffic.passages import find_passages
 from flcav.world.traffic.reach import find_driven, find_walked
 
 Array = NDArray[np.float64]
@@ -41,6 +43,7 @@ DRIVER = {  # attributes of SUMO's vehicle types by category, where they differ 
     "pedestrian": {"vClass": "pedestrian", "maxSpeed": "1.6", "speedFactor": "normc(0.8,0.15,0.4,1.0)"},
 }
 CAV_TYPE = "car.sedan"
+HEADWAY_S = 2.0  # least time between two vehicles that enter at the same place
 NEXT_M = 5.0  # least distance between two destinations, where there is a choice
 FASTEST = 20.0  # speed for which tours are long enough, of vehicles [m/s]
 FASTEST_WALK = 1.7  # and of pedestrians [m/s]
@@ -106,14 +109,34 @@ def _park_in_spaces(parameters: TownParameters, random: np.random.Generator) -> 
             yield Parked(category, shape, space.x, space.y, float(wrap_angle(yaw)))
 
 
+class Follower(NamedTuple):
+    """A vehicle that enters when another has left."""
+
+    name: str
+    type: str  # SUMO's
+    edges: list[str]  # its whole route
+
+
+@dataclass(frozen=True)
+class Demand:
+    """The road users of a run."""
+
+    routes: str  # SUMO's route file (XML)
+    followers: dict[str, Follower]  # by the name of the vehicle before; none where all tours are long enough
+
+
 def write_demand(
-    net: RoadNet, parameters: TownParameters, *, seed: int, cavs: int, until_s: float, fill_s: float
-) -> str:
-    """Return the text of SUMO's route file (XML): vehicle types, and a trip for every vehicle and pedestrian.
+    net: RoadNet, parameters: TownParameters, *, seed: int, cavs: int, from_s: float, until_s: float, fill_s: float
+) -> Demand:
+    """Return the demand of a town: a trip for every vehicle and pedestrian.
 
     CAVs depart at 0 s, all others at a uniform time before `fill_s` [s]. Each has a tour of random destinations too
     long to be finished by `until_s` [s] at `FASTEST` or `FASTEST_WALK`. Vehicles draw destinations by the street type's
     `traffic`, pedestrians by its `footfall`; CAVs draw the approaches of the candidate poles, if there are any.
+
+    Where the net has open ends, so that no tour is long enough, a CAV enters shortly before `from_s` [s] and drives on
+    to beyond `until_s`; another vehicle drives to an exit, and when it has left, the next one enters. Raises
+    `InputError` where no way is long enough for a CAV.
     """
     root = Element("routes")
     for category, shapes in SHAPES.items():
@@ -130,18 +153,37 @@ def write_demand(
     by_car, on_foot = find_driven(net, driven), find_walked(net, walked)
     reach = FASTEST * until_s
     trips: list[tuple[float, Element]] = []
+    passages = find_passages(net, driven)
+    exits = {edge.id for edge, left_s in zip(driven, passages.left_s) if np.isfinite(left_s)}  # none in a closed net
     for i in range(cavs):
         random = stream(seed, "cav", i)
-        edges = draw_tour(driven, by_car, watching if watching.any() else traffic, reach, random)
-        trips.append((0.0, _vehicle(f"cav{i}", CAV_TYPE, 0.0, edges)))
+        weight, depart = watching if watching.any() else traffic, 0.0
+        edges = draw_tour(driven, by_car, weight, reach, random)
+        if edges[-1] in exits:
+            depart = round(max(from_s - (i + 1) * HEADWAY_S, 0.0), 1)
+            least_s = until_s - depart
+            edges = [driven[row].id for row in passages.draw(weight, random, least_s=least_s, most_s=least_s)]
+        trips.append((depart, _vehicle(f"cav{i}", CAV_TYPE, depart, edges, entering=depart > 0)))
     categories = list(parameters.mix)
     shares = np.array([parameters.mix[category] for category in categories])
+    followers: dict[str, Follower] = {}
     for i in range(parameters.vehicles):
         random = stream(seed, "vehicle", i)
         kind = draw_type(categories[int(random.choice(len(categories), p=shares / shares.sum()))], parameters, random)
         depart = round(float(random.uniform(0.0, fill_s)), 1)
         tour = draw_tour(driven, by_car, traffic, reach, random)
-        trips.append((depart, _vehicle(f"veh{i}", kind, depart, tour)))
+        if tour[-1] not in exits:
+            trips.append((depart, _vehicle(f"veh{i}", kind, depart, tour)))
+            continue
+        name, rest = f"veh{i}", until_s - depart
+        rows = passages.draw(traffic, random, least_s=0.0, most_s=rest)
+        trips.append((depart, _vehicle(name, kind, depart, [driven[row].id for row in rows])))
+        while (rest := rest - max(float(passages.time_s[rows].sum()), HEADWAY_S)) > 0:
+            rows = passages.draw(traffic * passages.entries, random, least_s=0.0, most_s=rest)
+            followers[name] = Follower(
+                f"veh{parameters.vehicles + len(followers)}", kind, [driven[row].id for row in rows]
+            )
+            name = followers[name].name
     for i in range(parameters.pedestrians if walked else 0):
         random = stream(seed, "pedestrian", i)
         kind = draw_type("pedestrian", parameters, random)
@@ -152,7 +194,7 @@ def write_demand(
             trips.append((depart, _person(f"ped{i}", kind, depart, tour)))
     for _, trip in sorted(trips, key=lambda item: item[0]):
         root.append(trip)
-    return tostring(root, encoding="unicode")
+    return Demand(tostring(root, encoding="unicode"), followers)
 
 
 def weigh_pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str, float]:
@@ -207,9 +249,10 @@ def draw_type(category: str, parameters: TownParameters, random: np.random.Gener
     return f"{category}.{SHAPES[category][int(random.choice(len(weights), p=weights))].name}"
 
 
-def _vehicle(name: str, kind: str, depart: float, edges: list[str]) -> Element:
-    """Return SUMO's <trip> of a vehicle along `edges`."""
-    row = {"id": name, "type": kind, "depart": f"{depart:.1f}", "departPos": "random_free", "departLane": "best"}
+def _vehicle(name: str, kind: str, depart: float, edges: list[str], *, entering: bool = False) -> Element:
+    """Return SUMO's <trip> of a vehicle along `edges`: from rest somewhere on the first, or `entering` it in motion."""
+    start = {"departPos": "base", "departSpeed": "max"} if entering else {"departPos": "random_free"}
+    row = {"id": name, "type": kind, "depart": f"{depart:.1f}", **start, "departLane": "best"}
     return Element("trip", row | {"from": edges[0], "to": edges[-1], "via": " ".join(edges[1:-1])})
 
 

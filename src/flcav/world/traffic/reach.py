@@ -7,14 +7,20 @@ from numpy.typing import NDArray
 from flcav.world.map.roads import Edge, RoadNet
 
 
-def find_driven(net: RoadNet, edges: list[Edge]) -> NDArray[np.bool_]:
-    """Return (N, N) whether a vehicle can drive from each of the `edges` to each of them; in a circle to itself."""
+def make_drive_graph(net: RoadNet, edges: list[Edge]) -> networkx.DiGraph:
+    """Return the graph of the edges that vehicles can drive on, the `edges` first, and which leads to which."""
     graph = networkx.DiGraph()
     graph.add_nodes_from(edge.id for edge in edges)
     driven = {lane.id for edge in net.edges.values() for lane in edge.lanes_of("driving")}
     for way in net.connections:
         if way.start in driven and way.end in driven:
             graph.add_edge(_edge(way.start), _edge(way.end))
+    return graph
+
+
+def find_driven(net: RoadNet, edges: list[Edge]) -> NDArray[np.bool_]:
+    """Return (N, N) whether a vehicle can drive from each of the `edges` to each of them; in a circle to itself."""
+    graph = make_drive_graph(net, edges)
     row = {edge.id: i for i, edge in enumerate(edges)}
     whole = networkx.condensation(graph)
     out = np.zeros((len(edges), len(edges)), np.bool_)

@@ -66,8 +66,18 @@ class Walkers:
         return target
 
 
-def run_sumo(net: Path, routes: Path, seed: int, steps: list[int], out: Path, scenarios: list[Scenario]) -> None:
+def run_sumo(
+    net: Path,
+    routes: Path,
+    followers: Mapping[str, tuple[str, str, list[str]]],
+    seed: int,
+    steps: list[int],
+    out: Path,
+    scenarios: list[Scenario],
+) -> None:
     """Simulate up to the last of `steps` (T,), ascending, of 0.1 s each, and write the states at these to `out` (.npz).
+
+    When a vehicle has left that has one of the `followers` (name, type, edges), that one enters.
 
     Arrays: `id` and `type` (A,) of each actor; `row` (N, 2) instant and actor of each state; `state` (N, 4) SUMO's
     front x, y [m], angle [deg clockwise from north] and speed [m/s]; `light` (J,) and `light_state` (T, J) letters of
@@ -112,6 +122,13 @@ def run_sumo(net: Path, routes: Path, seed: int, steps: list[int], out: Path, sc
         while now < step:
             libsumo.simulationStep()
             now += 1
+            for name in libsumo.simulation.getArrivedIDList() if followers else ():
+                if name in followers:
+                    follower, kind, edges = followers[name]
+                    libsumo.route.add(follower, edges)
+                    libsumo.vehicle.add(
+                        follower, follower, kind, departPos="base", departSpeed="max", departLane="best"
+                    )
             walkers.follow({name: state_of(libsumo.person, name) for name in libsumo.person.getIDList()})
             if director:
                 director.direct()
@@ -161,7 +178,8 @@ def _simulate(folder: Path) -> NoReturn:
             os.dup2(said.fileno(), sys.stderr.fileno())
         job = json.loads((folder / "job.json").read_text())
         scenarios = [Scenario.model_validate(scenario) for scenario in job["scenarios"]]
-        run_sumo(Path(job["net"]), Path(job["routes"]), job["seed"], job["steps"], folder / "out.npz", scenarios)
+        net, routes, out = Path(job["net"]), Path(job["routes"]), folder / "out.npz"
+        run_sumo(net, routes, job["followers"], job["seed"], job["steps"], out, scenarios)
         code = 0
     except BaseException:
         traceback.print_exc()

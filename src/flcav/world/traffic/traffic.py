@@ -22,7 +22,7 @@ from flcav.world.shapes import SHAPES
 from flcav.world.trace import Event, Trace
 from flcav.world.traffic.bridges import find_footing
 from flcav.world.traffic.climb import stand_on_relief
-from flcav.world.traffic.demand import Parked, list_vehicle_types, park, write_demand
+from flcav.world.traffic.demand import Demand, Parked, list_vehicle_types, park, write_demand
 from flcav.world.traffic.sumo import simulate_in
 from flcav.world.traffic.sumo_process import STEP_S
 
@@ -52,7 +52,11 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: S
     if any(scenario.kind == "red_light_runner" for scenario in scenarios) and not town.signals.link:
         raise InputError(f"scenario 'red_light_runner': {town.name} has no traffic lights")
     net = read_net(town.net)
-    demand = write_demand(net, town.parameters, seed=seed, cavs=cavs, until_s=float(times_s[-1]), fill_s=FILL_S)
+    span = {"from_s": float(times_s[0]), "until_s": float(times_s[-1])}
+    try:
+        demand = write_demand(net, town.parameters, seed=seed, cavs=cavs, fill_s=FILL_S, **span)
+    except InputError as error:
+        raise InputError(f"{town.name}: {error}") from None
     before, now, after = (_windows(steps + offset) for offset in (-1, 0, 1))
     read = np.unique((before, now, after))
     raw = _run(town.net, demand, derive_seed(seed, "sumo"), read, scenarios)
@@ -71,15 +75,16 @@ def _windows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _run(
-    net: Path, demand: str, seed: int, steps: NDArray[np.int64], scenarios: Sequence[Scenario]
+    net: Path, demand: Demand, seed: int, steps: NDArray[np.int64], scenarios: Sequence[Scenario]
 ) -> dict[str, NDArray]:
     """Return the arrays of `sumo_process.run`; raises `RuntimeError` where SUMO fails."""
     with tempfile.TemporaryDirectory(prefix="flcav_traffic_") as name:
         folder = Path(name)
-        (folder / "routes.rou.xml").write_text(demand, encoding="utf-8")
+        (folder / "routes.rou.xml").write_text(demand.routes, encoding="utf-8")
         asked = [scenario.model_dump() for scenario in scenarios]
         values = {"net": str(net), "routes": str(folder / "routes.rou.xml"), "seed": seed, "steps": steps.tolist()}
-        (folder / "job.json").write_text(json.dumps(values | {"scenarios": asked}))
+        values |= {"followers": demand.followers, "scenarios": asked}
+        (folder / "job.json").write_text(json.dumps(values))
         try:
             simulate_in(folder)
         except RuntimeError as error:

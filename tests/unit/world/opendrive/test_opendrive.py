@@ -188,7 +188,7 @@ def test_traffic_flows_in_carlas_town(carla: ImportedTown) -> None:
     [
         ("not xml at all", "not an OpenDRIVE map"),
         ("<net/>", "its root is <net>"),
-        ("<OpenDRIVE/>", "with a <header>"),
+        ("<OpenDRIVE/>", "has no <road>"),
         ('<OpenDRIVE><header revMajor="2"/></OpenDRIVE>', "version '2' is not supported"),
         ('<OpenDRIVE><header revMajor="1"/></OpenDRIVE>', "has no <road>"),
         ('<OpenDRIVE><header revMajor="1" revMinor="4"/><road id="1" length="x"/></OpenDRIVE>', "OpenDRIVE"),

@@ -1,5 +1,6 @@
 """OpenDRIVE maps as others make them: left-hand traffic, circles, lone roads, gaps, and broken rules."""
 
+import re
 import xml.etree.ElementTree as ElementTree
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +17,7 @@ from flcav.world.map.roads import Edge, RoadNet, read_net
 from flcav.world.map.surfaces import subtract, unite
 from flcav.world.map.town import Town
 from flcav.world.opendrive.document import describe_map, read_map
-from flcav.world.opendrive.importing import import_town
+from flcav.world.opendrive.importing import ImportedTown, import_town
 from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map
 from flcav.world.opendrive.objects.signs import find_signs
@@ -168,9 +169,93 @@ def test_gaps_are_mended() -> None:
     assert len(notes) == 2
 
 
+def street(*right: str, before: str = "<OpenDRIVE>", length: float = 300) -> str:
+    """Return a map of one straight road, whose lanes on the right have these children beside their width."""
+    width = '<width sOffset="0" a="3.5" b="0" c="0" d="0"/>'
+    lanes = "".join(f'<lane id="{-i - 1}" type="driving">{width}{more}</lane>' for i, more in enumerate(right))
+    return (
+        f'{before}<road id="300" length="{length}" junction="-1"><type s="0" type="town"/><planView>'
+        f'<geometry s="0" x="0" y="0" hdg="0" length="{length}"><line/></geometry></planView><lanes>'
+        f'<laneSection s="0"><center><lane id="0"/></center><right>{lanes}</right></laneSection></lanes>'
+        "</road></OpenDRIVE>"
+    )
+
+
+def import_text(text: str, folder: Path) -> ImportedTown:
+    folder.mkdir()
+    (folder / "map.xodr").write_text(text)
+    return import_town(folder / "map.xodr", folder / "town")
+
+
+def test_optional_content_that_netconvert_requires_is_completed(tmp_path: Path) -> None:
+    """A centre lane without a type, restrictions as elements, no header, a comment before the declaration: 1.8."""
+    rule = '<access sOffset="0" rule="allow"><restriction type="{}"/><restriction type="{}"/></access>'
+    declared = '<!-- of a library -->\n<?xml version="1.0"?>\n<OpenDRIVE><header revMajor="1" revMinor="8"/>'
+    town = import_text(street("", rule.format("bus", "bicycle"), before=declared), tmp_path / "buses").town
+    (edge,) = read_net(town.net).streets
+    assert [lane.kind == "driving" for lane in edge.lanes] == [False, False, True]  # cars keep out of the bus lane
+    town = import_text(street("", rule.format("passengerCar", "bus")), tmp_path / "cars").town
+    (edge,) = read_net(town.net).streets
+    assert [lane.kind == "driving" for lane in edge.lanes] == [False, True, True]
+    with pytest.raises(InputError, match="has no road with a lane for driving"):
+        import_text(street(rule.format("bus", "bicycle")), tmp_path / "none")
+
+
+def test_contact_points_of_connections_follow_from_the_links(tmp_path: Path) -> None:
+    text = CROSS.read_text()
+    whole = import_text(text, tmp_path / "whole").town
+    bare = re.sub(r'(<connection [^>]*?) contactPoint="[a-z]*"', r"\1", text)
+    assert bare != text
+    mended = import_text(bare, tmp_path / "bare").town
+    assert read_net(whole.net).connections == read_net(mended.net).connections
+
+
+def test_lanes_and_direct_junctions_that_lack_something_are_told() -> None:
+    lanes = '<lanes><laneSection><left><lane id="1"/></left><center><lane id="0"/></center></laneSection></lanes>'
+    junction = '<junction id="5" type="direct"><connection id="0" incomingRoad="1" linkedRoad="2"/></junction>'
+    root = ElementTree.fromstring(f'<OpenDRIVE><road id="1">{lanes}</road><road id="2"/>{junction}</OpenDRIVE>')
+    assert mend_map(root) == (
+        "Connections of direct junctions: 1; their lanes are joined by where they lie.",
+        "Lanes without a type, closed to traffic: 1.",
+    )
+    assert [lane.get("type") for lane in root.iter("lane")] == ["none", "none"]
+
+
+def test_streets_that_end_at_the_edge_of_a_map_stay_busy(tmp_path: Path) -> None:
+    """Vehicles leave at the end of a one-way street, others enter; CAVs drive while they record."""
+    town = import_text(street("", length=2000), tmp_path / "oneway").town
+    early, late = (simulate(town, seed=1, cavs=2, times_s=np.round(t0 + np.arange(100) / 10, 1)) for t0 in (60, 400))
+    for trace in (early, late):
+        driving = np.char.startswith(trace.actor, "cav") | np.char.startswith(trace.actor, "veh")
+        assert trace.present[:, np.char.startswith(trace.actor, "cav")].all()
+        busy = trace.present[:, driving].sum(axis=1) / (2 + town.parameters.vehicles)
+        assert busy.min() >= 0.75  # some wait for a gap behind a bicycle
+        assert busy.max() <= 1.0
+    assert not set(early.actor[np.char.startswith(early.actor, "veh")]) & set(late.actor)  # all others by then
+    again = simulate(town, seed=1, cavs=2, times_s=late.time_s)
+    np.testing.assert_array_equal(again.position, late.position)
+    with pytest.raises(InputError, match=r"drive for 141 s, and its longest way out of the 2000 m of lanes takes 120"):
+        simulate(town, seed=1, cavs=1, times_s=np.arange(60.0, 200.0))
+
+
+def test_where_nobody_can_drive_is_told(tmp_path: Path) -> None:
+    imported = import_text(street("", length=14), tmp_path / "short")
+    assert "No vehicles: the map has 14 m of lanes open to cars." in imported.notes
+    with pytest.raises(InputError, match=r"town: a vehicle would have to drive for .* of the 14 m of lanes takes 0.8"):
+        simulate(imported.town, seed=1, cavs=1, times_s=np.array([60.0]))
+
+
+@pytest.mark.parametrize("name", ["a.b", "my town", "-x", "x" * 65])
+def test_names_that_no_frame_can_have_are_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the folder's name must be letters, digits, - and _"):
+        import_town(CROSS, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
 def test_limits_that_are_not_finite_are_left_out() -> None:
     limits = "".join(f'<speed sOffset="0" max="{text}"/>' for text in ("nan", "inf", "13.9", "no limit"))
-    road = f'<road id="1"><type s="0">{limits}</type><lanes><laneSection><right><lane id="-1">{limits}</lane></right>'
+    lane = f'<right><lane id="-1" type="driving">{limits}</lane></right>'
+    road = f'<road id="1"><type s="0">{limits}</type><lanes><laneSection>{lane}'
     root = ElementTree.fromstring(f"<OpenDRIVE>{road}</laneSection></lanes></road></OpenDRIVE>")
     assert mend_map(root) == ("Speed limits that are not finite, left out: 4.",)
     assert [row.get("max") for row in root.iter("speed")] == ["13.9", "no limit"] * 2
@@ -209,7 +294,7 @@ def test_streets_that_lie_a_country_apart_are_refused(tmp_path: Path) -> None:
         ('id="2" junction', 'id="1" junction', r"each road needs an id of its own, and two have '1' .*10\.1\)"),
         ('revMajor="1"', 'revMajor="2"', "version '2' is not supported"),
         ("<junction ", '<include file="more.xodr"/><junction ', "includes other files, which are not read"),
-        ("<header", "<heading", r"expected <OpenDRIVE> with a <header>: OpenDRIVE 1.8, 6\.4"),
+        ("<OpenDRIVE", "<RoadNetwork", r"root is <RoadNetwork>, expected <OpenDRIVE>: OpenDRIVE 1.8, 6\.4"),
         ("<lanes>", '<lanes><laneOffset s="x"/>', r"<laneOffset> needs a number as 's', not 'x' .*11\.4\)"),
         ("<junction ", '<junction id="10"/><junction ', r"each junction needs an id of its own.*12\.2\)"),
         ('<lane id="1" type', '<lane id="2" type', r"road '1': its left lanes are not numbered one by one .*11\.1"),
@@ -219,7 +304,7 @@ def test_streets_that_lie_a_country_apart_are_refused(tmp_path: Path) -> None:
     ],
 )
 def test_a_broken_rule_is_told_with_its_clause(old: str, new: str, message: str, tmp_path: Path) -> None:
-    text = CROSS.read_text().replace("</header>", f"</{new.removeprefix('<') if 'head' in new else 'header'}>")
+    text = CROSS.read_text().replace("</OpenDRIVE>", f"</{new.removeprefix('<') if 'Network' in new else 'OpenDRIVE'}>")
     assert old in text
     path = tmp_path / "map.xodr"
     path.write_text(text.replace(old, new, 1))
@@ -288,7 +373,7 @@ def test_a_limit_that_no_sign_shows_is_left_out_with_the_reason(attributes: str)
 
 def test_a_town_whose_limits_are_left_out_has_no_invented_ones(tmp_path: Path) -> None:
     root = read_map(CROSS)
-    assert "speed_60" in import_town(CROSS, tmp_path / "by rule").town.signs.kind  # of streets of 50 km/h
+    assert "speed_60" in import_town(CROSS, tmp_path / "by_rule").town.signs.kind  # of streets of 50 km/h
     signal = '<signal id="1" s="20" t="-5" type="274" value="50" orientation="+"/>'
     next(root.iterfind("road")).append(ElementTree.fromstring(f"<signals>{signal}</signals>"))
     imported = import_town(write(root, tmp_path / "map.xodr"), tmp_path / "town")

@@ -1,0 +1,79 @@
+"""Passages: routes through a road net with open ends, from where vehicles enter it to where they leave it."""
+
+from dataclasses import dataclass
+
+import networkx
+import numpy as np
+from numpy.typing import NDArray
+from shapely.geometry import LineString
+
+from flcav.config import InputError
+from flcav.world.map.roads import Edge, RoadNet
+from flcav.world.traffic.reach import make_drive_graph
+
+Array = NDArray[np.float64]
+
+HASTE = 1.2  # highest speed of a car, as a multiple of the limit
+ENTERING_S = 1.0  # a vehicle enters with its whole length on the first edge, and leaves with its front
+
+
+@dataclass(frozen=True)
+class Passages:
+    """The driven edges of a net, where each leads, and for how long a vehicle can drive on from there."""
+
+    edges: list[Edge]
+    onward: list[list[int]]  # per edge, the rows of those that follow it
+    time_s: Array  # (N,) on each edge at the limit
+    left_s: (
+        Array  # (N,) longest from the beginning of each edge to where the net ends; infinite where there is a circle
+    )
+    entries: NDArray[np.bool_]  # (N,) whether nothing leads to it
+
+    def draw(self, weight: Array, random: np.random.Generator, *, least_s: float, most_s: float) -> list[int]:
+        """Return the rows of a route that takes `least_s` [s] even at `HASTE`, and goes on for `most_s` or to an exit.
+
+        The first edge is drawn by `weight` (N,), each following one uniformly, both among those that lead far enough.
+        Raises `InputError` where no way does.
+        """
+        left = HASTE * (least_s + ENTERING_S) if least_s else 0.0
+        most = max(left, most_s)
+        share = weight * (self.left_s >= left)
+        if not share.any():
+            share = 1.0 * (self.left_s >= left)
+        if not share.any():
+            metres = sum(measure_edge(edge) for edge in self.edges)
+            raise InputError(
+                f"a vehicle would have to drive for {least_s:.3g} s, and its longest way out of the {metres:.0f} m "
+                f"of lanes takes {self.left_s.max(initial=0.0) / HASTE:.3g} s: record a shorter time, or fewer vehicles"
+            )
+        at = int(random.choice(len(self.edges), p=share / share.sum()))
+        route, driven_s = [at], self.time_s[at]
+        while self.onward[at] and driven_s < most:
+            far = [row for row in self.onward[at] if self.left_s[row] >= left - driven_s]
+            at = far[int(random.integers(len(far)))]
+            route.append(at)
+            driven_s += self.time_s[at]
+        return route
+
+
+def find_passages(net: RoadNet, edges: list[Edge]) -> Passages:
+    """Return the passages through the net by its driven `edges`."""
+    row = {edge.id: i for i, edge in enumerate(edges)}
+    graph = make_drive_graph(net, edges).subgraph(row)
+    time_s = np.array([measure_edge(edge) / edge.lanes_of("driving")[0].speed for edge in edges])
+    left_s = np.zeros(len(edges))
+    whole = networkx.condensation(graph)
+    for part in reversed(list(networkx.topological_sort(whole))):
+        names = whole.nodes[part]["members"]
+        circle = len(names) > 1 or any(graph.has_edge(name, name) for name in names)
+        for name in names:
+            following = [left_s[row[other]] for other in graph.successors(name) if other not in names]
+            left_s[row[name]] = np.inf if circle else time_s[row[name]] + max(following, default=0.0)
+    onward = [sorted(row[name] for name in graph.successors(edge.id)) for edge in edges]
+    entries = np.array([not any(graph.predecessors(edge.id)) for edge in edges])
+    return Passages(edges, onward, time_s, left_s, entries)
+
+
+def measure_edge(edge: Edge) -> float:
+    """Return the length of an edge's outermost driving lane [m]."""
+    return LineString(edge.lanes_of("driving")[0].shape).length
