@@ -240,7 +240,7 @@ def _make_kitti(folder: Path) -> None:
     for part in ("velodyne", "calib", "label_2", "image_2"):
         (folder / part).mkdir(parents=True)
     rng = np.random.default_rng(0)
-    rng.uniform(-20, 20, (300, 4)).astype("<f4").tofile(folder / "velodyne" / "000000.bin")
+    rng.uniform((-20, -20, -20, 0), (20, 20, 20, 1), (300, 4)).astype("<f4").tofile(folder / "velodyne" / "000000.bin")
     (folder / "calib" / "000000.txt").write_text(KITTI_CALIBRATION)
     (folder / "label_2" / "000000.txt").write_text(KITTI_LABELS)
     Image.new("RGB", (1242, 375)).save(folder / "image_2" / "000000.png")

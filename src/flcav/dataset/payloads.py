@@ -16,6 +16,7 @@ from PIL import Image
 
 from flcav.config import InputError
 from flcav.dataset.layout import payload_path
+from flcav.dataset.upright import turn_upright
 from flcav.sensors.frame import Frame
 
 DEPTH_BITS = 14  # bits kept of a depth's mantissa: rounds by up to 3 mm at 100 m
@@ -115,12 +116,13 @@ def read_plane(path: Path, plane: str) -> NDArray:
 def read_image(path: Path, dtype: type[np.generic], channels: int = 1) -> NDArray:
     """Return the pixels of a PNG, WebP or JPEG file as `dtype`, (H, W), or (H, W, channels) for more than one channel.
 
-    Raises `InputError` where the file is missing, not such an image, or has another number of channels.
+    They are upright. Raises `InputError` where the file is missing, not such an image, or has another number of
+    channels.
     """
     try:
         with Image.open(path, formats=("PNG", "WEBP", "JPEG")) as image:
             found = len(image.getbands())
-            pixels = np.asarray(image)
+            pixels = np.asarray(turn_upright(image))
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:

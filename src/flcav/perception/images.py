@@ -17,6 +17,7 @@ from flcav.config import InputError
 from flcav.dataset.formats.kitti import Calibration, read_calibration
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
+from flcav.dataset.upright import turn_upright
 from flcav.geometry import inverse, transform_points
 from flcav.network.messages import from_names, to_names
 from flcav.sensors.camera.lens import project_points
@@ -76,17 +77,18 @@ def pack_pictures(data: Dataset, number: int) -> dict[str, NDArray[np.uint8]]:
 def unpack_pictures(arrays: Mapping[str, NDArray[np.uint8]]) -> dict[str, Picture]:
     """Return the images in the arrays of a message by camera: the inverse of `pack_pictures`."""
     cameras = to_names(arrays["cameras"]).tolist()
-    return {each: np.asarray(Image.open(io.BytesIO(arrays[f"picture.{each}"].tobytes()))) for each in cameras}
+    files = {each: Image.open(io.BytesIO(arrays[f"picture.{each}"].tobytes())) for each in cameras}
+    return {each: np.asarray(turn_upright(file)) for each, file in files.items()}
 
 
 def read_picture(path: Path) -> Picture:
-    """Return the RGB or palette image of a PNG, JPEG or WebP file; raises `InputError` for any other file."""
+    """Return the RGB or palette image of a PNG, JPEG or WebP file, upright; raises `InputError` for any other file."""
     try:
         with Image.open(path, formats=("PNG", "JPEG", "WEBP")) as image:
             channels, mode = len(image.getbands()), image.mode
             if mode not in ("RGB", "P"):
                 raise InputError(f"{path}: a picture of {channels} channels ({mode}); 3 are wanted: red, green, blue")
-            pixels = np.asarray(image.convert("RGB"))
+            pixels = np.asarray(turn_upright(image).convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         if isinstance(error, InputError):
             raise

@@ -20,8 +20,16 @@ ITERATIONS = 4  # of Bowring's method
 
 
 def convert_to_geodetic(origin: GeoReference, enu: Array) -> Array:
-    """Return (..., 3) latitude [deg], longitude [deg], altitude [m], WGS 84, of points (..., 3) east, north, up [m]."""
-    return _from_earth(_to_earth(origin) + enu @ _earth_from_enu(origin).T)
+    """Return (..., 3) latitude [deg], longitude [deg], altitude [m], WGS 84, of points (..., 3) x, y, up [m].
+
+    x and y are east and north, unless `origin` has other axes.
+    """
+    return _from_earth(_to_earth(origin) + enu @ (_earth_from_enu(origin) @ _enu_from_map(origin)).T)
+
+
+def convert_from_geodetic(origin: GeoReference, place: GeoReference) -> Array:
+    """Return (3,) east, north, up [m] of `place` from `origin`, whatever their maps' axes."""
+    return (_to_earth(place) - _to_earth(origin)) @ _earth_from_enu(origin)
 
 
 def _to_earth(at: GeoReference) -> Array:
@@ -39,6 +47,10 @@ def _earth_from_enu(at: GeoReference) -> Array:
     north = (-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat))
     up = (np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat))
     return np.array((east, north, up)).T
+
+
+def _enu_from_map(at: GeoReference) -> Array:
+    return np.array(((*at.x_axis, 0.0), (*at.y_axis, 0.0), (0.0, 0.0, 1.0))).T
 
 
 def _from_earth(earth: Array) -> Array:

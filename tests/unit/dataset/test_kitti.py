@@ -36,7 +36,8 @@ def calibration(tmp_path: Path) -> Calibration:
 
 
 def test_points_are_as_written(tmp_path: Path):
-    points = np.arange(12, dtype=np.float32).reshape(3, 4)
+    points = np.arange(12, dtype=np.float32).reshape(3, 4) * (1, 1, 1, 0.05)
+    points = points.astype(np.float32)
     points.tofile(tmp_path / "a.bin")
     read = read_points(tmp_path / "a.bin")
     np.testing.assert_array_equal(read, points)

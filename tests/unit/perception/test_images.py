@@ -4,10 +4,21 @@ import io
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 
 from flcav.config import InputError
-from flcav.perception.images import check_picture, read_picture, read_pictures, recoloured, resize_picture
+from flcav.dataset.formats.kitti.files import _read_image
+from flcav.dataset.formats.reading import measure_picture
+from flcav.dataset.payloads import read_image
+from flcav.network.messages import from_names
+from flcav.perception.images import (
+    check_picture,
+    read_picture,
+    read_pictures,
+    recoloured,
+    resize_picture,
+    unpack_pictures,
+)
 
 RANDOM = np.random.default_rng(0)
 RGB = RANDOM.integers(0, 256, (40, 60, 3), dtype=np.uint8)
@@ -29,6 +40,35 @@ def test_files_and_folders(tmp_path):
     ((path, picture),) = read_pictures(tmp_path / "b.png")
     assert path == tmp_path / "b.png"
     assert np.array_equal(picture, RGB)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_every_reader_takes_a_picture_upright(suffix, orientation, tmp_path):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    path = saved(tmp_path / f"phone.{suffix}", RGB, exif=exif)
+    with Image.open(path) as image:
+        upright = np.asarray(ImageOps.exif_transpose(image))
+    assert upright.shape == ((40, 60, 3) if orientation < 5 else (60, 40, 3))
+    message = {"cameras": from_names(["front"]), "picture.front": np.frombuffer(path.read_bytes(), np.uint8)}
+    for found in (
+        read_picture(path),
+        next(read_pictures(tmp_path))[1],
+        read_image(path, np.uint8, channels=3),
+        _read_image(path),
+        unpack_pictures(message)["front"],
+    ):
+        assert np.array_equal(found, upright)
+    assert measure_picture(path) == upright.shape[1::-1]
+
+
+@pytest.mark.filterwarnings("ignore:Corrupt EXIF data")
+@pytest.mark.parametrize("exif", [b"Exif\0\0not a TIFF", b"Exif\0\0II*\0\xff\xff\xff\xff", b"Exif\0\0"])
+def test_damaged_exif_leaves_a_picture_as_it_is(exif, tmp_path):
+    path = saved(tmp_path / "phone.png", RGB, exif=exif)
+    assert np.array_equal(read_picture(path), RGB)
+    assert measure_picture(path) == (60, 40)
 
 
 @pytest.mark.parametrize(

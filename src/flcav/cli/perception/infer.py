@@ -21,7 +21,7 @@ def register(app: typer.Typer) -> None:
 def infer(
     task: str = typer.Argument(metavar="TASK", help=f"What to find: {ANY_TASK}."),
     inputs: list[Path] = typer.Argument(
-        help="KITTI .bin files (objects) or PNG, JPEG and WebP files, folders of them, or dataset folders."
+        help="Point clouds of KITTI, nuScenes, PCD (objects) or PNG, JPEG and WebP files, folders of them, or datasets."
     ),
     weights: Path | None = typer.Option(
         None, "--weights", help="Weights that flcav train wrote; by default those of the package."

@@ -17,6 +17,7 @@ from PIL import Image
 from flcav.config import InputError, parse_config
 from flcav.dataset.payloads import read_image
 from flcav.dataset.store import LazyMapping
+from flcav.dataset.upright import measure_upright
 from flcav.files import Json
 from flcav.geometry import Boxes, angles_of, count_points_in_boxes, inverse, transform_points
 from flcav.sensors.camera.lens import Lens, project
@@ -183,10 +184,17 @@ def unseen_views(amodal: Array, truncation: Array, occlusion: Array | None = Non
     )
 
 
-def check_finite(points: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
-    """Return the points (N, C) of the file at `path`; raises `InputError` where one is not finite."""
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: point {int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])} is not finite")
+def check_cloud(points: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
+    """Return the points (N, 4) of the file at `path`, x, y, z [m], intensity, as they are.
+
+    Raises `InputError` where one is not finite or has an intensity outside 0 to 1.
+    """
+    for fault, bad in (
+        ("is not finite", ~np.isfinite(points).all(axis=1)),
+        ("has an intensity outside 0 to 1", (points[:, 3] < 0) | (points[:, 3] > 1)),
+    ):
+        if bad.any():
+            raise InputError(f"{path}: point {int(np.flatnonzero(bad)[0])} {fault}")
     return points
 
 
@@ -208,10 +216,10 @@ def pinhole(intrinsics: Array, width: float, height: float, path: Path) -> Lens:
 
 
 def measure_picture(path: Path) -> tuple[int, int]:
-    """Return width and height of an image file [px]; raises `InputError` where it is missing or no image."""
+    """Return width and height of an image file, upright [px]; raises `InputError` where it is missing or no image."""
     try:
         with Image.open(path) as image:
-            return image.size
+            return measure_upright(image)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.dataset.formats.kitti import read_points
+from flcav.dataset.formats.sweeps import list_sweeps, read_sweep
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.perception.foreground import frame_reader
@@ -37,8 +37,8 @@ def detect_objects(
 ) -> Iterator[Finding]:
     """Yield the objects of score `threshold` or more in each point cloud of `path`.
 
-    path: a KITTI .bin file, a folder of them, or a dataset folder, of which `frames` (None: all). Raises `InputError`
-    as `read_point_clouds` does.
+    path: a file of a point cloud, see `read_sweep`, a folder of them, or a dataset folder, of which `frames` (None:
+    all). Raises `InputError` as `read_point_clouds` does.
     """
     for cloud in read_point_clouds(path, frames, network.config):
         (found,) = detect_moved(network, [cloud.points], [cloud.move], score_threshold=threshold)
@@ -46,17 +46,17 @@ def detect_objects(
 
 
 def read_point_clouds(path: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[Cloud]:
-    """Yield the point clouds of a KITTI .bin file, of a folder of them, or of `frames` (None: all) of a dataset folder.
+    """Yield the point clouds of a file, of a folder of them, or of `frames` (None: all) of a dataset folder.
 
     Those of a dataset are as a network of `config` sees them. Raises `InputError` where `path` is none of these, a
-    frame has no LiDAR, or a cloud is empty, truncated or not of finite numbers.
+    frame has no LiDAR, or a cloud is empty, truncated, of an unknown layout or not of numbers in range.
     """
     if (path / MANIFEST).is_file():
         clouds = _recorded(path, frames, config)
     elif path.is_dir():
-        files = sorted(path.glob("*.bin"))
+        files = list_sweeps(path)
         if not files:
-            raise InputError(f"{path}: neither a dataset nor a folder with .bin files")
+            raise InputError(f"{path}: neither a dataset nor a folder with .bin or .pcd files")
         clouds = map(_of_file, files)
     elif path.is_file():
         clouds = map(_of_file, [path])
@@ -66,7 +66,7 @@ def read_point_clouds(path: Path, frames: Sequence[int] | None, config: SecondCo
 
 
 def _of_file(path: Path) -> Cloud:
-    return Cloud(path, validate_points(read_points(path), path), None, partial(view_beside, path))
+    return Cloud(path, validate_points(read_sweep(path), path), None, partial(view_beside, path))
 
 
 def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[Cloud]:

@@ -206,7 +206,7 @@ def crop_to_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[
 
 
 def validate_points(points: NDArray[np.float32], origin: str | Path) -> NDArray[np.float32]:
-    """Return the points unchanged; raises `InputError` unless they are (N, 4), N >= 1, of finite numbers.
+    """Return the points unchanged; raises `InputError` unless they are (N, 4), N >= 1, with finite numbers in range.
 
     origin: their file or frame, named in the message.
     """
@@ -217,4 +217,6 @@ def validate_points(points: NDArray[np.float32], origin: str | Path) -> NDArray[
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points)).any(1).sum())
         raise InputError(f"{origin}: {bad} of {len(points)} points are not finite numbers")
+    if bad := int(((points[:, 3] < 0) | (points[:, 3] > 1)).sum()):
+        raise InputError(f"{origin}: {bad} of {len(points)} points have an intensity outside 0 to 1")
     return points

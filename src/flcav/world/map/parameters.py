@@ -33,6 +33,7 @@ Spacing = Annotated[float, Field(ge=0.5, le=10_000)]
 NotNegative = Annotated[float, Field(ge=0, le=10_000)]
 Many = Annotated[int, Field(ge=0, le=MOST)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Component = Annotated[float, Field(ge=-100, le=100)]
 
 
 def _interval(value: tuple[float, float]) -> tuple[float, float]:
@@ -183,11 +184,13 @@ class PostParameters(Config):
 
 
 class GeoReference(Config):
-    """Geodetic position of a town's local origin on the WGS 84 ellipsoid; x points east there and y north."""
+    """Geodetic position of a town's local origin on the WGS 84 ellipsoid, with its axes on the ground."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] = 49.0  # geodetic latitude, positive north
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 8.4  # geodetic longitude, positive east
     altitude_m: Annotated[float, Field(ge=-10_000, le=10_000)] = 0.0  # height above the ellipsoid
+    x_axis: tuple[Component, Component] = (1.0, 0.0)  # east and north of a metre along x [m]
+    y_axis: tuple[Component, Component] = (0.0, 1.0)  # east and north of a metre along y [m]
 
 
 class MapSource(Config):

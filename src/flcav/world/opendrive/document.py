@@ -1,5 +1,6 @@
 """Reading of an OpenDRIVE file, and its attributes beside the geometry: geo-reference, road types, limits, stops."""
 
+import math
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +24,29 @@ class Road:
 
 
 @dataclass(frozen=True)
+class MapOffset:
+    """Transformation from a map's coordinates to those of its projection, <offset> (ASAM OpenDRIVE 1.8, 8.5)."""
+
+    x: float = 0.0  # [m]
+    y: float = 0.0  # [m]
+    z: float = 0.0  # [m]
+    hdg: float = 0.0  # rotation before the translation, counter-clockwise [rad]
+
+    def apply(self, x: float, y: float) -> tuple[float, float]:
+        """Return the coordinates in the projection of a point (x, y) [m] of the map."""
+        cos, sin = math.cos(self.hdg), math.sin(self.hdg)
+        return x * cos - y * sin + self.x, x * sin + y * cos + self.y
+
+
+UNMOVED = MapOffset()
+
+
+@dataclass(frozen=True)
 class Document:
     """The attributes read from an OpenDRIVE file."""
 
-    geo_reference: str  # a PROJ string; empty where there is none
+    geo_reference: str  # a PROJ string or an EPSG code; empty where there is none
+    offset: MapOffset  # NaN where the map writes no number
     roads: dict[str, Road]  # by the road's id
     stops: frozenset[str]  # ids of the junctions with a stop sign
     left_hand: bool  # whether most of its roads have left-hand traffic
@@ -72,10 +92,20 @@ def describe_map(root: ElementTree.Element) -> Document:
     left = sum(row.get("rule") == "LHT" for row in rows)
     return Document(
         (root.findtext("header/geoReference") or "").strip(),
+        _offset(root.find("header/offset")),
         {row.get("id", ""): _road(row) for row in rows},
         frozenset(junction for row in rows for junction in _stops(row)),
         left_hand=2 * left > len(rows),
     )
+
+
+def _offset(row: ElementTree.Element | None) -> MapOffset:
+    if row is None:
+        return UNMOVED
+    try:
+        return MapOffset(*(float(row.get(name, "0")) for name in ("x", "y", "z", "hdg")))
+    except ValueError:
+        return MapOffset(math.nan)
 
 
 def _road(row: ElementTree.Element) -> Road:

@@ -1,43 +1,72 @@
-"""Inverse transverse Mercator and UTM projection on WGS 84, from the PROJ string of an OpenDRIVE header.
+"""Place of a map on the WGS 84 ellipsoid: inverse Mercator projections of an OpenDRIVE header, with its offset.
 
-Krüger's series in the third flattening n, to n^4 (C. F. F. Karney, "Transverse Mercator with an accuracy of a few
-nanometers", J. Geodesy 85, 2011, eqs. 11, 15, 36).
+Transverse Mercator is Krüger's series in the third flattening n, to n^4 (C. F. F. Karney, "Transverse Mercator with an
+accuracy of a few nanometers", J. Geodesy 85, 2011, eqs. 11, 15, 36).
 """
 
 import math
 
-from flcav.world.geodesy import ECCENTRICITY2, EQUATOR_M, FLATTENING
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.world.geodesy import ECCENTRICITY2, EQUATOR_M, FLATTENING, convert_from_geodetic
 from flcav.world.map.parameters import GeoReference
+from flcav.world.opendrive.document import UNMOVED, MapOffset
+from flcav.world.opendrive.projection import Projection, read_projection
 
-UTM_SCALE, UTM_FALSE_EASTING_M, UTM_FALSE_NORTHING_M = 0.9996, 500_000.0, 10_000_000.0
+STEP_M = 100.0  # distance over which the axes of a map's grid are taken
 
 
-def locate_origin(projection: str, x: float, y: float) -> GeoReference | None:
-    """Return the geodetic position of the point (x, y) [m] in a map with the PROJ string `projection`.
+def locate_origin(reference: str, x: float, y: float, offset: MapOffset = UNMOVED) -> GeoReference | None:
+    """Return the position of a map around its point (x, y) [m], with its axes on the ground.
 
-    None for a projection other than +proj=tmerc and +proj=utm, and for values that are no numbers or out of range. The
-    town keeps the axes of the projection's grid: y is grid north. The altitude is 0.
+    `reference` is the text of <geoReference>, see `read_projection`; `offset` is added to the map's coordinates before
+    they are those of the projection, along whose grid the axes lie then. None where the reference is not understood,
+    and where the place is none on Earth.
     """
-    parts = (word.lstrip("+").partition("=") for word in projection.split())
-    words = {name: value for name, _, value in parts}
+    projection = read_projection(reference)
+    if projection is None:
+        return None
     try:
-        if words.get("proj") == "utm":
-            north = 0.0 if "south" not in words else UTM_FALSE_NORTHING_M
-            meridian = 6.0 * int(words["zone"]) - 183.0
-            latitude, longitude = inverse_mercator(x - UTM_FALSE_EASTING_M, y - north, 0.0, meridian, UTM_SCALE)
-        elif words.get("proj") == "tmerc":
-            east, north = x - float(words.get("x_0", 0)), y - float(words.get("y_0", 0))
-            scale = float(words.get("k", words.get("k_0", 1)))
-            start, meridian = float(words.get("lat_0", 0)), float(words.get("lon_0", 0))
-            latitude, longitude = inverse_mercator(east, north, start, meridian, scale)
-        else:
-            return None
-    except (ValueError, KeyError):
+        here = _place(projection, offset, x, y)
+        x_axis, y_axis = (
+            convert_from_geodetic(here, _place(projection, offset, x + dx, y + dy))
+            - convert_from_geodetic(here, _place(projection, offset, x - dx, y - dy))
+            for dx, dy in ((STEP_M, 0.0), (0.0, STEP_M))
+        )
+        return GeoReference(
+            latitude_deg=round(here.latitude_deg, 9),
+            longitude_deg=round(here.longitude_deg, 9),
+            altitude_m=offset.z,
+            x_axis=_round(x_axis / (2 * STEP_M)),
+            y_axis=_round(y_axis / (2 * STEP_M)),
+        )
+    except (ArithmeticError, ValueError):  # no number, or one out of range
         return None
-    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
-        return None
+
+
+def _round(axis: NDArray[np.float64]) -> tuple[float, float]:
+    east, north, _ = (np.round(axis, 9) + 0.0).tolist()  # no -0.0
+    return east, north
+
+
+def _place(projection: Projection, offset: MapOffset, x: float, y: float) -> GeoReference:
+    """Return the position of the map's point (x, y) [m]; raises `ValueError` where there is none."""
+    x, y = offset.apply(x, y)
+    east, north = x - projection.easting_m, y - projection.northing_m
+    if projection.kind == "tmerc":
+        latitude, longitude = inverse_mercator(
+            east, north, projection.latitude_deg, projection.longitude_deg, projection.scale
+        )
+    else:
+        radius = projection.scale * EQUATOR_M
+        tangent = math.sinh(north / radius)
+        latitude = math.degrees(math.atan(tangent if projection.kind == "webmerc" else _geodetic_tangent(tangent)))
+        longitude = projection.longitude_deg + math.degrees(east / radius)
+    if not abs(longitude) <= 360:
+        raise ValueError(f"no such longitude: {longitude}")
     wrapped = (longitude + 180.0) % 360.0 - 180.0
-    return GeoReference(latitude_deg=round(latitude, 9), longitude_deg=round(wrapped, 9), altitude_m=0.0)
+    return GeoReference(latitude_deg=latitude, longitude_deg=wrapped, altitude_m=offset.z)
 
 
 def inverse_mercator(

@@ -19,7 +19,7 @@ import numpy as np
 import yaml
 from shapely.geometry import LineString
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.extras import format_install_command
 from flcav.files import find_existing
 from flcav.world.map.parameters import GeoReference, MapSource
@@ -39,6 +39,7 @@ from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 
 WIDEST_M = 5e5  # farthest that a street is from the middle of the town
 GAPS_M = 5000.0  # total length of the gaps between linked roads, in both directions, over which streets are drawn
+STRETCHED = 0.01  # difference between lengths of the map and on the ground that is worth a word
 NETCONVERT_S = 300.0  # longest run of netconvert
 PARTS = ("nod", "edg", "con")  # netconvert's plain XML files: nodes, edges, connections
 OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}
@@ -159,6 +160,16 @@ def _read_joined(path: Path, origin: Path, roads_m: float) -> RoadNet:
     return net
 
 
+def _format_place(geo: GeoReference) -> str:
+    """Return latitude and longitude as text, to some 10 m.
+
+    >>> _format_place(GeoReference(latitude_deg=-33.9, longitude_deg=18.42))
+    '33.9° S, 18.42° E'
+    """
+    latitude, longitude = round(geo.latitude_deg, 4), round(geo.longitude_deg, 4)
+    return f"{abs(latitude)}° {'S' if latitude < 0 else 'N'}, {abs(longitude)}° {'W' if longitude < 0 else 'E'}"
+
+
 @dataclass(frozen=True)
 class ImportedTown:
     """An imported town, and notes on what differs from the map."""
@@ -201,13 +212,20 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
         found = take_objects(root, streets.offset_m, net, folder / "town.net.xml", crosswalks=crossed > 0)
         notes += found.notes
         dx, dy = streets.offset_m
-        geo = locate_origin(document.geo_reference, -dx, -dy)
+        geo = locate_origin(document.geo_reference, -dx, -dy, document.offset)
         if geo is None:
             geo = GeoReference()
-            notes.append(
-                f"The map's geo-reference {document.geo_reference!r} is none of +proj=tmerc and +proj=utm, "
-                f"or of no place: the town lies at {geo.latitude_deg}° N, {geo.longitude_deg}° E."
+            why = (
+                f"The map's geo-reference {shorten(document.geo_reference)} is none of +proj=tmerc, +proj=utm and "
+                "+proj=merc on WGS 84 and no EPSG code of these, or its place is none"
+                if document.geo_reference
+                else "The map has no geo-reference"
             )
+            notes.append(f"{why}: the town lies at {_format_place(geo)}.")
+        else:
+            scale = 1 / np.hypot(*geo.y_axis)
+            stretched = f"; a metre there is {scale:.3g} m of the map" if abs(scale - 1) > STRETCHED else ""
+            notes.append(f"By its geo-reference the town lies at {_format_place(geo)}{stretched}.")
         if streets.sidewalks_added:
             notes.append("The map has no sidewalks: added along its town streets.")
         if streets.offset_m != (0.0, 0.0):

@@ -272,7 +272,7 @@ def test_a_geo_reference_of_no_place_is_told(tmp_path: Path) -> None:
     path = tmp_path / "map.xodr"
     path.write_text(CROSS.read_text().replace("+zone=32", "+zone=99"))
     imported = import_town(path, tmp_path / "town")
-    assert "+zone=99 +datum=WGS84 +units=m +no_defs' is none of +proj=tmerc and +proj=utm, or of no" in " ".join(
+    assert "+zone=99 +datum=WGS84 +units=m +no_defs' is none of +proj=tmerc, +proj=utm and +proj=merc on" in " ".join(
         imported.notes
     )
     assert imported.town.geo == GeoReference()

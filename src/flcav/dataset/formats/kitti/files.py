@@ -7,14 +7,19 @@ y left, z up).
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Never
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.config import InputError
+from flcav.dataset.formats.layout import describe_numbers, is_kitti
+from flcav.dataset.formats.reading import check_cloud
+from flcav.dataset.upright import turn_upright
 from flcav.geometry import Boxes, heading_vectors, inverse, transform_points, wrap_angle
 
+LAYOUT, POINT = "4 columns of float32", "x, y, z [m], intensity 0 to 1"
 POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
 LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
 MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
@@ -35,8 +40,8 @@ class Calibration:
 def read_points(path: Path) -> NDArray[np.float32]:
     """Return (N, 4) x, y, z [m] and reflectance [0, 1] of a point cloud, LiDAR frame.
 
-    Raises `InputError` where the file is missing, empty, truncated within a point, or holds a number that is not
-    finite.
+    Raises `InputError` where the file is missing, empty, truncated within a point, of another layout by its numbers,
+    or holds a number that is not finite or an intensity outside 0 to 1.
     """
     try:
         data = path.read_bytes()
@@ -44,14 +49,21 @@ def read_points(path: Path) -> NDArray[np.float32]:
         raise InputError(f"{path}: no such file") from None
     if not data:
         raise InputError(f"{path}: empty; a point cloud holds {POINT_BYTES} bytes for each point")
+    if not is_kitti(data):
+        _refuse_points(data, path)
+    return np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4)
+
+
+def _refuse_points(data: bytes, path: Path) -> Never:
+    """Raise `InputError` that says what the bytes are in place of a point cloud."""
+    if (found := describe_numbers(data)) not in ("", LAYOUT):
+        raise InputError(f"{path}: {found} by its numbers; wanted are {LAYOUT}: {POINT}")
     if len(data) % POINT_BYTES:
         raise InputError(
             f"{path}: truncated; {len(data)} bytes are not a multiple of {POINT_BYTES}, the size of a point"
         )
-    points = np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4)
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: point {int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])} is not finite")
-    return points
+    check_cloud(np.frombuffer(data, "<f4").reshape(-1, 4), path)
+    raise InputError(f"{path}: no point cloud by its numbers; wanted are {LAYOUT}: {POINT}")
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -226,6 +238,6 @@ def read_split(path: Path) -> list[str]:
 def _read_image(path: Path) -> NDArray[np.uint8]:
     try:
         with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
+            return np.asarray(turn_upright(image).convert("RGB"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         raise InputError(f"{path}: not an image") from None

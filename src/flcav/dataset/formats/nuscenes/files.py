@@ -1,13 +1,19 @@
 """nuScenes' file encodings of point clouds, radar sweeps and the map."""
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from flcav.config import InputError
+from flcav.dataset.formats.layout import BRIGHTEST
+from flcav.dataset.formats.reading import check_cloud
 from flcav.sensors.radar.radar import compute_echo_directions
 from flcav.world.map.town import Town
 
 OURS_FROM_LIDAR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # nuScenes': x right, y ahead
+POINT_BYTES = 20  # x, y, z, intensity, ring, each float32
 RESOLUTION_M = 0.1  # size of a pixel of the map
 RADAR = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z")]
@@ -32,6 +38,22 @@ def encode_lidar(points: NDArray[np.float32], elevations: NDArray[np.float64]) -
         between = (elevations[1:] + elevations[:-1]) / 2
         ring = np.searchsorted(between, np.arctan2(z, np.hypot(x, y)))
     return np.column_stack((-y, x, z, intensity * 255, ring)).astype("<f4").tobytes()
+
+
+def read_lidar(path: Path) -> NDArray[np.float32]:
+    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a file of `encode_lidar`.
+
+    Raises `InputError` where it is missing, truncated, or has a point that is not finite or an intensity out of range.
+    """
+    try:
+        data = path.read_bytes()
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{path}: no such file") from None
+    if not data or len(data) % POINT_BYTES:
+        raise InputError(f"{path}: truncated; {len(data)} bytes are no whole points of {POINT_BYTES} bytes")
+    right, ahead, up, intensity, _ = np.frombuffer(data, "<f4").reshape(-1, 5).T
+    cloud = np.stack((ahead, -right, up, intensity / np.float32(BRIGHTEST)), axis=1).astype(np.float32, copy=False)
+    return check_cloud(cloud, path)
 
 
 def encode_radar(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> bytes:

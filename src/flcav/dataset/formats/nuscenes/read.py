@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError, read_json
-from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, decode_radar
+from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, decode_radar, read_lidar
 from flcav.dataset.formats.nuscenes.rows import COLUMNS, Row, read_table, stream_table
 from flcav.dataset.formats.nuscenes.tables import VERSION
 from flcav.dataset.formats.pcd import read_pcd
@@ -24,7 +24,6 @@ from flcav.dataset.formats.reading import (
     LogSource,
     Picture,
     annotate,
-    check_finite,
     check_sizes,
     choose_split,
     difference_tracks,
@@ -64,7 +63,6 @@ OCCLUSION = {
 TOP, MOUNTED = "LIDAR_TOP", "calibrated_sensor.json"
 BEAMS, RANGE_M = 32, 70.0  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders do not say
 VERSIONS = ("v1.0-mini", "v1.0-trainval", "v1.0-test")  # nuScenes' own tables
-POINT = 5  # float32 of a point: x, y, z, intensity 0 to 255, ring
 
 
 class Spin(NamedTuple):
@@ -224,7 +222,7 @@ class NuscenesSource(LogSource):
         cameras = [name for name in data if kind[name] == "camera"]
         path = {name: self._root / row["filename"] for name, row in data.items()}
         ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)
-        clouds = {name: read_cloud(path[name]) for name in ranging}
+        clouds = {name: read_lidar(path[name]) for name in ranging}
         radar = {name: decode_radar(read_pcd(path[name])) for name in data if kind[name] == "radar"}
         own = self._notes[spin.sample]
         boxes = self._boxes[own]
@@ -262,19 +260,6 @@ class NuscenesSource(LogSource):
             agent_at_trigger={name: then for name, then in poses.items() if not np.array_equal(then, poses[TOP])},
             files=files,
         )
-
-
-def read_cloud(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1]; raises `InputError` for a missing or truncated file."""
-    try:
-        data = np.fromfile(path, "<f4")
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
-    if len(data) % POINT or path.stat().st_size % 4 or not len(data):
-        raise InputError(f"{path}: truncated; {path.stat().st_size} bytes are no whole points of {4 * POINT} bytes")
-    right, ahead, up, intensity, _ = data.reshape(-1, POINT).T
-    cloud = np.stack((ahead, -right, up, intensity / np.float32(255)), axis=1).astype(np.float32, copy=False)
-    return check_finite(cloud, path)
 
 
 def _find_tables(folder: Path) -> Path:

@@ -21,7 +21,7 @@ from flcav.dataset.formats.reading import (
     LogSource,
     Picture,
     annotate,
-    check_finite,
+    check_cloud,
     check_sizes,
     choose_split,
     measure_picture,
@@ -148,7 +148,7 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     except ValueError:
         raise InputError(f"{path}: not a point cloud of OPV2V, which has the fields x, y, z, rgb") from None
     red = (np.ascontiguousarray(colour).view("<u4") >> 16) & 255
-    return check_finite(np.stack((x, -y, z, red / np.float32(255)), axis=1).astype(np.float32), path)
+    return check_cloud(np.stack((x, -y, z, red / np.float32(255)), axis=1).astype(np.float32), path)
 
 
 def _calibrate(stem: Path) -> Calibration:

@@ -1,0 +1,99 @@
+"""Layouts of point clouds that are bare numbers: which one a file has, told by ranges of its numbers.
+
+KITTI's files are rows of x, y, z [m] and intensity 0 to 1, nuScenes' of x, y, z [m], intensity 0 to 255 and ring, all
+little-endian float32. Neither has a header. Read with another number of columns or another type, coordinates get into
+the column of intensities, or numbers become huge, tiny or no numbers.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+FARTHEST_M = 1e4  # largest coordinate that a LiDAR is taken to measure
+NEAREST_M = 1.0  # the farthest point of a sweep is beyond
+TINY = 1e-30  # smallest number above 0; what is smaller is of another type
+BRIGHTEST = 255  # largest intensity of nuScenes
+BESIDE_M = 1.75  # normals and colours are within
+TYPES = {"<f4": "float32", "<f8": "float64", ">f4": "big-endian float32", ">f8": "big-endian float64"}
+COLUMNS = range(2, 13)
+SAMPLE = 48_000  # values that columns are counted by
+FEW = 16  # rows of which nothing is told but ranges
+SLACK = 0.05  # by which a multiple of the right number of columns may seem better
+
+Values = NDArray[np.floating]
+
+
+def is_kitti(data: bytes) -> bool:
+    """Return whether the bytes are rows of x, y, z, intensity 0 to 1."""
+    rows = _rows(data, 4)
+    return rows is not None and _is_cloud(rows) and _within(rows[:, 3], 1) and not _mixes(rows)
+
+
+def is_nuscenes(data: bytes) -> bool:
+    """Return whether the bytes are rows of x, y, z, intensity 0 to 255, ring, and some point is brighter than 1."""
+    rows = _rows(data, 5)
+    if rows is None or not _is_cloud(rows):
+        return False
+    ring, intensity = rows[:, 4], rows[:, 3]
+    whole = bool((ring == np.rint(ring)).all())
+    return whole and _within(ring, BRIGHTEST) and _within(intensity, BRIGHTEST) and bool(intensity.max() > 1)
+
+
+def describe_numbers(data: bytes) -> str:
+    """Return the layout that bytes of neither layout seem to have, as "5 columns of float32"; empty if none."""
+    for dtype, name in TYPES.items():
+        if len(data) % np.dtype(dtype).itemsize == 0:
+            values = np.frombuffer(data, dtype)
+            if len(values) and _are_numbers(values) and np.nanmax(np.abs(values)) > NEAREST_M:
+                count = _count_columns(values)
+                return f"{count} columns of {name}" if count else ""
+    return ""
+
+
+def _rows(data: bytes, columns: int) -> NDArray[np.float32] | None:
+    return np.frombuffer(data, "<f4").reshape(-1, columns) if data and len(data) % (4 * columns) == 0 else None
+
+
+def _is_cloud(rows: NDArray[np.float32]) -> bool:
+    return (
+        bool(np.isfinite(rows).all())
+        and _are_numbers(rows)
+        and bool(np.linalg.norm(rows[:, :3], axis=1).max() > NEAREST_M)
+    )
+
+
+def _are_numbers(values: Values) -> bool:
+    """Return whether the values, but for those that are not finite, are of sizes that a LiDAR measures."""
+    size = np.abs(values[np.isfinite(values)])
+    return bool(len(size) and size.max() <= FARTHEST_M and not ((size > 0) & (size < TINY)).any())
+
+
+def _within(values: Values, most: float) -> bool:
+    return bool(((values >= 0) & (values <= most)).all())
+
+
+def _mixes(rows: NDArray[np.float32]) -> bool:
+    """Return whether rows are of other ones, although every fourth number is an intensity.
+
+    Of rows of eight numbers, every second half is no point, but a normal, a colour or padding. Of two-byte numbers y
+    is an intensity, too.
+    """
+    halves = [np.linalg.norm(half[half[:, :3].any(axis=1), :3], axis=1) for half in (rows[::2], rows[1::2])]
+    if min(map(len, halves)) < FEW:
+        return False
+    near, far = sorted(halves, key=lambda half: float(np.median(half)))
+    return _within(rows[:, 1], 1) or bool(near.max() < min(BESIDE_M, np.median(far)))
+
+
+def _count_columns(values: Values) -> int:
+    """Return the number of columns with which values differ least from those of the next row; 0 if none divides them.
+
+    Two draws of one distribution differ less, in the mean, than draws of two (G. J. Székely and M. L. Rizzo, "Energy
+    statistics", J. Statistical Planning and Inference 143, 2013, prop. 1).
+    """
+    changes = {
+        count: float(np.nanmean(np.abs(values[count:SAMPLE] - values[: min(len(values), SAMPLE) - count])))
+        for count in COLUMNS
+        if len(values) % count == 0 and len(values) > count
+    }
+    least = min(changes.values(), default=0.0)
+    return next((count for count, change in changes.items() if change <= (1 + SLACK) * least), 0)

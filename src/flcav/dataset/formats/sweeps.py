@@ -1,0 +1,59 @@
+"""Reading of a LiDAR sweep from a single file: KITTI's and nuScenes' bare numbers, PCD."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.dataset.formats.kitti.files import read_points
+from flcav.dataset.formats.layout import is_nuscenes
+from flcav.dataset.formats.nuscenes.files import read_lidar
+from flcav.dataset.formats.pcd import is_pcd, read_pcd
+from flcav.dataset.formats.reading import check_cloud
+from flcav.dataset.payloads import TIMES
+
+ENDINGS = (".bin", ".pcd")
+FIELDS = ("x", "y", "z", "intensity")
+OTHERS = {  # formats that are not read, by their first bytes
+    b"\x93NUMPY": "a NumPy array",
+    b"PK\x03\x04": "a zip archive",
+    b"\x1f\x8b": "compressed by gzip",
+    b"ply\n": "a PLY file",
+    b"ply\r\n": "a PLY file",
+    b"LASF": "a LAS file",
+    b"ARROW1": "a Feather file",
+    b"\x89HDF": "an HDF5 file",
+    b"\x89PNG": "a PNG image",
+    b"\xff\xd8\xff": "a JPEG image",
+}
+
+
+def read_sweep(path: Path) -> NDArray[np.float32]:
+    """Return (N, 4) x ahead, y left, z up [m], intensity [0, 1] of a point cloud's file, LiDAR frame.
+
+    Files of KITTI and nuScenes are told by their numbers, see `layout`; a PCD file has the fields `FIELDS`. Raises
+    `InputError` for other files, and for points that are not finite or have an intensity out of range.
+    """
+    try:
+        data = path.read_bytes()
+    except (FileNotFoundError, IsADirectoryError):
+        raise InputError(f"{path}: no such file") from None
+    for start, name in OTHERS.items():
+        if data.startswith(start):
+            raise InputError(f"{path}: {name}; supported are point clouds of KITTI (.bin), nuScenes (.pcd.bin) and PCD")
+    if is_pcd(data):
+        return _read_fields(path)
+    return read_lidar(path) if is_nuscenes(data) else read_points(path)
+
+
+def list_sweeps(folder: Path) -> list[Path]:
+    """Return the files of point clouds in a folder, in order; times of points, which datasets keep beside, are none."""
+    return sorted(file for file in folder.iterdir() if file.suffix in ENDINGS and not file.name.endswith(f".{TIMES}"))
+
+
+def _read_fields(path: Path) -> NDArray[np.float32]:
+    rows = read_pcd(path)
+    if missing := [name for name in FIELDS if name not in (rows.dtype.names or ())]:
+        raise InputError(f"{path}: a PCD file without {missing[0]}; wanted are the fields {', '.join(FIELDS)}")
+    return check_cloud(np.column_stack([rows[name] for name in FIELDS]).astype(np.float32), path)
