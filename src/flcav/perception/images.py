@@ -16,6 +16,7 @@ from PIL import Image, ImageEnhance, UnidentifiedImageError
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import Calibration, read_calibration
 from flcav.dataset.layout import MANIFEST
+from flcav.dataset.payloads import open_image
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, transform_points
 from flcav.network.messages import from_names, to_names
@@ -76,13 +77,13 @@ def pack_pictures(data: Dataset, number: int) -> dict[str, NDArray[np.uint8]]:
 def unpack_pictures(arrays: Mapping[str, NDArray[np.uint8]]) -> dict[str, Picture]:
     """Return the images in the arrays of a message by camera: the inverse of `pack_pictures`."""
     cameras = to_names(arrays["cameras"]).tolist()
-    return {each: np.asarray(Image.open(io.BytesIO(arrays[f"picture.{each}"].tobytes()))) for each in cameras}
+    return {each: np.asarray(open_image(io.BytesIO(arrays[f"picture.{each}"].tobytes()))) for each in cameras}
 
 
 def read_picture(path: Path) -> Picture:
     """Return the RGB or palette image of a PNG, JPEG or WebP file; raises `InputError` for any other file."""
     try:
-        with Image.open(path, formats=("PNG", "JPEG", "WEBP")) as image:
+        with open_image(path) as image:
             channels, mode = len(image.getbands()), image.mode
             if mode not in ("RGB", "P"):
                 raise InputError(f"{path}: a picture of {channels} channels ({mode}); 3 are wanted: red, green, blue")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flcav.config import InputError, read_json
+from flcav.config import InputError, path_within, read_json, shorten
 from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, decode_radar
 from flcav.dataset.formats.nuscenes.rows import COLUMNS, Row, read_table, stream_table
 from flcav.dataset.formats.nuscenes.tables import VERSION
@@ -24,6 +24,7 @@ from flcav.dataset.formats.reading import (
     LogSource,
     Picture,
     annotate,
+    assign_split,
     check_finite,
     check_sizes,
     choose_split,
@@ -91,7 +92,11 @@ class NuscenesSource(LogSource):
         self._mounted, self._channel = table["calibrated_sensor"], table["sensor"]
         for row in stream_table(self._tables, "sample_data", lambda row: row["is_key_frame"]):
             mounted = self._at(self._mounted, row["calibrated_sensor_token"])
-            self._data[row["sample_token"]][self._at(self._channel, mounted["sensor_token"])["channel"]] = row
+            channel, own = self._at(self._channel, mounted["sensor_token"])["channel"], self._data[row["sample_token"]]
+            if own.setdefault(channel, row) is not row:
+                raise InputError(
+                    f"{self._tables / 'sample_data.json'}: '{row['filename']}' is a second one of {channel}"
+                )
         used = {row["ego_pose_token"] for rows in self._data.values() for row in rows.values()}
         self._pose = read_table(self._tables, "ego_pose", lambda row: row["token"] in used)
         self._calibration: dict[str, Calibration] = {}  # by agent
@@ -147,16 +152,15 @@ class NuscenesSource(LogSource):
         ours, names = self._tables.name == VERSION, AgentNames()
         splits = self._tables / "splits.json"
         listed = read_json(splits) if splits.is_file() else {}
-        split_by_name = {
-            name: split.removeprefix("flcav_")
-            for split, own in (listed.items() if isinstance(listed, dict) else ())
-            for name in (own if isinstance(own, list) else ())
-        }
+        split_by_name: dict[str, str | None] = {}
+        for split, own in listed.items() if isinstance(listed, dict) else ():
+            for name in own if isinstance(own, list) else ():
+                assign_split(split_by_name, str(name), split.removeprefix("flcav_"), splits)
         of_scene: dict[str, list[str]] = defaultdict(list)
         for token, row in samples.items():
             of_scene[row["scene_token"]].append(token)
         times: dict[str, list[tuple[float, str, str]]] = defaultdict(list)
-        split_of = {}
+        split_of: dict[str, str | None] = {}
         for token, scene in scenes.items():
             log, name = self._at(logs, scene["log_token"]), scene["name"]
             for sample in of_scene[token]:
@@ -174,7 +178,10 @@ class NuscenesSource(LogSource):
             if not late.isdecimal():
                 raise InputError(f"{self._tables / 'scene.json'}: the scene '{name}' is none of an export by flcav")
             times[own] += [((samples[s]["timestamp"] - int(late)) / 1e6, agent, s) for s in of_scene[token]]
-            split_of[own] = split_by_name.get(name, "test" if self._tables.name.endswith("-test") else None)
+            if own in split_of and not ours:
+                raise InputError(f"{self._tables / 'scene.json'}: two scenes are called {shorten(name)}")
+            split = split_by_name.get(name, "test" if self._tables.name.endswith("-test") else None)
+            assign_split(split_of, own, split, splits)
         spins = {}
         for scene, found in times.items():
             rank = {time: index for index, time in enumerate(sorted({time for time, _, _ in found}))}
@@ -222,7 +229,8 @@ class NuscenesSource(LogSource):
         mounts, kind = calibration.agent_from_sensor, {name: self._kind(row) for name, row in data.items()}
         poses = {name: _placed(self._at(self._pose, row["ego_pose_token"])) for name, row in data.items()}
         cameras = [name for name in data if kind[name] == "camera"]
-        path = {name: self._root / row["filename"] for name, row in data.items()}
+        listed = self._tables / "sample_data.json"
+        path = {name: path_within(self._root, row["filename"], listed) for name, row in data.items()}
         ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)
         clouds = {name: read_cloud(path[name]) for name in ranging}
         radar = {name: decode_radar(read_pcd(path[name])) for name in data if kind[name] == "radar"}
