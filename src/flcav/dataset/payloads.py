@@ -96,13 +96,11 @@ def read_rows(path: Path, suffix: str, expected: int) -> NDArray[np.float32]:
     """
     row_bytes = 4 * COLUMNS[suffix]
     try:
-        found = path.stat().st_size
-        rows = np.fromfile(path, dtype="<f4")
+        if (found := path.stat().st_size) != expected * row_bytes and not path.is_dir():
+            raise InputError(f"{path}: {found} bytes where {expected} points take {expected * row_bytes}")
+        return np.fromfile(path, "<f4", expected * COLUMNS[suffix]).reshape(-1, COLUMNS[suffix])
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None
-    if found != expected * row_bytes:
-        raise InputError(f"{path}: {found} bytes where {expected} points take {expected * row_bytes}")
-    return rows.reshape(-1, COLUMNS[suffix])
 
 
 def read_plane(path: Path, plane: str) -> NDArray:

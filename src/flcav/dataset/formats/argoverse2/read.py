@@ -297,10 +297,10 @@ def _transforms(table: pa.Table, path: Path) -> Array:
 
 def _read_feather(path: Path, columns: tuple[str, ...]) -> pa.Table:
     """Return columns of a Feather file; raises `InputError` where it is missing, truncated, or lacks one of them."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; a log of Argoverse 2 has one")
     try:
         table = feather.read_table(path, memory_map=False)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; a log of Argoverse 2 has one") from None
     except (OSError, pa.ArrowException, ValueError):
         raise InputError(f"{path}: not a Feather file, or a truncated one") from None
     if lost := [name for name in columns if name not in table.column_names]:

@@ -231,6 +231,9 @@ class NuscenesSource(LogSource):
         cameras = [name for name in data if kind[name] == "camera"]
         listed = self._tables / "sample_data.json"
         path = {name: path_within(self._root, row["filename"], listed) for name, row in data.items()}
+        for file in path.values():
+            if not file.is_file():  # a device, too, would be read without end
+                raise InputError(f"{file}: no such file")
         ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)
         clouds = {name: read_cloud(path[name]) for name in ranging}
         radar = {name: decode_radar(read_pcd(path[name])) for name in data if kind[name] == "radar"}
@@ -245,9 +248,6 @@ class NuscenesSource(LogSource):
             for name in cameras
         }
         files = {name: path[name] for name in cameras}
-        for file in files.values():
-            if not file.is_file():
-                raise InputError(f"{file}: no such file")
         return LinkedFrame(
             scene=scene,
             index=spin.number,
