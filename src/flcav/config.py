@@ -73,14 +73,18 @@ def read_config(model: type[ConfigT], path: Path) -> ConfigT:
 
 def read_yaml(path: Path) -> object:
     """Return the value in the YAML (or JSON) file at `path`; raises `InputError` if it is missing or not YAML."""
+    _check_exists(path)
     try:
         text = path.read_text(encoding="utf-8")
         _check_yaml(text)
         return yaml.load(text, LOADER)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
     except (IsADirectoryError, yaml.YAMLError, ValueError) as error:
         raise InputError(f"{path}: not a YAML file ({error})") from None
+
+
+def _check_exists(path: Path) -> None:
+    if not path.exists():  # nor does a link to itself lead anywhere
+        raise InputError(f"{path}: no such file")
 
 
 def _check_yaml(text: str) -> None:
@@ -113,11 +117,10 @@ def _check_yaml(text: str) -> None:
 
 def read_json(path: Path) -> Json:
     """Return the value in the JSON file at `path`; raises `InputError` if it is missing or not JSON."""
+    _check_exists(path)
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
         _check_depth(value)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
     except (IsADirectoryError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error})") from None
     return value
@@ -157,10 +160,9 @@ class _Shallow(ElementTree.TreeBuilder):
 
 def read_xml(path: Path, kind: str) -> ElementTree.Element:
     """Return the root of the XML file at `path`; raises `InputError` if it is missing or not XML, so no `kind`."""
+    _check_exists(path)
     try:
         return ElementTree.parse(path, ElementTree.XMLParser(target=_Shallow())).getroot()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
     except (ElementTree.ParseError, IsADirectoryError, LookupError, ValueError) as error:
         raise InputError(f"{path}: not {kind} ({error})") from None
 

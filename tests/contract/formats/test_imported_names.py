@@ -143,7 +143,12 @@ def test_rows_and_scenes_of_nuscenes_that_are_there_twice(folder: Path):
         _check_refused("nuscenes", folder / "nuscenes", sentence)
         (tables / f"{table}.json").write_text(whole)
     tables.rename(tables.with_name("v1.0-mini"))
-    _edit(tables.with_name("v1.0-mini") / "scene.json", lambda rows: [row.update(name="one") for row in rows] and None)
+
+    def rename(rows: list[dict[str, Any]]) -> None:
+        for row in rows:
+            row["name"] = "one"
+
+    _edit(tables.with_name("v1.0-mini") / "scene.json", rename)
     _check_refused("nuscenes", folder / "nuscenes", "scene.json: two scenes are called 'one'")
 
 

@@ -90,13 +90,13 @@ class NuscenesSource(LogSource):
         table = {name: read_table(self._tables, name) for name in SMALL}
         self._data: dict[str, dict[str, Row]] = defaultdict(dict)  # sample -> channel -> row of sample_data
         self._mounted, self._channel = table["calibrated_sensor"], table["sensor"]
+        listed = self._tables / "sample_data.json"
         for row in stream_table(self._tables, "sample_data", lambda row: row["is_key_frame"]):
+            path_within(self._root, row["filename"], listed)
             mounted = self._at(self._mounted, row["calibrated_sensor_token"])
             channel, own = self._at(self._channel, mounted["sensor_token"])["channel"], self._data[row["sample_token"]]
             if own.setdefault(channel, row) is not row:
-                raise InputError(
-                    f"{self._tables / 'sample_data.json'}: '{row['filename']}' is a second one of {channel}"
-                )
+                raise InputError(f"{listed}: {shorten(row['filename'])} is a second one of {channel}")
         used = {row["ego_pose_token"] for rows in self._data.values() for row in rows.values()}
         self._pose = read_table(self._tables, "ego_pose", lambda row: row["token"] in used)
         self._calibration: dict[str, Calibration] = {}  # by agent
@@ -229,8 +229,7 @@ class NuscenesSource(LogSource):
         mounts, kind = calibration.agent_from_sensor, {name: self._kind(row) for name, row in data.items()}
         poses = {name: _placed(self._at(self._pose, row["ego_pose_token"])) for name, row in data.items()}
         cameras = [name for name in data if kind[name] == "camera"]
-        listed = self._tables / "sample_data.json"
-        path = {name: path_within(self._root, row["filename"], listed) for name, row in data.items()}
+        path = {name: self._root / row["filename"] for name, row in data.items()}
         for file in path.values():
             if not file.is_file():  # a device, too, would be read without end
                 raise InputError(f"{file}: no such file")
