@@ -1,8 +1,13 @@
-"""Validation of user-facing configuration: YAML and JSON files to frozen records, with one-sentence error messages."""
+"""Validation of user-facing configuration: YAML and JSON files to frozen records, with one-sentence error messages.
+
+Documents from elsewhere may be made to exhaust whoever reads them, and name files that are not theirs: nesting and what
+aliases stand for are bounded before anything is built of them, and names lead nowhere but into their own folder.
+"""
 
 import json
-from collections.abc import Mapping
-from pathlib import Path
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Mapping
+from pathlib import Path, PureWindowsPath
 from typing import Any, ClassVar, TypeVar, get_args
 
 import yaml
@@ -13,6 +18,9 @@ from flcav.files import Json
 
 Place = tuple[int | str, ...]  # path to a nested field: names of fields, indices and keys, as pydantic's `loc`
 
+DEEPEST = 100  # most levels of nesting in a document
+COPIED = 100_000  # most nodes that the aliases of a YAML document stand for
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 SHOWN = 80  # most characters of a wrong value that an error message quotes
 
 
@@ -65,27 +73,118 @@ def read_config(model: type[ConfigT], path: Path) -> ConfigT:
 
 def read_yaml(path: Path) -> object:
     """Return the value in the YAML (or JSON) file at `path`; raises `InputError` if it is missing or not YAML."""
+    _check_exists(path)
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (IsADirectoryError, yaml.YAMLError, ValueError, RecursionError) as error:
+        text = path.read_text(encoding="utf-8")
+        _check_yaml(text)
+        return yaml.load(text, LOADER)
+    except (IsADirectoryError, yaml.YAMLError, ValueError) as error:
         raise InputError(f"{path}: not a YAML file ({error})") from None
+
+
+def _check_exists(path: Path) -> None:
+    if not path.exists():  # nor does a link to itself lead anywhere
+        raise InputError(f"{path}: no such file")
+
+
+def _check_yaml(text: str) -> None:
+    """Raise ValueError where a YAML document is nested beyond DEEPEST, or its aliases stand for more than COPIED nodes.
+
+    Parsing into events takes neither recursion nor memory; the nodes of an alias are those of its anchor, copied.
+    """
+    size: dict[str, int] = {}  # by anchor: nodes within, aliases as what they stand for
+    within: list[tuple[str | None, int]] = []  # anchors of the open collections, and the nodes before each
+    nodes = copied = 0
+    for event in yaml.parse(text, LOADER):
+        if isinstance(event, yaml.AliasEvent):
+            copied += size.get(event.anchor, 0)
+            nodes += size.get(event.anchor, 0)
+        elif isinstance(event, yaml.CollectionStartEvent):
+            within.append((event.anchor, nodes))
+            nodes += 1
+            size |= {event.anchor: COPIED + 1} if event.anchor else {}  # within itself: without end
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = within.pop()
+            size |= {anchor: nodes - before} if anchor else {}
+        elif isinstance(event, yaml.ScalarEvent):
+            nodes += 1
+            size |= {event.anchor: 1} if event.anchor else {}
+        if len(within) > DEEPEST:
+            raise ValueError(f"nested more than {DEEPEST} levels deep")
+        if copied > COPIED:
+            raise ValueError(f"its aliases stand for more than {COPIED} values")
 
 
 def read_json(path: Path) -> Json:
     """Return the value in the JSON file at `path`; raises `InputError` if it is missing or not JSON."""
+    _check_exists(path)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        value = json.loads(path.read_text(encoding="utf-8"))
+        _check_depth(value)
     except (IsADirectoryError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error})") from None
+    return value
+
+
+def _check_depth(value: Json) -> None:
+    """Raise ValueError where lists and mappings are nested beyond DEEPEST."""
+    level = [value]
+    for _ in range(DEEPEST):
+        level = [each for one in level for each in _children(one) if isinstance(each, dict | list)]
+        if not level:
+            return
+    raise ValueError(f"nested more than {DEEPEST} levels deep")
+
+
+def _children(value: Json) -> Iterable[Json]:
+    if isinstance(value, dict):
+        return value.values()
+    return value if isinstance(value, list) else ()
+
+
+class _Shallow(ElementTree.TreeBuilder):
+    """A builder of the elements of an XML document; raises ValueError where they are nested beyond DEEPEST."""
+
+    depth = 0
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> ElementTree.Element:
+        self.depth += 1
+        if self.depth > DEEPEST:
+            raise ValueError(f"nested more than {DEEPEST} levels deep")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> ElementTree.Element:
+        self.depth -= 1
+        return super().end(tag)
+
+
+def read_xml(path: Path, kind: str) -> ElementTree.Element:
+    """Return the root of the XML file at `path`; raises `InputError` if it is missing or not XML, so no `kind`."""
+    _check_exists(path)
+    try:
+        return ElementTree.parse(path, ElementTree.XMLParser(target=_Shallow())).getroot()
+    except (ElementTree.ParseError, IsADirectoryError, LookupError, ValueError) as error:
+        raise InputError(f"{path}: not {kind} ({error})") from None
+
+
+def path_within(folder: Path, name: str, origin: Path | str) -> Path:
+    """Return the path of the file that is called `name` in the document `origin`, relative to `folder`.
+
+    Raises `InputError` for a name that is empty or leads out of the folder by any system's rules: one that is absolute,
+    begins with a drive letter, or has `..` or NUL in it. Links within the folder are left to whoever reads the file.
+    """
+    parts = PureWindowsPath(name)  # knows both slashes, and drives
+    if not parts.parts or parts.anchor or ".." in parts.parts or "\0" in name:
+        raise InputError(f"{origin}: {shorten(name)} is no name of a file in {folder}")
+    return folder / name
 
 
 def shorten(value: object) -> str:
     """Return the `repr` of a value for an error message; more than SHOWN characters are cut in the middle."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except RecursionError:
+        return f"a deeply nested {type(value).__name__}"
     return text if len(text) <= SHOWN else f"{text[: SHOWN // 2]} ... {text[-SHOWN // 4 :]}"
 
 

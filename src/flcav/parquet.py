@@ -1,6 +1,7 @@
 """Strict reading of Parquet files, and their writing as a whole."""
 
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -8,20 +9,34 @@ import pyarrow.parquet as pq
 from flcav.config import InputError
 from flcav.files import write_bytes
 
+HARMLESS_BYTES = 1 << 28  # that any table may take in memory
+UNFOLDED = 1000  # most bytes in memory that a byte of a larger table stands for; unlike rows unfold to a few
+
 
 def read_parquet(path: Path) -> pa.Table:
     """Return the table in a Parquet file, validated in full: its strings are UTF-8.
 
-    Raises `InputError` where the file is missing, not Parquet, or damaged.
+    Raises `InputError` where the file is missing, not Parquet, or damaged, and before it is read where it would unfold
+    to far more than tables do.
     """
     try:
-        table = pq.ParquetFile(path).read()
+        file = pq.ParquetFile(path)
+        if (size := _measure_table(file.metadata)) > max(HARMLESS_BYTES, UNFOLDED * path.stat().st_size):
+            raise ValueError(f"it would take {size} bytes of memory")
+        table = file.read()
         table.validate(full=True)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (pa.ArrowException, OSError, ValueError, OverflowError, MemoryError) as error:
         raise InputError(f"{path}: not a readable Parquet file ({error})") from None
     return table
+
+
+def _measure_table(metadata: Any) -> int:
+    """Return the bytes that a file's values take, by what its metadata says: at least eight each, or their pages'."""
+    groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
+    columns = (group.column(j) for group in groups for j in range(group.num_columns))
+    return sum(max(8 * column.num_values, column.total_uncompressed_size) for column in columns)
 
 
 def write_parquet(table: pa.Table, path: Path) -> None:

@@ -5,8 +5,10 @@ The exit code is 0 or 2. On 2 there is one sentence on stderr, no traceback, and
 
 import contextlib
 import io
+import json
 import os
 import re
+import resource
 import shutil
 import sys
 import tempfile
@@ -17,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from bombs import bomb
 from mutations import Rng, link_tree, mutate, odd_number
 from time_limits import Slow, within
 
@@ -35,6 +38,7 @@ class Call:
     seconds: float  # of computing that a mutated input takes on average, measured
     problems: bool = False  # whether it reports problems of its input with exit code 1
     kept: tuple[str, ...] = ()  # what is whole, and kept where a later input is bad
+    recordings: str = ""  # glob of the folders of which each is to become a scene; those above them are splits
 
     def arguments(self, folder: Path, out: Path, rng: Rng) -> list[str]:
         """Return the command line for inputs in `folder`."""
@@ -75,6 +79,9 @@ LEARNERS = {
     "trajectory": (0.55, 0.4, 0.8),
 }
 SCORED = {name: "--threshold #0.3" if isinstance(task_named(name), Scores) else "" for name in TASKS}
+BOMBS, COPIED = 0.05, 0.1  # shares of files that unfold without end or are links, of imports with a recording twice
+SPLITS = ("train", "test")  # folders of recordings in every such format
+MOST_MB = 1500  # of memory that a case may take beyond what the process has, libraries included
 FILES = {"weather": "picture.*", "signs": "picture.*", "objects": "cloud.bin"}
 
 
@@ -180,10 +187,10 @@ def calls() -> list[Call]:
             found.append(Call(f"errors {task} {options}", (*DATASET, weights), draws / 2))
     weights = "weights/objects.safetensors"
     found += [
-        Call(f"import {name} {folder}/ --out OUT", (f"{folder}/**/*",), seconds, kept=("out/.recording",))
-        for name, folder, seconds in (
-            *(("kitti", "real", 0.05), ("argoverse2", "argoverse2", 0.06)),
-            *(("nuscenes", "nuscenes", 0.1), ("opv2v", "opv2v", 0.1)),
+        Call(f"import {name} {folder}/ --out OUT", (f"{folder}/**/*",), 0.1, kept=("out/.recording",), recordings=glob)
+        for name, folder, glob in (
+            *(("kitti", "real", ""), ("argoverse2", "argoverse2", "argoverse2/*/*")),
+            *(("nuscenes", "nuscenes", ""), ("opv2v", "opv2v", "opv2v/*/*")),
         )
     ]
     found.append(Call(f"evaluate objects --data real/ --weights {weights}", ("real/training/*/*", weights), 0.15))
@@ -201,11 +208,16 @@ def run_case(inputs: Path, number: int, scratch: Path, choices: list[Call], limi
     files = sorted({path for glob in call.inputs for path in (scratch / "in").glob(glob) if path.is_file()})
     count = min(len(files), int(rng.choice((1, 1, 1, 2))))
     for path in rng.choice(np.array(files, dtype=object), count, replace=False):
-        done.append(mutate(path, rng))
+        done.append(bomb(path, rng) if rng.random() < BOMBS else mutate(path, rng))
+    done += _copy_recordings(call, scratch / "in", rng)
+    (scratch / "secret").write_text("not to be read, written or linked to")
     arguments = call.arguments(scratch / "in", scratch / "out", rng)
     before = _files(scratch)
+    held_mb = _peak_mb()
     code, out, said, slow, trace = _run(arguments, limit_s)
     broken = trace or ("" if slow else _broken(call, code, out, said, scratch, before))
+    if not broken and (taken_mb := _peak_mb() - held_mb) > MOST_MB:
+        broken = f"it took {taken_mb} MB of memory"
     shutil.rmtree(scratch, ignore_errors=True)
     return Outcome(number, " ".join(arguments), "; ".join(done), code, said, broken, slow)
 
@@ -217,24 +229,64 @@ def _broken(call: Call, code: int, out: str, said: str, scratch: Path, before: d
     if code not in (0, 2):
         return f"exit code {code}"
     after = _files(scratch)
-    left = {name for name, state in after.items() if before.get(name) != state and name not in (".", "out")}
+    changed = {name for name, state in after.items() if before.get(name) != state}
+    if elsewhere := sorted(name for name in changed if not name.startswith(("in", "out"))):
+        return f"written elsewhere: {elsewhere[:3]}"
+    if lost := before.keys() - after.keys():
+        return f"deleted: {sorted(lost)[:3]}"
+    links = [path for path in (scratch / "out").rglob("*") if path.is_symlink()]
+    if odd := [path for path in links if not path.resolve().is_relative_to((scratch / "in").resolve())]:
+        return f"a link to {odd[0].resolve()}"
+    if code == 0 and call.recordings and (lacking := _lacking(call, scratch)):
+        return lacking
+    left = changed - {".", "out"}
     if code == 2:
         lines = said.splitlines()
         if len(lines) != 1 or not lines[0].startswith("flcav: "):
             return f"{len(lines)} lines on stderr"
         if len(lines[0]) > 1500:
             return f"a sentence of {len(lines[0])} characters"
-        if left := {name for name in left if not name.startswith(call.kept)} | before.keys() - after.keys():
+        if left := {name for name in left if not name.startswith(call.kept)}:
             return f"left behind: {sorted(left)[:3]}"
     if parts := [name for name in left if ".part" in name]:
         return f"left behind: {parts[:3]}"
     return ""
 
 
+def _copy_recordings(call: Call, folder: Path, rng: Rng) -> list[str]:
+    """Copy a recording under the same name into another split, now and then; return what was done."""
+    found = _recordings(call, folder)
+    if not found or rng.random() > COPIED:
+        return []
+    one = found[int(rng.integers(len(found)))]
+    split = str(rng.choice([name for name in SPLITS if name != one.parent.name]))
+    shutil.copytree(one, one.parents[1] / split / one.name, symlinks=True)
+    return [f"{one.relative_to(folder)} also in {split}"]
+
+
+def _recordings(call: Call, folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob(call.recordings) if path.is_dir()) if call.recordings else []
+
+
+def _lacking(call: Call, scratch: Path) -> str:
+    """Return what of the recordings in the input is not in the dataset, "" where all are."""
+    found = _recordings(call, scratch / "in")
+    scenes = json.loads((scratch / "out" / "manifest.json").read_text())["scenes"]
+    return "" if len(scenes) == len(found) else f"{len(scenes)} scenes of {len(found)} recordings"
+
+
+def _peak_mb() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+
+
 def _files(folder: Path) -> dict[str, tuple[int, int]]:
     """Return what lies in the folder, with sizes and times; folders count as they are, not what is in them."""
     found = ((str(path.relative_to(folder)), path) for path in folder.rglob("*"))
-    return {name: (0, 0) if path.is_dir() else (path.stat().st_size, path.stat().st_mtime_ns) for name, path in found}
+    return {name: (0, 0) if path.is_dir() else _state(path) for name, path in found}
+
+
+def _state(path: Path) -> tuple[int, int]:
+    return path.lstat().st_size, path.lstat().st_mtime_ns
 
 
 def _run(arguments: list[str], limit_s: float) -> tuple[int, str, str, bool, str]:

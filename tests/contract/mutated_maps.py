@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from bombs import bomb
 from mutations import MUTATIONS, mutate
 from time_limits import Slow, within
 
@@ -20,6 +21,7 @@ from flcav.world.static import build_town_mesh
 from flcav.world.traffic.traffic import simulate
 
 BYTES, REVERSED = 0.1, 0.1  # shares of mutations that do not know XML, and of those that reverse children
+BOMBS = 0.02  # share of maps that unfold without end, or are links
 DRIVEN_S = np.array([5.0, 10.0])  # times at which traffic is read
 
 
@@ -41,6 +43,8 @@ def mutate_often(path: Path, rng: np.random.Generator, times: int) -> Iterator[s
         return
     for _ in range(times):
         yield _reverse(path, rng) if rng.random() < REVERSED else MUTATIONS[".xodr"](path, path.read_bytes(), rng)
+    if rng.random() < BOMBS:  # last, so that all other cases are what they are without
+        yield bomb(path, rng)
 
 
 def _reverse(path: Path, rng: np.random.Generator) -> str:

@@ -31,6 +31,10 @@ TEXTS = (
     *("", " ", "x", "2020-13-45", "é", "\N{GRINNING FACE}", "a\nb", "\x00", "nan", "1e309", "-1e309", "1e-320", "0x10"),
     *("true", "null", "..", "../../x", "/", "veh0", "cav0", "cav9", "x" * 5000, "[red]x[/red]", "%s", "{0}"),
 )  # fmt: skip
+NAMES = (  # of files and folders, which lead elsewhere or stand for something else
+    *("/etc/hostname", "C:\\x", "\\\\host\\x", "../secret", "a/../../../secret", "x/..", ".", "joined", "town"),
+    *("traces", "manifest.json", "recipe.json", "frames.parquet", ".recording", "-x", "CON", "x/y", "a" * 300),
+)  # fmt: skip
 OTHERS: tuple[Any, ...] = (None, True, False, [], {}, [[]], [None], {"x": 1}, [1, 2], [2, 1], ["a", "a"])
 ODD = (*NUMBERS, *TEXTS, *OTHERS)
 NOT_UTF8 = b"\xff\xfe\x80"
@@ -134,6 +138,10 @@ def mutate_values(values: Any, rng: Rng) -> str:
         owner[key] = _nested(int(_drawn((3, 50, 3000), rng)))
         return f"{where} is now nested"
     old = owner[key]
+    if draw > 0.9 and isinstance(old, str):
+        texts = [other[place] for other, place in nodes if isinstance(other[place], str)]
+        owner[key] = _drawn(NAMES if draw > 0.93 else texts, rng)
+        return f"{where} is now called {_said(owner[key])}"
     number = isinstance(old, int | float) and not isinstance(old, bool)
     owner[key] = _drawn(NUMBERS if number and rng.random() < 0.7 else ODD, rng)
     return f"{where} is now {_said(owner[key])}"
@@ -189,7 +197,7 @@ def _mutate_csv(path: Path, data: bytes, rng: Rng) -> str:
 def _mutate_cell(rows: list[list[str]], rng: Rng) -> str:
     number = int(rng.integers(0 if rng.random() < 0.2 else 1, len(rows)))
     column = int(rng.integers(len(rows[number])))
-    rows[number][column] = _text(_drawn(NUMBERS if rng.random() < 0.7 else TEXTS, rng))
+    rows[number][column] = _text(_drawn(NUMBERS if rng.random() < 0.7 else (*TEXTS, *NAMES), rng))
     return f"row {number}, column {column} is now {_said(rows[number][column])}"
 
 
@@ -251,7 +259,7 @@ def _odd_cell(cell: Any, kind: pa.DataType, rng: Rng) -> Any:
         cells[int(rng.integers(len(cells)))] = _odd_cell(cells[0], kind.value_type, rng)
         return cells
     if pa.types.is_string(kind):
-        return _drawn((*TEXTS, NOT_UTF8, cell), rng)
+        return _drawn((*TEXTS, *NAMES, NOT_UTF8, cell), rng)
     if pa.types.is_integer(kind):
         bits = kind.bit_width
         return _drawn((0, 1, -1, 7, 10**4, 2**31 - 1, -(2 ** (bits - 1)), 2 ** (bits - 1) - 1), rng)

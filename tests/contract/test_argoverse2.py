@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.checks.validate import validate
+from flcav.dataset.checks.copies import find_copies
+from flcav.dataset.checks.validate import find_leaks, validate
 from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.formats.reading import difference_tracks
 from flcav.dataset.store import Dataset
@@ -212,3 +213,82 @@ def test_points_of_a_real_log_lie_in_its_boxes(tmp_path: Path):
     np.testing.assert_allclose(moved / step, near[0].annotations.velocity[order[0]], atol=1.5)
     lidar = transform_points(inverse(near[0].world_from_agent), near[0].world_from_sensor("lidar")[None, :3, 3])
     assert lidar[0, 2] == pytest.approx(1.97, abs=0.01)
+
+
+def test_a_camera_of_argoverse_lies_in_its_log(tmp_path: Path):
+    write_log(tmp_path / "folder" / "val" / "log")
+    for table in ("intrinsics", "egovehicle_SE3_sensor"):
+        path = tmp_path / "folder" / "val" / "log" / "calibration" / f"{table}.feather"
+        read = feather.read_table(path)
+        names = [name.replace("ring_front_center", "../../../elsewhere") for name in read["sensor_name"].to_pylist()]
+        feather.write_feather(read.set_column(read.column_names.index("sensor_name"), "sensor_name", [names]), path)
+    with pytest.raises(InputError, match=r"intrinsics.feather: '../../../elsewhere' is no name of a file in "):
+        import_dataset("argoverse2", tmp_path / "folder", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def _write_logs(folder: Path, *, same: bool) -> None:
+    """Write two logs of one name, in `val` and in `test`: of the same sweeps, or of others."""
+    for split in ("val", "test"):
+        write_log(folder / split / "one")
+    if not same:
+        for path in (folder / "test" / "one" / "sensors" / "lidar").iterdir():
+            table = feather.read_table(path)
+            x = table["x"].to_numpy() + np.float16(1)
+            feather.write_feather(table.set_column(table.column_names.index("x"), "x", [x]), path)
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_logs_of_one_name_are_both_imported_and_told(same: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    _write_logs(tmp_path / "logs", same=same)
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as ended:
+        run(["import", "argoverse2", str(tmp_path / "logs"), "--out", str(out)])
+    assert ended.value.code == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "leakage" in line]
+    data = Dataset.open(out)
+    assert data.manifest.scenes == ["test-one", "val-one"]
+    assert data.manifest.recipe["splits"] == {"test": ["test-one"], "val": ["val-one"]}
+    assert len(data) == 4
+    assert (
+        said
+        == [
+            f"{out}: leakage, 'one' is in the splits 'test' and 'val', as the scenes test-one, val-one",
+            f"{out} (split 'test') and {out} (split 'val'): leakage, they share 2 point clouds, the first is of the "
+            "scenes 'test-one' and 'val-one'",
+        ][: 1 + same]
+    )
+    assert validate(out) == said
+
+
+def test_a_log_under_two_names_in_datasets_of_two_splits_is_a_leak(tmp_path: Path):
+    write_log(tmp_path / "logs" / "train" / "one")
+    write_log(tmp_path / "logs" / "val" / "other")
+    for split in ("train", "val"):
+        import_dataset("argoverse2", tmp_path / "logs", tmp_path / split, split=split)
+        assert validate(tmp_path / split) == []
+    train, val = tmp_path / "train", tmp_path / "val"
+    assert find_leaks({str(each): Dataset.open(each).manifest for each in (train, val)}) == []
+    assert find_copies([train, val, tmp_path / "nowhere"]) == [
+        f"{train} (split 'train') and {val} (split 'val'): leakage, they share 2 point clouds, the first is of the "
+        "scenes 'one' and 'other'"
+    ]
+    assert find_copies([train]) == []
+
+
+def test_a_log_of_one_name_in_datasets_of_two_splits_is_a_leak(tmp_path: Path):
+    _write_logs(tmp_path / "logs", same=False)
+    for split in ("test", "val"):
+        import_dataset("argoverse2", tmp_path / "logs", tmp_path / split, split=split)
+    manifests = {split: Dataset.open(tmp_path / split).manifest for split in ("test", "val")}
+    assert find_leaks(manifests) == [
+        "test (split 'test') and val (split 'val'): leakage, they share 1 scenes, the first is 'one'"
+    ]
+
+
+def test_a_log_that_is_linked_to_has_the_split_of_the_link(tmp_path: Path):
+    write_log(tmp_path / "store" / str(START))
+    (tmp_path / "logs" / "val").mkdir(parents=True)
+    (tmp_path / "logs" / "val" / "one").symlink_to(tmp_path / "store" / str(START))
+    import_dataset("argoverse2", tmp_path / "logs", tmp_path / "out", split="val")
+    assert Dataset.open(tmp_path / "out").manifest.recipe["splits"] == {"val": ["one"]}

@@ -231,7 +231,7 @@ def make_inputs(folder: Path) -> None:
         Image.fromarray(pixels).save(folder / f"picture.{suffix}")
     shutil.copy(next((folder / "data" / "top").glob("*.bin")), folder / "cloud.bin")
     _make_kitti(folder / "real" / "training")
-    write_log(folder / "argoverse2" / "log")
+    write_log(folder / "argoverse2" / "val" / "log")
     for name in ("nuscenes", "opv2v"):
         export(Dataset.open(folder / "data"), name, folder / name, ExportOptions(validation=0.0))
 
@@ -244,3 +244,5 @@ def _make_kitti(folder: Path) -> None:
     (folder / "calib" / "000000.txt").write_text(KITTI_CALIBRATION)
     (folder / "label_2" / "000000.txt").write_text(KITTI_LABELS)
     Image.new("RGB", (1242, 375)).save(folder / "image_2" / "000000.png")
+    (folder.parent / "ImageSets").mkdir()
+    (folder.parent / "ImageSets" / "train.txt").write_text("000000\n")

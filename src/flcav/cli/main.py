@@ -1,6 +1,7 @@
 """The `flcav` command. Exit codes: 0 done; 2 bad input, one sentence on stderr; 130 interrupted; 1 anything else."""
 
 import atexit
+import errno
 import gc
 import sys
 
@@ -94,7 +95,8 @@ def run(arguments: list[str] | None = None) -> None:
         code = 2
     except OSError as error:
         _say(f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror or error))
-        code = 2 if isinstance(error, FileNotFoundError | IsADirectoryError) else 1  # a named file is missing
+        missing = isinstance(error, FileNotFoundError | IsADirectoryError) or error.errno == errno.ELOOP
+        code = 2 if missing else 1  # a named file is missing
     sys.exit(code if isinstance(code, int) else 0)
 
 

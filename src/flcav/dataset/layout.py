@@ -62,6 +62,16 @@ class Manifest(StrictModel):
         return name if isinstance(name, str) else None
 
     @property
+    def split_of(self) -> dict[str, str]:
+        """Return scene -> split of an imported dataset as its files have it; scenes of no split are not among them."""
+        splits = self.recipe.get("splits")
+        return {
+            str(scene): split
+            for split, scenes in (splits.items() if isinstance(splits, Mapping) else ())
+            for scene in (scenes if isinstance(scenes, list | tuple) else ())
+        }
+
+    @property
     def labels(self) -> Sequence[Json]:
         """Return what is labelled: "objects" and "signs" of a recording, of an imported dataset what its files say."""
         labels = self.recipe.get("labels") if self.imported else ("objects", "signs")

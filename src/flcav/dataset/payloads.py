@@ -5,6 +5,8 @@ time, see `benchmarks/bench_recording.py`.
 """
 
 import io
+import math
+import warnings
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -24,6 +26,7 @@ _DROPPED = 23 - DEPTH_BITS
 PLANES = {"rgb": "webp", "depth_m": "depth.zst", "semantic": "semantic.png", "instance": "instance.png"}
 PICTURES = ("webp", "png", "jpg", "jpeg")  # of colour images: recorded ones are WebP, imported ones as they were
 POINTS, TIMES, RADAR, INFRARED = "bin", "times.bin", "radar.bin", "infrared.png"
+LARGEST_PX = 8192  # sides of an image, as those of a `Lens`
 TAIL = 4096  # bytes at the end of a JPEG or PNG in which its end is marked
 COLUMNS = {POINTS: 4, TIMES: 1, RADAR: 5}  # of little-endian float32 in row-major order
 
@@ -94,13 +97,11 @@ def read_rows(path: Path, suffix: str, expected: int) -> NDArray[np.float32]:
     """
     row_bytes = 4 * COLUMNS[suffix]
     try:
-        found = path.stat().st_size
-        rows = np.fromfile(path, dtype="<f4")
+        if (found := path.stat().st_size) != expected * row_bytes and not path.is_dir():
+            raise InputError(f"{path}: {found} bytes where {expected} points take {expected * row_bytes}")
+        return np.fromfile(path, "<f4", expected * COLUMNS[suffix]).reshape(-1, COLUMNS[suffix])
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None
-    if found != expected * row_bytes:
-        raise InputError(f"{path}: {found} bytes where {expected} points take {expected * row_bytes}")
-    return rows.reshape(-1, COLUMNS[suffix])
 
 
 def read_plane(path: Path, plane: str) -> NDArray:
@@ -120,16 +121,30 @@ def read_image(path: Path, dtype: type[np.generic], channels: int = 1) -> NDArra
     channels.
     """
     try:
-        with Image.open(path, formats=("PNG", "WEBP", "JPEG")) as image:
+        with open_image(path) as image:
             found = len(image.getbands())
             pixels = np.asarray(turn_upright(image))
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None
+    except InputError:
+        raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: not a readable image ({error})") from None
     if found != channels:
         raise InputError(f"{path}: not a readable image (it has {found} channels, not {channels})")
     return pixels.astype(dtype)
+
+
+def open_image(file: Path | io.BytesIO) -> Image.Image:
+    """Return a PNG, WebP or JPEG image, not decoded yet; raises `InputError` where a side exceeds LARGEST_PX."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # of images that are refused here
+        image = Image.open(file, formats=("PNG", "WEBP", "JPEG"))
+    if max(image.size) > LARGEST_PX:
+        image.close()
+        size = f"{image.width} x {image.height}"
+        raise InputError(f"{file}: a picture of {size} pixels; sides of at most {LARGEST_PX} are wanted")
+    return image
 
 
 def check_image(path: Path) -> None:
@@ -159,11 +174,19 @@ def check_image(path: Path) -> None:
 
 
 def _read_depth(path: Path) -> NDArray[np.float32]:
+    """Return the depths that `encode_depth` wrote; of what unfolds from the file no more is taken than they are."""
     try:
         with pa.CompressedInputStream(pa.OSFile(str(path)), "zstd") as stream:
-            planes = np.load(io.BytesIO(stream.read()), allow_pickle=False)
-        if planes.dtype != np.uint8:
-            raise ValueError(f"it holds {planes.dtype}")
+            if (version := np.lib.format.read_magic(stream)) != (1, 0):
+                raise ValueError(f"version {version} of .npy")
+            shape, by_column, dtype = np.lib.format.read_array_header_1_0(stream)
+            fits = len(shape) == 3 and shape[0] == 4 and all(0 <= side <= LARGEST_PX for side in shape)
+            if by_column or dtype != np.uint8 or not fits:
+                raise ValueError(f"it holds {dtype} of shape {shape}")
+            size = math.prod(shape)
+            if len(data := stream.read(size + 1)) != size:
+                raise ValueError("its length is not that of its header")
+        planes = np.frombuffer(data, np.uint8).reshape(shape)
         return np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f4")[..., 0]
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None

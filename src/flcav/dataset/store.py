@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from flcav.config import InputError, shorten
+from flcav.config import InputError, path_within, shorten
 from flcav.dataset.calibration import Calibrations, read_calibrations
 from flcav.dataset.checks.calibration import check_calibration
 from flcav.dataset.checks.frames import check_measurements, check_values
@@ -22,6 +22,7 @@ from flcav.dataset.layout import (
     CALIBRATION,
     FILES,
     LEVEL_FORMAT,
+    MANIFEST,
     FrameKey,
     Manifest,
     payload_path,
@@ -33,7 +34,7 @@ from flcav.dataset.layout import (
 from flcav.dataset.payloads import INFRARED, PICTURES, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, TILTS, read_table
 from flcav.sensors.frame import LONGEST_NAME, CameraImage, Frame, format_key
-from flcav.world.map.town import Town, load_town
+from flcav.world.map.town import PACKAGED, Town, load_town
 from flcav.world.trace import Trace
 
 KINDS = ("lidar", "radar", "cameras", "infrared")  # columns of `frames` that list sensors
@@ -185,13 +186,15 @@ class Dataset:
         return Trace.load(path) if path.is_file() else None
 
     def town(self) -> Town | None:
-        """Return the town of the dataset, from the dataset or from flcav; None where neither has it."""
+        """Return the town of the dataset, from its own folder or from flcav; None where neither has it."""
         name = str(self.manifest.recipe.get("town", ""))
         if not name:  # imported
             return None
-        kept = self.folder / town_path(name)
         try:
-            return load_town(kept if kept.is_dir() else name)
+            kept = path_within(self.folder, town_path(name), self.folder / MANIFEST)
+            if kept.is_dir():
+                return load_town(kept)
+            return load_town(name) if name in PACKAGED else None
         except InputError:
             return None
 

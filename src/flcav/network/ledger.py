@@ -161,7 +161,7 @@ class Ledger:
         try:
             budget = Budget(**json.loads((table.schema.metadata or {})[b"budget"]))
             return cls(budget, (LedgerEntry(**row) for row in table.to_pylist()))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise InputError(f"{path}: not a ledger ({error})") from None
 
 

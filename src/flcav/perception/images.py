@@ -16,6 +16,7 @@ from PIL import Image, ImageEnhance, UnidentifiedImageError
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import Calibration, read_calibration
 from flcav.dataset.layout import MANIFEST
+from flcav.dataset.payloads import open_image
 from flcav.dataset.store import Dataset
 from flcav.dataset.upright import turn_upright
 from flcav.geometry import inverse, transform_points
@@ -77,14 +78,14 @@ def pack_pictures(data: Dataset, number: int) -> dict[str, NDArray[np.uint8]]:
 def unpack_pictures(arrays: Mapping[str, NDArray[np.uint8]]) -> dict[str, Picture]:
     """Return the images in the arrays of a message by camera: the inverse of `pack_pictures`."""
     cameras = to_names(arrays["cameras"]).tolist()
-    files = {each: Image.open(io.BytesIO(arrays[f"picture.{each}"].tobytes())) for each in cameras}
+    files = {each: open_image(io.BytesIO(arrays[f"picture.{each}"].tobytes())) for each in cameras}
     return {each: np.asarray(turn_upright(file)) for each, file in files.items()}
 
 
 def read_picture(path: Path) -> Picture:
     """Return the RGB or palette image of a PNG, JPEG or WebP file, upright; raises `InputError` for any other file."""
     try:
-        with Image.open(path, formats=("PNG", "JPEG", "WEBP")) as image:
+        with open_image(path) as image:
             channels, mode = len(image.getbands()), image.mode
             if mode not in ("RGB", "P"):
                 raise InputError(f"{path}: a picture of {channels} channels ({mode}); 3 are wanted: red, green, blue")

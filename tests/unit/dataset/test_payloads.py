@@ -1,4 +1,5 @@
 import io
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -99,3 +100,46 @@ def test_a_truncated_image_is_told_by_its_end(kind: str, tmp_path: Path):
     path.write_bytes(b"")
     with pytest.raises(InputError, match="not an image, or a truncated one"):
         check_image(path)
+
+
+def _write_depth(path: Path, header: dict[str, object], zeros: int) -> Path:
+    """Write a depth file whose header may lie, with so many zeros after it."""
+    data = io.BytesIO()
+    np.lib.format.write_array_header_1_0(data, header)  # type: ignore[arg-type]
+    with pa.CompressedOutputStream(pa.OSFile(str(path), "wb"), "zstd") as stream:
+        stream.write(data.getvalue())
+        for start in range(0, zeros, 1 << 20):
+            stream.write(bytes(min(1 << 20, zeros - start)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("shape", "zeros", "sentence"),
+    [
+        ((4, 24, 32), 1 << 28, "its length is not that of its header"),
+        ((4, 24, 32), 3000, "its length is not that of its header"),
+        ((4, 10**6, 10**9), 100, "it holds uint8 of shape"),
+        ((4, -1, 32), 1 << 28, "it holds uint8 of shape"),
+        ((3, 24, 32), 3 * 24 * 32, "it holds uint8 of shape"),
+    ],
+)
+def test_no_more_is_unfolded_of_a_depth_image_than_it_holds(
+    tmp_path: Path, shape: tuple[int, ...], zeros: int, sentence: str
+):
+    header = {"descr": "|u1", "fortran_order": False, "shape": shape}
+    path = _write_depth(tmp_path / "d", header, zeros)
+    before = pa.total_allocated_bytes()
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=f"not a readable depth image .{sentence}"):
+            read_plane(path, "depth_m")
+        assert tracemalloc.get_traced_memory()[1] + pa.total_allocated_bytes() - before < 10e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_picture_larger_than_any_lens_is_not_decoded(tmp_path: Path, recwarn: pytest.WarningsRecorder):
+    Image.new("1", (12_000, 9_000)).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match="a picture of 12000 x 9000 pixels; sides of at most 8192 are wanted"):
+        read_image(tmp_path / "a.png", np.uint8)
+    assert not recwarn.list

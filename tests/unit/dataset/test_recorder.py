@@ -182,6 +182,13 @@ def test_a_folder_that_cannot_be_made(tmp_path: Path):
         record(ToySource(), tmp_path / "file" / "data")
 
 
+def test_two_scenes_of_one_name_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(ToySource, "scenes", lambda self: ["a", "b", "a"])
+    with pytest.raises(ValueError, match="two scenes are called 'a'"):
+        record(ToySource(), tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
 @pytest.mark.parametrize("name", ["../x", 95 * "x"])
 def test_names_that_would_leave_the_folder_or_are_too_long_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str

@@ -1,4 +1,5 @@
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -6,8 +7,11 @@ import pytest
 from toy_source import ToySource
 
 from flcav.config import InputError
+from flcav.dataset.checks.validate import validate
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.files import sha256
+from flcav.world.map.town import load_town
 
 
 @pytest.fixture
@@ -110,3 +114,32 @@ def test_an_empty_dataset(tmp_path: Path):
     record(ToySource(spins=0), tmp_path / "data")
     with pytest.raises(InputError, match="empty"):
         Dataset.open(tmp_path / "data")
+
+
+def test_a_listed_file_lies_in_the_dataset(folder: Path, tmp_path: Path):
+    secret = tmp_path / "secret"
+    secret.write_text("private")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    for name in ("../secret", str(secret), ""):
+        manifest["tables"][name] = {"bytes": 7, "sha256": sha256(secret)}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    problems = [problem for problem in validate(folder) if problem.endswith("no name of a file within the dataset")]
+    assert problems == [
+        f"{folder / name}: no name of a file within the dataset" for name in ("../secret", str(secret), "")
+    ]
+
+
+def test_a_town_is_in_the_dataset_or_of_the_package(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    elsewhere = shutil.copytree(Path(load_town("grid").net).parent, tmp_path / "elsewhere")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    monkeypatch.chdir(tmp_path)
+    for name, known in (("grid", True), ("elsewhere", False), ("../../elsewhere", False), (str(elsewhere), False)):
+        manifest["recipe"]["town"] = name
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+        assert (Dataset.open(folder).town() is not None) == known
+    shutil.copytree(elsewhere, folder / "town" / "elsewhere")
+    manifest["recipe"]["town"] = "elsewhere"
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    town = Dataset.open(folder).town()
+    assert town is not None
+    assert town.net == folder / "town" / "elsewhere" / "town.net.xml"

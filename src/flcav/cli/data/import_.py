@@ -23,15 +23,20 @@ def import_(
     Files that need no conversion are linked to, so they have to stay where they are.
     """
     from flcav import progress
+    from flcav.dataset.checks.copies import find_copies
+    from flcav.dataset.checks.validate import find_leaks
     from flcav.dataset.formats.importing import import_dataset
     from flcav.dataset.layout import read_manifest
 
     with progress.show_progress(f"import {out}") as report:
         notes = import_dataset(format, folder, out, split=split, progress=report)
-    counts = read_manifest(out).counts
+    manifest = read_manifest(out)
+    counts = manifest.counts
     typer.echo(
         f"{out}: imported {counts.scenes} scenes, {counts.frames} frames, {counts.annotations} objects, "
         f"{counts.points} points, {counts.images} images"
     )
     for note in notes:
         typer.echo(f"{folder}: {note}")
+    for leak in find_leaks({str(out): manifest}) + find_copies([out]):
+        typer.echo(leak, err=True)

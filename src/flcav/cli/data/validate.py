@@ -15,16 +15,17 @@ def validate(
 ) -> None:
     """Check datasets: files, tables, boxes against points and traffic, leakage between splits. Exit 1 on a problem."""
     from flcav import progress
+    from flcav.dataset.checks.copies import find_copies
     from flcav.dataset.checks.validate import find_leaks
     from flcav.dataset.checks.validate import validate as problems_of
     from flcav.dataset.layout import read_manifest
 
     manifests = {folder: read_manifest(folder) for folder in folders}
-    problems = find_leaks({str(folder): manifest for folder, manifest in manifests.items()})
+    problems = find_leaks({str(folder): manifest for folder, manifest in manifests.items()}) + find_copies(folders)
     for folder in folders:
         with progress.show_progress(f"validate {folder}") as report:
             problems += problems_of(folder, progress=report)
-    for problem in problems:
+    for problem in dict.fromkeys(problems):  # copies within a dataset are found by both
         typer.echo(problem)
     if problems:
         raise typer.Exit(1)

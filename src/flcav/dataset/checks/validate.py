@@ -10,8 +10,9 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
-from flcav.config import InputError, parse_config
+from flcav.config import InputError, parse_config, path_within
 from flcav.dataset.checks.calibration import check_calibrations
+from flcav.dataset.checks.copies import find_copies
 from flcav.dataset.checks.frames import check_measurements, check_points, check_sweeps, check_traffic, check_values
 from flcav.dataset.checks.images import check_images
 from flcav.dataset.checks.scenes import BlockedViews, check_motion
@@ -37,7 +38,7 @@ def validate(path: Path | str, *, progress: Report = ignore_progress) -> list[st
     folder = Path(path)
     manifest = read_manifest(folder)
     listed = _listed_files(folder, manifest)
-    damaged = {name: problem for name, entry in listed.items() if (problem := _damage(folder / name, *entry))}
+    damaged = {name: problem for name, entry in listed.items() if (problem := _damage(folder, name, *entry))}
     problems = [f"{folder / name}: {problem}" for name, problem in damaged.items()]
     problems += _extra_files(folder, listed)
     try:
@@ -45,6 +46,7 @@ def validate(path: Path | str, *, progress: Report = ignore_progress) -> list[st
     except InputError as error:
         return [*problems, str(error)]
     problems += check_order(dataset.keys)
+    problems += find_leaks({str(folder): manifest}) + find_copies([folder])
     problems += _other_counts(dataset)
     stated = manifest.recipe.get("calibration_error") or {}
     error = parse_config(CalibrationError, stated, f"{folder / MANIFEST}: calibration_error of the recipe")
@@ -110,7 +112,11 @@ def _listed_files(folder: Path, manifest: Manifest) -> dict[str, tuple[int, str]
     return listed
 
 
-def _damage(path: Path, recorded_bytes: int, recorded_hash: str) -> str | None:
+def _damage(folder: Path, name: str, recorded_bytes: int, recorded_hash: str) -> str | None:
+    try:
+        path = path_within(folder, name, folder)
+    except InputError:
+        return "no name of a file within the dataset"
     if not os.path.isfile(path):  # noqa: PTH113 - False for a name that is too long for any file, too
         return "missing"
     size = path.stat().st_size
@@ -143,9 +149,28 @@ def find_leaks(manifests: Mapping[str, Manifest]) -> list[str]:
     """Return a sentence for each pair of datasets of different splits that share traffic; `manifests` is by name.
 
     Frames of one scene show the same cars at the same places, so a scene belongs in one split. So does a traffic seed
-    of a town, which gives the same traffic in every recipe.
+    of a town, which gives the same traffic in every recipe, and an imported recording, by the name of its folder: for
+    each of them in several splits of one dataset, there is a sentence, too.
     """
-    return [sentence for pair in combinations(manifests.items(), 2) for sentence in _shared(*pair)]
+    repeated = [sentence for name, manifest in manifests.items() for sentence in _repeated(name, manifest)]
+    return repeated + [sentence for pair in combinations(manifests.items(), 2) for sentence in _shared(*pair)]
+
+
+def _recordings(manifest: Manifest) -> dict[str, list[str]]:
+    """Return recording -> scenes of a dataset: a scene is one, of its own name or, where imported, of its folder's."""
+    folders = manifest.recipe.get("folders")
+    found: dict[str, list[str]] = defaultdict(list)
+    for scene in manifest.scenes:
+        found[str(folders.get(scene, scene)) if isinstance(folders, Mapping) else scene].append(scene)
+    return found
+
+
+def _repeated(name: str, manifest: Manifest) -> Iterator[str]:
+    split_of = manifest.split_of
+    for recording, scenes in _recordings(manifest).items():
+        if len(splits := {split_of.get(scene, "") for scene in scenes}) > 1:
+            told = " and ".join(f"'{split}'" for split in sorted(splits))
+            yield f"{name}: leakage, '{recording}' is in the splits {told}, as the scenes {', '.join(scenes)}"
 
 
 def _shared(one: tuple[str, Manifest], other: tuple[str, Manifest]) -> Iterator[str]:
@@ -155,7 +180,7 @@ def _shared(one: tuple[str, Manifest], other: tuple[str, Manifest]) -> Iterator[
     if split == other_split:
         return
     where = f"{name} (split '{split}') and {other_name} (split '{other_split}')"
-    scenes = sorted(set(manifest.scenes) & set(other_manifest.scenes))
+    scenes = sorted(_recordings(manifest).keys() & _recordings(other_manifest).keys())
     if scenes:
         yield f"{where}: leakage, they share {len(scenes)} scenes, the first is '{scenes[0]}'"
     elif "seed" in recipe and (recipe.get("town"), recipe["seed"]) == (

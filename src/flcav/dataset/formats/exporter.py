@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -81,7 +81,8 @@ def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
     """
     scenes = list(dict.fromkeys(key.scene for key in dataset.keys))
     recorded_for = str(dataset.manifest.recipe.get("split", ""))
-    known = {} if recorded_for or "validation" in options.model_fields_set else _imported_splits(dataset)
+    own = {scene: split for scene, split in dataset.manifest.split_of.items() if split in SPLITS}
+    known = {} if recorded_for or "validation" in options.model_fields_set else own
     if known.keys() >= set(scenes):
         return {scene: known[scene] for scene in scenes}
     for split in ("val", "test"):
@@ -94,17 +95,6 @@ def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
     held_out = min(math.ceil(options.validation * len(scenes)), len(scenes) - 1)
     first = len(scenes) - held_out
     return {scene: "val" if i >= first else "train" for i, scene in enumerate(scenes)}
-
-
-def _imported_splits(dataset: Dataset) -> dict[str, str]:
-    """Return scene -> split of an imported dataset as its files have it; scenes of no split are not among them."""
-    splits = dataset.manifest.recipe.get("splits")
-    return {
-        str(scene): name
-        for name, scenes in (splits.items() if isinstance(splits, Mapping) else ())
-        if name in SPLITS and isinstance(scenes, Sequence)
-        for scene in scenes
-    }
 
 
 def split_with_validation(dataset: Dataset, options: ExportOptions, name: str) -> Mapping[str, str]:

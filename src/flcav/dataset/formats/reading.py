@@ -5,7 +5,8 @@ from tracks, and the rectangles that boxes fill in images.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Hashable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -14,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flcav.config import InputError, parse_config
-from flcav.dataset.payloads import read_image
+from flcav.config import InputError, parse_config, shorten
+from flcav.dataset.payloads import open_image, read_image
 from flcav.dataset.store import LazyMapping
 from flcav.dataset.upright import measure_upright
 from flcav.files import Json
@@ -43,18 +44,22 @@ class LogSource(ABC):
     _folder: Path
     _split: str | None  # that was asked for
     _split_of: Mapping[str, str | None]  # scene -> its split
+    _folders: Mapping[str, Path] = {}  # scene -> its folder, where a format has one for each
     _labelled: bool = True  # whether all frames have boxes
     _beams: int | None = None  # of the LiDAR, where the format settles them
     _range_m: float | None = None  # of the LiDAR, the largest
 
     def describe(self) -> Mapping[str, Json]:
-        """Return folder, splits and what is labelled."""
+        """Return folder, splits and what is labelled; of scenes that are not called as their folders, these."""
+        folders = {scene: self._folders[scene].name for scene in self._split_of if scene in self._folders}
+        renamed = {scene: name for scene, name in folders.items() if scene != name}
         return {
             "imported": self.FORMAT,
             "from": str(self._folder.resolve()),
             "split": self._split or "",
             "labels": ["objects"] if self._labelled else [],
             "splits": name_splits(self._split_of),
+            **({"folders": renamed} if renamed else {}),
             **({} if self._beams is None else {"beams": self._beams}),
             **({} if self._range_m is None else {"range_m": self._range_m}),
         }
@@ -218,7 +223,7 @@ def pinhole(intrinsics: Array, width: float, height: float, path: Path) -> Lens:
 def measure_picture(path: Path) -> tuple[int, int]:
     """Return width and height of an image file, upright [px]; raises `InputError` where it is missing or no image."""
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return measure_upright(image)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
@@ -246,6 +251,28 @@ class AgentNames:
         """Return the name of the agent of a `vehicle` with this `calibration`."""
         known = self._known.setdefault(vehicle, {})
         return known.setdefault(calibration, vehicle if not known else f"{vehicle}-{len(known) + 1}")
+
+
+def name_folders(folders: Sequence[Path]) -> dict[str, Path]:
+    """Return scene -> folder: a scene has the name of its folder, or `PARENT-NAME` where folders share a name.
+
+    Logs of one name in several splits are scenes of their own.
+    """
+    count = Counter(path.absolute().name for path in folders)
+    named = {}
+    for path in map(Path.absolute, folders):
+        scene = path.name if count[path.name] == 1 else f"{path.parent.name}-{path.name}"
+        if scene in named:
+            raise InputError(f"{path}: would be the scene '{scene}', as {named[scene]} is")
+        named[scene] = path
+    return named
+
+
+def assign_split(split_of: MutableMapping[str, str | None], scene: str, split: str | None, origin: Path) -> None:
+    """Put a scene into a split; raises `InputError` where it is in another: its frames show the same cars."""
+    if split_of.setdefault(scene, split) != split:
+        both = " and ".join(sorted(f"'{each}'" if each else "no split" for each in (split_of[scene], split)))
+        raise InputError(f"{origin}: the scene {shorten(scene)} is in {both}")
 
 
 def name_splits(split_of: Mapping[str, str | None]) -> dict[str, list[str]]:

@@ -10,15 +10,16 @@ import json
 import re
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import pyarrow as pa
 
+from flcav.config import shorten
 from flcav.dataset.calibration import encode_calibration
-from flcav.dataset.layout import CALIBRATION, FILES, TRACES, payload_path, table_path
-from flcav.dataset.payloads import PICTURES, check_image, encode_payloads
+from flcav.dataset.layout import CALIBRATION, FILES, MANIFEST, TOWN, TRACES, payload_path, table_path
+from flcav.dataset.payloads import PICTURES, POINTS, check_image, encode_payloads
 from flcav.dataset.rows import build_table, encode_frame
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
 from flcav.files import sha256, write_bytes, write_in_pieces
@@ -28,8 +29,11 @@ from flcav.world.trace import Trace
 
 PART_FRAMES = 16  # frames of a part: few are lost by an interruption, and starting a part is cheap beside them
 TRAFFIC = "traffic.parquet"
+HEADER = "recipe.json"
+JOINED = "joined"  # folder below `.recording` of the concatenated tables and the calibration
 PAYLOADS = "payloads"  # folder of a part with the files that are moved into the dataset unchanged
 _SAFE_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")
+OWN_NAMES = {TRACES, TOWN, MANIFEST, CALIBRATION, HEADER, JOINED, *map(table_path, (*SCHEMAS, FILES))}
 AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
@@ -53,6 +57,15 @@ class Part(NamedTuple):
 
 
 Job = Traffic | Part
+
+
+def check_scenes(scenes: Sequence[str]) -> None:
+    """Raise ValueError where a scene has no safe name of a folder, that of a dataset's own file, or another's."""
+    for scene in scenes:
+        if not _SAFE_NAME.fullmatch(scene) or scene in OWN_NAMES:
+            raise ValueError(f"{shorten(scene)}: the name of a scene that a dataset cannot hold")
+    if len(set(scenes)) < len(scenes):
+        raise ValueError(f"two scenes are called '{max(scenes, key=list(scenes).count)}'")
 
 
 def split_scene(source: Source, scene: str) -> list[Part]:
@@ -110,6 +123,8 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
             suffix = target.suffix[1:].lower()
             if suffix in PICTURES:
                 check_image(target)
+            elif suffix != POINTS:
+                raise ValueError(f"{target}: neither a picture nor a point cloud, by its ending")
             name = payload_path(sensor, frame.key, suffix)
             (part / PAYLOADS / name).parent.mkdir(parents=True, exist_ok=True)
             (part / PAYLOADS / name).symlink_to(target.resolve())
@@ -133,8 +148,9 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
 
 
 def _check_names(frame: Frame, scene: str) -> None:
-    names = (frame.key, *frame.calibration.agent_from_sensor)
-    if frame.scene != scene or TRACES in names or not all(_SAFE_NAME.fullmatch(name) for name in names):
+    links = frame.files if isinstance(frame, LinkedFrame) else {}
+    names = (frame.key, *frame.calibration.agent_from_sensor, *links)
+    if frame.scene != scene or OWN_NAMES & {*names} or not all(_SAFE_NAME.fullmatch(name) for name in names):
         raise ValueError(f"{frame.key}: scene, agent or sensor names that a dataset cannot hold: {names}")
 
 

@@ -28,7 +28,16 @@ from flcav.dataset.layout import (
     town_path,
     trace_path,
 )
-from flcav.dataset.recording.jobs import PAYLOADS, TRAFFIC, find_pending, record_scenes, split_scene
+from flcav.dataset.recording.jobs import (
+    HEADER,
+    JOINED,
+    PAYLOADS,
+    TRAFFIC,
+    check_scenes,
+    find_pending,
+    record_scenes,
+    split_scene,
+)
 from flcav.dataset.recording.ray_engine import start_ray_engine
 from flcav.dataset.recording.workers import start_processes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, write_table
@@ -41,8 +50,6 @@ from flcav.sources.source import Source, TownSource
 Header = Mapping[str, Mapping[str, Json]]  # "recipe" -> description of the source, "versions" -> of packages
 
 ENGINES = {"processes": start_processes, "ray": start_ray_engine}
-HEADER = "recipe.json"
-JOINED = "joined"  # folder below `.recording` of the concatenated tables and the calibration
 
 
 def record(
@@ -57,7 +64,8 @@ def record(
 
     `jobs` workers of the `engine`, one of ENGINES, do the work. Returns True if anything was recorded, False if `out`
     already held this very dataset. An interrupted recording of the same source is resumed. Raises `InputError` where
-    `out` holds anything else, or `jobs`, `engine` or the recipe is wrong; OSError where `out` cannot be written.
+    `out` holds anything else, or `jobs`, `engine` or the recipe is wrong; ValueError where scenes have names that no
+    folder may have, before anything is touched; OSError where `out` cannot be written.
 
     >>> from flcav import Recipe, record
     >>> recipe = Recipe(town="ring", cavs=1, spins_per_scene=1, warmup_s=5.0)
@@ -71,6 +79,7 @@ def record(
     if isinstance(source, Recipe):
         source = EmbeddedSource(source)
     out = Path(out)
+    check_scenes(source.scenes())
     header: Header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))
     try:
         if not _claim(out, header):
@@ -147,9 +156,13 @@ def _assemble(source: Source, out: Path, header: Header) -> None:
     folders = [part.folder(work) for scene in scenes for part in split_scene(source, scene)]
     listings = [work / table_path(FILES)] if _write_town(source, work, out) else []
     listings += [listing for scene in scenes if (listing := _move_traffic(work / scene, scene, out))]
+    moved: set[str] = set()
     for folder in folders:
         listings.append(folder / table_path(FILES))
         for name in pq.ParquetFile(listings[-1]).read()["path"].to_pylist():
+            if name in moved:
+                raise ValueError(f"{name}: a file of two frames")
+            moved.add(name)
             if (folder / PAYLOADS / name).exists():
                 _move(folder / PAYLOADS / name, out / name)
 

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError, shorten
+from flcav.config import InputError, read_xml, shorten
 
 Array = NDArray[np.float64]
 
@@ -92,12 +92,7 @@ class RoadNet:
 
 def read_net(path: Path) -> RoadNet:
     """Return the road network of a net file; raises `InputError` where it is missing or no SUMO net."""
-    try:
-        root = ElementTree.parse(path).getroot()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (ElementTree.ParseError, IsADirectoryError, LookupError, ValueError) as error:
-        raise InputError(f"{path}: not a SUMO net ({error})") from None
+    root = read_xml(path, "a SUMO net")
     if root.tag != "net":
         raise InputError(f"{path}: not a SUMO net (its root is <{root.tag}>, expected <net>)")
     try:

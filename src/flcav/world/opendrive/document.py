@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
 
-from flcav.config import SHOWN, InputError, shorten
+from flcav.config import SHOWN, InputError, read_xml, shorten
 from flcav.world.opendrive.objects.signs import read_limit
 from flcav.world.opendrive.standard import check_standard
 
@@ -57,15 +57,9 @@ def read_map(path: Path) -> ElementTree.Element:
 
     Raises `InputError` where the file is missing, no map of version 1, or breaks a rule of `standard`.
     """
-    try:
-        text = path.read_bytes()
-        root = ElementTree.fromstring(text[max(text.find(b"<?xml"), 0) :])  # comments stand before the declaration
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except IsADirectoryError:
-        raise InputError(f"{path}: is a folder, expected an OpenDRIVE file (.xodr)") from None
-    except (ElementTree.ParseError, UnicodeDecodeError, LookupError, ValueError) as error:
-        raise InputError(f"{path}: not an OpenDRIVE map ({error})") from None
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected an OpenDRIVE file (.xodr)")
+    root = read_xml(path, "an OpenDRIVE map")
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]  # version 1.8 has a namespace, earlier ones do not
     if root.tag.lower() != "opendrive":

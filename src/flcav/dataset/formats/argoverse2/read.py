@@ -17,7 +17,7 @@ import pyarrow.feather as feather
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flcav.config import InputError
+from flcav.config import InputError, path_within
 from flcav.dataset.checks.frames import LONGEST_SPIN_S
 from flcav.dataset.formats.reading import (
     FARTHEST,
@@ -28,6 +28,7 @@ from flcav.dataset.formats.reading import (
     check_sizes,
     choose_split,
     difference_tracks,
+    name_folders,
     pinhole,
     read_pictures,
     turned_boxes,
@@ -97,7 +98,7 @@ class Argoverse2Source(LogSource):
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where there is no log in `folder`, none of `split`, or a file of a log is missing."""
         self._folder, self._split = folder, split
-        found = _find_logs(folder)
+        self._folders = found = _find_logs(folder)
         names = AgentNames()
         self._logs = {
             scene: _open_log(found[scene], names)
@@ -185,16 +186,16 @@ class Poses:
 
 
 def _find_logs(folder: Path) -> dict[str, Path]:
-    """Return log id -> folder of the logs in `folder`, which is itself one, or holds them, or splits of them."""
+    """Return scene -> folder of the logs in `folder`, which is itself one, or holds them, or splits of them."""
     depths = (folder,), folder.glob("*"), (path for split in SPLITS for path in (folder / split).glob("*"))
     for paths in depths:
         if logs := sorted(path for path in paths if (path / "sensors" / "lidar").is_dir()):
-            return {path.resolve().name: path for path in logs}
+            return name_folders(logs)
     raise InputError(f"{folder}: no log of Argoverse 2; neither it nor a folder in it holds 'sensors/lidar'")
 
 
 def _split_of(log: Path) -> str | None:
-    name = log.resolve().parent.name
+    name = log.absolute().parent.name
     return name if name in SPLITS else None
 
 
@@ -259,6 +260,7 @@ def _read_lenses(folder: Path) -> dict[str, Lens]:
     table = _read_feather(path, ("sensor_name", *names))
     for row in table.to_pylist():
         matrix = np.array([[row["fx_px"], 0, row["cx_px"]], [0, row["fy_px"], row["cy_px"]], [0, 0, 1.0]])
+        path_within(folder / "sensors" / "cameras", row["sensor_name"], path)
         lenses[row["sensor_name"]] = pinhole(matrix, row["width_px"], row["height_px"], path)
     return lenses
 
@@ -295,10 +297,10 @@ def _transforms(table: pa.Table, path: Path) -> Array:
 
 def _read_feather(path: Path, columns: tuple[str, ...]) -> pa.Table:
     """Return columns of a Feather file; raises `InputError` where it is missing, truncated, or lacks one of them."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; a log of Argoverse 2 has one")
     try:
         table = feather.read_table(path, memory_map=False)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; a log of Argoverse 2 has one") from None
     except (OSError, pa.ArrowException, ValueError):
         raise InputError(f"{path}: not a Feather file, or a truncated one") from None
     if lost := [name for name in columns if name not in table.column_names]:

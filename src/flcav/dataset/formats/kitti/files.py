@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flcav.config import InputError
+from flcav.config import InputError, path_within
 from flcav.dataset.formats.layout import describe_numbers, is_kitti
 from flcav.dataset.formats.reading import check_cloud
+from flcav.dataset.payloads import open_image
 from flcav.dataset.upright import turn_upright
 from flcav.geometry import Boxes, heading_vectors, inverse, transform_points, wrap_angle
 
@@ -223,7 +224,10 @@ def check_objects(objects: Objects, width: int, height: int, path: Path) -> None
 
 
 def read_split(path: Path) -> list[str]:
-    """Return the names of the frames that a file of `ImageSets` lists; raises `InputError` where one is there twice."""
+    """Return the names of the frames that a file of `ImageSets` lists.
+
+    Raises `InputError` where one is there twice, or leads out of the folders of frames.
+    """
     try:
         names = path.read_text(encoding="utf-8").split()
     except FileNotFoundError:
@@ -232,12 +236,14 @@ def read_split(path: Path) -> list[str]:
         raise InputError(f"{path}: not a text file") from None
     if len(set(names)) != len(names):
         raise InputError(f"{path}: names a frame twice")
+    for name in names:
+        path_within(path.parents[1], name, path)
     return names
 
 
 def _read_image(path: Path) -> NDArray[np.uint8]:
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return np.asarray(turn_upright(image).convert("RGB"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         raise InputError(f"{path}: not an image") from None

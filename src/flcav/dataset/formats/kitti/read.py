@@ -30,6 +30,7 @@ from flcav.dataset.formats.reading import (
     AgentNames,
     LogSource,
     annotate,
+    assign_split,
     choose_split,
     measure_picture,
     read_pictures,
@@ -74,11 +75,13 @@ class KittiSource(LogSource):
         """Raises `InputError` where `folder` has no frames, none of `split`, or a file of a frame is missing."""
         self._folder, self._split = folder, split
         shots = _find_shots(folder)
-        split_of = {shot.scene: shot.split for shot in shots}
+        split_of: dict[str, str | None] = {}
+        for shot in shots:
+            assign_split(split_of, shot.scene, shot.split, folder)
         chosen = set(choose_split(folder, split_of, split))
         self._split_of = {scene: own for scene, own in split_of.items() if scene in chosen}
         self._shots: dict[str, list[Shot]] = defaultdict(list)
-        self._agent: dict[str, str] = {}
+        self._agent: dict[Shot, str] = {}
         self._calibration: dict[str, Calibration] = {}
         every = [shot for shot in shots if shot.scene in chosen]
         _check_complete(every)
@@ -88,7 +91,7 @@ class KittiSource(LogSource):
             mounted = _calibrate(read_calibration(calibration))
             self._shots[shot.scene].append(shot)
             text = "" if shot.exported else calibration.read_text()
-            agent = self._agent[shot.number] = names.of(shot.vehicle, text)
+            agent = self._agent[shot] = names.of(shot.vehicle, text)
             self._calibration.setdefault(agent, mounted)
         if not any(shot.exported for shot in every):
             self._beams, self._range_m = BEAMS, RANGE_M
@@ -103,7 +106,7 @@ class KittiSource(LogSource):
     def frames(self, scene: str) -> Iterator[LinkedFrame]:
         """Yield the frames of a scene; raises `InputError` where a file is missing, truncated or malformed."""
         for shot in sorted(self._shots[scene], key=lambda shot: (shot.spin, shot.vehicle)):
-            agent = self._agent[shot.number]
+            agent = self._agent[shot]
             yield _read_frame(shot, agent, self._calibration[agent])
 
 
@@ -195,7 +198,7 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
             for row in csv.DictReader(file):
                 scene, index, _ = row["frame"].removesuffix(row["agent"]).rsplit("_", 2)
                 found[row["number"]] = scene, int(index), row["agent"], float(row["time_s"])
-    except (KeyError, ValueError, TypeError, AttributeError):
+    except (KeyError, ValueError, TypeError, AttributeError, csv.Error):
         raise InputError(
             f"{path}: not the list of frames of an export; without it the folder can be read, too"
         ) from None

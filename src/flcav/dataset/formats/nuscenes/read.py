@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flcav.config import InputError, read_json
+from flcav.config import InputError, path_within, read_json, shorten
 from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, decode_radar, read_lidar
 from flcav.dataset.formats.nuscenes.rows import COLUMNS, Row, read_table, stream_table
 from flcav.dataset.formats.nuscenes.tables import VERSION
@@ -24,6 +24,7 @@ from flcav.dataset.formats.reading import (
     LogSource,
     Picture,
     annotate,
+    assign_split,
     check_sizes,
     choose_split,
     difference_tracks,
@@ -87,9 +88,13 @@ class NuscenesSource(LogSource):
         table = {name: read_table(self._tables, name) for name in SMALL}
         self._data: dict[str, dict[str, Row]] = defaultdict(dict)  # sample -> channel -> row of sample_data
         self._mounted, self._channel = table["calibrated_sensor"], table["sensor"]
+        listed = self._tables / "sample_data.json"
         for row in stream_table(self._tables, "sample_data", lambda row: row["is_key_frame"]):
+            path_within(self._root, row["filename"], listed)
             mounted = self._at(self._mounted, row["calibrated_sensor_token"])
-            self._data[row["sample_token"]][self._at(self._channel, mounted["sensor_token"])["channel"]] = row
+            channel, own = self._at(self._channel, mounted["sensor_token"])["channel"], self._data[row["sample_token"]]
+            if own.setdefault(channel, row) is not row:
+                raise InputError(f"{listed}: {shorten(row['filename'])} is a second one of {channel}")
         used = {row["ego_pose_token"] for rows in self._data.values() for row in rows.values()}
         self._pose = read_table(self._tables, "ego_pose", lambda row: row["token"] in used)
         self._calibration: dict[str, Calibration] = {}  # by agent
@@ -145,16 +150,15 @@ class NuscenesSource(LogSource):
         ours, names = self._tables.name == VERSION, AgentNames()
         splits = self._tables / "splits.json"
         listed = read_json(splits) if splits.is_file() else {}
-        split_by_name = {
-            name: split.removeprefix("flcav_")
-            for split, own in (listed.items() if isinstance(listed, dict) else ())
-            for name in (own if isinstance(own, list) else ())
-        }
+        split_by_name: dict[str, str | None] = {}
+        for split, own in listed.items() if isinstance(listed, dict) else ():
+            for name in own if isinstance(own, list) else ():
+                assign_split(split_by_name, str(name), split.removeprefix("flcav_"), splits)
         of_scene: dict[str, list[str]] = defaultdict(list)
         for token, row in samples.items():
             of_scene[row["scene_token"]].append(token)
         times: dict[str, list[tuple[float, str, str]]] = defaultdict(list)
-        split_of = {}
+        split_of: dict[str, str | None] = {}
         for token, scene in scenes.items():
             log, name = self._at(logs, scene["log_token"]), scene["name"]
             for sample in of_scene[token]:
@@ -172,7 +176,10 @@ class NuscenesSource(LogSource):
             if not late.isdecimal():
                 raise InputError(f"{self._tables / 'scene.json'}: the scene '{name}' is none of an export by flcav")
             times[own] += [((samples[s]["timestamp"] - int(late)) / 1e6, agent, s) for s in of_scene[token]]
-            split_of[own] = split_by_name.get(name, "test" if self._tables.name.endswith("-test") else None)
+            if own in split_of and not ours:
+                raise InputError(f"{self._tables / 'scene.json'}: two scenes are called {shorten(name)}")
+            split = split_by_name.get(name, "test" if self._tables.name.endswith("-test") else None)
+            assign_split(split_of, own, split, splits)
         spins = {}
         for scene, found in times.items():
             rank = {time: index for index, time in enumerate(sorted({time for time, _, _ in found}))}
@@ -221,6 +228,9 @@ class NuscenesSource(LogSource):
         poses = {name: _placed(self._at(self._pose, row["ego_pose_token"])) for name, row in data.items()}
         cameras = [name for name in data if kind[name] == "camera"]
         path = {name: self._root / row["filename"] for name, row in data.items()}
+        for file in path.values():
+            if not file.is_file():  # a device, too, would be read without end
+                raise InputError(f"{file}: no such file")
         ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)
         clouds = {name: read_lidar(path[name]) for name in ranging}
         radar = {name: decode_radar(read_pcd(path[name])) for name in data if kind[name] == "radar"}
@@ -235,9 +245,6 @@ class NuscenesSource(LogSource):
             for name in cameras
         }
         files = {name: path[name] for name in cameras}
-        for file in files.values():
-            if not file.is_file():
-                raise InputError(f"{file}: no such file")
         return LinkedFrame(
             scene=scene,
             index=spin.number,

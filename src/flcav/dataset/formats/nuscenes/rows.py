@@ -44,8 +44,15 @@ def keep_all(_row: Row) -> bool:
 
 
 def read_table(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all) -> dict[str, Row]:
-    """Return token -> row of a table, the rows that are `kept`; raises `InputError` as `stream_table`."""
-    return {row["token"]: row for row in stream_table(folder, name, kept)}
+    """Return token -> row of a table, the rows that are `kept`.
+
+    Raises `InputError` as `stream_table`, and where two rows have one token.
+    """
+    rows: dict[str, Row] = {}
+    for row in stream_table(folder, name, kept):
+        if rows.setdefault(row["token"], row) is not row:
+            raise InputError(f"{folder / name}.json: two rows have the token {shorten(row['token'])}")
+    return rows
 
 
 def stream_table(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all) -> Iterator[Row]:

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, read_yaml
 from flcav.dataset.formats.opv2v.write import CAMERAS, FOLDERS, KMH, from_carla
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
@@ -25,6 +24,7 @@ from flcav.dataset.formats.reading import (
     check_sizes,
     choose_split,
     measure_picture,
+    name_folders,
     pinhole,
     read_pictures,
     turned_boxes,
@@ -40,7 +40,6 @@ About = Mapping[str, Any]  # OPV2V's file of a frame
 PERIOD_S = 0.1
 LIDAR, CATEGORY = "lidar", "car"
 DIGITS = 9  # of mounts, which are computed of poses
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 PROTOCOL = "data_protocol.yaml"
 
 
@@ -61,7 +60,7 @@ class Opv2vSource(LogSource):
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where there is no scenario, none of `split`, or a file of a frame is missing."""
         self._folder, self._split = folder, split
-        found = _find_scenarios(folder)
+        self._folders = found = _find_scenarios(folder)
         split_of = {scene: _split_of(path) for scene, path in found.items()}
         self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._calibration: dict[str, Calibration] = {}
@@ -181,12 +180,7 @@ def _read_vehicles(about: About) -> tuple[Boxes, Array]:
 def _read_about(stem: Path) -> About:
     """Return the content of a frame's YAML file; raises `InputError` where it is missing, truncated or no frame."""
     path = stem.with_suffix(".yaml")
-    try:
-        about = yaml.load(path.read_text(encoding="utf-8"), LOADER)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (yaml.YAMLError, UnicodeDecodeError):
-        raise InputError(f"{path}: not a YAML file, or a truncated one") from None
+    about: Any = read_yaml(path)
     try:
         about["vehicles"].values()
         for row in about["vehicles"].values():
@@ -219,10 +213,7 @@ def _read_names(path: Path) -> dict[str, str]:
     """Return number -> name of agents and tracks by an export's `data_protocol.yaml`; empty of any other."""
     if not path.is_file():
         return {}
-    try:
-        protocol = yaml.load(path.read_text(encoding="utf-8"), LOADER)
-    except (yaml.YAMLError, UnicodeDecodeError):
-        raise InputError(f"{path}: not a YAML file, or a truncated one") from None
+    protocol = read_yaml(path)
     numbers = protocol.get("numbers") if isinstance(protocol, dict) else None
     return {str(number): str(name) for name, number in numbers.items()} if isinstance(numbers, dict) else {}
 
@@ -257,10 +248,10 @@ def _find_scenarios(folder: Path) -> dict[str, Path]:
     for depth in ("*/*.yaml", "*/*/*.yaml", "*/*/*/*.yaml"):
         if frames := [path for path in folder.glob(depth) if path.stem.isdigit()]:
             found = sorted({path.parent.parent for path in frames})
-            return {path.resolve().name: path for path in found}
+            return name_folders(found)
     raise InputError(f"{folder}: no scenario of OPV2V; agents' folders with a YAML file for each frame are wanted")
 
 
 def _split_of(scenario: Path) -> str | None:
-    name = scenario.resolve().parent.name
+    name = scenario.absolute().parent.name
     return {own: split for split, own in FOLDERS.items()}.get(name, "test" if name.startswith("test") else None)
