@@ -1,61 +1,197 @@
-"""Acceptance of an update: what the server refuses, which a client finds in the same way before it sends."""
+"""Acceptance of replies: what the server asked for is the measure of what a client sends, before anything is computed.
 
-from dataclasses import replace
+Every reply of a round is read here. It has the records that were asked for and no others, arrays of the names, shapes
+and types that the server's own weights give, and numbers within the limits of the rules; or it is refused.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from flwr.app import ArrayRecord, ConfigRecord, MetricRecord, RecordDict
 
-from flcav.federation.encoding import decode
+from flcav.config import shorten
+from flcav.federation.encoding import count_coordinates, decode, is_local, sent_forms
+from flcav.federation.records import (
+    ARRAYS,
+    ASK,
+    CIPHERS,
+    EXTRA,
+    LOSS,
+    MASKS,
+    METRICS,
+    NAMES,
+    NORM,
+    SAMPLES,
+    SHARES,
+    VECTOR,
+    to_numpy,
+)
 from flcav.federation.rules import Rules
-from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.secure.masks import is_public_key
+from flcav.federation.secure.parties import PublicKeys
+from flcav.federation.strategies.strategy import Exchanges, Strategy
+from flcav.federation.trainable import Forms, LocalUpdate, Weights, forms_of, learned_names
+from flcav.federation.upload import Arrays
 
 
-class UpdateRefused(ValueError):
-    """An update that is no update of the round, or whose values are not finite."""
+class ReplyRefused(ValueError):
+    """A reply that is none to what was asked, or beyond the limits of the rules."""
 
 
-def read_update(sent: LocalUpdate, start: Weights, rules: Rules, extra: Weights) -> LocalUpdate:
-    """Return an update as it was sent with the client's weights for its arrays.
+@dataclass(frozen=True)
+class Expected:
+    """What the server expects of the updates of a round."""
 
-    `start` are the weights that the round began with, `extra` has the names, shapes and types of the arrays beside the
-    update. Raises `UpdateRefused` where the update cannot be used.
+    rules: Rules
+    start: Weights  # that the round began with
+    extra: Forms = field(default_factory=dict)  # of the arrays beside an update
+
+
+def extra_forms(strategy: Strategy, rules: Rules, start: Weights, sent: Weights) -> Forms:
+    """Return shape and type of the arrays that clients send beside their updates: what `strategy` reports of `start`.
+
+    sent: what the server sends beside the weights.
     """
+    if not isinstance(strategy, Exchanges):
+        return {}
+    exchanged = {*rules.upload.exchanged(start)}
+    gradient = {name: np.zeros_like(start[name]) for name in learned_names(start) if name in exchanged}
+    return forms_of(strategy.report(LocalUpdate(start, 1, 0.0, gradient), sent, {})[0])
+
+
+def read_update(content: RecordDict, expected: Expected) -> LocalUpdate:
+    """Return the update in a reply, with the client's weights for its arrays; raises `ReplyRefused`."""
+    rules, start, extra = expected.rules, expected.start, expected.extra
+    _check_records(content, [ARRAYS, METRICS, EXTRA] if extra else [ARRAYS, METRICS])
+    samples, loss = _read_numbers(content, LOSS, rules)
+    sent = _read_arrays(content, ARRAYS, sent_forms(start, rules))
+    update = LocalUpdate({}, samples, loss, extra=_read_arrays(content, EXTRA, extra) if extra else {})
     try:
-        update = replace(sent, weights=decode(sent.weights, start, rules))
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise UpdateRefused(f"a message that is no update ({error})") from None
-    if (fault := find_fault(update, start, extra)) is not None:
-        raise UpdateRefused(fault)
+        with np.errstate(over="ignore", invalid="ignore"):  # of values that the norm is about to refuse
+            update = replace(update, weights=decode(sent, start, rules))
+    except ValueError as error:
+        raise ReplyRefused(str(error)) from None
+    _check_change({name: update.weights[name] for name in rules.upload.exchanged(start)}, start, rules)
+    _check_change(update.extra, {}, rules)
     return update
 
 
-def is_usable(sent: LocalUpdate, start: Weights, rules: Rules) -> bool:
-    """Return whether the server accepts an update that it gets; arguments as those of `read_update`."""
+def is_usable(content: RecordDict, expected: Expected) -> bool:
+    """Return whether the server accepts an update."""
     try:
-        read_update(sent, start, rules, sent.extra)
-    except UpdateRefused:
+        read_update(content, expected)
+    except ReplyRefused:
         return False
     return True
 
 
-def find_fault(update: LocalUpdate, start: Weights, extra: Weights) -> str | None:
-    """Return what makes an update unusable, None for a usable one.
+def read_masked(content: RecordDict, expected: Expected, peers: Sequence[str]) -> LocalUpdate | Sequence[str]:
+    """Return a masked update, or the names of those of `peers` whose shares for the client do not open.
 
-    `start` has the names, shapes and types that the weights must have, `extra` those of the arrays beside them.
+    Masked values cannot be told from others. Raises `ReplyRefused`.
     """
-    for arrays, like in ((update.weights, start), (update.extra, extra)):
-        if set(arrays) != set(like):
-            odd = sorted(set(arrays) ^ set(like))
-            return f"an array '{odd[0]}' that is missing or unknown"
-        for name, array in arrays.items():
-            if (array.shape, array.dtype) != (like[name].shape, like[name].dtype):
-                return f"'{name}' is {array.dtype} {array.shape} instead of {like[name].dtype} {like[name].shape}"
-            if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-                return f"'{name}' has values that are not finite"
-    return find_fault_of_numbers(update)
+    if ASK in content:
+        accused = _read_entry(content, NAMES)
+        if not isinstance(accused, list) or not accused or not set(accused) <= set(peers):
+            raise ReplyRefused(f"shares of {shorten(accused)} that do not open")
+        return [name for name in peers if name in accused]
+    _check_records(content, [ARRAYS, METRICS])
+    samples, loss = _read_numbers(content, LOSS, expected.rules)
+    size = count_coordinates(expected.start, expected.rules)
+    return LocalUpdate(_read_arrays(content, ARRAYS, {VECTOR: ((size,), np.dtype(np.uint32))}), samples, loss)
 
 
-def find_fault_of_numbers(update: LocalUpdate) -> str | None:
-    """Return what makes an update unusable whatever its arrays are: no samples, or a loss that is not finite."""
-    if update.samples < 1 or not np.isfinite(update.loss):
-        return f"{update.samples} samples and a loss of {update.loss}"
-    return None
+def read_norm(content: RecordDict, rules: Rules) -> tuple[float, int]:
+    """Return the norm of an update and the number of samples that a client tells; raises `ReplyRefused`."""
+    _check_records(content, [METRICS])
+    samples, norm = _read_numbers(content, NORM, rules)
+    return norm, samples
+
+
+def read_keys(content: RecordDict) -> PublicKeys:
+    """Return a client's public keys of a round; raises `ReplyRefused`."""
+    found = PublicKeys(*(_read_entry(content, kind) for kind in (CIPHERS, MASKS)))
+    if not (is_public_key(found.cipher) and is_public_key(found.mask)):
+        raise ReplyRefused("keys that nobody can agree on a secret with")
+    return found
+
+
+def read_shares(content: RecordDict, owners: Sequence[str], size: int) -> dict[str, bytes]:
+    """Return the shares of `size` bytes that a client sends, one for each name of `owners`; raises `ReplyRefused`."""
+    names, shares = _read_entry(content, NAMES), _read_entry(content, SHARES)
+    if not isinstance(names, list) or not isinstance(shares, list) or len(names) != len(shares):
+        raise ReplyRefused(f"no shares by name, but {shorten(names)}")
+    found = dict(zip(names, shares, strict=True))
+    if found.keys() != {*owners} or len(names) != len(owners):
+        raise ReplyRefused(f"{len(names)} shares, of {shorten(names)}, where {len(owners)} were asked for")
+    if odd := [name for name, share in found.items() if not isinstance(share, bytes) or len(share) != size]:
+        raise ReplyRefused(f"a share of {odd[0]} that is not of {size} bytes")
+    return found
+
+
+def _check_records(content: RecordDict, wanted: Sequence[str]) -> None:
+    if odd := sorted(set(content) ^ set(wanted)):
+        kind = "lacks" if odd[0] in wanted else "has an unknown"
+        raise ReplyRefused(f"a reply that {kind} '{odd[0]}'")
+
+
+def _read_entry(content: RecordDict, key: str) -> Any:
+    """Return an entry of the answer's one record; None where it has none."""
+    _check_records(content, [ASK])
+    record = content[ASK]
+    return record.get(key) if isinstance(record, ConfigRecord) else None
+
+
+def _read_numbers(content: RecordDict, key: str, rules: Rules) -> tuple[int, float]:
+    """Return the number of samples, and the loss or the norm, of a reply's metrics."""
+    metrics, limits = content[METRICS], rules.limits
+    if not isinstance(metrics, MetricRecord) or set(metrics) != {SAMPLES, key}:
+        raise ReplyRefused(f"metrics that are not {SAMPLES} and {key}")
+    samples, number = metrics[SAMPLES], metrics[key]
+    if not isinstance(samples, int) or not isinstance(number, int | float):
+        raise ReplyRefused(f"{shorten(samples)} samples and a {key} of {shorten(number)}")
+    least, most = (0.0, limits.norm) if key == NORM else (-limits.loss, limits.loss)
+    if not (1 <= samples <= limits.samples and least <= number <= most):  # also of what is no number
+        told = f"; {limits.samples} samples are the most, and a {key} of {most:g} the largest"
+        raise ReplyRefused(f"{samples} samples and a {key} of {number}{told}")
+    if is_local(rules) and samples != 1:
+        raise ReplyRefused(f"{samples} samples, where all clients count the same")
+    return samples, float(number)
+
+
+def _read_arrays(content: RecordDict, key: str, wanted: Forms) -> Arrays:
+    """Return the arrays of a record, which are declared to be and are of these shapes and types."""
+    record = content[key]
+    if not isinstance(record, ArrayRecord):
+        raise ReplyRefused(f"'{key}' holds no arrays")
+    if odd := sorted(set(record) ^ set(wanted)):
+        raise ReplyRefused(f"an array {shorten(odd[0])} that is missing or unknown")
+    found = {}
+    for name, (shape, dtype) in wanted.items():
+        array = record[name]
+        if (tuple(array.shape), array.dtype) != (shape, str(dtype)):
+            raise ReplyRefused(
+                f"'{name}' is {array.dtype[:20]} {shorten(tuple(array.shape))} instead of {dtype} {shape}"
+            )
+        try:
+            found[name] = to_numpy(array)
+        except (TypeError, ValueError) as error:
+            raise ReplyRefused(f"'{name}': {error}") from None
+    return found
+
+
+def _check_change(weights: Weights, start: Weights, rules: Rules) -> None:
+    """Raise `ReplyRefused` where the L2 norm of the change of all floating arrays is above the limit, or not finite."""
+    total, most = 0.0, rules.limits.norm
+    for name, array in weights.items():
+        if np.issubdtype(array.dtype, np.floating):
+            dtype = np.result_type(array.dtype, np.float32)
+            with np.errstate(over="ignore", invalid="ignore"):
+                change = np.subtract(array, start.get(name, dtype.type(0)), dtype=dtype).ravel()
+                total += float(np.dot(change, change))
+            if not np.isfinite(total) and not np.isfinite(array).all():
+                raise ReplyRefused(f"'{name}' has values that are not finite")
+    if not total <= most**2:
+        raise ReplyRefused(f"a change of the norm {total**0.5:.3g}, where {most:g} is the largest")

@@ -2,14 +2,23 @@
 
 import inspect
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
-from flcav.federation.acceptance import is_usable
+from flcav.federation.acceptance import Expected, extra_forms, is_usable
+from flcav.federation.conduct import (
+    ANSWERED,
+    RequestRefused,
+    Requests,
+    affordable_answers,
+    asked_for,
+    keep_answered,
+    recall_answered,
+)
 from flcav.federation.encoding import encode, flatten, is_local
 from flcav.federation.noise import Secret, derive_key
 from flcav.federation.privacy import change_norm
@@ -22,7 +31,9 @@ from flcav.federation.records import (
     EXTRA,
     LOSS,
     LOST,
+    MASKED,
     METRICS,
+    NAMES,
     NORM,
     SAMPLES,
     SEND,
@@ -36,7 +47,7 @@ from flcav.federation.records import (
 )
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.secure.masks import to_integers
-from flcav.federation.secure.messages import KEYS, MASKED, NAMES, SHARES, UNMASK, answer_secretly, mask_update
+from flcav.federation.secure.messages import answer_secretly, complain, mask_update
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.trainable import Correction, LocalUpdate, Trainable, Update, Weights, count_samples, learned_names
@@ -48,34 +59,61 @@ OWN, RESIDUAL = "own", "residual"  # records of a node's state: what strategy an
 KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
 
 
+def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
+    """Return the records of a node's state that a checkpoint has: those of strategy and compression, and under clients'
+    own noise or masks what they have answered.
+    """
+    keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"
+    guards = is_local(rules) or rules.secure is not None
+    return (*((OWN, RESIDUAL) if keeps else ()), *((ANSWERED,) if guards else ()))
+
+
 def client_app(
-    trainables: Mapping[str, Trainable], strategy: Strategy, rules: Rules, secrets: Mapping[str, Secret] = {}
+    trainables: Mapping[str, Trainable],
+    strategy: Strategy,
+    rules: Rules,
+    secrets: Mapping[str, Secret] = {},
+    spent: int = 0,
 ) -> ClientApp:
     """Return a Flower client app that trains the one of `trainables` (by client name) that its node stands for.
 
     A node stands for the client at the place `PARTITION` of its config. Its seed is derived from the round's seed and
     the client's name. `secrets` are those of the clients, by name, that local noise is drawn by unless it is seeded;
-    they are in no message. To a query it answers with its place and with what it keeps between rounds, after taking
-    over what the message brings of that.
+    they are in no message. What it answers and what not, see `conduct`; `spent` are the rounds of earlier federations
+    that count against its privacy budget. To a query it answers with its place and with what it keeps between rounds;
+    before it has any state, it takes over what the message brings of that.
 
     What error feedback leaves out, and a strategy's own arrays, are taken over where the server gets the update and can
     use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
     arrives.
     """
-    app, clients = ClientApp(), [*trainables]
+    app, clients, requests = ClientApp(), [*trainables], Requests()
+    affordable = lru_cache(maxsize=1)(lambda: affordable_answers(rules.privacy))
+
+    def admit(message: Message, context: Context, name: str, work: LocalWork) -> str:
+        """Return what is asked for; raises `RequestRefused` where the client is not to answer."""
+        asked, before = asked_for(message.content), recall_answered(context)
+        repeatable = rules.secure is None and OWN not in context.state and RESIDUAL not in context.state
+        answered = before.admit(work.round, asked, requests.digest(message.content), rules, repeatable)
+        if (most := affordable()) is not None and answered.rounds > most - spent:
+            raise RequestRefused(f"a round more than the {most} that the privacy budget of {name} affords")
+        keep_answered(context, answered)
+        return asked
 
     @app.train()
     def train(message: Message, context: Context) -> Message:
         name = clients[int(context.node_config[PARTITION])]
-        asked = message.content.config_records[ASK][ASK] if ASK in message.content.config_records else None
-        if asked in (KEYS, SHARES, UNMASK):
-            return answer_secretly(message, context, name)
         work = LocalWork.from_record(message.content.config_records[CONFIG])
+        asked = admit(message, context, name, work)
+        if rules.secure is not None and asked != MASKED:
+            return answer_secretly(message, context, name, rules.secure)
         seed = derive_seed(work.seed, name)
         key = derive_key(secrets[name], "noise", work.round, work.seed) if name in secrets else None
         if asked == COUNT:
             return reply_norm(message, 0.0, count_samples(trainables[name], work.steps))
-        extra, own = {}, {}
+        if asked == MASKED and (complaint := complain(message, context)) is not None:
+            return complaint
+        extra, own, sent = {}, {}, _optional(message.content, EXTRA)
         if asked == SEND:
             start, update = _recall(context)
         else:
@@ -85,26 +123,31 @@ def client_app(
             _keep(context, start, update)
             names = [each for each in learned_names(start) if each in rules.upload.exchanged(start)]
             return reply_norm(message, change_norm(subtract(update.weights, start, names)), update.samples)
-        if asked == MASKED and rules.secure is not None:
+        if rules.secure is not None:
             peers = len(message.content.config_records[ASK][NAMES]) + 1  # type: ignore[arg-type]
             integers = to_integers(flatten(update, start, rules, seed, key), rules.secure.largest, peers)
             masked = {VECTOR: mask_update(message, context, integers)}
             about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
             return reply(message, LocalUpdate(masked, *about), {})
-        sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)
-        answer = reply(message, sent, extra)
-        if (left or own) and LOST not in message.content and is_usable(replace(sent, extra=extra), start, rules):
-            _record(context, RESIDUAL, left)
-            _record(context, OWN, own)
+        encoded, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)
+        answer = reply(message, encoded, extra)
+        if (left or own) and LOST not in message.content:
+            expected = Expected(rules, start, extra_forms(strategy, rules, start, sent))
+            if is_usable(answer.content, expected):
+                _record(context, RESIDUAL, left)
+                _record(context, OWN, own)
         return answer
 
     @app.query()
     def query(message: Message, context: Context) -> Message:
+        kept = (OWN, RESIDUAL, ANSWERED)
+        if message.content and (context.state or not {*message.content} <= {*kept}):
+            raise RequestRefused("a client's state is its own once it has any")
         for key in message.content:
             context.state[key] = message.content[key]
-        kept = {key: context.state[key] for key in (OWN, RESIDUAL) if key in context.state}
+        found = {key: context.state[key] for key in kept if key in context.state}
         place = MetricRecord({PARTITION: int(context.node_config[PARTITION])})
-        return Message(RecordDict({**kept, METRICS: place}), reply_to=message)
+        return Message(RecordDict({**found, METRICS: place}), reply_to=message)
 
     def _train(
         trainable: Trainable, message: Message, context: Context, start: Weights, work: LocalWork, seed: int

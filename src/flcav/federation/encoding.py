@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from flcav.federation.privacy import add_noise, clip_change
 from flcav.federation.rules import Rules
-from flcav.federation.trainable import LocalUpdate, Update, Weights, learned_names
-from flcav.federation.upload import VALUES, Arrays, add, compress, decompress, subtract
+from flcav.federation.trainable import Forms, LocalUpdate, Update, Weights, forms_of, learned_names
+from flcav.federation.upload import VALUES, Arrays, add, compress, compressed_forms, decompress, subtract
 from flcav.seeds import derive_seed
 
 
@@ -36,15 +36,23 @@ def encode(
     return LocalUpdate({**sent, **rest}, update.samples, update.loss), kept
 
 
+def sent_forms(start: Weights, rules: Rules) -> Forms:
+    """Return shape and type of each array of the message that `encode` makes."""
+    names, learned = rules.upload.exchanged(start), set(learned_names(start))
+    whole = forms_of({name: start[name] for name in names})
+    if not is_changed(rules):
+        return whole
+    change = compressed_forms(rules.upload, {name: start[name] for name in names if name in learned})
+    return {**change, **({} if is_local(rules) else {name: whole[name] for name in names if name not in learned})}
+
+
 def decode(sent: Weights, start: Weights, rules: Rules) -> Weights:
     """Return the weights of a client after its local training, as far as its message tells; otherwise those of `start`.
 
-    Raises KeyError, IndexError or ValueError where the arrays are not those of `encode`.
+    The arrays have the forms of `sent_forms`. Raises ValueError where they are not those of `encode`.
     """
     names, learned = rules.upload.exchanged(start), set(learned_names(start))
     if not is_changed(rules):
-        if odd := sorted(set(sent) ^ set(names)):
-            raise ValueError(f"an array '{odd[0]}' that is missing or unknown")
         return {name: sent.get(name, array) for name, array in start.items()}
     like = {name: start[name] for name in names if name in learned}
     weights = add(start, decompress(rules.upload, sent, like))

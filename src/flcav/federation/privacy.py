@@ -152,6 +152,11 @@ def most_participations(selection: Selection, clients: int, rounds: int) -> int:
     return -(-rounds * selection.clients // clients)
 
 
+def least_participations(selection: Selection, clients: int, rounds: int) -> int:
+    """Return how many of the first `rounds` rounds every client took part in that could."""
+    return rounds * (selection.clients or 0) // clients if selection.rule == "round-robin" else rounds
+
+
 def affordable_rounds(privacy: Privacy, selection: Selection, names: Sequence[str], rounds: int, earlier: int) -> int:
     """Return how many of `rounds` rounds the privacy budget affords, after `earlier` ones with the same clients.
 

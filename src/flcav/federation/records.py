@@ -1,16 +1,17 @@
 """Conversion between weights and updates (NumPy) and the records of Flower's messages."""
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
-from typing import Any
 
 import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 from flwr.common.constant import SType
 from numpy.typing import NDArray
 
-from flcav.federation.trainable import LocalUpdate, Update, Weights
+from flcav.config import shorten
+from flcav.federation.trainable import Update, Weights
 
 ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"  # records of a message, by key
 EXTRA = "extra"  # a strategy's arrays beside the weights, where it has any
@@ -21,7 +22,14 @@ NORM, SEND = "norm", "send"  # ask for the norm of the update after training; fo
 COUNT = "count"  # ask for the number of samples before training
 LOST = "lost"  # record of a message whose answer will not arrive
 LOST_BY_NETWORK = 100  # error code in the place of an answer that does not arrive; Flower's own codes are below
+KEYS, SHARES, MASKED, UNMASK = "keys", "shares", "masked", "unmask"  # ask, in this order, under secure aggregation
+NAMES, CIPHERS, MASKS = "names", "ciphers", "masks"  # entries of its messages; that of shares is `SHARES`
 SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
+
+NPY_VERSION_1 = b"\x93NUMPY\x01\x00"
+NUMBERS = {  # types of arrays in messages, by name
+    str(np.dtype(code)): np.dtype(code) for code in (*np.typecodes["AllInteger"], *np.typecodes["AllFloat"], "?")
+}
 
 
 @dataclass(frozen=True)
@@ -52,8 +60,8 @@ def to_arrays(weights: Weights) -> ArrayRecord:
 
 
 def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
-    """Return the arrays of a Flower record as weights, in the same order."""
-    return {name: _to_numpy(array) for name, array in arrays.items()}
+    """Return the arrays of a Flower record as weights, in the same order; raises as `to_numpy`."""
+    return {name: to_numpy(array) for name, array in arrays.items()}
 
 
 def _to_array(value: NDArray[np.number]) -> Array:
@@ -64,34 +72,41 @@ def _to_array(value: NDArray[np.number]) -> Array:
     return Array(dtype=str(value.dtype), shape=value.shape, stype=SType.NUMPY, data=data)
 
 
-def _to_numpy(array: Array) -> np.ndarray:
-    """Return what `array.numpy()` does; a header of NumPy's file format is parsed once for all arrays that have it."""
-    data = array.data
+def to_numpy(array: Array) -> np.ndarray:
+    """Return the numbers of a Flower array, whoever sent it: what `array.numpy()` does, for arrays of numbers.
+
+    The header of NumPy's file format is not parsed but compared with the one of the array's declared shape and type,
+    whose size must be that of the data: so nothing is allocated that was not received. Raises TypeError for another
+    format, ValueError where header, declaration and data do not agree.
+    """
+    if array.stype != SType.NUMPY:
+        raise TypeError(f"'{array.stype}' is no format of arrays")
+    shape, dtype, data = tuple(array.shape), NUMBERS.get(array.dtype), array.data
+    if dtype is None:
+        raise ValueError(f"{shorten(array.dtype)} is no type of numbers")
     start = 10 + int.from_bytes(data[8:10], "little")  # of the numbers, in version 1.0 of the format
-    if array.stype != SType.NUMPY or (form := _parse_header(data[:start])) is None:
-        return array.numpy()
-    shape, dtype = form
-    return np.frombuffer(data, dtype, offset=start).reshape(shape).copy()
+    for order in ("C", "F"):
+        if data[:8] == NPY_VERSION_1 and data[10:start].rstrip(b" \n") == _describe(shape, dtype, order):
+            break
+    else:
+        raise ValueError(f"its header is not that of {dtype} {shape}")
+    if len(data) - start != math.prod(shape) * dtype.itemsize:
+        raise ValueError(f"it has {len(data) - start} bytes instead of those of {dtype} {shape}")
+    return np.frombuffer(data, dtype, offset=start).reshape(shape, order=order).copy()
 
 
 @lru_cache(maxsize=4096)
-def _parse_header(head: bytes) -> tuple[tuple[int, ...], np.dtype] | None:
-    """Return shape and type in a header of version 1.0, of an array in C order; None for any other."""
-    file = BytesIO(head)
-    try:
-        if np.lib.format.read_magic(file) != (1, 0):
-            return None
-        shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
-    except ValueError:
-        return None
-    return None if fortran_order or dtype.hasobject else (shape, dtype)
+def _describe(shape: tuple[int, ...], dtype: np.dtype, order: str) -> bytes:
+    """Return the header of an array in NumPy's file format, without its length and padding."""
+    descr = np.lib.format.dtype_to_descr(dtype)
+    return f"{{'descr': {descr!r}, 'fortran_order': {order == 'F'}, 'shape': {shape!r}, }}".encode()
 
 
 def read_arrays(content: RecordDict, key: str) -> dict[str, np.ndarray]:
     """Return the weights in a record of a message or a state.
 
-    Raises KeyError where it is missing, TypeError where it has none. `content.array_records` would leave a reference
-    cycle, by which the arrays stay in memory until they are collected.
+    Raises KeyError where it is missing, TypeError where it has none, and as `to_numpy`. `content.array_records` would
+    leave a reference cycle, by which the arrays stay in memory until they are collected.
     """
     record = content[key]
     if not isinstance(record, ArrayRecord):
@@ -104,20 +119,18 @@ def reply(message: Message, update: Update, extra: Weights) -> Message:
 
     Without extra arrays there is no record of them. Raises as `to_metrics`.
     """
+    return Message(update_content(update, extra), reply_to=message)
+
+
+def update_content(update: Update, extra: Weights) -> RecordDict:
+    """Return the records of `reply`."""
     records = {ARRAYS: to_arrays(update.weights)} | ({EXTRA: to_arrays(extra)} if extra else {})
-    return Message(RecordDict({**records, METRICS: to_metrics(update)}), reply_to=message)
+    return RecordDict({**records, METRICS: to_metrics(update)})
 
 
 def to_metrics(update: Update) -> MetricRecord:
     """Return samples and loss of an update as metrics; raises ValueError for samples that no message can hold."""
     return MetricRecord({SAMPLES: _count(update.samples), LOSS: float(update.loss)})
-
-
-def to_update(answer: Message) -> LocalUpdate:
-    """Return the update in a client's reply: the inverse of `reply`. Raises KeyError where a record is missing."""
-    metrics: Any = answer.content[METRICS]
-    extra = read_arrays(answer.content, EXTRA) if EXTRA in answer.content else {}
-    return LocalUpdate(read_arrays(answer.content, ARRAYS), int(metrics[SAMPLES]), float(metrics[LOSS]), extra=extra)
 
 
 def reply_norm(message: Message, norm: float, samples: int) -> Message:
@@ -134,9 +147,3 @@ def _count(samples: float) -> int:
     if not abs(samples) < 2**63 or samples != int(samples):
         raise ValueError(f"{samples} samples")
     return int(samples)
-
-
-def to_norm(answer: Message) -> tuple[float, int]:
-    """Return norm and number of samples in a client's reply: the inverse of `reply_norm`; raises as `to_update`."""
-    metrics = answer.content.metric_records[METRICS]
-    return float(metrics[NORM]), int(metrics[SAMPLES])  # type: ignore[arg-type]

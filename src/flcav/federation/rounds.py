@@ -5,9 +5,10 @@ round where one client fails.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from flwr.app import ArrayRecord, ConfigRecord, Message, MessageType, MetricRecord, RecordDict
@@ -15,9 +16,9 @@ from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
 from numpy.typing import NDArray
 
-from flcav.federation.acceptance import UpdateRefused, find_fault_of_numbers, read_update
+from flcav.federation.acceptance import Expected, ReplyRefused, extra_forms, read_masked, read_norm, read_update
 from flcav.federation.attendance import Attendance, ClientFailed
-from flcav.federation.encoding import count_coordinates, unflatten
+from flcav.federation.encoding import unflatten
 from flcav.federation.noise import derive_key
 from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
 from flcav.federation.records import (
@@ -35,20 +36,20 @@ from flcav.federation.records import (
     VECTOR,
     LocalWork,
     to_arrays,
-    to_norm,
-    to_update,
     to_weights,
 )
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.secure.masks import to_values
 from flcav.federation.secure.messages import SecureSum, TooFewClients
+from flcav.federation.secure.parties import SumLost, settle_complaints
 from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import RunningMean, average
 from flcav.federation.strategies.strategy import Averages, Exchanges, Stateful, find_weigher
-from flcav.federation.trainable import LocalUpdate, Weights, learned_names
+from flcav.federation.trainable import LocalUpdate, Weights, forms_of, learned_names
 
 OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
+AnswerT = TypeVar("AnswerT")
 Away = Callable[[int], Mapping[str, str]]  # of a round, by client why it is not there when the round begins
 
 
@@ -62,12 +63,10 @@ class Intake:
         self.updates: dict[str, LocalUpdate] = {}  # by client, where they are kept
         self.samples: dict[str, int] = {}  # by client
         self.losses: dict[str, float] = {}  # by client
-        self.extra: Weights | None = None  # of the first update; None: there is none yet
 
     def add(self, client: str, update: LocalUpdate) -> None:
         """Add a client's update."""
         self.samples[client], self.losses[client] = update.samples, update.loss
-        self.extra = update.extra if self.extra is None else self.extra
         if self._weigher is None:
             self.updates[client] = update
             return
@@ -114,10 +113,12 @@ class Rounds(FlowerStrategy):
         self._state, self._done, self._earlier, self._on_round = state, done, earlier, on_round
         self._centre, self._away = centre, away
         self._nodes = {name: node for node, name in names.items()}
-        self._start: Weights = {}
+        self._expected = Expected(rules, {})  # of the updates of this round
         self._here = Attendance()  # of this round
         self._drawn: dict[str, float] = {}  # of unbiased selection: probability of the clients that were drawn
         self._secure: SecureSum | None = None  # of this round
+        self._begin: Callable[[list[str]], list[Message]]  # masks among clients, of this round
+        self._grid: Grid  # of this round
         self._shares: dict[str, float] = {}  # of unbiased selection: of all samples, by client
 
     def summary(self) -> None:
@@ -132,10 +133,12 @@ class Rounds(FlowerStrategy):
         asked to send it. Under other unbiased selections all first report their number of samples. Where fewer take
         part than `least_clients`, nobody is asked to send an update.
         """
-        self._start = to_weights(arrays)
+        start = to_weights(arrays)
         work, records = self._work(self._done + server_round), {ARRAYS: arrays}
-        if isinstance(self._strategy, Exchanges) and (sent := self._strategy.send(self._state.server)):
+        sent = self._strategy.send(self._state.server) if isinstance(self._strategy, Exchanges) else {}
+        if sent:
             records[EXTRA] = to_arrays(sent)
+        self._expected = Expected(self._rules, start, extra_forms(self._strategy, self._rules, start, sent))
         if self._centre is not None:
             records[CENTRE] = to_arrays({name: self._centre[name] for name in learned_names(self._centre)})
         selection, local = self._rules.selection, work.record()
@@ -152,7 +155,9 @@ class Rounds(FlowerStrategy):
         if self._here.shortage is not None:
             return []
         if self._rules.secure is not None:
-            return self._begin_securely(grid, {**records, CONFIG: local}, self._rules.secure)
+            self._grid = grid
+            self._begin = partial(self._begin_securely, grid, {**records, CONFIG: local}, self._rules.secure)
+            return self._begin(self._here.chosen)
         return self._address(self._senders, {**records, CONFIG: local})
 
     @property
@@ -179,21 +184,24 @@ class Rounds(FlowerStrategy):
         reported = [name for name in self._here.chosen if name in self._shares]
         self._drawn = dict.fromkeys(reported, self._rules.selection.inclusion_probability(len(names)))
 
-    def _begin_securely(self, grid: Grid, records: dict[str, Any], how: SecureAggregation) -> list[Message]:
-        """Exchange keys and shares among the chosen clients, and return the messages to those who are left.
+    def _begin_securely(
+        self, grid: Grid, records: dict[str, Any], how: SecureAggregation, clients: list[str]
+    ) -> list[Message]:
+        """Exchange keys and shares among clients, and return the messages to those who are left.
 
         Nobody is sent a message where too few are left.
         """
 
-        def exchange(asks: Mapping[str, ConfigRecord]) -> dict[str, ConfigRecord]:
+        def exchange(
+            asks: Mapping[str, ConfigRecord], read: Callable[[str, RecordDict], AnswerT]
+        ) -> dict[str, AnswerT]:
             asked = [each for name, ask in asks.items() for each in self._address([name], {CONFIG: local, ASK: ask})]
-            replies = self._in_order([*asks], grid.send_and_receive(asked))
-            return {name: message.content.config_records[ASK] for name, message in replies}
+            return dict(self._read([*asks], grid.send_and_receive(asked), read))
 
         local = records[CONFIG]
         self._secure = SecureSum(exchange, how.needed(len(self._here.chosen)))
         try:
-            asks = self._secure.agree(self._here.chosen)
+            asks = self._secure.agree(clients)
         except TooFewClients as error:
             self._here.shortage, asks = error, {}
         return [each for name, ask in asks.items() for each in self._address([name], {**records, ASK: ask})]
@@ -209,8 +217,9 @@ class Rounds(FlowerStrategy):
         """Return the aggregated weights, and as metrics the number of samples and the mean loss weighted by samples.
 
         Where the network lost clients, and fewer are left than secure aggregation or the strategy needs, or where fewer
-        take part than secure aggregation or `least_clients` asks for and none failed, the weights stay as they were,
-        and the record names those who were chosen as failed, with the reason; where nobody was drawn it names nobody.
+        take part than secure aggregation or `least_clients` asks for and none failed, or where clients revealed shares
+        that leave no way to the sum, the weights stay as they were, and the record names those who were chosen as
+        failed, with the reason; where nobody was drawn it names nobody.
         Raises `ClientFailed` where fewer clients than are wanted sent a usable update, or than the strategy needs
         though the network lost none, or where fewer take part than are wanted and clients failed to report,
         `TooFewClients` where so few are left for secure aggregation, ValueError where the strategy returns arrays of
@@ -223,10 +232,10 @@ class Rounds(FlowerStrategy):
             if here.shortage is not None:
                 raise here.shortage
             weights = self._combine(received, number)
-        except (ClientFailed, TooFewClients) as error:
-            if not here.lost and not here.few:
+        except (ClientFailed, TooFewClients, SumLost) as error:
+            if not (here.lost or here.few or isinstance(error, SumLost)):
                 raise
-            weights, received = self._start, Intake(None)
+            weights, received = self._expected.start, Intake(None)
             here.failed |= {name: str(error) for name in here.chosen if name not in here.failed}
         loss, epsilon = received.mean_loss(), None
         if self._rules.privacy is not None:
@@ -239,16 +248,25 @@ class Rounds(FlowerStrategy):
 
     def _receive_norms(self, asked: Iterable[str], replies: Iterable[Message]) -> dict[str, float]:
         """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
-        told: dict[str, tuple[float, int]] = {}
-        for name, message in self._in_order(asked, replies):
-            norm, samples = to_norm(message)
-            if np.isfinite(norm) and norm >= 0 and samples >= 1:
-                told[name] = norm, samples
-            else:
-                self._here.failed[name] = f"a norm of {norm} and {samples} samples"
+        told = dict(self._read(asked, replies, lambda _, content: read_norm(content, self._rules)))
         total = sum(samples for _, samples in told.values())
         self._shares = {name: samples / max(total, 1) for name, (_, samples) in told.items()}
         return {name: norm * self._shares[name] for name, (norm, _) in told.items()}
+
+    def _read(
+        self, asked: Iterable[str], replies: Iterable[Message], read: Callable[[str, RecordDict], AnswerT]
+    ) -> Iterator[tuple[str, AnswerT]]:
+        """Yield by client, in the order in which they were asked, what `read` makes of its name and its reply.
+
+        Clients that fail, and those whose reply is refused, are noted with the reason.
+        """
+        for name, message in self._in_order(asked, replies):
+            try:
+                found = read(name, message.content)
+            except ReplyRefused as error:
+                self._here.failed[name] = str(error)
+            else:
+                yield name, found
 
     def _in_order(self, asked: Iterable[str], replies: Iterable[Message]) -> Iterator[tuple[str, Message]]:
         """Yield the replies with content by client, in the order in which they were asked; note the failures.
@@ -273,48 +291,47 @@ class Rounds(FlowerStrategy):
 
     def _receive(self, replies: Iterable[Message]) -> Intake:
         """Return the usable updates, and note what is wrong with the others."""
-        rules = self._rules
-        plain = rules.secure is None and rules.privacy is None and not rules.selection.weighs
+        if self._secure is not None:
+            return self._receive_masked(self._secure, replies)
+        plain = self._rules.privacy is None and not self._rules.selection.weighs
         received = Intake(find_weigher(self._strategy) if plain else None)
-        for name, message in self._in_order(self._senders, replies):
-            try:
-                sent = to_update(message)
-                if self._secure is not None:
-                    update = self._check_masked(sent)
-                else:
-                    like = sent.extra if received.extra is None else received.extra
-                    update = read_update(sent, self._start, rules, like)
-            except UpdateRefused as error:
-                self._here.failed[name] = str(error)
-            except (KeyError, TypeError, ValueError) as error:
-                self._here.failed[name] = f"a message that is no update ({error})"
-            else:
-                received.add(name, update)
+        for name, update in self._read(self._senders, replies, lambda _, content: read_update(content, self._expected)):
+            received.add(name, update)
         return received
 
-    def _check_masked(self, sent: LocalUpdate) -> LocalUpdate:
-        """Return a masked update, whose values cannot be told from others.
+    def _receive_masked(self, secure: SecureSum, replies: Iterable[Message]) -> Intake:
+        """Return the masked updates.
 
-        Raises `UpdateRefused` for no samples or a loss that is not finite, ValueError where it is no masked update.
+        Where shares that one client sealed for another do not open, the round is begun anew without the liars.
         """
-        size, vector = count_coordinates(self._start, self._rules), sent.weights[VECTOR]
-        if (vector.shape, vector.dtype) != ((size,), np.dtype(np.uint32)):
-            raise ValueError(f"{vector.dtype} {vector.shape} instead of uint32 ({size},)")
-        if (fault := find_fault_of_numbers(sent)) is not None:
-            raise UpdateRefused(fault)
-        return sent
+        received, complaints, here, peers = Intake(None), {}, self._here, secure.peers
+
+        def read(name: str, content: RecordDict) -> LocalUpdate | Sequence[str]:
+            return read_masked(content, self._expected, [peer for peer in peers if peer != name])
+
+        for name, answer in self._read(here.chosen, replies, read):
+            if isinstance(answer, LocalUpdate):
+                received.add(name, answer)
+            else:
+                complaints[name] = answer
+        if not complaints:
+            return received
+        here.failed |= settle_complaints(complaints)
+        again = self._begin([name for name in peers if name not in here.failed])
+        return Intake(None) if here.shortage else self._receive(self._grid.send_and_receive(again))
 
     def _average_securely(self, updates: Mapping[str, LocalUpdate], how: SecureAggregation) -> Weights:
         """Return start + (sum of the clients' changes) / their number; the sum is all that is unmasked."""
         assert self._secure is not None
         masked = {name: np.asarray(update.weights[VECTOR], np.uint32) for name, update in updates.items()}
-        peers = self._secure.peers
-        total = to_values(self._secure.finish(masked), how.largest, peers)
-        return unflatten(total / len(updates), self._start, self._rules)
+        summed, liars = self._secure.finish(masked)
+        self._here.failed |= liars
+        total = to_values(summed, how.largest, len(self._secure.peers))
+        return unflatten(total / len(updates), self._expected.start, self._rules)
 
     def _combine(self, received: Intake, number: int) -> Weights:
         """Return the weights after round `number`, and change the strategy's state."""
-        privacy, start, updates, each = self._rules.privacy, self._start, received.updates, received.combinable
+        privacy, start, updates, each = self._rules.privacy, self._expected.start, received.updates, received.combinable
         if self._rules.secure is not None:
             each = [LocalUpdate(self._average_securely(updates, self._rules.secure), 1, 0.0)]
         elif privacy is not None and not privacy.local:
@@ -337,7 +354,7 @@ class Rounds(FlowerStrategy):
             self._state.server = {name: np.asarray(array) for name, array in after.items()}
         else:
             weights = self._strategy.combine(start, each)
-        if _form(weights) != _form(start):
+        if forms_of(weights) != forms_of(start):
             name = type(self._strategy).__name__
             raise ValueError(f"{name} returned arrays of other names, shapes or types than the round started from")
         return weights
@@ -365,7 +382,3 @@ def average_inversely(start: Weights, updates: Mapping[str, LocalUpdate], weight
             moved[name] += weights[client] * (update.weights[name].astype(np.float64) - start[name])
     mean = average([update.weights for update in updates.values()], [*weights.values()])
     return mean | {name: (start[name] + array).astype(start[name].dtype) for name, array in moved.items()}
-
-
-def _form(weights: Weights) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
-    return {name: (array.shape, array.dtype) for name, array in weights.items()}

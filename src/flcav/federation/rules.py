@@ -24,6 +24,22 @@ class SecureAggregation(Config):
         return max(clients // 2 + 1, 2) if self.threshold is None else self.threshold
 
 
+MOST_SAMPLES, LARGEST = 10**12, 1e12  # of any limit
+
+
+class Limits(Config):
+    """Limits of one client's reply and of its training; beyond them the round goes on without the client.
+
+    The defaults refuse what no vehicle can mean, so that sums stay finite; they are no defence against clients that lie
+    within them, which lower limits and robust strategies are.
+    """
+
+    samples: int = Field(default=10**6, ge=1, le=MOST_SAMPLES)  # most that a client says it trained on
+    norm: float = Field(default=LARGEST, gt=0, le=LARGEST)  # largest L2 norm of an update's change, sent or told
+    loss: float = Field(default=LARGEST, gt=0, le=LARGEST)  # largest magnitude of a training loss
+    train_s: float | None = Field(default=None, gt=0)  # wall time to train in a round; default: none
+
+
 class RegionalModels(Config):
     """Regional models as in Ditto (Li et al., ICML 2021): each is pulled to the cloud's, but never replaced by it."""
 
@@ -48,15 +64,18 @@ class Rules(Config):
     privacy: Privacy | None = None  # clipping and noise; default: none
     secure: SecureAggregation | None = None  # default: the server sees every update
     personal: Patterns | RegionalModels = ()  # what edge servers keep for their regions: arrays, as in `head.*`, or all
+    limits: Limits = Limits()  # of what is taken from a client
     least_clients: LeastClients = None  # whose updates a round needs; default: half of those asked whom no network lost
 
     def of_servers(self) -> "Rules":
         """Return the rules among edge servers, which federate with the cloud, where vehicles have these.
 
         All take part, none may fail, and they send in the same form; noise is the vehicles', and what comes after it is
-        as private.
+        as private. Samples are those of all vehicles of a region, and each of these has its own time to train.
         """
-        return Rules(upload=self.upload.model_copy(update={"kept": self.personal_arrays}), least_clients="all")
+        limits = self.limits.model_copy(update={"samples": MOST_SAMPLES, "train_s": None})
+        upload = self.upload.model_copy(update={"kept": self.personal_arrays})
+        return Rules(upload=upload, limits=limits, least_clients="all")
 
     def tell_shortage(self, clients: int) -> str:
         """Return in words that fewer clients take part in a round than the number `least_clients`, or "" for enough."""

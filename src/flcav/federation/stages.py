@@ -5,27 +5,28 @@ server is k rounds of federation with the vehicles of its region (Wang et al., I
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from flwr.app import ArrayRecord
+from flwr.clientapp import ClientApp
 from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Result
 
 from flcav.config import InputError
-from flcav.federation.client import OWN, RESIDUAL, check_arguments, client_app
-from flcav.federation.privacy import affordable_rounds
+from flcav.federation.client import check_arguments, client_app, kept_records
+from flcav.federation.privacy import affordable_rounds, least_participations
 from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_weights
 from flcav.federation.rounds import OnRound, Rounds
 from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
+from flcav.federation.runtimes.deadline import TimedClients
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, BudgetedGrid, MeteredGrid
 from flcav.federation.runtimes.outages import LossyGrid
 from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
-from flcav.federation.state import ClientStates, FederationState
+from flcav.federation.state import FederationState, ReadStates
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust, needs_known_number
@@ -129,10 +130,10 @@ def federate(
     state = FederationState() if state is None else state
     results: list[Result] = []
 
-    def serve(grid: Grid, nodes: Mapping[int, str], read_states: Callable[[], ClientStates]) -> None:
+    def serve(grid: Grid, nodes: Mapping[int, str], read_states: ReadStates) -> None:
         def keep(round_: int, aggregated: Weights, loss: float) -> None:
-            if keeps:
-                state.clients = read_states()
+            if kept:
+                state.clients = read_states(kept)
             on_round(round_, aggregated, loss)
 
         app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep, centre, account.find_away)
@@ -140,13 +141,27 @@ def federate(
         link = MeteredGrid(BudgetedGrid(lossy, account, nodes), account, nodes)
         results.append(app.start(link, to_arrays(weights), rounds - done))
 
-    keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"  # something on the clients
+    kept = kept_records(strategy, rules)
     secrets = {party: state.keep_secret(party) for party in rules.secret_parties(names) if party in clients}
-    make_app = partial(client_app, strategy=strategy, rules=rules, secrets=secrets)
-    if runtime is None or isinstance(runtime, ClientProcesses):
-        trained, at_once = (clients, 1) if runtime is None else (RemoteClients(clients, runtime), runtime.count)
-        with EmbeddedGrid(make_app(trained), names, state.clients, at_once) as grid:
-            serve(grid, grid.names, lambda: grid.read_states((OWN, RESIDUAL)))
+    how: Any = {
+        "strategy": strategy,
+        "rules": rules,
+        "secrets": secrets,
+        "spent": least_participations(rules.selection, len(names), earlier),
+    }
+    limit_s = rules.limits.train_s
+
+    def make_app(trained: Mapping[str, Trainable]) -> ClientApp:
+        return client_app(trained if limit_s is None else TimedClients(trained, limit_s), **how)
+
+    if isinstance(runtime, ClientProcesses):
+        with EmbeddedGrid(
+            client_app(RemoteClients(clients, runtime, limit_s), **how), names, state.clients, runtime.count
+        ) as grid:
+            serve(grid, grid.names, grid.read_states)
+    elif runtime is None:
+        with EmbeddedGrid(make_app(clients), names, state.clients) as grid:
+            serve(grid, grid.names, grid.read_states)
     else:
         runtime.run(clients, make_app, state.clients, serve)
     arrays: ArrayRecord = results[0].arrays

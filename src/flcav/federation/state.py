@@ -1,7 +1,7 @@
 """State of a federation between rounds, as arrays for a checkpoint, and the record of each round."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -14,6 +14,7 @@ from flcav.records import LEFT_OUT, Record
 
 Arrays = dict[str, NDArray[np.number]]  # by name
 ClientStates = dict[str, dict[str, Arrays]]  # by client and kind
+ReadStates = Callable[[Iterable[str]], ClientStates]  # of what clients keep, by kind
 
 SERVER, CLIENT, PERSONAL = "server", "client", "personal"
 FAILED = "failed or lost"  # begins what is told of clients without an update

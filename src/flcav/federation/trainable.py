@@ -11,12 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 Weights = Mapping[str, NDArray[np.number]]  # name -> array, parameters and buffers, in a fixed order
+Forms = Mapping[str, tuple[tuple[int, ...], np.dtype]]  # shape and type of arrays by name
 STATISTICS = (  # of batch normalisation, last part of a name: PyTorch's, and those of the package's own layer
     "running_mean",
     "running_var",
     "running_variance",
     "num_batches_tracked",
 )
+
+
+def forms_of(weights: Weights) -> Forms:
+    """Return shape and type of each array."""
+    return {name: (array.shape, array.dtype) for name, array in weights.items()}
 
 
 def learned_names(weights: Weights) -> list[str]:

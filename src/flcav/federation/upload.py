@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flcav.config import Config, InputError
-from flcav.federation.trainable import Weights, learned_names
+from flcav.federation.trainable import Forms, Weights, forms_of, learned_names
 
 Arrays = dict[str, NDArray[np.number]]  # by name
 INDICES, VALUES, SCALES = "#indices", "#values", "#scales"  # arrays of a compressed change; no parameter is called so
@@ -93,7 +93,7 @@ def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | Non
             flat = np.concatenate([np.ravel(array).astype(np.float32) for array in change.values()])
             if residual is not None:
                 flat = flat + residual
-            kept = max(1, round(upload.fraction * flat.size))
+            kept = _kept_coordinates(upload, flat.size)
             size = np.where(np.isnan(flat), np.inf, np.abs(flat))  # what is no number is sent, and so refused
             indices = np.sort(np.argsort(-size, kind="stable")[:kept])
             sent = {INDICES: indices.astype(np.uint32), VALUES: flat[indices]}
@@ -103,15 +103,31 @@ def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | Non
             return dict(change), {}
 
 
+def _kept_coordinates(upload: Upload, size: int) -> int:
+    return max(1, round(upload.fraction * size))
+
+
+def compressed_forms(upload: Upload, like: Weights) -> Forms:
+    """Return shape and type of each array that `compress` makes of a change of arrays like these."""
+    match upload.compression:
+        case "fp16":
+            return {name: (array.shape, np.dtype(np.float16)) for name, array in like.items()}
+        case "int8":
+            levels = {name: (array.shape, np.dtype(np.int8)) for name, array in like.items()}
+            return {**levels, SCALES: ((len(like),), np.dtype(np.float32))}
+        case "top-k":
+            kept = (_kept_coordinates(upload, sum(array.size for array in like.values())),)
+            return {INDICES: (kept, np.dtype(np.uint32)), VALUES: (kept, np.dtype(np.float32))}
+        case _:
+            return forms_of(like)
+
+
 def decompress(upload: Upload, sent: Weights, like: Weights) -> Arrays:
     """Return the change of floating arrays that `compress` sent; `like` has their names, shapes and types.
 
-    Raises KeyError, IndexError or ValueError where `sent` is no such message.
+    What was sent has the forms of `compressed_forms`. Raises ValueError for coordinates that do not rise, or are none
+    of the arrays'.
     """
-    if upload.compression != "top-k":
-        for name, array in like.items():
-            if sent[name].shape != array.shape:
-                raise ValueError(f"'{name}' has shape {sent[name].shape} instead of {array.shape}")
     match upload.compression:
         case "int8":
             scales = dict(zip(like, sent[SCALES], strict=True))
@@ -119,7 +135,10 @@ def decompress(upload: Upload, sent: Weights, like: Weights) -> Arrays:
                 return {name: (sent[name] * scales[name]).astype(array.dtype) for name, array in like.items()}
         case "top-k":
             flat = np.zeros(sum(array.size for array in like.values()), np.float32)
-            flat[sent[INDICES].astype(np.int64, casting="safe")] = sent[VALUES]
+            places = np.asarray(sent[INDICES], np.int64)
+            if not (places[:-1] < places[1:]).all() or places[-1] >= flat.size:
+                raise ValueError(f"coordinates that are not rising places below {flat.size}")
+            flat[places] = sent[VALUES]
             ends = np.cumsum([array.size for array in like.values()])[:-1]
             parts = np.split(flat, ends)
             return {

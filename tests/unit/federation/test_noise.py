@@ -13,7 +13,7 @@ from scipy.stats import kstest
 from flcav.federation import rounds
 from flcav.federation.noise import SECRET_BYTES, derive_key, draw_secret, secret_noise
 from flcav.federation.privacy import Privacy, add_noise, average_privately, clip_change
-from flcav.federation.records import ARRAYS, to_update
+from flcav.federation.records import ARRAYS, read_arrays
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account
@@ -70,8 +70,8 @@ def listen(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def sent_noise(heard: Sequence[Any]) -> list[np.ndarray]:
     """Return the noise of each update that was sent under local noise: clients send their changes, all alike."""
     change = clip_change({name: np.full(array.shape, 0.25) for name, array in START.items()}, LOCAL.clip)
-    updates = [to_update(each) for each in heard if each.metadata.src_node_id != 1 and ARRAYS in each.content]
-    return [update.weights["w"] - START["w"] - change["w"] for update in updates]
+    replies = [each.content for each in heard if each.metadata.src_node_id != 1 and ARRAYS in each.content]
+    return [read_arrays(content, ARRAYS)["w"] - START["w"] - change["w"] for content in replies]
 
 
 def test_secret_numbers_are_normal_and_repeat_by_their_key():

@@ -1,5 +1,6 @@
 """What an update is sent as: bytes of the messages, what comes back, error feedback, and named layers."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,9 @@ from regression import ledger
 from safetensors.numpy import load, save
 
 from flcav.config import InputError
-from flcav.federation.acceptance import UpdateRefused, read_update
-from flcav.federation.encoding import decode, encode
+from flcav.federation.acceptance import Expected, ReplyRefused, read_update
+from flcav.federation.encoding import encode
+from flcav.federation.records import update_content
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.runtimes.metered import Account
@@ -179,10 +181,10 @@ def test_messages_that_are_no_update_are_told():
         ("layers", {"body.weight": START["body.weight"]}),
     ):
         rules = Rules(upload=Upload(**KINDS[kind]))
-        sent = encode(update, START, rules, {}, 1)[0].weights
-        decode(sent, START, rules)
-        with pytest.raises((ValueError, IndexError, KeyError)):
-            decode({**sent, **wrong}, START, rules)
+        sent, expected = encode(update, START, rules, {}, 1)[0], Expected(rules, START)
+        read_update(update_content(sent, {}), expected)
+        with pytest.raises(ReplyRefused):
+            read_update(update_content(replace(sent, weights={**sent.weights, **wrong}), {}), expected)
 
 
 @pytest.mark.filterwarnings("error")
@@ -193,8 +195,8 @@ def test_a_change_that_is_not_finite_is_refused_in_every_form(kind: str, value: 
     weights["body.weight"][3, 4] = value
     rules = Rules(upload=Upload(**KINDS[kind]))
     sent, _ = encode(LocalUpdate(weights, 2, 1.0), START, rules, {}, 1)
-    with pytest.raises(UpdateRefused, match=r"'body.weight' has values that are not finite"):
-        read_update(sent, START, rules, {})
+    with pytest.raises(ReplyRefused, match=r"'body.weight' has values that are not finite"):
+        read_update(update_content(sent, {}), Expected(rules, START))
 
 
 def test_layers_of_another_network_are_one_sentence():

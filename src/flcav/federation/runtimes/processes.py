@@ -5,15 +5,17 @@ a client returns does not depend on the process, nor on how many there are.
 """
 
 import contextlib
+import os
 import pickle
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from queue import SimpleQueue
 from typing import Any
 
 from flcav.config import InputError
 from flcav.federation.runtimes.blocks import Parcel, SharedBlock
+from flcav.federation.runtimes.deadline import ClientLate
 from flcav.federation.trainable import Trainable, Update, Weights, count_samples
 from flcav.machine.memory import keep_freed_memory
 from flcav.machine.processes import exit_with_parent, start_server
@@ -65,19 +67,22 @@ class ClientProcesses:
         """Return the ids of the processes that have started."""
         return [pid for each in self._all for pid in each.pids]
 
-    def _train(self, name: str, weights: Weights, how: Mapping[str, Any]) -> Update:
+    def _train(self, name: str, weights: Weights, how: Mapping[str, Any], limit_s: float | None) -> Update:
         """Return what the client's `train` does in the first free process; raises what it raises.
 
-        May be called from several threads. Raises `ClientKilled` where the process ends before.
+        May be called from several threads. Raises `ClientKilled` where the process ends before, `ClientLate` where it
+        was ended as it had not trained within `limit_s`.
         """
         process = self._free.get()
         try:
-            return process.train(name, weights, how)
-        except BrokenProcessPool:
+            return process.train(name, weights, how, limit_s)
+        except (BrokenProcessPool, ClientLate) as error:
             process.end()
             self._all.remove(process)
             process = _Process(self._pickled)
             self._all.append(process)
+            if isinstance(error, ClientLate):
+                raise
             raise ClientKilled("its process was killed while it trained") from None
         finally:
             self._free.put(process)
@@ -95,14 +100,18 @@ class _Process:
     def pids(self) -> list[int]:
         return [] if self._pool is None else [*(self._pool._processes or {})]
 
-    def train(self, name: str, weights: Weights, how: Mapping[str, Any]) -> Update:
+    def train(self, name: str, weights: Weights, how: Mapping[str, Any], limit_s: float | None) -> Update:
         if self._pool is None:
             self._block = SharedBlock(
                 2 * sum(array.nbytes for array in weights.values())
             )  # some send arrays beside them
             given = self._clients, self._block
             self._pool = ProcessPoolExecutor(1, mp_context=start_server(), initializer=_start, initargs=given)
-        return self._block.read(self._pool.submit(_train_here, self._block.write((name, weights, how))).result())
+            self._pool.submit(os.getpid).result()  # the time to start is not the client's
+        trained = self._pool.submit(_train_here, self._block.write((name, weights, how)))
+        if not wait([trained], limit_s).done:
+            raise ClientLate(limit_s)
+        return self._block.read(trained.result())
 
     def renew(self, clients: bytes) -> None:
         self._clients = clients
@@ -120,14 +129,16 @@ class _Process:
 class RemoteClients(Mapping[str, Trainable]):
     """Clients as they are reached from this process: they train in `processes`."""
 
-    def __init__(self, clients: Mapping[str, Trainable], processes: ClientProcesses) -> None:
-        """Stand for `clients`, which `processes` have, too."""
-        self._names, self._processes = clients, processes
+    def __init__(
+        self, clients: Mapping[str, Trainable], processes: ClientProcesses, limit_s: float | None = None
+    ) -> None:
+        """Stand for `clients`, which `processes` have, too, and which may train for `limit_s` (None: for any time)."""
+        self._names, self._processes, self._limit_s = clients, processes, limit_s
 
     def __getitem__(self, name: str) -> Trainable:
         if name not in self._names:
             raise KeyError(name)
-        return _Remote(name, self._processes, self._names)
+        return _Remote(name, self._processes, self._names, self._limit_s)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -137,11 +148,13 @@ class RemoteClients(Mapping[str, Trainable]):
 
 
 class _Remote:
-    def __init__(self, name: str, processes: ClientProcesses, clients: Mapping[str, Trainable]) -> None:
-        self._name, self._processes, self._clients = name, processes, clients
+    def __init__(
+        self, name: str, processes: ClientProcesses, clients: Mapping[str, Trainable], limit_s: float | None
+    ) -> None:
+        self._name, self._processes, self._clients, self._limit_s = name, processes, clients, limit_s
 
     def train(self, weights: Weights, **how: Any) -> Update:
-        return self._processes._train(self._name, weights, how)
+        return self._processes._train(self._name, weights, how, self._limit_s)
 
     def count_samples(self, steps: int) -> int:
         return count_samples(self._clients[self._name], steps)

@@ -9,7 +9,7 @@ from flwr.serverapp import Grid
 from flcav.federation.client import client_app
 from flcav.federation.encoding import decode, unflatten
 from flcav.federation.noise import draw_secret
-from flcav.federation.records import ARRAYS, VECTOR, to_arrays, to_update, to_weights
+from flcav.federation.records import ARRAYS, VECTOR, read_arrays, to_arrays, to_weights
 from flcav.federation.rounds import Rounds
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import EmbeddedGrid
@@ -18,15 +18,15 @@ from flcav.federation.secure.masks import to_values
 from flcav.federation.stages import Schedule
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
-from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.federation.trainable import Trainable, Weights
 
 
 class ReadGrid(WrappedGrid):
-    """A grid whose server keeps the last update of each client as it was sent."""
+    """A grid whose server keeps the arrays of each client's last update as they were sent."""
 
     def __init__(self, grid: Grid, names: Mapping[int, str]) -> None:
         self._grid, self._names = grid, names
-        self.updates: dict[str, LocalUpdate] = {}
+        self.updates: dict[str, Weights] = {}
 
     def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
         """Pass messages on."""
@@ -40,7 +40,7 @@ class ReadGrid(WrappedGrid):
         """Yield the replies, and keep those that are updates."""
         for reply in self._grid.send_and_receive(messages, timeout=timeout):
             if reply.has_content() and ARRAYS in reply.content:
-                self.updates[self._names[reply.metadata.src_node_id]] = to_update(reply)
+                self.updates[self._names[reply.metadata.src_node_id]] = read_arrays(reply.content, ARRAYS)
             yield reply
 
 
@@ -59,8 +59,8 @@ def read_round(
     seen: dict[str, Weights] = {}
     for name, update in reading.updates.items():
         if rules.secure is None:
-            seen[name] = decode(update.weights, start, rules)
+            seen[name] = decode(update, start, rules)
         else:
-            vector = np.asarray(update.weights[VECTOR], np.uint32)
+            vector = np.asarray(update[VECTOR], np.uint32)
             seen[name] = unflatten(to_values(vector, rules.secure.largest, len(clients)), start, rules)
     return seen, after

@@ -14,17 +14,15 @@ from flwr.clientapp import ClientApp
 from flwr.serverapp import Grid, ServerApp
 from flwr.simulation import run_simulation
 
-from flcav.federation.client import OWN, PARTITION, RESIDUAL
+from flcav.federation.client import PARTITION
 from flcav.federation.records import METRICS, read_arrays, to_arrays
 from flcav.federation.runtimes.embedded import keep_identity
-from flcav.federation.state import Arrays, ClientStates
+from flcav.federation.state import Arrays, ClientStates, ReadStates
 from flcav.federation.trainable import Trainable
 from flcav.machine.processes import ray_session
 
 STARTING_S = 120.0  # for the nodes to be there
-Serve = Callable[
-    [Grid, Mapping[int, str], Callable[[], ClientStates]], None
-]  # grid, names by node, reading of the states
+Serve = Callable[[Grid, Mapping[int, str], ReadStates], None]  # grid, names by node, reading of the states
 
 
 class RaySimulation:
@@ -52,7 +50,7 @@ class RaySimulation:
         def main(grid: Grid, context: Context) -> None:
             try:
                 nodes = _introduce(grid, names, states)
-                serve(grid, nodes, lambda: _read_states(grid, nodes))
+                serve(grid, nodes, lambda keys: _read_states(grid, nodes, keys))
             except BaseException as error:
                 raised.append(error)
 
@@ -112,11 +110,11 @@ def _query(nodes: Iterable[int], kept: Mapping[int, Mapping[str, Arrays]]) -> li
     ]
 
 
-def _read_states(grid: Grid, nodes: Mapping[int, str]) -> ClientStates:
-    """Return the arrays that clients keep between rounds, by client and record."""
+def _read_states(grid: Grid, nodes: Mapping[int, str], keys: Iterable[str]) -> ClientStates:
+    """Return the arrays that clients keep between rounds under these records, by client and record."""
     found: ClientStates = {}
     for reply in grid.send_and_receive(_query(nodes, {})):
         if reply.has_content():
-            own = {key: read_arrays(reply.content, key) for key in (OWN, RESIDUAL) if key in reply.content}
+            own = {key: read_arrays(reply.content, key) for key in keys if key in reply.content}
             found |= {nodes[reply.metadata.src_node_id]: own} if own else {}
     return {name: found[name] for name in nodes.values() if name in found}

@@ -24,10 +24,27 @@ def draw_keys() -> tuple[bytes, bytes]:
     return private.private_bytes_raw(), private.public_key().public_bytes_raw()
 
 
+def public_key(private: bytes) -> bytes:
+    """Return the public key of an X25519 private key."""
+    return X25519PrivateKey.from_private_bytes(private).public_key().public_bytes_raw()
+
+
 def agree(private: bytes, public: bytes, purpose: str) -> bytes:
     """Return the 32-byte key that two clients have in common for a purpose (X25519, HKDF with SHA-256)."""
     common = X25519PrivateKey.from_private_bytes(private).exchange(X25519PublicKey.from_public_bytes(public))
     return HKDF(SHA256(), 32, salt=None, info=purpose.encode()).derive(common)
+
+
+def is_public_key(data: object) -> bool:
+    """Return whether it is an X25519 public key that secrets can be agreed on with: of 32 bytes, and of no small order.
+
+    With a point of small order every secret would be 0 (RFC 7748, section 6.1).
+    """
+    try:
+        agree(bytes(range(32)), data, "trial")  # type: ignore[arg-type]: whatever a client sent
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 def seal(key: bytes, data: bytes) -> bytes:

@@ -3,35 +3,54 @@
 import base64
 import json
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from flwr.app import ConfigRecord, Context, Message, RecordDict
 
-from flcav.federation.records import ASK
+from flcav.federation.acceptance import read_keys, read_shares
+from flcav.federation.records import ASK, CIPHERS, KEYS, MASKED, MASKS, NAMES, SHARES, UNMASK
+from flcav.federation.rules import SecureAggregation
 from flcav.federation.secure.masks import Vector, add_vectors
-from flcav.federation.secure.parties import PublicKeys, SecureClient, unmask_sum
+from flcav.federation.secure.parties import SEALED_BYTES, PublicKeys, SecureClient, find_liars, unmask_sum
+from flcav.federation.secure.shamir import SHARE_BYTES
 
-KEYS, SHARES, MASKED, UNMASK = "keys", "shares", "masked", "unmask"  # what the server asks for, in this order
-NAMES, SURVIVORS, DROPPED, THRESHOLD, CIPHERS, MASKS = "names", "survivors", "dropped", "threshold", "ciphers", "masks"
+SURVIVORS, DROPPED, THRESHOLD = "survivors", "dropped", "threshold"  # entries of the server's messages
 SECRETS = "secrets"  # record of a node's state: the client's own part of a round
 
-Exchange = Callable[[Mapping[str, ConfigRecord]], dict[str, ConfigRecord]]  # asks by client; answers of those who did
+AnswerT = TypeVar("AnswerT")
+
+
+class Exchange(Protocol):
+    """Messages of one step: what each client is asked, and what is read of each usable answer."""
+
+    def __call__(
+        self, asks: Mapping[str, ConfigRecord], read: Callable[[str, RecordDict], AnswerT]
+    ) -> dict[str, AnswerT]:
+        """Return by client, of those with a usable answer, what `read` makes of its name and its answer."""
+        ...
 
 
 class TooFewClients(OSError):
     """Fewer clients are left than secure aggregation needs."""
 
 
-def answer_secretly(message: Message, context: Context, name: str) -> Message:
-    """Return a client's answer to the server's request for keys, shares, or shares of others."""
+def answer_secretly(message: Message, context: Context, name: str, how: SecureAggregation) -> Message:
+    """Return a client's answer to the server's request for keys, shares, or shares of others.
+
+    Raises ValueError for a request that would reveal more than `how` and the protocol do.
+    """
     asked = message.content.config_records[ASK]
     if asked[ASK] == KEYS:
         client = SecureClient.draw(name)
         record = ConfigRecord({CIPHERS: client.keys.cipher, MASKS: client.keys.mask})
     elif asked[ASK] == SHARES:
         client = _recall(context)
-        peers = _peers(asked)
-        sealed = client.share(peers, _number(asked[THRESHOLD]))
+        peers, threshold = _peers(asked), _number(asked[THRESHOLD])
+        if threshold < how.needed(len(peers)):
+            raise ValueError(
+                f"a threshold of {threshold} of {len(peers)} clients: {how.needed(len(peers))} are agreed on"
+            )
+        sealed = client.share(peers, threshold)
         record = ConfigRecord({NAMES: [*sealed], SHARES: [*sealed.values()]})
     else:
         client = _recall(context)
@@ -39,6 +58,13 @@ def answer_secretly(message: Message, context: Context, name: str) -> Message:
         record = ConfigRecord({NAMES: [*shares], SHARES: [*shares.values()]})
     _keep(context, client)
     return Message(RecordDict({ASK: record}), reply_to=message)
+
+
+def complain(message: Message, context: Context) -> Message | None:
+    """Return a client's answer to a request for its masked update where others' shares do not open; else None."""
+    if odd := _recall(context).find_unopened(_named(message.content.config_records[ASK])):
+        return Message(RecordDict({ASK: ConfigRecord({NAMES: odd})}), reply_to=message)
+    return None
 
 
 def mask_update(message: Message, context: Context, update: Vector) -> Vector:
@@ -63,8 +89,9 @@ class SecureSum:
 
         Raises `TooFewClients`.
         """
-        answers = self._exchange({name: ConfigRecord({ASK: KEYS}) for name in chosen})
-        self._keys = {name: PublicKeys(_bytes(each[CIPHERS]), _bytes(each[MASKS])) for name, each in answers.items()}
+        self._keys = self._exchange(
+            {name: ConfigRecord({ASK: KEYS}) for name in chosen}, lambda _, content: read_keys(content)
+        )
         self._check(len(self._keys), "sent keys")
         ask = {
             ASK: SHARES,
@@ -73,8 +100,10 @@ class SecureSum:
             MASKS: [keys.mask for keys in self._keys.values()],
             THRESHOLD: self._threshold,
         }
-        answers = self._exchange({name: ConfigRecord(ask) for name in self._keys})
-        sealed = {name: _named(each) for name, each in answers.items()}
+        sealed = self._exchange(
+            dict.fromkeys(self._keys, ConfigRecord(ask)),
+            lambda name, content: read_shares(content, [each for each in self._keys if each != name], SEALED_BYTES),
+        )
         self._peers = [*sealed]
         self._check(len(sealed), "shared their secrets")
         asks = {}
@@ -85,20 +114,30 @@ class SecureSum:
         return asks
 
     @property
-    def peers(self) -> int:
-        """Return the number of clients that mask their updates in common, which fixes the step of their integers."""
-        return len(self._peers)
+    def peers(self) -> list[str]:
+        """Return the clients that mask their updates in common; their number fixes the step of their integers."""
+        return self._peers
 
-    def finish(self, masked: Mapping[str, Vector]) -> Vector:
-        """Return the sum of the updates of those clients who sent theirs, `masked`; raises `TooFewClients`."""
+    def finish(self, masked: Mapping[str, Vector]) -> tuple[Vector, dict[str, str]]:
+        """Return the sum of the updates of those clients who sent theirs, `masked`, and who revealed wrong shares, how.
+
+        Raises `TooFewClients`, and `SumLost` where wrong shares leave no way to the sum.
+        """
         survivors = [*masked]
         dropped = [name for name in self._peers if name not in masked]
         self._check(len(survivors), "sent an update")
         ask = ConfigRecord({ASK: UNMASK, SURVIVORS: survivors, DROPPED: dropped})
-        answers = self._exchange(dict.fromkeys(survivors, ask))
-        self._check(len(answers), "helped to unmask the sum")
-        shares = {name: _named(answer) for name, answer in answers.items()}
-        return unmask_sum(add_vectors(masked.values()), self._keys, survivors, dropped, shares)
+        shares = self._exchange(
+            dict.fromkeys(survivors, ask),
+            lambda _, content: read_shares(content, [*survivors, *dropped], SHARE_BYTES),
+        )
+        self._check(len(shares), "helped to unmask the sum")
+        about = add_vectors(masked.values()), self._keys, survivors, dropped
+        try:
+            return unmask_sum(*about, shares), {}
+        except OverflowError:
+            liars = find_liars(self._keys, shares, self._threshold)
+            return unmask_sum(*about, {name: each for name, each in shares.items() if name not in liars}), liars
 
     def _check(self, left: int, did: str) -> None:
         if left < self._threshold:

@@ -12,9 +12,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from cryptography.exceptions import InvalidTag
 
-from flcav.federation.secure.masks import Vector, agree, draw_keys, expand, seal, unseal
-from flcav.federation.secure.shamir import SHARE_BYTES, join_shares, split_secret
+from flcav.federation.secure.masks import Vector, agree, draw_keys, expand, public_key, seal, unseal
+from flcav.federation.secure.shamir import SHARE_BYTES, find_wrong_shares, join_shares, split_secret
+
+SEALED_BYTES = 2 * SHARE_BYTES + 16  # of the shares of both secrets, and their authentication
+
+
+class SumLost(OSError):
+    """The sum of a round cannot be unmasked from the shares that clients revealed."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +56,12 @@ class SecureClient:
     def share(self, peers: Mapping[str, PublicKeys], threshold: int) -> dict[str, bytes]:
         """Return by name of every other client, sealed for it, a share of this one's seed and of its key of masks.
 
-        peers: public keys of all clients of the round, this one included. Raises ValueError where `threshold` is not
-        more than half of them: two halves could then reveal both of a client's masks.
+        peers: public keys of all clients of the round, this one included. Raises ValueError where its own are
+        others, and where `threshold` is not more than half of them: two halves could then reveal both of a client's
+        masks.
         """
+        if peers[self.name] != self.keys:
+            raise ValueError("another public key in the place of this client's own")
         if not len(peers) / 2 < threshold <= len(peers):
             raise ValueError(f"a threshold of {threshold} of {len(peers)} clients: more than half of them is wanted")
         self.peers, self.threshold = dict(peers), threshold
@@ -74,6 +84,16 @@ class SecureClient:
             total = add_mask(total, common, self.name < name)
         return total
 
+    def find_unopened(self, sealed: Mapping[str, bytes]) -> list[str]:
+        """Return the names of those whose shares for this client do not open: who sealed others than it should."""
+        found = []
+        for name, shares in sealed.items():
+            try:
+                self._open(name, shares)
+            except InvalidTag:
+                found.append(name)
+        return found
+
     def reveal(self, survivors: Sequence[str], dropped: Sequence[str]) -> dict[str, bytes]:
         """Return this client's shares: of the survivors' seeds, and of the keys of masks of those who dropped out.
 
@@ -86,12 +106,12 @@ class SecureClient:
         self.revealed = True
         found = {}
         for name in (*survivors, *dropped):
-            if name == self.name:
-                both = self.own_shares
-            else:
-                both = unseal(self._sealing_key(name, self.name), self.sealed[name])
+            both = self.own_shares if name == self.name else self._open(name, self.sealed[name])
             found[name] = both[:SHARE_BYTES] if name in survivors else both[SHARE_BYTES:]
         return found
+
+    def _open(self, name: str, sealed: bytes) -> bytes:
+        return unseal(self._sealing_key(name, self.name), sealed)
 
     def _sealing_key(self, sender: str, receiver: str) -> bytes:
         other = receiver if sender == self.name else sender
@@ -115,6 +135,8 @@ def unmask_sum(
 
     keys: public keys of all clients that shares were made for, in that order. dropped: clients in whose masks the
     survivors took part and who sent no update. shares: by survivor what it revealed, of `threshold` or more of them.
+    Raises OverflowError where these do not fit together, `SumLost` where one who dropped out shared a key that is not
+    its own.
     """
     places = {name: place for place, name in enumerate(keys)}
 
@@ -125,7 +147,52 @@ def unmask_sum(
         total = add_mask(total, joined(name), plus=False)
     for name in dropped:
         private = joined(name)
+        if public_key(private) != keys[name].mask:
+            raise SumLost(f"{name} dropped out, and had shared a key that is not its own")
         for other in survivors:
             common = agree(private, keys[other].mask, "mask")
             total = add_mask(total, common, plus=other > name)
     return np.asarray(total, np.uint32)
+
+
+def find_liars(
+    keys: Mapping[str, PublicKeys], shares: Mapping[str, Mapping[str, bytes]], threshold: int
+) -> dict[str, str]:
+    """Return who reveals shares that do not fit those of the others, with the reason; arguments as of `unmask_sum`.
+
+    A client that dealt shares that do not fit together cannot be told from those that it dealt wrong ones. Raises
+    `SumLost` where no `threshold` shares of a secret fit, or fewer clients than that are left.
+    """
+    places = {name: place for place, name in enumerate(keys)}
+    liars: dict[str, str] = {}
+    for owner in next(iter(shares.values())):
+        try:
+            wrong = find_wrong_shares(
+                {places[holder]: revealed[owner] for holder, revealed in shares.items()}, threshold
+            )
+        except ValueError as error:
+            raise SumLost(f"of the secrets of {owner} {error}") from None
+        liars |= {
+            holder: f"reveals a share of {owner} that does not fit" for holder in shares if places[holder] in wrong
+        }
+    if len(shares) - len(liars) < threshold:
+        raise SumLost(f"{', '.join(liars)} reveal shares that do not fit")
+    return liars
+
+
+def settle_complaints(complaints: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Return the fewest clients whose lies explain all complaints, with the reason: those in most of them.
+
+    complaints: by client who, as it says, sealed shares for it that do not open. Where one client complains about one
+    other, it cannot be told which of the two lies, and both are returned.
+    """
+    pairs = [(accuser, accused) for accuser, several in complaints.items() for accused in several]
+    liars: dict[str, str] = {}
+    while pairs:
+        every = [name for pair in pairs for name in pair]
+        most = max(map(every.count, every))
+        for name in [each for each in dict.fromkeys(every) if every.count(each) == most]:
+            others = [b if a == name else a for a, b in pairs if name in (a, b)]
+            liars[name] = f"shares between it and {', '.join(others)} that do not open"
+        pairs = [pair for pair in pairs if not liars.keys() & {*pair}]
+    return liars
