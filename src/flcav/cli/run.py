@@ -99,9 +99,14 @@ def _run(
 
 
 def _tell(results: "list[Run]", summary: "Summary | None") -> None:
+    from flcav.pipeline.results.spending import TOGETHER
+
     if summary is None:
         for finding in results[0].findings:
             typer.echo(f"{finding.question}: {finding.verdict}. {finding.sentence}")
+        for name, arm in results[0].arms.items():
+            if arm.privacy is not None:
+                typer.echo(f"{name}, {TOGETHER}: {arm.privacy.describe()}")
         return
     for row in (*summary.measures, *summary.differences):
         judged = f": {row.judged.verdict}, {row.judged.describe()}" if row.judged else ""

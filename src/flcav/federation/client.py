@@ -92,6 +92,8 @@ def client_app(
             about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
             return reply(message, LocalUpdate(masked, *about), {})
         sent, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)
+        if rules.hides_draws:  # neither the ledger's bytes nor the server's figures are to tell who was drawn
+            sent = replace(sent, samples=min(sent.samples, 1), loss=0.0)
         answer = reply(message, sent, extra)
         if (left or own) and LOST not in message.content and is_usable(replace(sent, extra=extra), start, rules):
             _record(context, RESIDUAL, left)

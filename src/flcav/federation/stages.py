@@ -22,7 +22,7 @@ from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_wei
 from flcav.federation.rounds import OnRound, Rounds
 from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
-from flcav.federation.runtimes.metered import Account, BudgetedGrid, MeteredGrid
+from flcav.federation.runtimes.metered import Account, BudgetedGrid, MeteredGrid, conceal
 from flcav.federation.runtimes.outages import LossyGrid
 from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
 from flcav.federation.state import ClientStates, FederationState
@@ -93,10 +93,12 @@ def federate(
     `state`: without it no federation can be repeated, nor gone on with to the same weights.
 
     Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
-    before this one, with the same clients and rules, which count against that budget. Clients train in this process, or
-    several at a time in a `runtime`: `ClientProcesses` of the same clients, or Flower's simulation on Ray; the weights
-    are the same. Clients are pulled to `centre`, where there is one, by the `personal` of the rules. `clients` is asked
-    for a client when it is to train; of updates no more are in memory than the strategy needs.
+    before this one, with the same clients and rules, which count against that budget, and after which the turns of
+    round-robin go on. Where epsilon rests on secret draws of clients, records and ledger do not name them. Clients
+    train in this process, or several at a time in a `runtime`: `ClientProcesses` of the same clients, or Flower's
+    simulation on Ray; the weights are the same. Clients are pulled to `centre`, where there is one, by the `personal`
+    of the rules. `clients` is asked for a client when it is to train; of updates no more are in memory than the
+    strategy needs.
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
     no update, and fewer are left than `rules` ask for (by default half of those asked) or, though `account` lost none,
@@ -137,7 +139,8 @@ def federate(
 
         app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep, centre, account.find_away)
         lossy = LossyGrid(grid, account, nodes) if account.outages else grid
-        link = MeteredGrid(BudgetedGrid(lossy, account, nodes), account, nodes)
+        told = {node: conceal(name) for node, name in nodes.items()} if rules.hides_draws else nodes
+        link = MeteredGrid(BudgetedGrid(lossy, account, told), account, told)
         results.append(app.start(link, to_arrays(weights), rounds - done))
 
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"  # something on the clients
@@ -334,7 +337,7 @@ class EdgeServer:
         its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are;
         of regional models these are all, and vehicles are pulled to the cloud's from the second cloud round on.
         Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles
-        keep to.
+        keep to. Under central noise the region counts by its number of vehicles, whoever took part.
         """
         start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own
         regional = isinstance(self.rules.personal, RegionalModels)
@@ -353,4 +356,6 @@ class EdgeServer:
         self.begun, self.trained = start, found.weights
         names = [*found.weights] if regional else name_like(found.weights, self.rules.personal_arrays)
         self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
+        if self.rules.privacy is not None and not self.rules.privacy.local:  # no noise covers numbers of samples
+            return replace(found, samples=len(self.vehicles))
         return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody

@@ -11,6 +11,8 @@ from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link
 
+UNDISCLOSED = "undisclosed"  # in the place of a client's name
+
 
 @dataclass(frozen=True)
 class Outage:
@@ -38,6 +40,15 @@ class Account:
     def describe(self, direction: Direction, round_: int, client: str, size: int) -> LedgerEntry:
         """Return the entry of a message of `size` bytes."""
         return LedgerEntry(self.stage, self.task, self.link, direction, round_, client, size)
+
+
+def conceal(client: str) -> str:
+    """Return the name that a client's messages are entered under where nobody is to know who was drawn.
+
+    Of "region/vehicle" it has the region.
+    """
+    region, slash, _ = client.rpartition("/")
+    return f"{region}{slash}{UNDISCLOSED}"
 
 
 class BudgetedGrid(WrappedGrid):

@@ -26,6 +26,7 @@ from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.run import LinkUse, Run
 from flcav.pipeline.results.saved import ERRORS
+from flcav.pipeline.results.spending import TOGETHER
 from flcav.pipeline.results.tests import SweepComparison, SweepDetections
 from flcav.pipeline.running import WORK
 from flcav.report import style
@@ -109,6 +110,8 @@ def page(run: Run) -> dict[str, Any]:
         "delta": f"{recipe.federation.privacy.delta:g}" if recipe.federation.privacy else None,
         "divergences": [row for row in rounds if row["divergence"] is not None],
         "seeded": SEEDED if recipe.federation.privacy and recipe.federation.privacy.seeded else None,
+        "together": TOGETHER,
+        "spent": {arm: result.privacy.describe() for arm, result in run.arms.items() if result.privacy is not None},
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
