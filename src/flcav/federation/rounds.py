@@ -93,9 +93,8 @@ class Rounds(FlowerStrategy):
     `rules` say who takes part, what is sent and what is kept private; `work` gives the local training of a round by its
     number; numbers continue after the `done` rounds. `names` are the clients' names by node. `earlier` is the number of
     rounds of earlier federations with the same clients, which privacy is accounted with and after which the turns of
-    round-robin go on. `state` is changed in place;
-    `on_round` is called after each aggregation. `centre` is the model that clients are pulled to, if any. `away` tells
-    who is not there when a round begins: they take no part in it.
+    round-robin go on. `state` is changed in place; `on_round` is called after each aggregation. `centre` is the model
+    that clients are pulled to, if any. `away` tells who is not there when a round begins: they take no part in it.
     """
 
     def __init__(

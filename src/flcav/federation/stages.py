@@ -22,7 +22,7 @@ from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_wei
 from flcav.federation.rounds import OnRound, Rounds
 from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
-from flcav.federation.runtimes.metered import Account, BudgetedGrid, MeteredGrid, conceal
+from flcav.federation.runtimes.metered import Account, BudgetedGrid, MeteredGrid
 from flcav.federation.runtimes.outages import LossyGrid
 from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
 from flcav.federation.state import ClientStates, FederationState
@@ -129,6 +129,7 @@ def federate(
     if rounds <= done:
         return LocalUpdate(weights, 0, 0.0)
     state = FederationState() if state is None else state
+    account = replace(account, concealed=rules.hides_draws)
     results: list[Result] = []
 
     def serve(grid: Grid, nodes: Mapping[int, str], read_states: Callable[[], ClientStates]) -> None:
@@ -139,8 +140,7 @@ def federate(
 
         app = Rounds(strategy, rules, schedule.work, nodes, state, done, earlier, keep, centre, account.find_away)
         lossy = LossyGrid(grid, account, nodes) if account.outages else grid
-        told = {node: conceal(name) for node, name in nodes.items()} if rules.hides_draws else nodes
-        link = MeteredGrid(BudgetedGrid(lossy, account, told), account, told)
+        link = MeteredGrid(BudgetedGrid(lossy, account, nodes), account, nodes)
         results.append(app.start(link, to_arrays(weights), rounds - done))
 
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"  # something on the clients

@@ -13,6 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.state import RoundRecord
 from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
+from flcav.pipeline.collecting.caveats import PLACED_BARE
 from flcav.pipeline.federations.checkpoint import Checkpoint
 from flcav.pipeline.federations.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
@@ -115,5 +116,8 @@ def test_the_page_and_the_results_have_what_is_spent_together() -> None:
     told = "a vehicle's whole data in all tasks and trainings together: epsilon 21.44 at delta 1e-05"
     assert f"main, {told}." in unescape(html.render(page(run), {}))
     assert told not in unescape(html.render(page(plain), {}))
+    hidden = unescape(html.render(page(replace(run, caveats=(*run.caveats, PLACED_BARE))), {}))
+    assert hidden.count(PLACED_BARE) == 1
+    assert f"Privacy: {PLACED_BARE}." in hidden
     assert Run.from_json(run.as_json(), "run").arms[MAIN].privacy == spent.privacy
     assert '"privacy": {"epsilon"' not in json.dumps(plain.as_json())

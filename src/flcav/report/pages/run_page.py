@@ -16,6 +16,7 @@ from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.arms import Names, resolve_settings
+from flcav.pipeline.collecting.caveats import PLACED_BARE
 from flcav.pipeline.collecting.findings import WORDS
 from flcav.pipeline.federations.network import CLOCK
 from flcav.pipeline.federations.records import list_rounds
@@ -116,7 +117,8 @@ def page(run: Run) -> dict[str, Any]:
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
         "statistics": [(stage.task, each) for stage in main.stages for each in stage.statistics or ()],
-        "caveats": run.caveats,
+        "caveats": [caveat for caveat in run.caveats if caveat != PLACED_BARE],
+        "bare": PLACED_BARE if PLACED_BARE in run.caveats else None,
         "elapsed_s": run.elapsed_s,
         "provenance": run.provenance,
     }
