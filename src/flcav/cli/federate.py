@@ -44,6 +44,7 @@ def federate(
     from flcav.files import check_writable
     from flcav.pipeline.federations.alone import RESULTS, TRAIN_TIMES, federate_regions, measure_times
     from flcav.pipeline.recipe import load_run_recipe
+    from flcav.pipeline.results.spending import TOGETHER
     from flcav.sources.recipe import find_recipe
 
     check_writable(out)
@@ -61,6 +62,8 @@ def federate(
         typer.echo(f"{out / each.weights}: {_describe(each.result)}")
     for task, seconds in times.train_s.items():
         typer.echo(f"{task}: train_s {seconds:.3g}, the median CPU time of a vehicle's training in a round [s]")
+    if results.privacy is not None:
+        typer.echo(f"{TOGETHER}: {results.privacy.describe()}")
     typer.echo(f"{out / TRAIN_TIMES}: times and speeds of each vehicle")
     typer.echo(f"{out / RESULTS}: all rounds")
 

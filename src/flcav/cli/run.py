@@ -99,9 +99,17 @@ def _run(
 
 
 def _tell(results: "list[Run]", summary: "Summary | None") -> None:
+    from flcav.pipeline.collecting.caveats import PLACED_BARE
+    from flcav.pipeline.results.spending import TOGETHER
+
     if summary is None:
         for finding in results[0].findings:
             typer.echo(f"{finding.question}: {finding.verdict}. {finding.sentence}")
+        for name, arm in results[0].arms.items():
+            if arm.privacy is not None:
+                typer.echo(f"{name}, {TOGETHER}: {arm.privacy.describe()}")
+        if PLACED_BARE in results[0].caveats:
+            typer.echo(f"privacy: {PLACED_BARE}")
         return
     for row in (*summary.measures, *summary.differences):
         judged = f": {row.judged.verdict}, {row.judged.describe()}" if row.judged else ""

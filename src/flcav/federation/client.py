@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -130,6 +131,8 @@ def client_app(
             about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
             return reply(message, LocalUpdate(masked, *about), {})
         encoded, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)
+        if rules.hides_draws:  # neither the ledger's bytes nor the server's figures are to tell who was drawn
+            encoded = replace(encoded, samples=min(encoded.samples, 1), loss=0.0)
         answer = reply(message, encoded, extra)
         if (left or own) and LOST not in message.content:
             expected = Expected(rules, start, extra_forms(strategy, rules, start, sent))

@@ -94,7 +94,8 @@ def _protect(change: Arrays, rules: Rules, seed: int, key: bytes | None) -> Arra
     privacy = rules.privacy
     if privacy is None or not is_local(rules):
         return change
-    return add_noise(clip_change(change, privacy.clip), privacy, seed, key)
+    noisy = add_noise(clip_change(change, privacy.clip), privacy, seed, key)
+    return {name: array.astype(change[name].dtype) for name, array in noisy.items()}
 
 
 def is_local(rules: Rules) -> bool:

@@ -9,7 +9,8 @@ of its own, or, where the noise is `seeded`, by the seed of the round, which all
 import bisect
 import logging
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ from flcav.federation.upload import add, subtract
 from flcav.seeds import stream
 
 Arrays = dict[str, NDArray[np.number]]  # by name
+ROUNDING = 1e-12  # relative: more than the sum of squares of a clipped change is off in float64
 SEEDED = "seeded, no guarantee against who knows the seed"  # of epsilon whose noise can be drawn again
 
 
@@ -51,10 +53,14 @@ class Privacy(Config):
         return not self.local and selection.rule in ("poisson", "uniform")
 
 
-def clip_change(change: Weights, norm: float) -> Arrays:
-    """Return a change scaled down so that its L2 norm over all arrays is at most `norm`."""
-    factor = min(1.0, norm / max(change_norm(change), 1e-300))
-    return {name: (array * factor).astype(array.dtype) for name, array in change.items()}
+def clip_change(change: Weights, norm: float) -> dict[str, NDArray[np.float64]]:
+    """Return a change in float64, scaled down so that its L2 norm over all arrays is at most `norm`.
+
+    In fewer bits a scaled array could be longer again: each number would be rounded, tiny ones by as much as they are.
+    """
+    length = change_norm(change)
+    factor = 1.0 if length <= norm else norm / length * (1 - ROUNDING)
+    return {name: array.astype(np.float64) * factor for name, array in change.items()}
 
 
 def change_norm(change: Weights) -> float:
@@ -96,7 +102,7 @@ def average_privately(
     total: Arrays = {name: np.zeros(start[name].shape) for name in names}
     for update in updates:
         for name, array in clip_change(subtract(update.weights, start, names), privacy.clip).items():
-            total[name] += np.asarray(array, np.float64)
+            total[name] += array
     noisy = add_noise(total, privacy, seed, key)
     return add(start, {name: array / expected for name, array in noisy.items()})
 
@@ -110,7 +116,15 @@ def expected_clients(selection: Selection, names: Sequence[str]) -> float:
 
 
 def account_epsilon(privacy: Privacy, selection: Selection, names: Sequence[str], rounds: int) -> float:
-    """Return epsilon at `privacy.delta` after this many rounds, by Renyi differential privacy.
+    """Return epsilon at `privacy.delta` after this many rounds of one training: see `compose_epsilon`."""
+    return compose_epsilon(privacy, selection, [(len(names), rounds)])
+
+
+def compose_epsilon(privacy: Privacy, selection: Selection, trainings: Iterable[tuple[int, int]]) -> float:
+    """Return epsilon at `privacy.delta` of several trainings with one client's data, by Renyi differential privacy.
+
+    trainings: of each the number of clients, in the same order, and of rounds; the turns of round-robin go on in all
+    rounds of a training, and begin anew with the next.
 
     Central, Poisson sampling: amplified, neighbours differ by a client that is added or removed. Central, a fixed
     number drawn without replacement: amplified, neighbours differ in the data of one client, which changes a sum by up
@@ -121,31 +135,29 @@ def account_epsilon(privacy: Privacy, selection: Selection, names: Sequence[str]
     from dp_accounting import NeighboringRelation, rdp
 
     logging.getLogger("absl").setLevel(logging.ERROR)  # warns of each order of Renyi divergence that it leaves out
-    event: dp_accounting.DpEvent
-    relation, times = NeighboringRelation.ADD_OR_REMOVE_ONE, rounds
-    if privacy.local:
-        event = dp_accounting.GaussianDpEvent(privacy.noise / 2)
-        times = most_participations(selection, len(names), rounds)
-    elif selection.rule == "poisson":
-        assert selection.probability is not None
-        event = dp_accounting.PoissonSampledDpEvent(selection.probability, dp_accounting.GaussianDpEvent(privacy.noise))
-    elif selection.rule == "uniform":
-        assert selection.clients is not None
+    replaced = privacy.local or selection.rule == "uniform"  # else a client is added or removed
+    gaussian = dp_accounting.GaussianDpEvent(privacy.noise / 2 if replaced else privacy.noise)
+    relation = NeighboringRelation.ADD_OR_REMOVE_ONE
+    if privacy.amplified(selection) and selection.rule == "uniform":
         relation = NeighboringRelation.REPLACE_ONE
-        event = dp_accounting.SampledWithoutReplacementDpEvent(
-            len(names), selection.clients, dp_accounting.GaussianDpEvent(privacy.noise / 2)
-        )
-    else:
-        event = dp_accounting.GaussianDpEvent(privacy.noise)
-        times = most_participations(selection, len(names), rounds)
+    times = Counter[int]()  # by number of clients
+    for clients, rounds in trainings:
+        times[clients] += rounds if privacy.amplified(selection) else most_participations(selection, clients, rounds)
     accountant = rdp.RdpAccountant(neighboring_relation=relation)
-    if times:
-        accountant.compose(event, times)
+    for clients, number in (+times).items():
+        event: dp_accounting.DpEvent = gaussian
+        if privacy.amplified(selection) and selection.rule == "poisson":
+            assert selection.probability is not None
+            event = dp_accounting.PoissonSampledDpEvent(selection.probability, gaussian)
+        elif privacy.amplified(selection):
+            assert selection.clients is not None
+            event = dp_accounting.SampledWithoutReplacementDpEvent(clients, selection.clients, gaussian)
+        accountant.compose(event, number)
     return float(accountant.get_epsilon(privacy.delta))
 
 
 def most_participations(selection: Selection, clients: int, rounds: int) -> int:
-    """Return the most rounds, of the first `rounds`, that a client can take part in."""
+    """Return the most rounds, of the first `rounds` of a training, that a client can take part in."""
     if selection.rule != "round-robin":
         return rounds
     assert selection.clients is not None

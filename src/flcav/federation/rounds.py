@@ -91,9 +91,9 @@ class Rounds(FlowerStrategy):
 
     `rules` say who takes part, what is sent and what is kept private; `work` gives the local training of a round by its
     number; numbers continue after the `done` rounds. `names` are the clients' names by node. `earlier` is the number of
-    rounds of earlier federations with the same clients, which privacy is accounted with. `state` is changed in place;
-    `on_round` is called after each aggregation. `centre` is the model that clients are pulled to, if any. `away` tells
-    who is not there when a round begins: they take no part in it.
+    rounds of earlier federations with the same clients, which privacy is accounted with and after which the turns of
+    round-robin go on. `state` is changed in place; `on_round` is called after each aggregation. `centre` is the model
+    that clients are pulled to, if any. `away` tells who is not there when a round begins: they take no part in it.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class Rounds(FlowerStrategy):
         if self._centre is not None:
             records[CENTRE] = to_arrays({name: self._centre[name] for name in learned_names(self._centre)})
         selection, local = self._rules.selection, work.record()
-        chosen = selection.choose([*self._names.values()], work.round, self._draws_by(work))
+        chosen = selection.choose([*self._names.values()], work.round, self._draws_by(work), self._earlier)
         asked = [*self._names.values()] if selection.unbiased else chosen
         self._here = Attendance(asked, chosen, self._away(work.round))
         if selection.unbiased:
@@ -167,8 +167,7 @@ class Rounds(FlowerStrategy):
 
     def _draws_by(self, work: LocalWork) -> int:
         """Return the seed that the clients of a round are drawn by: that of the round, or one that nobody knows."""
-        privacy = self._rules.privacy
-        if privacy is None or not privacy.hides_draws(self._rules.selection):
+        if not self._rules.hides_draws:
             return work.seed
         return int.from_bytes(self._key("selection", work), "little")
 
@@ -216,6 +215,8 @@ class Rounds(FlowerStrategy):
     ) -> tuple[ArrayRecord | None, MetricRecord | None]:
         """Return the aggregated weights, and as metrics the number of samples and the mean loss weighted by samples.
 
+        Where who was drawn is to stay secret, the record has nothing of the clients, and both numbers are 0.
+
         Where the network lost clients, and fewer are left than secure aggregation or the strategy needs, or where fewer
         take part than secure aggregation or `least_clients` asks for and none failed, or where clients revealed shares
         that leave no way to the sum, the weights stay as they were, and the record names those who were chosen as
@@ -241,10 +242,13 @@ class Rounds(FlowerStrategy):
         if self._rules.privacy is not None:
             rounds, names = self._earlier + number, [*self._names.values()]
             epsilon = account_epsilon(self._rules.privacy, self._rules.selection, names, rounds)
-        about = (number, tuple(received.samples), here.failed, epsilon)
-        self._state.records.append(RoundRecord(*about, loss, sum(received.samples.values())))
-        self._on_round(number, weights, loss)
-        return to_arrays(weights), MetricRecord({SAMPLES: sum(received.samples.values()), LOSS: loss})
+        samples = sum(received.samples.values())
+        record = RoundRecord(number, tuple(received.samples), here.failed, epsilon, loss, samples)
+        if self._rules.hides_draws:
+            record = RoundRecord(number, (), epsilon=epsilon)
+        self._state.records.append(record)
+        self._on_round(number, weights, record.loss)
+        return to_arrays(weights), MetricRecord({SAMPLES: record.samples, LOSS: record.loss})
 
     def _receive_norms(self, asked: Iterable[str], replies: Iterable[Message]) -> dict[str, float]:
         """Return the norms of the clients' updates times their shares of all samples, by client in node order."""

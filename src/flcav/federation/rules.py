@@ -84,6 +84,11 @@ class Rules(Config):
             return ""
         return f"least_clients: {least} are wanted in a round, and {clients} take{'s' if clients == 1 else ''} part"
 
+    @property
+    def hides_draws(self) -> bool:
+        """Return whether epsilon is amplified by draws of clients that are to stay secret."""
+        return self.privacy is not None and self.privacy.hides_draws(self.selection)
+
     def secret_parties(self, clients: Sequence[str]) -> Sequence[str]:
         """Return who draws noise by a secret: each of these clients, or `SERVER`; nobody where it is seeded."""
         if self.privacy is None or self.privacy.seeded:

@@ -15,6 +15,7 @@ from flcav.seeds import stream
 
 Rule = Literal["all", "uniform", "poisson", "round-robin", "importance", "deadline", "planned"]
 
+LONGEST = 3.0  # norm of an update that counts in importance selection, as a multiple of the clients' median
 NEEDED: Mapping[Rule, str | None] = {  # the field that a rule needs, which others do not take
     "all": None,
     "uniform": "clients",
@@ -84,10 +85,11 @@ class Selection(Config):
         if self.rule == "deadline" and not self.choose(names, 1, 0):
             raise InputError(f"selection: no client is predicted to end a round within {self.deadline_s:g} s")
 
-    def choose(self, names: Sequence[str], round_: int, seed: int) -> list[str]:
+    def choose(self, names: Sequence[str], round_: int, seed: int, earlier: int = 0) -> list[str]:
         """Return the clients of round `round_` (from 1) in their order, for clients that `check_clients` takes.
 
-        Of importance selection these are all, as each reports its norm, and of a deadline that a network is to predict.
+        The turns of round-robin go on after `earlier` rounds of federations before, with the same clients. Of
+        importance selection these are all, as each reports its norm, and of a deadline that a network is to predict.
         """
         count, rng = self.clients or 0, stream(seed, "selection")
         match self.rule:
@@ -97,7 +99,7 @@ class Selection(Config):
                 assert self.probability is not None
                 chosen = set(np.flatnonzero(rng.random(len(names)) < self.probability).tolist())
             case "round-robin":
-                chosen = {((round_ - 1) * count + place) % len(names) for place in range(count)}
+                chosen = {((earlier + round_ - 1) * count + place) % len(names) for place in range(count)}
             case "deadline":
                 assert self.deadline_s is not None
                 in_time = [self.predicts or self.seconds[name] <= self.deadline_s for name in names]
@@ -120,10 +122,14 @@ class Selection(Config):
     def draw(self, norms: Mapping[str, float], seed: int) -> dict[str, float]:
         """Return the clients that importance selection draws, with the probability of each.
 
-        `norms` are the norms of the clients' updates times their shares of all samples.
+        `norms` are the norms of the clients' updates times their shares of all samples. Each counts as `LONGEST` times
+        their lower median at most, so that fewer than half of the clients, whatever norms they tell, leave the others
+        a part in the draw; the mean stays unbiased, since its weights are by the same probabilities.
         """
         assert self.clients is not None
-        probabilities = optimal_probabilities(np.array([*norms.values()]), self.clients)
+        told = np.array([*norms.values()])
+        middle = float(np.sort(told)[(len(told) - 1) // 2]) if len(told) else 0.0
+        probabilities = optimal_probabilities(np.minimum(told, LONGEST * middle), self.clients)
         drawn = stream(seed, "importance").random(len(norms)) < probabilities
         return {name: float(p) for name, p, taken in zip(norms, probabilities, drawn, strict=True) if taken}
 

@@ -94,10 +94,12 @@ def federate(
     `state`: without it no federation can be repeated, nor gone on with to the same weights.
 
     Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
-    before this one, with the same clients and rules, which count against that budget. Clients train in this process, or
-    several at a time in a `runtime`: `ClientProcesses` of the same clients, or Flower's simulation on Ray; the weights
-    are the same. Clients are pulled to `centre`, where there is one, by the `personal` of the rules. `clients` is asked
-    for a client when it is to train; of updates no more are in memory than the strategy needs.
+    before this one, with the same clients and rules, which count against that budget, and after which the turns of
+    round-robin go on. Where epsilon rests on secret draws of clients, records and ledger do not name them. Clients
+    train in this process, or several at a time in a `runtime`: `ClientProcesses` of the same clients, or Flower's
+    simulation on Ray; the weights are the same. Clients are pulled to `centre`, where there is one, by the `personal`
+    of the rules. `clients` is asked for a client when it is to train; of updates no more are in memory than the
+    strategy needs.
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
     no update, and fewer are left than `rules` ask for (by default half of those asked) or, though `account` lost none,
@@ -128,6 +130,7 @@ def federate(
     if rounds <= done:
         return LocalUpdate(weights, 0, 0.0)
     state = FederationState() if state is None else state
+    account = replace(account, concealed=rules.hides_draws)
     results: list[Result] = []
 
     def serve(grid: Grid, nodes: Mapping[int, str], read_states: ReadStates) -> None:
@@ -349,7 +352,7 @@ class EdgeServer:
         its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are;
         of regional models these are all, and vehicles are pulled to the cloud's from the second cloud round on.
         Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles
-        keep to.
+        keep to. Under central noise the region counts by its number of vehicles, whoever took part.
         """
         start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own
         regional = isinstance(self.rules.personal, RegionalModels)
@@ -368,4 +371,6 @@ class EdgeServer:
         self.begun, self.trained = start, found.weights
         names = [*found.weights] if regional else name_like(found.weights, self.rules.personal_arrays)
         self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
+        if self.rules.privacy is not None and not self.rules.privacy.local:  # no noise covers numbers of samples
+            return replace(found, samples=len(self.vehicles))
         return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody

@@ -22,7 +22,10 @@ FAILED = "failed or lost"  # begins what is told of clients without an update
 
 @dataclass(frozen=True)
 class RoundRecord(Record):
-    """One round: whose updates were combined, who failed, and what the updates say of themselves."""
+    """One round: whose updates were combined, who failed, and what the updates say of themselves.
+
+    Where epsilon rests on secret draws of clients, it says nothing of them: no names, a loss and a number of 0.
+    """
 
     round: int  # from 1
     clients: tuple[str, ...]  # whose updates were combined, by name

@@ -17,6 +17,7 @@ from flcav.perception.distillation import Imitates
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import to_arrays
+from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.recipe import (
     CENTRAL,
     CLOUD,
@@ -172,6 +173,7 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
             "central noise draws in secret; 'privacy.seeded' simulates both"
         )
     _check_numbers(recipe, setting, edge)
+    _check_bare_labels(setting)
     if isinstance(edge, FedMD) and setting.central is None:
         _check_outputs(recipe, setting)
     if setting.distillation.pose_graph and setting.central is None:
@@ -216,6 +218,18 @@ def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> N
         raise InputError(f"{why}, and noise is for one number{instead}")
     if needs_known_number(strategy):
         raise InputError(f"{why}, and {type(strategy).__name__} needs a known one{instead}")
+
+
+def _check_bare_labels(setting: Setting) -> None:
+    """Raise `InputError` for labels that vehicles make together where noise or masks hide what each of them learns."""
+    how = setting.federation
+    averaged = [task for task, kind in setting.labels.items() if LABEL_SOURCES[kind].averaged]
+    if averaged and setting.central is None and (how.privacy is not None or how.secure is not None):
+        hidden = "secure" if how.privacy is None else "privacy"
+        raise InputError(
+            f"{hidden}: with the labels '{setting.labels[averaged[0]]}' of {averaged[0]} each vehicle sends boxes and "
+            "poses that change what others learn from, and neither noise nor masks cover them; choose other labels"
+        )
 
 
 def _plans_joiners(recipe: RunRecipe, setting: Setting) -> bool:

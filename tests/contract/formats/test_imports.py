@@ -5,6 +5,8 @@ import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -110,6 +112,13 @@ def test_an_export_is_imported_as_it_was(name: str, source: Dataset, imported: d
             np.testing.assert_allclose(new.agent_from_sensor[lidar], old.agent_from_sensor["lidar"], atol=1e-6)
         else:
             assert new.time_s == pytest.approx(old.time_s, abs=1e-6)
+
+
+@pytest.mark.parametrize(("share", "scenes", "held_out"), [(0.07, 100, 7), (0.28, 25, 7), (0.2, 11, 3), (0.0, 5, 0)])
+def test_a_share_of_the_scenes_is_the_number_that_it_says(share: float, scenes: int, held_out: int) -> None:
+    keys, manifest = [SimpleNamespace(scene=f"s{i}") for i in range(scenes)], SimpleNamespace(recipe={})
+    dataset = cast(Dataset, SimpleNamespace(keys=keys, manifest=manifest))
+    assert [*split_scenes(dataset, ExportOptions(validation=share)).values()].count("val") == held_out
 
 
 @pytest.mark.parametrize("name", ROUND)

@@ -158,7 +158,68 @@ def test_median_and_trimmed_mean_go_coordinate_by_coordinate():
         np.testing.assert_array_equal(Median().combine(updates[0].weights, updates)[name], middle)
         trimmed = TrimmedMean(0.3).combine(updates[0].weights, updates)[name]
         np.testing.assert_allclose(trimmed, trim_mean(stacked.astype(float), 0.3, axis=0), rtol=1e-6)
-    assert Median().combine(updates[3].weights, updates)["n"] == 0
+    for strategy in (Median(), TrimmedMean(0.3)):
+        assert strategy.combine(updates[3].weights, updates)["n"] == 5  # no single client's either
+
+
+@pytest.mark.parametrize(("fraction", "clients", "out"), [(0.29, 100, 29), (0.07, 100, 7), (0.3, 10, 3), (0.3, 11, 3)])
+def test_a_fraction_of_the_clients_is_the_number_that_it_says(fraction: float, clients: int, out: int):
+    updates = [LocalUpdate({"w": np.array([float(i**3)])}, 1, 0.0) for i in range(clients)]
+    kept = [float(i**3) for i in range(out, clients - out)]
+    assert TrimmedMean(fraction).combine(updates[0].weights, updates)["w"] == pytest.approx(np.mean(kept))
+    TrimmedMean(0.29).check_clients(100)
+
+
+def normalised_updates(honest: int, rng: np.random.Generator, common: float = 1.0) -> list[LocalUpdate]:
+    drift = common * rng.normal(size=400) * 0.01
+    return [
+        LocalUpdate(
+            {
+                "w": drift + rng.normal(size=400) * 0.01,
+                "norm.running_mean": 0.1 * rng.normal(size=8),
+                "norm.running_var": 1.0 + 0.1 * rng.random(8),
+                "norm.num_batches_tracked": np.array(7),
+            },
+            9,
+            0.0,
+        )
+        for _ in range(honest)
+    ]
+
+
+@pytest.mark.parametrize("kept", [1, 4])
+@pytest.mark.parametrize("common", [0.0, 0.5, 2.0])
+def test_krum_adopts_no_liar_s_statistics_and_no_claim_of_samples(kept: int, common: float):
+    """Liars in what is learned send the start, or the mean of three trainings, which are near to all others."""
+    poison = {
+        "norm.running_mean": np.full(8, 1e30),
+        "norm.running_var": np.full(8, -1e30),
+        "norm.num_batches_tracked": np.array(2**60),
+    }
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        honest, start = normalised_updates(7, rng, common), {"w": np.zeros(400)}
+        band = np.mean([each.weights["w"] for each in normalised_updates(3, rng, common)], axis=0)
+        for learned in (start["w"], band):
+            liars = [LocalUpdate({"w": learned, **poison}, 2**62, 0.0)] * 3
+            updates = [*liars, *honest]
+            begun = {**start, **honest[0].weights}
+            found = Krum(byzantine=3, kept=kept).combine(begun, updates)
+            assert [*found] == [*begun]
+            for name in ("norm.running_mean", "norm.running_var"):
+                own = [each.weights[name] for each in honest]
+                assert (np.min(own, axis=0) <= found[name]).all()
+                assert (found[name] <= np.max(own, axis=0)).all()
+            assert found["norm.num_batches_tracked"] == 7
+
+
+def test_multi_krum_weighs_those_that_it_keeps_alike():
+    updates = normalised_updates(8, np.random.default_rng(3))
+    few, many = (replace(updates[2], samples=samples) for samples in (1, 10**15))
+    found = [
+        Krum(byzantine=2, kept=5).combine(each.weights, [*updates[:2], each, *updates[3:]]) for each in (few, many)
+    ]
+    np.testing.assert_array_equal(found[0]["w"], found[1]["w"])
 
 
 @pytest.mark.parametrize("kept", [1, 3])
@@ -178,10 +239,9 @@ def test_krum_chooses_whom_flower_chooses(kept: int):
             updates[int(cast(int, each.metric_records["metrics"]["place"]))]
             for each in select_multikrum(contents, 2, kept)
         ]
-        samples = [each.samples for each in chosen]
         found = Krum(byzantine=2, kept=kept).combine(updates[0].weights, updates)
         for name in ("a", "b"):
-            mean = np.average([each.weights[name] for each in chosen], axis=0, weights=samples)
+            mean = np.mean([each.weights[name] for each in chosen], axis=0)
             np.testing.assert_allclose(found[name], mean, rtol=1e-5)
 
 

@@ -18,8 +18,8 @@ from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
-from flcav.federation.stages import Schedule, federate
-from flcav.federation.state import SERVER, FederationState
+from flcav.federation.stages import EdgeServer, Schedule, federate
+from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import Upload
 from flcav.seeds import derive_seed, stream
@@ -46,10 +46,33 @@ class Mover:
         return LocalUpdate({name: (array + 0.25).astype(np.float32) for name, array in weights.items()}, 2, 0.5)
 
 
+class Watched(Mover):
+    """Moves every weight, notes by which seed, and says that it has as many samples as it is given."""
+
+    def __init__(self, seeds: list[int], samples: int) -> None:
+        self.seeds, self.samples = seeds, samples
+
+    def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
+        self.seeds.append(seed)
+        update = super().train(weights, steps=steps, learning_rate=learning_rate, seed=seed)
+        return replace(update, samples=self.samples, loss=float(self.samples))
+
+
 def run(rules: Rules, state: FederationState, number: int = 3) -> Weights:
     account = Account(ledger(10.0), "edge", "mover", "wireless")
     clients, schedule = {name: Mover() for name in NAMES}, replace(SCHEDULE, rounds=number)
     return federate(clients, START, schedule, account, rules=rules, state=state).weights
+
+
+def watch(rules: Rules, number: int) -> tuple[list[list[str]], FederationState, Account]:
+    """Return who trained in each round of a federation in which vehicles have 1, 4, 16, ... samples."""
+    account, state = Account(ledger(90.0), "edge", "mover", "wireless"), FederationState()
+    seeds: dict[str, list[int]] = {f"grid/{name}": [] for name in NAMES}
+    clients = {name: Watched(own, 4**i) for i, (name, own) in enumerate(seeds.items())}
+    schedule = replace(SCHEDULE, rounds=number)
+    federate(clients, START, schedule, account, rules=rules, state=state)
+    works = [schedule.work(round_).seed for round_ in range(1, number + 1)]
+    return [[name for name in seeds if derive_seed(seed, name) in seeds[name]] for seed in works], state, account
 
 
 def listen(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
@@ -139,18 +162,50 @@ def test_the_same_secrets_give_the_same_weights_and_others_do_not(privacy: Priva
 
 def test_draws_that_amplify_epsilon_are_not_those_of_the_seed():
     for selection in (POISSON, UNIFORM):
-        by_seed = [selection.choose(NAMES, number, SCHEDULE.work(number).seed) for number in range(1, 21)]
+        names = [f"grid/{name}" for name in NAMES]
+        by_seed = [selection.choose(names, number, SCHEDULE.work(number).seed) for number in range(1, 21)]
 
         def drawn(privacy: Privacy, selection: Selection = selection) -> list[list[str]]:
-            state = FederationState()
-            run(Rules(privacy=privacy, selection=selection), state, 20)
-            return [[*record.clients] for record in state.records]
+            return watch(Rules(privacy=privacy, selection=selection), 20)[0]
 
         found = [drawn(CENTRAL) for _ in range(2)]
         assert found[0] != by_seed != found[1] != found[0]
         assert np.mean([len(each) for each in found[0]]) == pytest.approx(2.5 if selection is POISSON else 2, abs=1.2)
         assert drawn(CENTRAL.model_copy(update={"seeded": True})) == by_seed
         assert drawn(LOCAL) == by_seed  # is not amplified
+
+
+@pytest.mark.parametrize("selection", [POISSON, UNIFORM], ids=lambda each: each.rule)
+def test_records_and_ledger_do_not_tell_who_was_drawn_in_secret(selection: Selection):
+    drawn, state, account = watch(Rules(privacy=CENTRAL, selection=selection), 6)
+    assert len({*map(tuple, drawn)}) > 1
+    assert state.records == [RoundRecord(number, (), epsilon=1.0) for number in range(1, 7)]
+    entries = account.ledger.entries
+    assert {entry.client for entry in entries} == {"grid/undisclosed"}
+    sizes = {(entry.round, entry.direction, entry.bytes) for entry in entries}
+    assert len(sizes) == len({(round_, direction) for round_, direction, _ in sizes})  # whatever samples and losses are
+    assert len(entries) == 2 * sum(map(len, drawn))
+    told, state, account = watch(Rules(privacy=CENTRAL.model_copy(update={"seeded": True}), selection=selection), 6)
+    assert [[*record.clients] for record in state.records] == told
+    assert {entry.client for entry in account.ledger.entries} == {name for each in told for name in each}
+
+
+def test_weights_of_regions_do_not_tell_who_was_drawn():
+    """Each vehicle has a power of two of samples, so that the sum of a draw would name it."""
+    rules = Rules(privacy=CENTRAL, selection=POISSON)
+    for seed in range(10):
+        account = Account(ledger(90.0), "cloud", "mover", "wireless")
+        servers = {
+            region: EdgeServer(
+                {f"{region}/{i}": Watched([], 2**i) for i in range(number)}, 1, account, START, rules=rules
+            )
+            for region, number in (("grid", 6), ("ring", 3))
+        }
+        clients: dict[str, Any] = {**servers}
+        wireline, schedule = Account(ledger(90.0), "cloud", "mover", "wireline"), replace(SCHEDULE, rounds=1, seed=seed)
+        found = federate(clients, START, schedule, wireline, rules=rules.of_servers()).weights["w"].astype(float)
+        grid, ring = (server.trained["w"].astype(float) for server in servers.values())
+        np.testing.assert_allclose(found, (6 * grid + 3 * ring) / 9, atol=1e-6)
 
 
 @pytest.mark.parametrize(

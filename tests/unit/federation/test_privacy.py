@@ -5,7 +5,14 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from dp_accounting import GaussianDpEvent, NeighboringRelation, PoissonSampledDpEvent, pld
+from dp_accounting import (
+    GaussianDpEvent,
+    NeighboringRelation,
+    PoissonSampledDpEvent,
+    SampledWithoutReplacementDpEvent,
+    pld,
+    rdp,
+)
 from pydantic import ValidationError
 from regression import ledger
 from scipy.optimize import brentq
@@ -19,12 +26,13 @@ from flcav.federation.privacy import (
     average_privately,
     change_norm,
     clip_change,
+    compose_epsilon,
     most_participations,
 )
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
-from flcav.federation.stages import Schedule, check_federation, federate
+from flcav.federation.stages import EdgeServer, Schedule, check_federation, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedadam import FedAdam
@@ -79,6 +87,19 @@ def test_clipping_bounds_the_norm_of_all_arrays_together():
     np.testing.assert_allclose(clipped["b"], change["b"] * 0.5 / length)
     np.testing.assert_array_equal(clip_change(change, 2 * length)["a"], change["a"])
     assert not clip_change({"a": np.zeros(3)}, 1.0)["a"].any()
+
+
+@pytest.mark.parametrize("clip", [1e3, 1.0, 1e-3, 1e-6])
+@pytest.mark.parametrize(("kind", "longest"), [(np.float16, 6e4), (np.float32, 3.3e38), (np.float64, 1e120)])
+def test_no_clipped_change_is_longer_than_the_bound_by_rounding(kind: Any, longest: float, clip: float):
+    rng = np.random.default_rng(0)
+    for size in (1, 10, 10**4, 10**5):
+        for length in np.geomspace(1e-3, longest, 7):
+            for values in (np.full(size, length), length * rng.uniform(-1, 1, size)):
+                change = {"w": values.astype(kind), "b": np.array([-length]).astype(kind)}
+                clipped = clip_change(change, clip)
+                assert change_norm(clipped) <= clip
+                assert change_norm(clipped) == pytest.approx(min(clip, change_norm(change)))
 
 
 @pytest.mark.parametrize("seeded", [False, True])
@@ -162,6 +183,71 @@ def test_a_client_is_accounted_for_the_rounds_that_it_takes_part_in():
         assert most_participations(turns, 10, number) == counts.max()
     privacy = Privacy(clip=1.0, noise=2.0)
     assert account_epsilon(privacy, turns, NAMES, 5) == account_epsilon(privacy, EVERY, NAMES, 2)
+
+
+class Counting(Stride):
+    """Counts its trainings."""
+
+    taken = 0
+
+    def train(self, weights: Weights, **how: Any) -> LocalUpdate:
+        self.taken += 1
+        return super().train(weights, **how)
+
+
+@pytest.mark.parametrize("case", range(20))
+def test_the_account_is_of_the_client_that_took_part_most_in_all_stages(case: int):
+    """Stage II, and cloud rounds of several edge rounds each after it; counted are the trainings themselves."""
+    rng = np.random.default_rng(case)
+    number, edge, k, cloud = (int(rng.integers(low, high)) for low, high in ((2, 8), (1, 6), (1, 4), (1, 4)))
+    names, total, some = NAMES[:number], edge + k * cloud, int(rng.integers(1, number + 1))
+    seconds = dict(zip(names, rng.uniform(0, 1, number).tolist(), strict=True)) | {names[0]: 0.1}
+    selection = (
+        Selection(rule="round-robin", clients=some),
+        Selection(),
+        Selection(rule="deadline", deadline_s=0.5, seconds=seconds),
+        Selection(rule="uniform", clients=some),
+        Selection(rule="poisson", probability=0.3),
+    )[case % 5 if case < 10 else 0]
+    privacy = Privacy(clip=1.0, noise=1.5, where="local" if case % 2 else "central", seeded=True)
+    rules, vehicles = Rules(privacy=privacy, selection=selection), {name: Counting(1.0) for name in names}
+    account, state = Account(ledger(99.0), "edge", "stride", "wireless"), FederationState()
+    given: Any = (START, Schedule(edge, 1, 0.1, 0.1, case), account)
+    found = federate({**vehicles}, *given, rules=rules, state=state)
+    records, state = state.records, FederationState()
+    server = EdgeServer({**vehicles}, k, account, found.weights, rules=rules, state=state, earlier=edge)
+    further: Any = ({"ring": server}, found.weights, Schedule(cloud, 1, 0.1, 0.1, case), account)
+    federate(*further, rules=rules.of_servers())
+    records += state.records
+    assert len(records) == total
+    most = max(each.taken for each in vehicles.values())
+    if privacy.amplified(selection):
+        relation = NeighboringRelation.REPLACE_ONE if selection.clients else NeighboringRelation.ADD_OR_REMOVE_ONE
+        sampled = (
+            SampledWithoutReplacementDpEvent(number, some, GaussianDpEvent(0.75))
+            if selection.clients
+            else PoissonSampledDpEvent(0.3, GaussianDpEvent(1.5))
+        )
+        accountant = rdp.RdpAccountant(neighboring_relation=relation).compose(sampled, total)
+        assert records[-1].epsilon == pytest.approx(accountant.get_epsilon(privacy.delta))
+    elif selection.rule in ("uniform", "poisson"):  # local noise: by chance it may be in every round
+        assert records[-1].epsilon == account_epsilon(privacy, EVERY, names, total)
+    else:
+        assert records[-1].epsilon == account_epsilon(privacy, EVERY, names, most)
+
+
+@pytest.mark.parametrize("selection", [EVERY, UNIFORM, POISSON, Selection(rule="round-robin", clients=4)])
+def test_several_trainings_with_one_client_s_data_compose(selection: Selection):
+    privacy = Privacy(clip=1.0, noise=1.5)
+    one = account_epsilon(privacy, selection, NAMES, 5)
+    four = compose_epsilon(privacy, selection, [(10, 5)] * 4)
+    assert one < four < 4 * one
+    if selection.rule == "round-robin":  # each begins with the same client, whose turn comes twice in five rounds
+        assert four == account_epsilon(privacy, EVERY, NAMES, 8)
+        assert compose_epsilon(privacy, selection, [(10, 20)]) == four
+    else:
+        assert four == pytest.approx(account_epsilon(privacy, selection, NAMES, 20))
+    assert compose_epsilon(privacy, selection, [(10, 5), (7, 0)]) == one
 
 
 def test_rounds_stop_at_the_budget():

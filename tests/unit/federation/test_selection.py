@@ -120,6 +120,19 @@ def test_the_mean_under_importance_selection_is_unbiased():
     assert (np.abs(np.mean(estimates, axis=0) - mean) < 4 * error).all()
 
 
+@pytest.mark.parametrize(("lie", "liars"), [(1.7e308, 1), (1.7e308, 2), (1e30, 3), (np.inf, 3), (1e9, 4)])
+def test_norms_of_a_minority_that_lies_neither_fill_nor_empty_the_draw(lie: float, liars: int):
+    selection, honest = Selection(rule="importance", clients=3), {f"cav{i}": 1.0 + i for i in range(8)}
+    told = honest | {f"liar{i}": lie for i in range(liars)}
+    draws = [selection.draw(told, seed) for seed in range(300)]
+    assert np.mean([len(each) for each in draws]) == pytest.approx(3, abs=0.3)
+    assert np.mean([sum(name in honest for name in each) for each in draws]) > 0.9
+    alike = {name: 1.0 + i / 4 for i, name in enumerate(honest)}  # no norm is that long: as they are told
+    expected = optimal_probabilities(np.array([*alike.values()]), 3)
+    found = {name: p for seed in range(60) for name, p in selection.draw(alike, seed).items()}
+    assert [found[name] for name in alike] == [*expected]
+
+
 def chances(selection: Selection, names: Sequence[str]) -> dict[tuple[str, ...], float]:
     """Return the probability of every set of clients that a selection may choose."""
     subsets = [set_ for size in range(len(names) + 1) for set_ in combinations(names, size)]
@@ -142,7 +155,7 @@ def test_unbiased_rounds_are_those_of_all_clients_in_the_mean_of_all_draws(rule:
     everybody, expected, biased = end(Selection()), np.zeros(3), np.zeros(3)
     plain = Selection(**RULES[rule])
     for drawn, chance in chances(plain, [*clients]).items():
-        monkeypatch.setattr(Selection, "choose", lambda own, names, round_, seed, drawn=drawn: [*drawn])
+        monkeypatch.setattr(Selection, "choose", lambda own, names, round_, seed, earlier=0, drawn=drawn: [*drawn])
         expected += chance * end(Selection(**RULES[rule], unbiased=True))
         biased += chance * end(plain)
     np.testing.assert_allclose(expected, everybody, atol=1e-6)

@@ -127,6 +127,11 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
     assert ends[0] == ends[1]
     assert {name: len(times) for name, times in read_times(tmp_path / "timed").items()} == {"a/cav0": 3, "a/cav1": 3}
     assert read_times(tmp_path / "plain") == {}
+    secret = Rules.model_validate({"privacy": PRIVACY, "selection": {"rule": "uniform", "clients": 1}})
+    how = (FEDAVG, 0, Ledger(Budget(1.0, 1.0)), tmp_path / "secret", ignore_progress)
+    schedule = learning.schedule(1, 2, "edge", "a")
+    federate_edge(EdgeFederation(learning, network, clients, schedule, *how), secret, timed=True)
+    assert not (tmp_path / "secret" / TIMES).exists()  # its lines would name who was drawn
 
 
 def test_unbiased_federations_are_timed_too(tmp_path: Path) -> None:

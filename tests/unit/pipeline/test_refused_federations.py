@@ -148,6 +148,25 @@ def test_a_budget_below_one_round_is_refused_with_the_recipe() -> None:
     check_federations(*settings({"other": small | amplified}))
 
 
+@pytest.mark.parametrize(
+    ("federation", "said"),
+    [
+        ({"privacy": PRIVACY}, "privacy"),
+        ({"privacy": PRIVACY | {"where": "local"}}, "privacy"),
+        ({"secure": {}}, "secure"),
+        ({"secure": {}, "privacy": PRIVACY | {"where": "local"}}, "privacy"),
+    ],
+)
+def test_labels_that_vehicles_make_together_are_refused_where_updates_are_hidden(federation: Any, said: str) -> None:
+    recipe, _ = settings({"other": federation})
+    for kind in ("ideal-road", "road"):  # boxes of the road alone
+        check_federations(recipe, resolve_settings(recipe, {"objects": kind}).values())
+    averaged = resolve_settings(recipe, {"objects": "road-average"}).values()
+    with pytest.raises(InputError, match=rf"arm 'other': {said}: with the labels 'road-average' of objects each vehi"):
+        check_federations(recipe, averaged)
+    check_federations(recipe, [replace(each, central="federate") for each in averaged])
+
+
 def test_what_is_drawn_late_or_in_secret_cannot_be_driven() -> None:
     poisson, privacy = {"rule": "poisson", "probability": 0.5}, {"clip": 1, "noise": 1}
     for federation, said in (

@@ -11,7 +11,7 @@ from flcav.fusion.distillation import Distillation
 from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
 from flcav.pipeline.arms import resolve_settings
-from flcav.pipeline.collecting.caveats import list_caveats
+from flcav.pipeline.collecting.caveats import PLACED_BARE, list_caveats
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels import pseudo_labels
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold, select_frames_near
@@ -92,6 +92,25 @@ def test_the_road_detector_is_said_to_have_been_trained_where_it_labels() -> Non
     assert caveats("road-average", "hilly_suburb") == ("trained road detector", told)
     assert caveats("own-detections", "arterial") == ()
     assert caveats("own-detections", "arterial", arm="road") == (told,)
+
+
+@pytest.mark.parametrize("hidden", [{"privacy": {"clip": 1, "noise": 1}}, {"secure": {}}])
+def test_places_of_errors_are_said_to_be_sent_bare_where_updates_are_hidden(hidden: Any) -> None:
+    def caveats(placed: Any, federation: Any, **arm: Any) -> tuple[str, ...]:
+        recipe = RunRecipe.model_validate(
+            {
+                "tasks": {"objects": {"history": "objects"}},
+                "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate"}},
+                "budgets_mb": {"wireless": 1, "wireline": 1},
+                "placement": placed,
+                "arms": {"other": {"federation": federation, **arm}},
+            }
+        )
+        return list_caveats(recipe, (), resolve_settings(recipe, {"objects": "own-detections"}).values())
+
+    assert caveats({}, hidden) == (PLACED_BARE,)
+    assert caveats({}, {}) == caveats({}, hidden, central="federate") == ()
+    assert caveats({"rule": "none", "tasks": []}, hidden) == ()
 
 
 def test_a_vehicle_s_messages_are_priced_for_all_spins_of_its_windows(monkeypatch: pytest.MonkeyPatch) -> None:

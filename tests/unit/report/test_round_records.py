@@ -1,6 +1,8 @@
 """Records of rounds: from a federation's checkpoint and ledger, as a table and as curves."""
 
+import json
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -11,11 +13,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.state import RoundRecord
 from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
+from flcav.pipeline.collecting.caveats import PLACED_BARE
 from flcav.pipeline.federations.checkpoint import Checkpoint
 from flcav.pipeline.federations.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import LEDGER
+from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.results.training import FederatedRound, LabelQuality, StageResult
 from flcav.report.pages import html
 from flcav.report.pages.run_page import page
@@ -103,3 +107,17 @@ def test_the_page_has_precision_and_recall_of_labels_where_they_were_measured() 
     assert "<td>grid</td><td>1</td><td>8</td><td>10</td><td>0.750</td><td>0.600</td>" in text
     assert Run.from_json(measured.as_json(), "run").arms[MAIN].stages == (stage,)
     assert "Labels that vehicles learn from" not in html.render(page(run), {})
+
+
+def test_the_page_and_the_results_have_what_is_spent_together() -> None:
+    plain = made_up_run()
+    spent = replace(plain.arms[MAIN], privacy=PrivacySpent(21.44, 1e-5, False))
+    run = replace(plain, arms={**plain.arms, MAIN: spent})
+    told = "a vehicle's whole data in all tasks and trainings together: epsilon 21.44 at delta 1e-05"
+    assert f"main, {told}." in unescape(html.render(page(run), {}))
+    assert told not in unescape(html.render(page(plain), {}))
+    hidden = unescape(html.render(page(replace(run, caveats=(*run.caveats, PLACED_BARE))), {}))
+    assert hidden.count(PLACED_BARE) == 1
+    assert f"Privacy: {PLACED_BARE}." in hidden
+    assert Run.from_json(run.as_json(), "run").arms[MAIN].privacy == spent.privacy
+    assert '"privacy": {"epsilon"' not in json.dumps(plain.as_json())

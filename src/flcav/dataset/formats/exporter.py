@@ -92,7 +92,7 @@ def split_scenes(dataset: Dataset, options: ExportOptions) -> Mapping[str, str]:
                     f"{dataset.folder}: its recipe says 'split: {recorded_for}', so --validation is not for it"
                 )
             return dict.fromkeys(scenes, split)
-    held_out = min(math.ceil(options.validation * len(scenes)), len(scenes) - 1)
+    held_out = min(math.ceil(round(options.validation * len(scenes), 9)), len(scenes) - 1)
     first = len(scenes) - held_out
     return {scene: "val" if i >= first else "train" for i, scene in enumerate(scenes)}
 

@@ -11,6 +11,8 @@ from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link
 
+UNDISCLOSED = "undisclosed"  # in the place of a client's name
+
 
 @dataclass(frozen=True)
 class Outage:
@@ -29,6 +31,7 @@ class Account:
     task: str  # its name
     link: Link  # wireless or wireline
     outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by round and client
+    concealed: bool = False  # whether nobody is to know who was drawn: entries have a client's region alone
 
     def find_away(self, round_: int) -> dict[str, str]:
         """Return by client why it is not there when a round begins: all that take no part in it."""
@@ -37,6 +40,9 @@ class Account:
 
     def describe(self, direction: Direction, round_: int, client: str, size: int) -> LedgerEntry:
         """Return the entry of a message of `size` bytes."""
+        if self.concealed:
+            region, slash, _ = client.rpartition("/")
+            client = f"{region}{slash}{UNDISCLOSED}"
         return LedgerEntry(self.stage, self.task, self.link, direction, round_, client, size)
 
 

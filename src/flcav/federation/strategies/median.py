@@ -10,15 +10,20 @@ from flcav.federation.trainable import Update, Weights
 
 
 def combine_coordinates(
-    updates: Sequence[Update], combined: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    models: Sequence[Weights], combined: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> dict[str, NDArray[np.number]]:
-    """Return `combined` of each floating array of all clients, stacked (clients, ...); of any other the first's."""
+    """Return `combined` of each floating array of all clients, stacked (clients, ...); of others the lower median."""
     return {
-        name: combined(np.stack([update.weights[name].astype(np.float64) for update in updates])).astype(array.dtype)
+        name: combined(np.stack([own[name].astype(np.float64) for own in models])).astype(array.dtype)
         if np.issubdtype(array.dtype, np.floating)
-        else array
-        for name, array in updates[0].weights.items()
+        else np.sort(np.stack([own[name] for own in models]), axis=0)[(len(models) - 1) // 2]
+        for name, array in models[0].items()
     }
+
+
+def take_median(models: Sequence[Weights]) -> dict[str, NDArray[np.number]]:
+    """Return the coordinate-wise median of all clients' arrays."""
+    return combine_coordinates(models, lambda stacked: np.median(stacked, axis=0))
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class Median:
 
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
         """Return the median of the updates' weights, coordinate by coordinate."""
-        return combine_coordinates(updates, lambda stacked: np.median(stacked, axis=0))
+        return take_median([update.weights for update in updates])
 
     def check_clients(self, clients: int) -> None:
         """Accept any number of clients: the median of two is their mean."""

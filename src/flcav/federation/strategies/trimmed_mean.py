@@ -1,5 +1,6 @@
 """Coordinate-wise trimmed mean of the clients' weights (Yin et al., ICML 2018, option II)."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -21,14 +22,18 @@ class TrimmedMean:
 
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
         """Return the trimmed mean of the updates' weights, coordinate by coordinate."""
-        out = int(self.fraction * len(updates))
+        out = self._count_out(len(updates))
 
         def trimmed(stacked: NDArray[np.float64]) -> NDArray[np.float64]:
             return np.sort(stacked, axis=0)[out : len(stacked) - out].mean(axis=0)
 
-        return combine_coordinates(updates, trimmed)
+        return combine_coordinates([update.weights for update in updates], trimmed)
 
     def check_clients(self, clients: int) -> None:
         """Raise `InputError` where the fraction of so few clients is less than one of them."""
-        if self.fraction and int(self.fraction * clients) == 0:
+        if self.fraction and self._count_out(clients) == 0:
             raise InputError(f"trimmed-mean: a fraction of {self.fraction:g} of {clients} clients leaves nobody out")
+
+    def _count_out(self, clients: int) -> int:
+        """Return how many are left out at either end; of 100 clients .29 are 29, though .29 * 100 is 28.999..."""
+        return math.floor(round(self.fraction * clients, 9))

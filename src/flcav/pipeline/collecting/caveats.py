@@ -1,4 +1,4 @@
-"""Caveats of a run's labels, which are stated with its results."""
+"""Caveats of a run's labels and of its privacy, which are stated with its results."""
 
 from collections.abc import Iterable
 
@@ -8,12 +8,15 @@ from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.recipe import RunRecipe
 from flcav.world.map.town import HILLY
 
+PLACED_BARE = "vehicles send the places of their errors as they are: neither noise nor masks cover the error registry"
+
 
 def list_caveats(recipe: RunRecipe, labels: Iterable[str], settings: Iterable[Setting]) -> tuple[str, ...]:
-    """Return the caveats of the kinds `labels`, and of the road detector where it labels in a town it was trained in.
+    """Return the caveats of the kinds `labels`, of privacy, and of a road detector in a town that it was trained in.
 
     settings: those of all arms.
     """
+    settings = [*settings]
     own = dict.fromkeys(LABEL_SOURCES[kind].caveat for kind in labels)
     labelled = {
         region
@@ -25,7 +28,14 @@ def list_caveats(recipe: RunRecipe, labels: Iterable[str], settings: Iterable[Se
         region for region in recipe.with_role("federate") if region in labelled and _was_trained_in(recipe, region)
     ]
     told = f"the road detector was trained in {' and '.join(known)}, so that its labels are better there than elsewhere"
-    return (*filter(None, own), *([told] if known else []))
+    bare = [PLACED_BARE] if any(_places_bare(setting) for setting in settings) else []
+    return (*filter(None, own), *([told] if known else []), *bare)
+
+
+def _places_bare(setting: Setting) -> bool:
+    """Return whether vehicles whose updates noise or masks hide send the places of their errors as they are."""
+    hidden = setting.federation.privacy is not None or setting.federation.secure is not None
+    return hidden and setting.central is None and bool(setting.placement.tasks)
 
 
 def _was_trained_in(recipe: RunRecipe, region: str) -> bool:

@@ -1,5 +1,6 @@
 """Assembly of a run's results from its finished steps."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from flcav.pipeline.collecting.differences import list_differences
 from flcav.pipeline.collecting.findings import findings
 from flcav.pipeline.collecting.history import gaps_closed
 from flcav.pipeline.collecting.tests import collect_regional_tests, collect_test, number_retrainings
+from flcav.pipeline.federations.spent import Training, compose_trainings
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.provenance import provenance
@@ -97,7 +99,21 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
         earlier=tuple(earlier) or None,
         regional=collect_regional_tests(graph, work, arm) or None,
         retrained=_retrained(graph, work, arm) if CLOUD in arm.stages else None,
+        privacy=None if arm.central else compose_trainings(arm.federation, list_trainings(graph, work, arm)),
     )
+
+
+def list_trainings(graph: Graph, work: Path, arm: Setting) -> Iterator[Training]:
+    """Yield the trainings of every task with a region's vehicles, an arm's retrainings included."""
+    per_cloud_round = arm.federation.edge_rounds_per_cloud_round
+    for name in (name_repeat(arm.name, number) for number in (0, *number_retrainings(graph))):
+        for region in arm.regions:
+            for task in graph.recipe.tasks:
+                stages = {
+                    stage: StageResult.load(work / graph.names.stage(name, stage, region, task)) for stage in arm.stages
+                }
+                rounds = sum(own.rounds * (per_cloud_round if at == CLOUD else 1) for at, own in stages.items())
+                yield Training(region, stages[EDGE].clients, rounds)
 
 
 def _retrained(graph: Graph, work: Path, arm: Setting) -> tuple[StageResult, ...] | None:

@@ -8,12 +8,14 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 from flcav.config import InputError
 from flcav.files import atomic_path
 from flcav.pipeline.arms import check_federations
 from flcav.pipeline.federations.checkpoint import DAMAGED, LAST, Checkpoint
 from flcav.pipeline.federations.rounds import LOSS
+from flcav.pipeline.federations.spent import Training, compose_trainings
 from flcav.pipeline.federations.timing import TrainTimes, read_times, summarise_times
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.graph import Graph
@@ -21,11 +23,13 @@ from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
 from flcav.pipeline.results.saved import WEIGHTS, Saved
+from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.results.training import Round, StageResult, Watched
 from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.steps import Notify, Stale, Step, ignore_steps, run_steps
 from flcav.pipeline.work.edge import EdgeSettings, edge_step
 from flcav.pipeline.work.settings import make_step
+from flcav.records import LEFT_OUT
 
 WORK, RESULTS, TRAIN_TIMES = "work", "federation.json", "times.json"
 FEDERATE = "federate"  # in the names of the steps
@@ -48,6 +52,7 @@ class Federations(Saved):
     arm: str
     federations: tuple[Federation, ...]
     provenance: Provenance
+    privacy: Annotated[PrivacySpent | None, LEFT_OUT] = None  # all tasks together; None: no noise
 
 
 def federate_regions(
@@ -89,7 +94,9 @@ def federate_regions(
 
     run_steps([*before, *alone.values()], out / WORK, jobs=1, notify=tell, stale=stale)
     found = tuple(_collect(graph, out, name, about[1]) for name, about in asked.items())
-    results = Federations(recipe, arm, found, provenance(recipe.seed))
+    trainings = [Training(each.result.region or "", each.result.clients, each.result.rounds) for each in found]
+    spent = compose_trainings(graph.settings[arm].federation, trainings)
+    results = Federations(recipe, arm, found, provenance(recipe.seed), spent)
     results.save(out, RESULTS)
     return results
 

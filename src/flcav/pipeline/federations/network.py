@@ -93,7 +93,7 @@ def drive_rounds(
     for number, seed in enumerate(seeds, start=1):
         links = scenes[(earlier + number - 1) % len(scenes)]
         present = {name for name, here in zip(links.vehicle, links.present[0].tolist(), strict=True) if here}
-        chosen = rules.selection.choose(fleet.clients, number, seed)
+        chosen = rules.selection.choose(fleet.clients, number, seed, earlier)
         outages |= {(number, each): Outage(AWAY) for each in chosen if fleet.work(each).client not in present}
         there = [each for each in chosen if (number, each) not in outages]
         if rules.selection.predicts:

@@ -8,7 +8,7 @@ from typing import Any
 from safetensors.numpy import load_file, save
 
 from flcav.config import InputError
-from flcav.federation.privacy import SEEDED, Privacy
+from flcav.federation.privacy import Privacy
 from flcav.federation.rounds import OnRound
 from flcav.federation.state import FederationState, describe_failures
 from flcav.federation.strategies.fedavg import average
@@ -20,6 +20,7 @@ from flcav.perception.weights import from_arrays, save_network, to_arrays
 from flcav.pipeline.federations.checkpoint import Checkpoint, find_checkpoint
 from flcav.pipeline.federations.secrets import read_secrets, remove_secrets, write_secrets
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
+from flcav.pipeline.results.spending import PrivacySpent
 from flcav.progress import Report
 
 LOSS = "loss"  # begins the note of a round
@@ -131,8 +132,7 @@ class FederationCheckpoints:
         private = [epsilon for epsilon in spent if epsilon is not None]
         if self._privacy is None or not private:
             return []
-        seeded = f" ({SEEDED})" if self._privacy.seeded else ""
-        return [f"epsilon {max(private):.2f} at delta {self._privacy.delta:g}{seeded}"]
+        return [PrivacySpent(max(private), self._privacy.delta, self._privacy.seeded).describe()]
 
     def _tell_failures(self) -> list[str]:
         """Return who failed or was lost since the last note, in words; of stage III in all rounds of edge servers."""

@@ -10,6 +10,7 @@ from flcav.pipeline.recipe import RunRecipe
 from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.plans import Plan, RoundPlan
 from flcav.pipeline.results.saved import Saved
+from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.results.tests import Difference, Finding, RegionalTest, Test, Tested
 from flcav.pipeline.results.training import Pretrained, StageResult, Watched
 from flcav.records import LEFT_OUT
@@ -49,6 +50,7 @@ class ArmResult:
     retrained: Annotated[tuple[StageResult, ...] | None, LEFT_OUT] = (
         None  # stage III of each retraining, in their order
     )
+    privacy: Annotated[PrivacySpent | None, LEFT_OUT] = None  # all tasks and retrainings together; None: no noise
 
     @property
     def plans(self) -> tuple[Plan, ...]:

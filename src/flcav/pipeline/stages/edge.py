@@ -80,7 +80,8 @@ def federate_edge(
     """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
 
     A privacy budget may end it before the schedule's end. Vehicles train in so many `processes` of a `runtime` of
-    `RUNTIMES`, to the same weights; where that is `timed`, their times are kept, see `read_times`. The vehicles that
+    `RUNTIMES`, to the same weights; where that is `timed`, their times are kept, see `read_times`,
+    unless nobody is to know who was drawn. The vehicles that
     `outages` name by round are lost in it. Under `replanning` the number of rounds, who joins them and who is lost are
     those of the plan before each.
     """
@@ -99,7 +100,7 @@ def federate_edge(
         if own.shared is None
         else (partial(federate_outputs, own.shared), give_outputs(own.clients, own.shared, to_arrays(own.network)))
     )
-    clients = time_clients(clients, own.folder) if timed else clients
+    clients = time_clients(clients, own.folder) if timed and not rules.hides_draws else clients
     with open_runtime(runtime, clients, processes) as where:
         how["runtime"] = where
 

@@ -16,6 +16,7 @@ from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.arms import Names, resolve_settings
+from flcav.pipeline.collecting.caveats import PLACED_BARE
 from flcav.pipeline.collecting.findings import WORDS
 from flcav.pipeline.federations.network import CLOCK
 from flcav.pipeline.federations.records import list_rounds
@@ -26,6 +27,7 @@ from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.run import LinkUse, Run
 from flcav.pipeline.results.saved import ERRORS
+from flcav.pipeline.results.spending import TOGETHER
 from flcav.pipeline.results.tests import SweepComparison, SweepDetections
 from flcav.pipeline.running import WORK
 from flcav.report import style
@@ -109,11 +111,14 @@ def page(run: Run) -> dict[str, Any]:
         "delta": f"{recipe.federation.privacy.delta:g}" if recipe.federation.privacy else None,
         "divergences": [row for row in rounds if row["divergence"] is not None],
         "seeded": SEEDED if recipe.federation.privacy and recipe.federation.privacy.seeded else None,
+        "together": TOGETHER,
+        "spent": {arm: result.privacy.describe() for arm, result in run.arms.items() if result.privacy is not None},
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
         "statistics": [(stage.task, each) for stage in main.stages for each in stage.statistics or ()],
-        "caveats": run.caveats,
+        "caveats": [caveat for caveat in run.caveats if caveat != PLACED_BARE],
+        "bare": PLACED_BARE if PLACED_BARE in run.caveats else None,
         "elapsed_s": run.elapsed_s,
         "provenance": run.provenance,
     }

@@ -1,0 +1,21 @@
+"""Record of the privacy that a vehicle spends in all trainings with its data."""
+
+from dataclasses import dataclass
+
+from flcav.federation.privacy import SEEDED
+from flcav.records import Record
+
+TOGETHER = "a vehicle's whole data in all tasks and trainings together"
+
+
+@dataclass(frozen=True)
+class PrivacySpent(Record):
+    """Epsilon and delta of differential privacy, of one client's whole data."""
+
+    epsilon: float
+    delta: float
+    seeded: bool  # whether who knows the run's seed can draw the noise again
+
+    def describe(self) -> str:
+        """Return it in words; of seeded noise with whom it does not hold against."""
+        return f"epsilon {self.epsilon:.2f} at delta {self.delta:g}" + (f" ({SEEDED})" if self.seeded else "")

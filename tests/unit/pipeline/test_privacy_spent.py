@@ -1,0 +1,71 @@
+"""Privacy that a vehicle spends in all trainings with its data, against an account of every participation."""
+
+import math
+from pathlib import Path
+
+import pytest
+from dp_accounting import GaussianDpEvent, rdp
+
+from flcav.federation.privacy import SEEDED, Privacy
+from flcav.federation.rules import Rules
+from flcav.federation.selection import Selection
+from flcav.pipeline.arms import name_repeat
+from flcav.pipeline.collecting.collect import list_trainings
+from flcav.pipeline.federations.spent import Training, compose_trainings
+from flcav.pipeline.graph.graph import Graph
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, RunRecipe
+from flcav.pipeline.results.spending import PrivacySpent
+from flcav.pipeline.results.training import StageResult
+
+PRIVACY = {"clip": 1.0, "noise": 1.0}
+
+
+def composed(participations: int) -> float:
+    return rdp.RdpAccountant().compose(GaussianDpEvent(1.0), participations).get_epsilon(1e-5)
+
+
+def test_tasks_and_retrainings_compose_and_do_not_add_up() -> None:
+    rules = Rules(privacy=Privacy.model_validate(PRIVACY))
+    one, four = (compose_trainings(rules, [Training("grid", 4, 3)] * number) for number in (1, 4))
+    assert one is not None
+    assert four is not None
+    assert (one.epsilon, four.epsilon) == pytest.approx((composed(3), composed(12)))
+    assert f"{one.epsilon:.0f} {four.epsilon:.0f}" == "9 21"
+    elsewhere = compose_trainings(rules, [Training("grid", 4, 3), Training("ring", 4, 3)])  # other vehicles
+    assert elsewhere == one
+    assert compose_trainings(rules, [Training("grid", 4, 0)]) is None
+    assert compose_trainings(Rules(), [Training("grid", 4, 3)]) is None
+    assert one.describe() == f"epsilon {composed(3):.2f} at delta 1e-05"
+    assert PrivacySpent(1.0, 1e-5, True).describe() == f"epsilon 1.00 at delta 1e-05 ({SEEDED})"
+
+
+@pytest.mark.parametrize("selection", [Selection(), Selection(rule="round-robin", clients=2)])
+def test_a_run_composes_all_that_its_vehicles_took_part_in(selection: Selection, tmp_path: Path) -> None:
+    plan = {"samples": 2, "edge_rounds": 1, "cloud_rounds": 1}
+    recipe = RunRecipe.model_validate(
+        {
+            "tasks": {"weather": {"plan": plan}, "signs": {"plan": plan}},
+            "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate", "vehicles": 3}},
+            "budgets_mb": {"wireless": 90, "wireline": 90},
+            "placement": {"rule": "none"},
+            "retrainings": 1,
+            "federation": {
+                "privacy": PRIVACY,
+                "edge_rounds_per_cloud_round": 2,
+                "selection": selection.model_dump(exclude_defaults=True),
+            },
+        }
+    )
+    graph, taken = Graph(recipe, tmp_path), 0
+    for task, edge, cloud in (("weather", 2, 3), ("signs", 1, 1)):
+        for arm in (MAIN, name_repeat(MAIN, 1)):
+            for stage, rounds in ((EDGE, edge), (CLOUD, cloud)):
+                folder = tmp_path / graph.names.stage(arm, stage, "grid", task)
+                folder.mkdir()
+                StageResult(stage, task, "grid" if stage == EDGE else None, rounds, 9, 3, ()).save(folder)
+            rounds = edge + 2 * cloud
+            taken += rounds if selection.rule == "all" else math.ceil(rounds * 2 / 3)
+    setting = graph.settings[MAIN]
+    spent = compose_trainings(setting.federation, list_trainings(graph, tmp_path, setting))
+    assert spent is not None
+    assert spent.epsilon == pytest.approx(composed(taken))
