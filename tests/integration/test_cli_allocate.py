@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -45,8 +46,10 @@ def test_a_weighted_error_is_told_with_its_mean(tmp_path, capsys):
     (tmp_path / "problem.yaml").write_text(yaml.safe_dump(values))
     assert called("allocate", tmp_path / "problem.yaml") == 0
     told = " ".join(capsys.readouterr().out.split())
-    total = float(told.split("weighted error ")[1].split(",")[0])
-    assert f"Weighted error: {TERMS['weighted error']} Here they sum to 3, and the mean is {total / 3:.4g}." in told
+    assert re.search(r"weighted error 0\.\d\d, optimal for the fitted curves \(proven within", told)
+    assert called("allocate", tmp_path / "problem.yaml", "--json") == 0
+    total = json.loads(capsys.readouterr().out)["objective"]
+    assert f"Weighted error: {TERMS['weighted error']} Here they sum to 3, and the mean is {total / 3:.2g}." in told
 
 
 def test_a_graph_is_planned_down_to_its_vehicles(capsys):

@@ -8,7 +8,7 @@ from scipy.optimize import approx_fprime, curve_fit
 
 from flcav.config import InputError
 from flcav.optimization.curves.bands import bootstrap_bands, fit_upper_curve
-from flcav.optimization.curves.fitting import explain_exponent, fit_additive, fit_effective
+from flcav.optimization.curves.fitting import explain_exponent, fit, fit_additive, fit_effective
 from flcav.optimization.curves.forms import additive_forms, effective_forms, federated_forms
 from flcav.optimization.curves.history import accumulate_resources, article_histories, parse_histories
 
@@ -80,6 +80,49 @@ def test_two_points_have_no_band_and_say_so():
     fit = fit_additive([10, 100], [0, 0], [0, 0], [0.5, 0.7])
     assert bootstrap_bands(fit) is None
     assert "nothing is left to check" in fit.warnings[0]
+
+
+LOGGED = {  # the last three rows are logged a second time, as after a resume
+    "samples": [50, 200, 800, 3200, 3200, 3200, 3200, 3200, 50, 3200, 3200],
+    "edge_rounds": [0, 0, 0, 0, 2, 8, 8, 8, 0, 0, 8],
+    "cloud_rounds": [0, 0, 0, 0, 0, 0, 1, 4, 0, 0, 4],
+    "error": [0.636, 0.577, 0.524, 0.488, 0.411, 0.369, 0.325, 0.304, 0.636, 0.488, 0.304],
+}
+
+
+def test_rows_logged_twice_count_once_and_are_told() -> None:
+    told = parse_histories(LOGGED, "runs.csv", "a")["a"]
+    once = parse_histories({name: column[:8] for name, column in LOGGED.items()}, "runs.csv", "a")["a"]
+    assert (told.repeats, once.repeats) == (3, 0)
+    assert told.warnings == ("3 rows repeat an earlier one in every column and count once",)
+    assert once.warnings == ()
+    np.testing.assert_array_equal(told.resources, once.resources)
+    assert fit(told).curve == fit(once).curve
+    assert fit(told).rmse > 1e-3  # with repeats in the count of AICc the curve met every point
+    others = parse_histories(LOGGED | {"seed": [1] * 8 + [1, 2, 1]}, "runs.csv", "a")["a"]
+    assert (others.repeats, others.seeds.count("2")) == (2, 1)  # the same error of another seed is a measurement
+
+
+def test_a_saturated_fit_has_no_band_whatever_counts_twice_or_nothing() -> None:
+    x, accuracy = np.array([10.0, 100.0]), np.array([0.5, 0.7])
+    repeated = fit_additive(np.tile(x, 6), [0] * 12, [0] * 12, np.tile(accuracy, 6))
+    weights = [1, 1, 0, 0, 0, 0]
+    weightless = fit_additive([*x, 20, 30, 40, 50], [0] * 6, [0] * 6, [*accuracy, 0.1, 0.9, 0.1, 0.9], weights)
+    for found in (repeated, weightless):
+        assert bootstrap_bands(found, repeats=20) is None
+        assert "2 independent points for 2 parameters" in found.warnings[0]
+        assert "the band is not known" in found.warnings[0]
+
+
+def test_repeated_points_choose_no_richer_curve_and_leave_its_band_a_width() -> None:
+    samples, edge, cloud, error = (np.tile(np.array(column[:8], dtype=float), 5) for column in LOGGED.values())
+    found = fit_additive(samples, edge, cloud, 1 - error)
+    assert found.fitted is not None
+    assert (found.fitted.independent, len(found.fitted.parameters)) == (8, 6)
+    band = bootstrap_bands(found, repeats=20)
+    assert band is not None
+    low, high = band.between(found.fitted.resources)
+    assert np.all(high - low > 1e-3)
 
 
 def test_what_lies_beyond_the_history_is_said():

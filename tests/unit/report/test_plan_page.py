@@ -97,7 +97,7 @@ def test_half_a_budget_that_allows_nothing_is_said() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("objective", "words"),
-    [("max-min", ("predicted largest error", "This is proven", "more of it would lower the largest error")),
+    [("max-min", ("predicted largest error", "proven for the fitted", "more of it would lower the largest error")),
      ("area", ("predicted area", "not proven", "several local optima", "would raise the area"))],
 )  # fmt: skip
 def test_other_objectives_are_called_what_they_are(objective: str, words: tuple[str, ...]) -> None:

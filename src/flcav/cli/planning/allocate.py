@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from flcav.optimization.allocation.vehicles import Shares
     from flcav.optimization.problem import Problem
 
+SHOWN = ".2g"  # predictions: trainings on the same frames differ in the second digit
+
 
 class Compared(StrEnum):
     """Baseline plans."""
@@ -140,14 +142,15 @@ def _show(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") -> N
 
     console, measure = plain_console(), MEASURES[problem.objective]
     console.print(_table(plan))
-    console.print(f"{measure} {plan.objective:.6g}, {plan.status} ({_proven(plan.gap)})")
+    curves = "the fitted curves" if len(plan.tasks) > 1 else "the fitted curve"
+    console.print(f"{measure} {plan.objective:{SHOWN}}, {plan.status} for {curves} ({_proven(plan.gap)})")
     console.print(f"{measure.capitalize()}: {explain_objective(problem, plan.objective)}")
     verb = "adds" if problem.objective == "area" else "saves"
     for link in ("wireless", "wireline"):
         used, budget = getattr(plan.used_mb, f"{link}_mb"), getattr(problem.budgets_mb, link)
         console.print(f"{link}: {used:.1f} of {budget:.6g} MB")
         for each in (each for each in more if each.link == link):
-            saved = f"{each.saved:.3g}" if each.saved else "nothing"
+            saved = f"{each.saved:{SHOWN}}" if each.saved else "nothing"
             budget = f"{each.added:.0%} more ({each.added_mb:.6g} MB)"
             console.print(f"  {budget}, solved anew: {verb} {saved} ({_proven(each.gap)})")
     if plan.busy_s is not None:
@@ -166,7 +169,7 @@ def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
     console = plain_console()
     console.print(_table(beside))
     note = f" ({beside.note})" if beside.note else ""
-    console.print(f"{beside.name}: {beside.objective:.6g}{note}; the plan above: {plan.objective:.6g}")
+    console.print(f"{beside.name}: {beside.objective:{SHOWN}}{note}; the plan above: {plan.objective:{SHOWN}}")
 
 
 def _table(plan: "Allocation | Baseline") -> "Table":
@@ -175,10 +178,11 @@ def _table(plan: "Allocation | Baseline") -> "Table":
     table = Table("task", *("samples", "edge rounds", "cloud rounds", "error", "wireless MB", "wireline MB"))
     for task in plan.tasks:
         counts = (str(task.samples), str(task.edge_rounds), str(task.cloud_rounds))
-        error = f"{task.predicted_error:.4f}" + ("" if task.upper_error is None else f" (up to {task.upper_error:.4f})")
+        upper = "" if task.upper_error is None else f" (up to {task.upper_error:{SHOWN}})"
+        error = f"{task.predicted_error:{SHOWN}}{upper}"
         table.add_row(task.name, *counts, error, f"{task.wireless_mb:.1f}", f"{task.wireline_mb:.1f}")
         for member in task.members:
-            table.add_row(f"  {member.name}", "", "", "", f"{member.predicted_error:.4f}", "", "")
+            table.add_row(f"  {member.name}", "", "", "", f"{member.predicted_error:{SHOWN}}", "", "")
     return table
 
 

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from flcav.optimization.allocation.problem_file import FittedFields
-    from flcav.optimization.curves.bands import Array, Bands
+    from flcav.optimization.curves.bands import Bands
     from flcav.optimization.curves.curves import OwnCurve
     from flcav.optimization.curves.fitting import CurveFit
+    from flcav.optimization.curves.history import History
 
 
 class Model(StrEnum):
@@ -89,7 +90,7 @@ def fit(
     from flcav.optimization.curves import fitting
     from flcav.optimization.curves.bands import bootstrap_bands, fit_upper_curve
     from flcav.optimization.curves.held_out import hold_out_runs
-    from flcav.optimization.curves.history import History, parse_histories
+    from flcav.optimization.curves.history import parse_histories
 
     if model is Model.additive:
         refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")
@@ -98,7 +99,7 @@ def fit(
     held, unnamed = _held(problem, history.stem)
     answers, shown, found_of = [], [], {}
 
-    def fit_curve(points: History) -> "CurveFit":
+    def fit_curve(points: "History") -> "CurveFit":
         return fitting.fit(points, model=model.value, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
 
     for task, points in parse_histories(read_table(history, ()).to_pydict(), str(history), unnamed).items():
@@ -109,7 +110,7 @@ def fit(
             raise InputError(f"{history}: task {task!r}: {error}") from None
         band = bootstrap_bands(found, level=level, repeats=repeats, seed=seed, k=k)
         upper = None if band is None else fit_upper_curve(found, band)
-        own = _answer(task, found, band, upper, points.resources, asked, k)
+        own = _answer(task, found, band, upper, points, asked, k)
         answers.append(own if checked is None else own | {"held_out": dataclasses.asdict(checked)})
         shown.append(found)
         found_of[task] = collect_fitted_fields(found, points.resources, upper)
@@ -179,7 +180,7 @@ def _answer(
     fit: "CurveFit",
     found: "Bands | None",
     upper: "OwnCurve | None",
-    measured: "Array",
+    points: "History",
     asked: list[list[float]],
     k: int,
 ) -> dict[str, Any]:
@@ -192,7 +193,7 @@ def _answer(
     if found is not None:
         band = {
             **{"method": METHOD, "level": found.level, "repeats": len(found.curves), "seed": found.seed},
-            "at": tabulate_bands(fit, found, np.unique(measured, axis=0), k),
+            "at": tabulate_bands(fit, found, np.unique(points.resources, axis=0), k),
         }
     predicted = tabulate_bands(fit, found, np.array(asked).reshape(-1, 3), k)
     extrapolated = [fit.explain_extrapolation(*counts) for counts in asked]
@@ -204,7 +205,7 @@ def _answer(
         "band": band,
         "upper": None if upper is None else upper.model_dump(),
         "asked": [{**row, "warning": warning} for row, warning in zip(predicted, extrapolated)],
-        "warnings": [*fit.warnings, *filter(None, extrapolated)],
+        "warnings": [*points.warnings, *fit.warnings, *filter(None, extrapolated)],
     }
 
 

@@ -41,7 +41,7 @@ TERMS = {
     "Plans are in whole samples and rounds, so more megabytes help in steps.",
     "up to": "the upper band of a curve, which this plan makes least; the predicted error is the curve's own.",
     "proven": "the solver also finds a bound that no plan can be below, so how far this one could still be improved is "
-    "known.",
+    "known. It is a bound for the fitted curves; a training may go otherwise.",
 }
 Array = NDArray[np.float64]
 Edit = tuple[int, int, str]  # start, end, replacement
@@ -58,7 +58,7 @@ def explain_objective(problem: Problem, objective: float) -> str:
     weights = sum(task.weight for task in resolve_problem(problem).tasks)
     if problem.objective != "weighted" or abs(weights - 1) < 1e-9:
         return sentence
-    return f"{sentence} Here they sum to {weights:.3g}, and the mean is {objective / weights:.4g}."
+    return f"{sentence} Here they sum to {weights:.3g}, and the mean is {objective / weights:.2g}."
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """Confidence bands of learning curves by the residual bootstrap (Efron and Tibshirani 1993, section 9.3).
 
 Every repeat draws n residuals of the fit with replacement, adds them to the fitted errors, and fits the same form
-again. Residuals are scaled by sqrt(n / (n - P)), as P fitted parameters make them smaller than the errors of
-measurement. Residuals are drawn rather than points: a draw of five points often has too few different ones for a fit.
+again. Residuals are scaled by sqrt(n / (n - P)) for n independent points, as P fitted parameters make them smaller than
+the errors of measurement; the band of a saturated fit, n <= P, is not known. Residuals are drawn rather than points: a
+draw of five points often has too few different ones for a fit.
 """
 
 from collections.abc import Sequence
@@ -41,14 +42,14 @@ class Bands:
 def bootstrap_bands(
     fit: CurveFit, *, level: float = 0.9, repeats: int = 200, seed: int = 0, k: int = 1
 ) -> Bands | None:
-    """Return the confidence band of `fit`; None where there are no more points than parameters, so no residuals."""
+    """Return the confidence band of `fit`; None where it is saturated: its residuals are no errors of measurement."""
     fitted = fit.fitted
-    if fitted is None or fit.points <= len(fitted.parameters):
+    if fitted is None or fitted.spare < 1:
         return None
     predicted, root = fitted.form.predict(fitted.parameters, fitted.resources), np.sqrt(fitted.weight)
     known = root > 0
     residual = ((fitted.error - predicted) * root)[known]
-    residual = (residual - residual.mean()) * np.sqrt(fit.points / (fit.points - len(fitted.parameters)))
+    residual = (residual - residual.mean()) * np.sqrt(fitted.independent / fitted.spare)
     rng = stream(seed, "bands")
     curves = []
     for _ in range(repeats):

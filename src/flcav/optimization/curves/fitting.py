@@ -30,7 +30,7 @@ from flcav.optimization.curves.levels import level_seeds
 
 Array = NDArray[np.float64]
 
-ROBUST_FROM = 10  # points: the spread of fewer residuals does not tell which of them are outliers
+ROBUST_FROM = 10  # independent points: the spread of fewer residuals does not tell which of them are outliers
 SAME_COST = 1e-3  # relative difference of equal costs
 EXACT, ROUGH = 1e-14, 1e-6  # tolerances of the solver: for the curve that is returned; for comparisons and repeats
 QUANTITIES = ("samples", "edge_rounds", "cloud_rounds")
@@ -67,11 +67,9 @@ class Fit(Generic[CurveT]):
         if self.fitted is None:
             return ()
         said = []
-        spare = self.points - len(self.fitted.parameters)
-        if spare < 1:
-            said.append(
-                f"{self.points} points for {len(self.fitted.parameters)} parameters: nothing is left to check them"
-            )
+        if self.fitted.spare < 1:
+            counts = f"{self.fitted.independent} independent points for {len(self.fitted.parameters)} parameters"
+            said.append(f"{counts}: nothing is left to check them, and the band is not known")
         decays = zip(STAGES, self.curve.decays()) if isinstance(self.curve, Additive) else [("samples", self.curve)]
         said += [told for stage, decay in decays if (told := explain_exponent(stage, decay.b)) is not None]
         if self.r_squared is None:
@@ -117,6 +115,17 @@ class FitState(Generic[CurveT]):
     error: Array  # (n,)
     weight: Array  # (n,)
     scale: float | None  # residual at which the soft L1 loss turns from squares to absolute values; None: squares
+
+    @property
+    def independent(self) -> int:
+        """Number of different points of a positive weight: a repeated point tells nothing new."""
+        points = np.column_stack((self.resources, self.error))
+        return len(np.unique(points[self.weight > 0], axis=0))
+
+    @property
+    def spare(self) -> int:
+        """Degrees of freedom of the residuals; a fit without any is saturated."""
+        return self.independent - len(self.parameters)
 
 
 def fit(
@@ -266,7 +275,7 @@ def _fit_squares(
 
 def _refine(fitted: FitState[CurveT], tolerance: float) -> FitState[CurveT]:
     """Return a least-squares fit refined under soft L1 where there are many points; else the fit itself."""
-    if len(fitted.error) < ROBUST_FROM:
+    if fitted.independent < ROBUST_FROM:
         return fitted
     form, weight, p = fitted.form, fitted.weight, fitted.parameters
     residuals = (form.predict(p, fitted.resources) - fitted.error) * np.sqrt(weight)
@@ -317,9 +326,9 @@ def _measured(fitted: FitState[CurveT]) -> Fit[CurveT]:
     form, weight = fitted.form, fitted.weight
     residual = form.predict(fitted.parameters, fitted.resources) - fitted.error
     mean_square = float((weight * residual**2).sum() / weight.sum())
-    n, parameters = len(residual), len(fitted.parameters) + 1  # the variance is one more parameter
+    n, parameters = fitted.independent, len(fitted.parameters) + 1  # the variance is one more parameter
     spare = n - parameters - 1
     correction = 2 * parameters * (parameters + 1) / spare if spare > 0 else (1e9 if form.simplest else np.inf)
     aicc = n * np.log(max(mean_square, 1e-18)) + 2 * parameters + correction
     rmse = float(np.sqrt((residual**2).mean()))
-    return Fit(form.curve(fitted.parameters), rmse, n, float(aicc), fitted)
+    return Fit(form.curve(fitted.parameters), rmse, len(residual), float(aicc), fitted)

@@ -7,7 +7,9 @@ Tables of two forms are read:
 - Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight][, run][, seed]`, as the project's own runs
   write it.
 
-Either may have `error`, which is 1 - accuracy, in place of `accuracy`.
+Either may have `error`, which is 1 - accuracy, in place of `accuracy`. A row that equals an earlier one in every column
+was logged twice, and is no second measurement: it is left out. Rows of the same resources with another accuracy, run or
+seed stay.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,6 +43,15 @@ class History:
     weight: Array  # (n,) of each point's squared residual in a fit
     runs: tuple[str, ...] = ()  # that the points are of; none where the history does not name them
     seeds: tuple[str, ...] = ()  # of the runs; runs of one seed share frames
+    repeats: int = 0  # rows of the table that are left out, as they equal an earlier one in every column
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence on the rows that are left out; none where there are none."""
+        if not self.repeats:
+            return ()
+        rows = "1 row repeats" if self.repeats == 1 else f"{self.repeats} rows repeat"
+        return (f"{rows} an earlier one in every column and count{'s' * (self.repeats == 1)} once",)
 
     def select(self, chosen: NDArray[np.bool_]) -> "History":
         """Return the points that are true in `chosen` (n,)."""
@@ -76,15 +87,17 @@ def parse_histories(columns: Table, origin: str, unnamed: str) -> dict[str, Hist
             raise InputError(f"{origin}: row {row}: stage = {stage!r} must be one of {', '.join(STAGES)}")
     names = [str(name) for name in columns.get("task", [unnamed] * len(accuracy))]
     found = {}
+    whole = list(zip(*columns.values(), strict=True))
     for task in dict.fromkeys(names):
-        rows = [row for row, name in enumerate(names) if name == task]
+        logged = [row for row, name in enumerate(names) if name == task]
+        rows = sorted({whole[row]: row for row in reversed(logged)}.values())
         own = amounts[rows]
         if not joint:
             own = accumulate_resources([str(columns["stage"][row]) for row in rows], own[:, 0])
         runs, seeds = (
             tuple(str(columns[name][row]) for row in rows) if name in columns else () for name in ("run", "seed")
         )
-        found[task] = History(own, accuracy[rows], weight[rows], runs, seeds)
+        found[task] = History(own, accuracy[rows], weight[rows], runs, seeds, len(logged) - len(rows))
     return found
 
 

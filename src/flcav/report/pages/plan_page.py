@@ -144,9 +144,9 @@ def _sentences(values: Mapping[str, Any], both: Sequence[BudgetPoint]) -> dict[s
 def _proof(values: Mapping[str, Any]) -> str:
     if values["lower_bound"] is None:
         return "Nothing is proven of it: it is the best of several local optima."
-    bound = f"no plan within these budgets has less than {values['lower_bound']:.6g}"
+    bound = f"no plan within these budgets has less than {values['lower_bound']:.4g}"
     near = f", and this one has at most {100 * values['gap']:.2g} % more" if values["gap"] > 1e-9 else ""
-    return f"This is proven: {bound}{near}."
+    return f"This is proven for the fitted curves: {bound}{near}."
 
 
 def _link(name: str, link: Mapping[str, Any], verb: str) -> str:
