@@ -37,12 +37,12 @@ class Attendance:
         self.few = bool(short) or (secure is not None and secure.needed(chosen) > chosen)
 
     def check(self, rules: Rules, strategy: Strategy, number: int) -> None:
-        """Raise `ClientFailed` where in round `number` fewer sent what can be used than are wanted or `strategy` needs.
+        """Raise `ClientFailed` where in round `number` fewer sent what can be used than are wanted.
 
         By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
         a norm or a number of samples, and of those who were then to send an update. `all` is of both, too, a number of
-        those who were to send; who was away does not count. Where the network lost clients that the strategy needs, the
-        round has no update, and so where fewer take part than the rules need, unless a client failed.
+        those who were to send; who was away does not count. Where fewer are left than `strategy` needs, the round has no
+        update, and so where fewer take part than the rules need, unless a client failed.
         """
         reasons = "; ".join(f"{name}: {reason}" for name, reason in self.failed.items())
         if self.few:
@@ -61,6 +61,4 @@ class Attendance:
             try:
                 strategy.check_clients(sum(name not in self.failed for name in self.chosen))
             except InputError as error:
-                if not self.lost:
-                    raise ClientFailed(f"round {number}: {error} ({reasons})") from None
-                self.shortage = ClientFailed(str(error))
+                self.shortage = ClientFailed(str(error))  # a minority that sends rubbish does not end a federation

@@ -217,14 +217,13 @@ class Rounds(FlowerStrategy):
 
         Where who was drawn is to stay secret, the record has nothing of the clients, and both numbers are 0.
 
-        Where the network lost clients, and fewer are left than secure aggregation or the strategy needs, or where fewer
-        take part than secure aggregation or `least_clients` asks for and none failed, or where clients revealed shares
-        that leave no way to the sum, the weights stay as they were, and the record names those who were chosen as
-        failed, with the reason; where nobody was drawn it names nobody.
-        Raises `ClientFailed` where fewer clients than are wanted sent a usable update, or than the strategy needs
-        though the network lost none, or where fewer take part than are wanted and clients failed to report,
-        `TooFewClients` where so few are left for secure aggregation, ValueError where the strategy returns arrays of
-        other names, shapes or types.
+        Where fewer are left than the strategy needs, or the network lost clients and fewer are left than secure
+        aggregation needs, or where fewer take part than secure aggregation or `least_clients` asks for and none failed,
+        or where clients revealed shares that leave no way to the sum, the weights stay as they were, and the record
+        names those who were chosen as failed, with the reason; where nobody was drawn it names nobody.
+        Raises `ClientFailed` where fewer clients than are wanted sent a usable update, or where fewer take part than
+        are wanted and clients failed to report, `TooFewClients` where so few are left for secure aggregation, ValueError
+        where the strategy returns arrays of other names, shapes or types.
         """
         number, here = self._done + server_round, self._here
         received = Intake(None) if here.shortage else self._receive(replies)
@@ -234,7 +233,7 @@ class Rounds(FlowerStrategy):
                 raise here.shortage
             weights = self._combine(received, number)
         except (ClientFailed, TooFewClients, SumLost) as error:
-            if not (here.lost or here.few or isinstance(error, SumLost)):
+            if isinstance(error, TooFewClients) and not (here.lost or here.few):
                 raise
             weights, received = self._expected.start, Intake(None)
             here.failed |= {name: str(error) for name in here.chosen if name not in here.failed}
