@@ -41,8 +41,8 @@ class Attendance:
 
         By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
         a norm or a number of samples, and of those who were then to send an update. `all` is of both, too, a number of
-        those who were to send; who was away does not count. Where fewer are left than `strategy` needs, the round has no
-        update, and so where fewer take part than the rules need, unless a client failed.
+        those who were to send; who was away does not count. Where fewer are left than `strategy` needs, the round has
+        no update, and so where fewer take part than the rules need, unless a client failed.
         """
         reasons = "; ".join(f"{name}: {reason}" for name, reason in self.failed.items())
         if self.few:

@@ -222,8 +222,8 @@ class Rounds(FlowerStrategy):
         or where clients revealed shares that leave no way to the sum, the weights stay as they were, and the record
         names those who were chosen as failed, with the reason; where nobody was drawn it names nobody.
         Raises `ClientFailed` where fewer clients than are wanted sent a usable update, or where fewer take part than
-        are wanted and clients failed to report, `TooFewClients` where so few are left for secure aggregation, ValueError
-        where the strategy returns arrays of other names, shapes or types.
+        are wanted and clients failed to report, `TooFewClients` where so few are left for secure aggregation,
+        ValueError where the strategy returns arrays of other names, shapes or types.
         """
         number, here = self._done + server_round, self._here
         received = Intake(None) if here.shortage else self._receive(replies)
