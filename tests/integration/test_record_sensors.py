@@ -14,6 +14,9 @@ from PIL import Image
 
 from flcav.config import InputError
 from flcav.dataset.checks.validate import validate
+from flcav.dataset.formats.sweeps import read_sweep
+from flcav.dataset.layout import payload_path
+from flcav.dataset.payloads import POINTS
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import FILES_SCHEMA, write_table
@@ -65,6 +68,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def folder(recorded: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(recorded, tmp_path / "data"))
+
+
+def test_a_recorded_sweep_is_read_as_a_file(recorded: Path):
+    data = Dataset.open(recorded)
+    for number in range(len(data)):
+        for name in data.lidars(number):
+            path = recorded / payload_path(name, data.name(number), POINTS)
+            np.testing.assert_array_equal(read_sweep(path), data.frame(number).lidar[name])
 
 
 def resign(folder: Path) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pyarrow.feather as feather
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -220,6 +221,20 @@ def test_times_beside_points_are_no_cloud(tmp_path: Path) -> None:
     for name in ("a.bin", "a.times.bin", "b.txt"):
         (tmp_path / name).touch()
     assert [file.name for file in list_sweeps(tmp_path)] == ["a.bin"]
+
+
+def test_sweeps_of_argoverse_are_told_by_their_numbers(tmp_path: Path) -> None:
+    files = sorted((REAL / "argoverse2").rglob("lidar/*.feather"))
+    if not files:
+        pytest.skip(f"{REAL} has no logs of Argoverse 2: they are not part of the project")
+    for path in files:
+        table = feather.read_table(path)
+        x, y, z, intensity = (table[name].to_numpy().astype(np.float32) for name in ("x", "y", "z", "intensity"))
+        points = np.column_stack((x, y, z, intensity / np.float32(255)))
+        (tmp_path / "cloud.bin").write_bytes(points.tobytes())
+        np.testing.assert_array_equal(read_sweep(tmp_path / "cloud.bin"), points)
+        (tmp_path / "cloud.bin").write_bytes(np.column_stack((-y, x, z, intensity, intensity % 32)).tobytes())
+        np.testing.assert_array_equal(read_sweep(tmp_path / "cloud.bin"), points)
 
 
 def test_real_sweeps_are_read_as_they_are() -> None:

@@ -14,10 +14,9 @@ TINY = 1e-30  # smallest number above 0; what is smaller is of another type
 BRIGHTEST = 255  # largest intensity of nuScenes
 BESIDE_M = 1.75  # normals and colours are within
 TYPES = {"<f4": "float32", "<f8": "float64", ">f4": "big-endian float32", ">f8": "big-endian float64"}
-COLUMNS = range(2, 13)
+COLUMNS = range(3, 13)
 SAMPLE = 48_000  # values that columns are counted by
 FEW = 16  # rows of which nothing is told but ranges
-SLACK = 0.05  # by which a multiple of the right number of columns may seem better
 
 Values = NDArray[np.floating]
 
@@ -85,15 +84,17 @@ def _mixes(rows: NDArray[np.float32]) -> bool:
 
 
 def _count_columns(values: Values) -> int:
-    """Return the number of columns with which values differ least from those of the next row; 0 if none divides them.
+    """Return the number of columns with which values differ least from those of the next row; 0 if there is none.
 
     Two draws of one distribution differ less, in the mean, than draws of two (G. J. Székely and M. L. Rizzo, "Energy
-    statistics", J. Statistical Planning and Inference 143, 2013, prop. 1).
+    statistics", J. Statistical Planning and Inference 143, 2013, prop. 1). With a multiple of the right number they
+    differ as little: it is the smallest that is better than all numbers but its multiples.
     """
-    changes = {
-        count: float(np.nanmean(np.abs(values[count:SAMPLE] - values[: min(len(values), SAMPLE) - count])))
-        for count in COLUMNS
-        if len(values) % count == 0 and len(values) > count
-    }
-    least = min(changes.values(), default=0.0)
-    return next((count for count, change in changes.items() if change <= (1 + SLACK) * least), 0)
+    some = values[:SAMPLE]
+    if len(some) < FEW * max(COLUMNS):
+        return 0
+    changes = {count: float(np.nanmean(np.abs(some[count:] - some[:-count]))) for count in COLUMNS}
+    for count, change in changes.items():
+        if len(values) % count == 0 and all(change < other for many, other in changes.items() if many % count):
+            return count
+    return 0
