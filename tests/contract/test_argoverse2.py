@@ -292,3 +292,13 @@ def test_a_log_that_is_linked_to_has_the_split_of_the_link(tmp_path: Path):
     (tmp_path / "logs" / "val" / "one").symlink_to(tmp_path / "store" / str(START))
     import_dataset("argoverse2", tmp_path / "logs", tmp_path / "out", split="val")
     assert Dataset.open(tmp_path / "out").manifest.recipe["splits"] == {"val": ["one"]}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_sensor_or_a_pose_is_there_once(name: str, tmp_path: Path):
+    write_log(tmp_path / "log")
+    path = tmp_path / "log" / f"{name}.feather"
+    table = feather.read_table(path)
+    feather.write_feather(pa.concat_tables([table, table.slice(0, 1)]), path)
+    with pytest.raises(InputError, match=r"feather: two rows with one '(timestamp_ns|sensor_name)'"):
+        import_dataset("argoverse2", tmp_path / "log", tmp_path / "out")
