@@ -286,12 +286,15 @@ def test_a_log_of_one_name_in_datasets_of_two_splits_is_a_leak(tmp_path: Path):
     ]
 
 
-def test_a_log_that_is_linked_to_has_the_split_of_the_link(tmp_path: Path):
+def test_a_log_that_is_linked_to_has_the_split_of_the_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     write_log(tmp_path / "store" / str(START))
     (tmp_path / "logs" / "val").mkdir(parents=True)
     (tmp_path / "logs" / "val" / "one").symlink_to(tmp_path / "store" / str(START))
-    import_dataset("argoverse2", tmp_path / "logs", tmp_path / "out", split="val")
-    assert Dataset.open(tmp_path / "out").manifest.recipe["splits"] == {"val": ["one"]}
+    (tmp_path / "logs" / "val" / "inside").mkdir()
+    monkeypatch.chdir(tmp_path / "logs" / "val" / "inside")
+    for number, folder in enumerate((tmp_path / "logs", Path("../one"), Path("../../val/../val/one"))):
+        import_dataset("argoverse2", folder, tmp_path / f"{number}", split="val")
+        assert Dataset.open(tmp_path / f"{number}").manifest.recipe["splits"] == {"val": ["one"]}
 
 
 @pytest.mark.parametrize("name", TABLES)

@@ -29,6 +29,7 @@ from flcav.dataset.formats.reading import (
     choose_split,
     difference_tracks,
     name_folders,
+    name_place,
     pinhole,
     read_pictures,
     turned_boxes,
@@ -195,7 +196,7 @@ def _find_logs(folder: Path) -> dict[str, Path]:
 
 
 def _split_of(log: Path) -> str | None:
-    name = log.absolute().parent.name
+    name, _ = name_place(log)
     return name if name in SPLITS else None
 
 
