@@ -286,9 +286,22 @@ def test_a_log_of_one_name_in_datasets_of_two_splits_is_a_leak(tmp_path: Path):
     ]
 
 
-def test_a_log_that_is_linked_to_has_the_split_of_the_link(tmp_path: Path):
+def test_a_log_that_is_linked_to_has_the_split_of_the_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     write_log(tmp_path / "store" / str(START))
     (tmp_path / "logs" / "val").mkdir(parents=True)
     (tmp_path / "logs" / "val" / "one").symlink_to(tmp_path / "store" / str(START))
-    import_dataset("argoverse2", tmp_path / "logs", tmp_path / "out", split="val")
-    assert Dataset.open(tmp_path / "out").manifest.recipe["splits"] == {"val": ["one"]}
+    (tmp_path / "logs" / "val" / "inside").mkdir()
+    monkeypatch.chdir(tmp_path / "logs" / "val" / "inside")
+    for number, folder in enumerate((tmp_path / "logs", Path("../one"), Path("../../val/../val/one"))):
+        import_dataset("argoverse2", folder, tmp_path / f"{number}", split="val")
+        assert Dataset.open(tmp_path / f"{number}").manifest.recipe["splits"] == {"val": ["one"]}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_sensor_or_a_pose_is_there_once(name: str, tmp_path: Path):
+    write_log(tmp_path / "log")
+    path = tmp_path / "log" / f"{name}.feather"
+    table = feather.read_table(path)
+    feather.write_feather(pa.concat_tables([table, table.slice(0, 1)]), path)
+    with pytest.raises(InputError, match=r"feather: two rows with one '(timestamp_ns|sensor_name)'"):
+        import_dataset("argoverse2", tmp_path / "log", tmp_path / "out")

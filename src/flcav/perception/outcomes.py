@@ -5,6 +5,8 @@ The bootstrap gives 95 % percentile intervals of the measure and of paired diffe
 how the measure is computed from it.
 """
 
+import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +48,7 @@ class Outcomes:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
             return cls(arrays.pop(SCENE), arrays)
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: no outcomes of a test ({error})") from None
 
 

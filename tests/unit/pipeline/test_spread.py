@@ -41,6 +41,7 @@ def test_runs_of_one_measure_are_pooled(tmp_path: Path) -> None:
         ("nan,9,seed1", "row 1: sd must be from 0 to 1"),
         ("0.1,1,seed1", "trainings 2 or more"),
         ("0.1,9", "row 1: column 'run' is missing"),
+        ("0.1,9," + 200_000 * "x", "own.csv: not a CSV table .field larger than"),
     ],
 )
 def test_a_row_that_is_no_spread_is_named(tmp_path: Path, cells: str, said: str) -> None:

@@ -4,6 +4,7 @@ What a format does not say is NaN, or UNKNOWN_PIXELS. Computed are returns (the 
 from tracks, and the rectangles that boxes fill in images.
 """
 
+import os
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, MutableMapping, Sequence
@@ -51,7 +52,7 @@ class LogSource(ABC):
 
     def describe(self) -> Mapping[str, Json]:
         """Return folder, splits and what is labelled; of scenes that are not called as their folders, these."""
-        folders = {scene: self._folders[scene].name for scene in self._split_of if scene in self._folders}
+        folders = {scene: name_place(self._folders[scene])[1] for scene in self._split_of if scene in self._folders}
         renamed = {scene: name for scene, name in folders.items() if scene != name}
         return {
             "imported": self.FORMAT,
@@ -258,14 +259,21 @@ def name_folders(folders: Sequence[Path]) -> dict[str, Path]:
 
     Logs of one name in several splits are scenes of their own.
     """
-    count = Counter(path.absolute().name for path in folders)
+    count = Counter(name_place(path)[1] for path in folders)
     named = {}
-    for path in map(Path.absolute, folders):
-        scene = path.name if count[path.name] == 1 else f"{path.parent.name}-{path.name}"
+    for path in folders:
+        parent, name = name_place(path)
+        scene = name if count[name] == 1 else f"{parent}-{name}"
         if scene in named:
             raise InputError(f"{path}: would be the scene '{scene}', as {named[scene]} is")
         named[scene] = path
     return named
+
+
+def name_place(path: Path) -> tuple[str, str]:
+    """Return the names of a path's folder and of itself, as it is called and not what it links to."""
+    whole = Path(os.path.abspath(path))  # noqa: PTH100 - `resolve` follows links, `absolute` keeps `..`
+    return whole.parent.name, whole.name
 
 
 def assign_split(split_of: MutableMapping[str, str | None], scene: str, split: str | None, origin: Path) -> None:

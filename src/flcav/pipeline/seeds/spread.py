@@ -88,7 +88,11 @@ def read_spreads(name: str, beside: Path) -> Spreads:
 
     Raises `InputError` where there is no such table, or a row is not a spread.
     """
-    rows = csv.DictReader(io.StringIO(read_table("spread", name, "spread", "spreads", beside)))
+    table = io.StringIO(read_table("spread", name, "spread", "spreads", beside))
+    try:
+        rows = list(csv.DictReader(table))
+    except csv.Error as error:  # of a cell that is longer than any
+        raise InputError(f"{name}: not a CSV table ({error})") from None
     spreads: dict[Key, list[Spread]] = {}
     for number, row in enumerate(rows, start=1):
         if missing := [field.name for field in fields(SpreadRow) if row.get(field.name) is None]:

@@ -29,6 +29,7 @@ from flcav.dataset.formats.reading import (
     choose_split,
     difference_tracks,
     name_folders,
+    name_place,
     pinhole,
     read_pictures,
     turned_boxes,
@@ -174,7 +175,7 @@ class Poses:
     """The ego vehicle's poses in the city, by time."""
 
     def __init__(self, path: Path) -> None:
-        table = _read_feather(path, ("timestamp_ns", *PLACED))
+        table = _read_feather(path, ("timestamp_ns", *PLACED), key="timestamp_ns")
         self._path, self._transforms = path, _transforms(table, path)
         self._row = {time: row for row, time in enumerate(table["timestamp_ns"].to_pylist())}
 
@@ -195,7 +196,7 @@ def _find_logs(folder: Path) -> dict[str, Path]:
 
 
 def _split_of(log: Path) -> str | None:
-    name = log.absolute().parent.name
+    name, _ = name_place(log)
     return name if name in SPLITS else None
 
 
@@ -250,14 +251,14 @@ def _read_sweep(path: Path, origin: Array) -> tuple[NDArray[np.float32], NDArray
 def _read_mounts(folder: Path) -> dict[str, Array]:
     """Return sensor -> (4, 4) pose in the ego frame."""
     path = folder / "calibration" / "egovehicle_SE3_sensor.feather"
-    table = _read_feather(path, ("sensor_name", *PLACED))
+    table = _read_feather(path, ("sensor_name", *PLACED), key="sensor_name")
     return dict(zip(table["sensor_name"].to_pylist(), _transforms(table, path)))
 
 
 def _read_lenses(folder: Path) -> dict[str, Lens]:
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
     path, lenses = folder / "calibration" / "intrinsics.feather", {}
-    table = _read_feather(path, ("sensor_name", *names))
+    table = _read_feather(path, ("sensor_name", *names), key="sensor_name")
     for row in table.to_pylist():
         matrix = np.array([[row["fx_px"], 0, row["cx_px"]], [0, row["fy_px"], row["cy_px"]], [0, 0, 1.0]])
         path_within(folder / "sensors" / "cameras", row["sensor_name"], path)
@@ -295,8 +296,11 @@ def _transforms(table: pa.Table, path: Path) -> Array:
     return transforms
 
 
-def _read_feather(path: Path, columns: tuple[str, ...]) -> pa.Table:
-    """Return columns of a Feather file; raises `InputError` where it is missing, truncated, or lacks one of them."""
+def _read_feather(path: Path, columns: tuple[str, ...], *, key: str | None = None) -> pa.Table:
+    """Return columns of a Feather file.
+
+    Raises `InputError` where it is missing, truncated, lacks one of them, or has two rows with one value of `key`.
+    """
     if not path.is_file():
         raise InputError(f"{path}: no such file; a log of Argoverse 2 has one")
     try:
@@ -312,6 +316,8 @@ def _read_feather(path: Path, columns: tuple[str, ...]) -> pa.Table:
             raise InputError(f"{path}: the column '{name}' is not of {'texts' if name in TEXT else 'numbers'}")
         if pa.types.is_floating(kind) and not (near := np.abs(table[name].to_numpy().astype(float)) < FARTHEST).all():
             raise InputError(f"{path}: the column '{name}' has no number in row {int(near.argmin())}, or one too large")
+    if key and len(table[key].unique()) < len(table):
+        raise InputError(f"{path}: two rows with one '{key}'")
     return table.select(list(columns)).combine_chunks()
 
 

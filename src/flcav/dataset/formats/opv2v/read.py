@@ -25,6 +25,7 @@ from flcav.dataset.formats.reading import (
     choose_split,
     measure_picture,
     name_folders,
+    name_place,
     pinhole,
     read_pictures,
     turned_boxes,
@@ -253,5 +254,5 @@ def _find_scenarios(folder: Path) -> dict[str, Path]:
 
 
 def _split_of(scenario: Path) -> str | None:
-    name = scenario.absolute().parent.name
+    name, _ = name_place(scenario)
     return {own: split for split, own in FOLDERS.items()}.get(name, "test" if name.startswith("test") else None)
