@@ -115,6 +115,15 @@ class MeanOverSeeds(Estimate):
             return 0.0 if far else 1.0
         return float(2 * stdtr(freedom, -far / (self.slope * error)))
 
+    def ends(self, level: float = LEVEL) -> tuple[float, float]:
+        """Return the ends of the interval of a two-sided test at `level`, where the spread is known."""
+        error, freedom = _standard_error(self.sd, self.seeds, self.shared)
+        half = float(stdtrit(freedom, 1 - level / 2)) * error
+        if not self.share:
+            return self.mean - half, self.mean + half
+        low, high = expit(logit(self.mean) + self.slope * half * np.array([-1, 1])).tolist()
+        return low, high
+
     def seeds_to_tell(self, hypothesis: float = 0.0, level: float = LEVEL) -> int | None:
         """Return `plan_seeds` for an effect as large as the distance from `hypothesis`, if the spread is known."""
         if not self.known:
@@ -184,6 +193,17 @@ class OneTraining(MeanOverSeeds):
     def known(self) -> bool:
         """Return that there is a test."""
         return True
+
+    def ends(self, level: float = LEVEL) -> tuple[float, float]:
+        """Return the ends of the interval of `widen` at `level`; half-widths over scenes are as normal quantiles."""
+        assert self.low is not None
+        assert self.high is not None
+        grown = float(ndtri(1 - level / 2) / ndtri(TAILS[1]))
+        own = Spread(self.sd, self.trainings).half_width
+        half = float(stdtrit(self.trainings - 1, 1 - level / 2)) * self.sd
+        sides = np.array([self.mean - self.low, self.high - self.mean])
+        below, above = np.hypot(grown * np.sqrt(np.maximum(sides**2 - own**2, 0.0)), half).tolist()
+        return self.mean - below, self.mean + above
 
     def p_value(self, hypothesis: float = 0.0) -> float:
         """Return the level at which the interval of `widen` ends at `hypothesis`."""
@@ -289,14 +309,8 @@ def mean_over_seeds(
     array = np.asarray(values, dtype=np.float64)
     sd = float(array.std(ddof=1)) if len(array) > 1 else 0.0
     found = MeanOverSeeds(float(array.mean()), None, None, len(array), sd, shared, share)
-    if not found.known:
-        return found
-    error, freedom = _standard_error(sd, len(array), shared)
-    half = float(stdtrit(freedom, TAILS[1])) * error
-    ends = [found.mean - half, found.mean + half]
-    if share:
-        ends = expit(logit(found.mean) + found.slope * half * np.array([-1, 1])).tolist()
-    return replace(found, low=ends[0], high=ends[1])
+    low, high = found.ends() if found.known else (None, None)
+    return replace(found, low=low, high=high)
 
 
 def _standard_error(sd: float, seeds: int, shared: SharedScenes) -> tuple[float, float]:

@@ -7,10 +7,14 @@ is at most 5 % (Holm, "A Simple Sequentially Rejective Multiple Test Procedure",
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 from flcav.intervals import LEVEL, MOST_SEEDS, MeanOverSeeds
+from flcav.records import LEFT_OUT
+from flcav.sample_size import SampleSize, plan_sample
 
 HELD, NOT_HELD, UNDECIDED = "held", "did not hold", "undecided"
+ESTIMATE = "estimate"  # in the place of a verdict, of a difference about which nothing is claimed
 REACHED = {HELD: "reached", NOT_HELD: "not reached", UNDECIDED: UNDECIDED}  # the words for an aim
 
 
@@ -45,6 +49,14 @@ class Claim:
 
 
 @dataclass(frozen=True)
+class Alone:
+    """A claim that its own interval would decide, and the correction for the others leaves undecided."""
+
+    p: float  # not corrected
+    ends: tuple[float, float]  # of its simultaneous interval: at `LEVEL` divided by the number of claims
+
+
+@dataclass(frozen=True)
 class Judged:
     """The verdict on one of several claims that are judged together."""
 
@@ -52,20 +64,41 @@ class Judged:
     p: float | None  # corrected for the claims of the family; None where the spread over seeds or scenes is not known
     family: int  # number of claims that are judged together
     seeds: int | None  # that it takes to decide, if the effect is as large as was found; None: unknown, or too many
+    size: Annotated[SampleSize | None, LEFT_OUT] = None  # the same with test scenes, where seeds share them
+    alone: Annotated[Alone | None, LEFT_OUT] = None
 
-    def describe(self, takes: str = "seeds") -> str:
+    def describe(self, word: str = "seeds") -> str:
         """Return p and the number of claims as text, and of an undecided claim how many seeds it would take.
 
-        `takes`: the word for seeds.
+        `word`: the plural of a seed, or of a training.
         """
         if self.p is None:
             return "the spread over seeds is not known"
         corrected = f", corrected for {self.family} claims" if self.family > 1 else ""
-        said = f"p {format_p(self.p)}{corrected}"
+        said = f"p {format_p(self.p)}{corrected}{self._tell_alone()}"
         if self.verdict != UNDECIDED:
             return said
-        seeds = f"more than {MOST_SEEDS}" if self.seeds is None else f"about {self.seeds}"
-        return f"{said}; to tell an effect of this size takes {seeds} {takes}"
+        takes = f"about {self.seeds} {word}" if self.seeds else f"more than {MOST_SEEDS} {word}"
+        return f"{said}; to tell an effect of this size takes {self.size.describe(word) if self.size else takes}"
+
+    @property
+    def p_cell(self) -> str:
+        """Return the corrected p for a table, with what the correction made undecided; empty where it is not known."""
+        return "" if self.p is None else f"{format_p(self.p)}{self._tell_alone()}"
+
+    @property
+    def takes_cell(self) -> str:
+        """Return for a table the seeds that would decide; empty where the claim is decided, or cannot be."""
+        if self.verdict != UNDECIDED or self.p is None:
+            return ""
+        return self.size.describe("seeds") if self.size else str(self.seeds or f"more than {MOST_SEEDS}")
+
+    def _tell_alone(self) -> str:
+        if self.alone is None:
+            return ""
+        low, high = self.alone.ends
+        ends = f"{signed(low)} to {signed(high)}" if low < 0 else f"{low:.3f} to {high:.3f}"
+        return f" ({format_p(self.alone.p)} alone; simultaneous interval {ends})"
 
 
 def correct_p_values(p_values: Sequence[float]) -> list[float]:
@@ -100,9 +133,14 @@ def judge_known(claims: Sequence[Claim | None]) -> list[Judged | None]:
 
 
 def _judged(claim: Claim, p: float, family: int) -> Judged:
-    above = claim.mean.mean > claim.than
+    above, level = claim.mean.mean > claim.than, LEVEL / family
     said = UNDECIDED if p > LEVEL else HELD if above != claim.at_most else NOT_HELD
-    return Judged(said, p, family, claim.mean.seeds_to_tell(claim.than, LEVEL / family))
+    own = claim.mean.p_value(claim.than)
+    alone = None
+    if said == UNDECIDED and own is not None and own <= LEVEL:
+        alone = Alone(own, claim.mean.ends(level))
+    size = plan_sample(claim.mean, claim.than, level) if said == UNDECIDED else None
+    return Judged(said, p, family, claim.mean.seeds_to_tell(claim.than, level), size, alone)
 
 
 def describe_aims(aims: Mapping[str, Claim]) -> list[str]:
@@ -118,8 +156,7 @@ def _describe_aim(aim: str, mean: MeanOverSeeds, judged: Judged) -> str:
     over = f"{mean.describe()} over {mean.seeds} seeds of standard deviation {mean.sd:.3f}"
     if mean.seeds == 1:
         over = f"{mean.mean:.3f} of one seed"
-    takes = "seeds on these test scenes" if mean.shared.scenes else "seeds"
-    return f"*{aim}*: **{REACHED[judged.verdict]}**, {over}; {judged.describe(takes)}."
+    return f"*{aim}*: **{REACHED[judged.verdict]}**, {over}; {judged.describe()}."
 
 
 def format_p(p: float) -> str:

@@ -1,7 +1,20 @@
-import pytest
+from typing import Any
 
-from flcav.intervals import Estimate, Spread, of_one_training
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import expit, logit
+
+from flcav.intervals import Estimate, SharedScenes, Spread, mean_over_seeds, of_one_training
+from flcav.sample_size import plan_sample
 from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, Claim, explain_verdict, judge, judge_known, signed, verdict
+
+CLEAR, OPEN = [0.02, 0.03, 0.035, 0.01], [0.02, -0.03, 0.035, -0.01]
+
+
+def ttest(values: list[float]) -> float:
+    theirs: Any = stats.ttest_1samp(values, 0.0)
+    return theirs.pvalue
 
 
 @pytest.mark.parametrize(
@@ -36,3 +49,57 @@ def test_the_words_say_what_was_decided():
     assert explain_verdict(UNDECIDED) == "this run does not decide"
     assert explain_verdict(NOT_HELD) == "the claim did not hold in this run"
     assert (signed(-0.0125), signed(2, 1)) == ("−0.013", "+2.0")
+
+
+def test_a_claim_that_its_own_interval_decides_alone_is_told_with_its_simultaneous_interval() -> None:
+    mean = mean_over_seeds(CLEAR)
+    assert mean.low is not None
+    assert mean.low > 0
+    first, *_ = judge([Claim(mean), *[Claim(mean_over_seeds(OPEN))] * 4])
+    half = stats.t.ppf(1 - 0.01 / 2, 3) * np.std(CLEAR, ddof=1) / 2
+    assert first.verdict == UNDECIDED
+    assert first.alone is not None
+    assert first.alone.p == mean.p_value()
+    assert first.alone.ends == pytest.approx((mean.mean - half, mean.mean + half))
+    low, high = (signed(end) for end in first.alone.ends)
+    p = ttest(CLEAR)
+    told = f" ({p:.3f} alone; simultaneous interval {low} to {high})"
+    assert first.p_cell == f"{5 * p:.3f}{told}"
+    seeds = mean.seeds_to_tell(level=0.01)
+    takes = f"to tell an effect of this size takes about {seeds} seeds"
+    assert first.describe() == f"p {5 * p:.3f}, corrected for 5 claims{told}; {takes}"
+    assert first.takes_cell == str(seeds)
+
+
+def test_what_is_decided_or_open_anyway_has_no_simultaneous_interval() -> None:
+    decided, open_ = judge([Claim(mean_over_seeds([0.5, 0.51, 0.505])), Claim(mean_over_seeds(OPEN))])
+    assert (decided.verdict, decided.alone, decided.size, decided.takes_cell) == (HELD, None, None, "")
+    assert (open_.verdict, open_.alone) == (UNDECIDED, None)
+    assert (decided.p_cell, open_.p_cell) == ("< 0.001", f"{ttest(OPEN):.3f}")
+    single = judge([Claim(mean_over_seeds([0.5]))])[0]
+    assert (single.p_cell, single.takes_cell) == ("", "")
+
+
+def test_a_simultaneous_interval_of_a_share_is_on_its_scale_and_that_of_one_training_has_both_sources() -> None:
+    values = [0.9, 0.92, 0.95]
+    share = mean_over_seeds(values, share=True)
+    slope = 1 / (share.mean * (1 - share.mean))
+    half = stats.t.ppf(1 - 0.01 / 2, 2) * np.std(values, ddof=1) / np.sqrt(3) * slope
+    assert share.ends(0.01) == pytest.approx(tuple(expit(logit(share.mean) + half * np.array([-1, 1]))))
+    training = of_one_training(Estimate(0.06, 0.022, 0.11), 30, Spread(0.012, 9))
+    assert training is not None
+    trained = stats.t.ppf(1 - 0.01 / 2, 8) * 0.012
+    below, above = (side * stats.norm.ppf(1 - 0.01 / 2) / stats.norm.ppf(0.975) for side in (0.038, 0.05))
+    assert training.ends(0.01) == pytest.approx((0.06 - np.hypot(below, trained), 0.06 + np.hypot(above, trained)))
+    assert training.ends() == pytest.approx((training.low, training.high))
+    p_value = training.p_value()
+    assert training.ends(p_value)[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_an_undecided_claim_on_shared_scenes_tells_trainings_and_scenes() -> None:
+    mean = mean_over_seeds(OPEN, shared=SharedScenes(0.003, 20))
+    (found,) = judge([Claim(mean)])
+    assert found.size == plan_sample(mean, 0.0, 0.05)
+    assert found.size is not None
+    assert found.takes_cell == found.size.describe("seeds")
+    assert found.describe("trainings").endswith(f"of this size takes {found.size.describe('trainings')}")

@@ -104,7 +104,7 @@ def _tell(results: "list[Run]", summary: "Summary | None") -> None:
 
     if summary is None:
         for finding in results[0].findings:
-            typer.echo(f"{finding.question}: {finding.verdict}. {finding.sentence}")
+            typer.echo(f"{finding.question}: {finding.decision}. {finding.sentence}")
         for name, arm in results[0].arms.items():
             if arm.privacy is not None:
                 typer.echo(f"{name}, {TOGETHER}: {arm.privacy.describe()}")
@@ -112,7 +112,8 @@ def _tell(results: "list[Run]", summary: "Summary | None") -> None:
             typer.echo(f"privacy: {PLACED_BARE}")
         return
     for row in (*summary.measures, *summary.differences):
-        judged = f": {row.judged.verdict}, {row.judged.describe()}" if row.judged else ""
+        kind = f" ({row.kind} claim)" if row.kind else ""
+        judged = f": {row.judged.verdict}{kind}, {row.judged.describe()}" if row.judged else ""
         typer.echo(f"{row.name}: {row.estimate.describe()} over {len(summary.seeds)} seeds{judged}")
 
 
@@ -134,5 +135,5 @@ def compare(
         arm = "" if row.arm == "main" else f" ({row.arm})"
         typer.echo(
             f"{row.region}, {row.task}, {row.stage}{arm}: {row.measure} {row.first:.3f} -> {row.second:.3f}, "
-            f"{change.mean:+.3f} ({interval}): {row.verdict}"
+            f"{change.mean:+.3f} ({interval}): {row.verdict}{f', p {row.judged.p_cell}' if row.judged else ''}"
         )

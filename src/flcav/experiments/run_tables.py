@@ -31,7 +31,7 @@ def tables(run: Run) -> dict[str, str]:
         run = widen_anew(run, read_spreads(run.recipe.spread, Path()))
     judged = judge_anew(run)
     own = {
-        "findings": format_bullets(f"*{each.question}* **{each.verdict}**. {each.sentence}" for each in judged),
+        "findings": format_bullets(f"*{each.question}* **{each.decision}**. {each.sentence}" for each in judged),
         "tests": _tests(run),
         "differences": _differences(run),
         "plan": _plan(run),
@@ -47,9 +47,8 @@ def judge_anew(run: Run) -> tuple[Finding, ...]:
     """Return the findings of a run's results by the present rules; those that it was saved with may be older."""
     labels = {task: choose_labels(task, own.labels) for task, own in run.recipe.tasks.items()}
     settings = resolve_settings(run.recipe, labels)
-    roles = {name: region.role for name, region in run.recipe.regions.items()}
     caveats = {task: LABEL_SOURCES[kind].caveat for task, kind in labels.items()}
-    return findings(run.differences, run.tested, run.arms, settings, roles, caveats)
+    return findings(run.differences, run.tested, run.arms, settings, run.recipe, caveats)
 
 
 def _tests(run: Run) -> str:

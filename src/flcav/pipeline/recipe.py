@@ -22,6 +22,7 @@ from flcav.world.weather import WeatherSchedule
 
 MAIN = "main"  # the arm that the recipe itself describes
 PRETRAIN, EDGE, CLOUD, CENTRAL = "pretrain", "edge", "cloud", "central"
+ELSEWHERE = "elsewhere"  # the claim that federated learning helps in regions that do not federate
 MORE_EDGE = "more_edge"  # after stage II: as many further edge rounds as stage III has, without the cloud
 
 Role = Literal["pretrain", "federate", "unseen"]
@@ -269,6 +270,9 @@ class RunRecipe(Config):
     navigation: NavigationErrors = NavigationErrors()  # errors of vehicles' poses and clocks, in labels of road sensors
     recording: Recording = Recording()  # changes to how all regions are recorded
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
+    primary_claims: tuple[str, ...] = Field(
+        default=(), max_length=3
+    )  # what the run is made to decide: edge, cloud, elsewhere, or arms by name; they are corrected apart from others
 
     @model_validator(mode="before")
     @classmethod
@@ -301,6 +305,9 @@ class RunRecipe(Config):
             raise ValueError(f"arms: '{MAIN}' is the run itself; choose another name")
         for name, arm in self.arms.items():
             self._check_arm(name, arm)
+        claims = (EDGE, CLOUD, ELSEWHERE, *self.arms)
+        if unknown := set(self.primary_claims) - set(claims):
+            raise ValueError(f"primary_claims: '{sorted(unknown)[0]}' is none of {', '.join(claims)}")
         if unknown := set(self.placement.tasks) - set(self.tasks):
             raise ValueError(
                 f"placement.tasks: '{sorted(unknown)[0]}' is none of the run's tasks: {', '.join(self.tasks)}"

@@ -1,5 +1,6 @@
 """Sentences of a run, from its numbers."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -14,7 +15,7 @@ from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference
-from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
+from flcav.verdicts import ESTIMATE, HELD, NOT_HELD, UNDECIDED
 
 CAVEAT = "trained road detector"
 MEANS = {
@@ -44,7 +45,7 @@ def difference(stage: str, before: tuple[str, str], mean: float, low: float, hig
     return Difference("", MAIN, stage, *before, "grid", "objects", found, found, Spread(0.012, 9))
 
 
-def told(*differences: Difference, densest: int = 8):
+def told(*differences: Difference, densest: int = 8, primary: Sequence[str] = ()):
     from test_run_recipe import parsed
 
     own = {
@@ -53,9 +54,10 @@ def told(*differences: Difference, densest: int = 8):
         "slow": {"training": {"steps": 9}},
         "ideal": {"labels": {"objects": "ideal-road"}},
     }
-    settings = resolve_settings(parsed(arms=own), {"objects": "road"})
+    recipe = parsed(arms=own, primary_claims=primary)
+    settings = resolve_settings(recipe, {"objects": "road"})
     arms = {MAIN: arm(2), "densest": arm(densest), "random": arm(2), "slow": arm(2)}
-    return findings(differences, TESTS + TIED, arms, settings, {"grid": "federate"}, {"objects": CAVEAT})
+    return findings(differences, TESTS + TIED, arms, settings, recipe, {"objects": CAVEAT})
 
 
 def test_each_finding_tells_its_own_numbers_frames_and_verdict() -> None:
@@ -68,7 +70,7 @@ def test_each_finding_tells_its_own_numbers_frames_and_verdict() -> None:
     assert "0.412 (pretrained) and 0.503 (edge FL): +0.091, 95 % interval +0.055 to +0.127" in edge.sentence
     assert "p 0.002, corrected for 3 claims: the claim held in this run" in edge.sentence
     assert "0.503 (edge FL) and 0.495 (edge + cloud FL): −0.008" in cloud.sentence
-    assert "trainings on these scenes: this run does not decide" in cloud.sentence
+    assert "nor any number of scenes for one training): this run does not decide" in cloud.sentence
     assert "0.544 (edge FL (densest)) and 0.503 (edge FL)" in pole.sentence
     assert pole.question == "Does the placed pole beat the pole with the densest traffic?"
     for finding in (edge, cloud, pole):
@@ -83,7 +85,7 @@ def test_claims_of_a_run_are_judged_together() -> None:
     assert [each.verdict for each in told(one)] == [HELD]
     edge, *_ = told(one, *others)
     assert edge.verdict == UNDECIDED
-    assert "corrected for 5 claims; to tell an effect of this size takes" in edge.sentence
+    assert "corrected for 5 claims (0.015 alone; simultaneous interval −0." in edge.sentence
     unknown = replace(others[0], spread=None)
     assert told(one, unknown)[0].verdict == HELD, "what cannot be judged does not count"
 
@@ -125,10 +127,40 @@ def test_other_rules_that_choose_the_same_pole_leave_nothing_to_compare_and_anot
     assert "pole" not in slow.sentence
 
 
-def test_a_trained_road_detector_is_compared_with_an_ideal_one() -> None:
-    (ideal,) = told(difference(EDGE, ("ideal", EDGE), 0.0, -0.02, 0.02))
-    assert ideal.question == "Do labels of the trained road detector beat those of an ideal one?"
-    assert ideal.verdict == UNDECIDED
+def test_what_a_trained_road_detector_loses_to_an_ideal_one_is_no_claim_and_corrects_none() -> None:
+    one, lost = (
+        difference(EDGE, (MAIN, PRETRAIN), 0.06, 0.022, 0.11),
+        difference(EDGE, ("ideal", EDGE), -0.03, -0.04, -0.02),
+    )
+    edge, *others = told(one, *[lost] * 4)
+    assert edge == told(one)[0]
+    for ideal in others:
+        assert ideal.question == "What do labels of the trained road detector lose to those of an ideal one?"
+        assert ideal.verdict == ESTIMATE
+        assert "−0.030, 95 % interval −0.040 to −0.020" in ideal.sentence
+        assert ideal.sentence.endswith(f"of 9 trainings): an estimate, no claim ({CAVEAT}).")
+    (unknown,) = told(replace(lost, spread=None))
+    assert unknown.verdict == ESTIMATE
+    assert "decide" not in unknown.sentence
+
+
+def test_primary_claims_are_corrected_apart_from_others() -> None:
+    one, other = (
+        difference(EDGE, (MAIN, PRETRAIN), 0.06, 0.022, 0.11),
+        difference(CLOUD, (MAIN, EDGE), 0.0, -0.02, 0.02),
+    )
+    pole = difference(EDGE, ("densest", EDGE), -0.041, -0.06, -0.02)
+    edge, cloud, again, densest = told(one, other, other, pole, primary=["edge", "densest"])
+    assert [each.decision for each in (edge, cloud)] == ["held, primary claim", "undecided, secondary claim"]
+    assert (again.kind, densest.kind) == ("secondary", "primary")
+    assert "corrected for 2 claims" in edge.sentence
+    assert "corrected for 2 claims" in cloud.sentence
+    assert told(one, other, other, pole)[0].verdict == UNDECIDED, "without primary claims all are corrected together"
+    cloud_alone = told(one, other, primary=["cloud"])
+    assert [each.kind for each in cloud_alone] == ["secondary", "primary"]
+    assert "p 0.015: the claim held" in cloud_alone[0].sentence
+    (elsewhere,) = told(difference(CLOUD, (MAIN, PRETRAIN), 0.06, 0.022, 0.11), primary=["elsewhere"])
+    assert elsewhere.kind == "primary"
 
 
 def test_one_scene_decides_nothing() -> None:

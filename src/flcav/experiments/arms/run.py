@@ -214,9 +214,12 @@ def _road_share(reached: Mapping[str, Reached]) -> float:
 
 
 def judge_differences(summary: ArmsSummary) -> dict[str, Judged]:
-    """Return the verdicts on the claims that the differences are positive, corrected together."""
-    judged = judge([Claim(mean) for mean in summary.differences.values()])
-    return dict(zip(summary.differences, judged, strict=True))
+    """Return the verdicts on the claims that the differences are positive, corrected together.
+
+    Nobody claims that the trained road detector beats an ideal one: what is lost to that is an estimate.
+    """
+    claims = {name: Claim(mean) for name, mean in summary.differences.items() if not name.endswith(f" - {IDEAL}")}
+    return dict(zip(claims, judge(list(claims.values())), strict=True))
 
 
 def _known(number: float | None) -> float:

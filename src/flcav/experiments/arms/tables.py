@@ -5,7 +5,7 @@ from collections import Counter
 from flcav.experiments.arms.run import ARMS, EFFECT, ArmsResult, judge_differences
 from flcav.intervals import LEVEL, MOST_SEEDS, MeanOverSeeds, half_width, plan_seeds
 from flcav.markdown import format_table
-from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, format_p, verdict
+from flcav.verdicts import ESTIMATE, HELD, NOT_HELD, UNDECIDED, verdict
 
 
 def tables(results: ArmsResult) -> dict[str, str]:
@@ -38,8 +38,9 @@ def _differences(results: ArmsResult) -> str:
         own = [seed.differences[name] for seed in results.seeds]
         times = Counter(verdict(each.low, each.high) for each in own)
         counted = " / ".join(str(times[each]) for each in (HELD, UNDECIDED, NOT_HELD))
-        p = judged[name].p
-        rows.append([name, mean.describe(sign=True), "" if p is None else format_p(p), judged[name].verdict, counted])
+        one = judged.get(name)
+        told = (one.p_cell, one.verdict) if one else ("", ESTIMATE)
+        rows.append([name, mean.describe(sign=True), *told, counted])
     header = (
         "difference in AP50",
         "mean over seeds",
@@ -54,12 +55,11 @@ def _power(results: ArmsResult) -> str:
     """Return how many seeds it takes to tell `EFFECT`, and differences of the size found, after correction."""
     judged, rows = judge_differences(results.summary), []
     for name, mean in results.summary.differences.items():
-        level = LEVEL / max(judged[name].family, 1)
+        one = judged.get(name)
+        level = LEVEL / max(one.family, 1) if one else LEVEL
         half = f"{half_width(mean.sd, mean.seeds):.3f}" if mean.seeds > 1 else ""
         wanted = plan_seeds(EFFECT, mean.sd, level) if mean.known else None
-        undecided = judged[name].verdict == UNDECIDED
-        rows.append([name, f"{mean.sd:.3f}", half, _told(wanted, mean)])
-        rows[-1].append(_told(judged[name].seeds, mean) if undecided else "")
+        rows.append([name, f"{mean.sd:.3f}", half, _told(wanted, mean), one.takes_cell if one else ""])
     header = (
         "difference in AP50",
         "standard deviation over seeds",

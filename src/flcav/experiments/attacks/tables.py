@@ -2,9 +2,8 @@
 
 from flcav.experiments.attacks.faults import LIES, STRATEGIES, FaultsResult
 from flcav.experiments.attacks.leakage import LeakageResult, Level
-from flcav.intervals import MOST_SEEDS
 from flcav.markdown import format_table
-from flcav.verdicts import UNDECIDED, Claim, format_p, judge
+from flcav.verdicts import Claim, judge
 
 
 def fault_tables(results: FaultsResult) -> dict[str, str]:
@@ -14,9 +13,8 @@ def fault_tables(results: FaultsResult) -> dict[str, str]:
     judged = judge([Claim(results.gained[lie][name]) for lie, name in pairs])
     gained = []
     for (lie, name), one in zip(pairs, judged, strict=True):
-        p = "" if one.p is None else format_p(one.p)
-        takes = "" if one.verdict != UNDECIDED or one.p is None else one.seeds or f"more than {MOST_SEEDS}"
-        gained.append([lie, name, results.gained[lie][name].describe(sign=True), p, one.verdict, takes])
+        found = results.gained[lie][name].describe(sign=True)
+        gained.append([lie, name, found, one.p_cell, one.verdict, one.takes_cell])
     claim, seeds = "claim that it is positive", "if undecided: seeds that tell an effect of the size found"
     return {
         "accuracy": format_table((f"lie of 3 of 10 vehicles, {len(results.seeds)} seeds", *STRATEGIES), rows),

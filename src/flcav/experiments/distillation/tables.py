@@ -4,7 +4,6 @@ import numpy as np
 
 from flcav.experiments.distillation.run import ARMS, PRETRAINED, DistillationResult, judge_differences
 from flcav.markdown import format_table
-from flcav.verdicts import format_p
 
 
 def tables(results: DistillationResult) -> dict[str, str]:
@@ -24,7 +23,7 @@ def _arms(results: DistillationResult) -> str:
 def _differences(results: DistillationResult) -> str:
     judged = judge_differences(results)
     rows = [
-        [name, mean.describe(sign=True), "" if (p := judged[name].p) is None else format_p(p), judged[name].verdict]
+        [name, mean.describe(sign=True), judged[name].p_cell, judged[name].verdict]
         for name, mean in results.differences.items()
     ]
     return format_table(("difference in AP50", "mean over seeds", "p, corrected", "claim that it is positive"), rows)

@@ -15,9 +15,8 @@ from flcav.experiments.exchanges.run import (
     ExchangeResult,
     judge_differences,
 )
-from flcav.intervals import MOST_SEEDS
 from flcav.markdown import format_table
-from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, format_p
+from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
 
 WORDS = {HELD: "higher", NOT_HELD: "lower", UNDECIDED: UNDECIDED}  # of the claim that a difference is positive
 
@@ -68,13 +67,10 @@ def _costs(results: ExchangeResult) -> str:
 def _differences(results: ExchangeResult) -> str:
     judged, rows = judge_differences(results), []
     for name in (each for names in results.groups.values() for each in names if each in results.differences):
-        one, places, seeds = judged[name], results.differences[name], ""
-        if one.verdict == UNDECIDED and one.p is not None:
-            seeds = f"more than {MOST_SEEDS}" if one.seeds is None else str(one.seeds)
-        p = "" if one.p is None else format_p(one.p)
+        one, places = judged[name], results.differences[name]
         shown = [place for place in (OWN, UNSEEN) if place in results.places]
         told = [places[place].describe(sign=True) if place in places else "" for place in shown]
-        rows.append([name, told[0], p, WORDS[one.verdict], seeds, *told[1:]])
+        rows.append([name, told[0], one.p_cell, WORDS[one.verdict], one.takes_cell, *told[1:]])
     header = (
         "arm",
         f"{results.measure} - that of whole weights, {OWN}",

@@ -15,7 +15,6 @@ from flcav.experiments.placement.records import (
 )
 from flcav.intervals import MOST_SEEDS
 from flcav.markdown import format_table
-from flcav.verdicts import UNDECIDED, format_p
 
 POOLED = "mean over regions"
 
@@ -42,9 +41,9 @@ def _claims(results: PlacementProof) -> str:
         [
             name,
             claims[name].describe(sign=True),
-            "" if one.p is None else format_p(one.p),
+            one.p_cell,
             one.verdict,
-            (one.seeds or f"more than {MOST_SEEDS}") if one.verdict == UNDECIDED and one.p is not None else "",
+            one.takes_cell,
         ]
         for name, one in judge_claims(claims).items()
     ]

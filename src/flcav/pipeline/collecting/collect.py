@@ -40,7 +40,6 @@ def collect_results(graph: Graph, work: Path) -> Run:
     ]
     arms = {name: _arm(graph, work, arm) for name, arm in settings.items()}
     differences = list_differences(graph, work)
-    roles = {name: region.role for name, region in recipe.regions.items()}
     rests = {task: LABEL_SOURCES[kind].caveat for task, kind in main.labels.items()}
     return Run(
         recipe=recipe,
@@ -49,7 +48,7 @@ def collect_results(graph: Graph, work: Path) -> Run:
         watched=tuple(watched),
         tested=tuple(tests),
         differences=tuple(differences),
-        findings=findings(differences, tests, arms, settings, roles, rests),
+        findings=findings(differences, tests, arms, settings, recipe, rests),
         gap_closed=gaps_closed(tests, recipe),
         provenance=provenance(recipe.seed),
         caveats=(*list_caveats(recipe, main.labels.values(), settings.values()), *compare_rigs(graph)),

@@ -1,20 +1,23 @@
-"""Findings of a run: verdicts on the claims of the method, as sentences with the numbers behind them.
+"""Findings of a run: verdicts on its claims, and what it loses to upper bounds, with the numbers behind them.
 
 A claim says that a difference of a measure is positive. Of a run with retrainings it is judged by the mean over its
 trainings, which share their test scenes. Of one training the 95 % interval is a paired bootstrap over scenes, widened
-by the spread of retraining, and the p-value is that of this interval. P-values of a run are corrected together (Holm).
+by the spread of retraining, and the p-value is that of this interval. P-values are corrected together (Holm), those of
+primary claims apart from those of others.
 A claim held, or did not hold, if its corrected p-value is at most 0.05. It is undecided else, and where the spread is
 not known: another training on the same frames might say otherwise.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from flcav.intervals import MeanOverSeeds, of_one_training
 from flcav.pipeline.arms import Setting
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
+from flcav.pipeline.collecting.claims import Asked, ask, judge_asked
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference, Finding, Test
-from flcav.verdicts import UNDECIDED, Claim, Judged, explain_verdict, judge_known, signed
+from flcav.verdicts import ESTIMATE, UNDECIDED, Judged, explain_verdict, signed
 
 WORDS = {
     PRETRAIN: "pretrained",
@@ -37,34 +40,25 @@ def findings(
     tests: Sequence[Test],
     arms: Mapping[str, ArmResult],
     settings: Mapping[str, Setting],
-    roles: Mapping[str, str],
+    recipe: RunRecipe,
     caveats: Mapping[str, str],
 ) -> tuple[Finding, ...]:
     """Return a finding for each difference of the run itself.
 
-    `settings`: those of each arm. `roles`: role of each region. `caveats`: those of the labels, by task.
+    `settings`: those of each arm. `caveats`: those of the labels, by task.
     """
     values = {(test.arm, test.stage, test.region, test.task): test for test in tests}
     own = [each for each in differences if each.arm == MAIN]
+    asked = [ask(each, recipe, settings) for each in own]
     same = [_tell_same_poles(each, arms, settings) for each in own]
-    return tuple(
-        _finding(each, judged, _question(each, settings, roles), values, none_differs, caveats)
-        for each, judged, none_differs in zip(own, _judge(own, values, same), same, strict=True)
-    )
-
-
-def _judge(
-    differences: Sequence[Difference], values: Mapping[tuple[str, str, str, str], Test], same: Sequence[str | None]
-) -> list[Judged | None]:
-    """Return the verdicts on all differences, judged together; None where the spread of retraining is not known.
-
-    `same`: what is said of each difference where nothing differs, which is not judged.
-    """
     means = [
         None if none_differs else _mean(each, values[each.arm, each.stage, each.region, each.task].result.scenes)
-        for each, none_differs in zip(differences, same, strict=True)
+        for each, none_differs in zip(own, same, strict=True)
     ]
-    return judge_known([None if mean is None else Claim(mean) for mean in means])
+    return tuple(
+        replace(_finding(each, judged, about, values, none_differs, caveats), kind=about.named)
+        for each, judged, about, none_differs in zip(own, judge_asked(asked, means), asked, same, strict=True)
+    )
 
 
 def _mean(each: Difference, scenes: int) -> MeanOverSeeds | None:
@@ -77,7 +71,7 @@ def _mean(each: Difference, scenes: int) -> MeanOverSeeds | None:
 def _finding(
     each: Difference,
     judged: Judged | None,
-    question: str,
+    asked: Asked,
     values: Mapping[tuple[str, str, str, str], Test],
     same: str | None,
     caveats: Mapping[str, str],
@@ -85,9 +79,11 @@ def _finding(
     """Return the finding of a difference; `same`: what is said where nothing differs."""
     test, before = values[each.arm, each.stage, each.region, each.task], _before(each, values)
     after = test.result
-    place = f"{each.region}, {each.task}"
+    place, question = f"{each.region}, {each.task}", asked.question
+    loss = asked.kind == "loss"
+    open_, undecided = (ESTIMATE, "") if loss else (UNDECIDED, ", so this run does not decide")
     if same is not None:
-        return Finding(place, question, UNDECIDED, f"{same}: there is nothing to compare, so this run does not decide.")
+        return Finding(place, question, open_, f"{same}: there is nothing to compare{undecided}.")
     mean, low, high = each.estimate.mean, each.estimate.low, each.estimate.high
     told = (
         f"On {each.region}, {after.measure} of {each.task} was {before.estimate.mean:.3f} "
@@ -96,16 +92,18 @@ def _finding(
     )
     over = f"{after.frames} test frames of {after.scenes} scenes"
     if low is None or high is None:
-        return Finding(place, question, UNDECIDED, f"{told}, over {over}: too few scenes for an interval.")
+        return Finding(place, question, open_, f"{told}, over {over}: too few scenes for an interval.")
     rests = f" ({caveats[each.task]})" if caveats.get(each.task) else ""
-    if each.spread is None or judged is None:
-        unknown = "how much another training on the same frames would differ is not known, so this run does not decide"
+    if each.spread is None or (judged is None and not loss):
+        unknown = f"how much another training on the same frames would differ is not known{undecided}"
         sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over} alone; {unknown}{rests}."
-        return Finding(place, question, UNDECIDED, sentence)
+        return Finding(place, question, open_, sentence)
     of = f"{over} and over retraining (standard deviation {each.spread.sd:.3f} of {each.spread.trainings} trainings)"
-    said = f"{judged.describe('trainings on these scenes')}: {explain_verdict(judged.verdict)}"
-    sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {of}; {said}{rests}."
-    return Finding(place, question, judged.verdict, sentence)
+    found = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {of}"
+    if judged is None:
+        return Finding(place, question, ESTIMATE, f"{found}: an estimate, no claim{rests}.")
+    said = f"{judged.describe('trainings')}: {explain_verdict(judged.verdict)}"
+    return Finding(place, question, judged.verdict, f"{found}; {said}{rests}.")
 
 
 def _tell_trainings(each: Difference) -> str:
@@ -115,24 +113,6 @@ def _tell_trainings(each: Difference) -> str:
 def _before(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) -> Test:
     key = (each.before_arm, each.before_stage, each.region, each.task)
     return values.get(key) or values[MAIN, *key[1:]]
-
-
-def _question(each: Difference, settings: Mapping[str, Setting], roles: Mapping[str, str]) -> str:
-    if each.before_arm == MAIN:
-        if each.stage == EDGE:
-            return "Does federated learning beat pretraining alone?"
-        if each.before_stage == EDGE:
-            return "Does cloud FL add to edge FL?"
-        where = "in the town of pretraining, too" if roles[each.region] == "pretrain" else "where nobody learned"
-        return f"Does federated learning help {where}?"
-    own, other = (settings[arm] for arm in (MAIN, each.before_arm))
-    if (own.placement.rule, other.placement.rule) == ("vrcsp", "densest"):
-        return "Does the placed pole beat the pole with the densest traffic?"
-    if other.placement.rule == "none" != own.placement.rule:
-        return "Does the placed pole beat no pole?"
-    if (own.labels[each.task], other.labels[each.task]) == ("road", "ideal-road"):
-        return "Do labels of the trained road detector beat those of an ideal one?"
-    return f"Does the run beat its arm '{each.before_arm}'?"
 
 
 def _tell_same_poles(each: Difference, arms: Mapping[str, ArmResult], settings: Mapping[str, Setting]) -> str | None:

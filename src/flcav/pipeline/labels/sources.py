@@ -18,6 +18,11 @@ class LabelSource:
     averaged: bool = False  # the road average of a window's poles and vehicles, renewed before each round of stage II
     caveat: str = ""  # stated with every result that depends on them
 
+    @property
+    def bound(self) -> bool:
+        """Return whether the labels are ground truth, or rest on it: figures with them are upper bounds."""
+        return not self.from_detections or (self.from_poles and not self.trained)
+
 
 LABEL_SOURCES: Mapping[str, LabelSource] = {
     "own-detections": LabelSource(from_detections=True),

@@ -98,11 +98,12 @@ class Mean:
     name: str
     estimate: MeanOverSeeds
     judged: Annotated[Judged | None, LEFT_OUT] = None  # of the run's own differences: the claim that they are positive
+    kind: Annotated[str | None, LEFT_OUT] = None  # of this claim: primary or secondary, where the recipe names some
 
 
 @dataclass(frozen=True)
 class Summary(Saved):
-    """Means over several seeds of a recipe; verdicts on differences are corrected together."""
+    """Means over several seeds of a recipe; verdicts are corrected together, on primary claims apart from others."""
 
     seeds: tuple[int, ...]
     measures: tuple[Mean, ...]

@@ -85,12 +85,18 @@ class Difference:
 
 @dataclass(frozen=True)
 class Finding:
-    """The verdict of a run on one claim."""
+    """The verdict of a run on one claim, or its estimate of a loss."""
 
     place: str  # region and task
     question: str
-    verdict: str  # held | did not hold | undecided
+    verdict: str  # held | did not hold | undecided | estimate
     sentence: str  # with the numbers behind it
+    kind: Annotated[str | None, LEFT_OUT] = None  # primary | secondary; None: the recipe names no primary claims
+
+    @property
+    def decision(self) -> str:
+        """Return the verdict, with the kind of the claim where it is known."""
+        return self.verdict if self.kind is None else f"{self.verdict}, {self.kind} claim"
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from flcav.pipeline.collecting.tests import mean_of_tests, mean_over_trainings
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Test
 from flcav.pipeline.running import RESULTS, WORK, seed_folders
-from flcav.verdicts import UNDECIDED, Claim, judge, judge_known
+from flcav.verdicts import UNDECIDED, Claim, Judged, judge, judge_known
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task
 
@@ -32,6 +32,7 @@ class Compared:
     second: float
     difference: Estimate  # over scenes and retraining; over seeds and scenes where both runs have several seeds
     verdict: str  # of the claim that the second is better, corrected for the number of tests
+    judged: Judged | None = None  # with its p-value; None for one training of unknown spread
 
 
 def compare(first: Path, second: Path) -> tuple[Compared, ...]:
@@ -53,7 +54,7 @@ def compare(first: Path, second: Path) -> tuple[Compared, ...]:
     means = [mean_of_tests(key[3], *_listed([row[key] for row in rows])) for key in common]
     judged = judge([Claim(mean) for mean in means])
     return tuple(
-        _compared(key, [row[key].compared for row in rows], mean, one.verdict)
+        _compared(key, [row[key].compared for row in rows], mean, one)
         for key, mean, one in zip(common, means, judged, strict=True)
     )
 
@@ -97,7 +98,7 @@ def _judge_trainings(pairs: Sequence[_Pair]) -> tuple[Compared, ...]:
     """Return the differences of one seed with their verdicts, judged together; unknown ones are undecided."""
     judged = judge_known([None if pair.estimate is None else Claim(pair.estimate) for pair in pairs])
     return tuple(
-        pair.compared if one is None else replace(pair.compared, verdict=one.verdict)
+        pair.compared if one is None else replace(pair.compared, verdict=one.verdict, judged=one)
         for pair, one in zip(pairs, judged, strict=True)
     )
 
@@ -111,6 +112,6 @@ def _listed(pairs: Sequence[_Pair]) -> tuple[list[float], list[tuple[Path, Path]
     return [pair.compared.difference.mean for pair in pairs], [pair.folders for pair in pairs]
 
 
-def _compared(key: Key, rows: Sequence[Compared], change: Estimate, decided: str) -> Compared:
+def _compared(key: Key, rows: Sequence[Compared], change: Estimate, judged: Judged) -> Compared:
     first, second = float(np.mean([row.first for row in rows])), float(np.mean([row.second for row in rows]))
-    return Compared(*key, rows[0].measure, first, second, change, decided)
+    return Compared(*key, rows[0].measure, first, second, change, judged.verdict, judged)

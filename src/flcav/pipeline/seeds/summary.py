@@ -5,19 +5,21 @@ from dataclasses import replace
 from pathlib import Path
 
 from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.pipeline.arms import resolve_settings
+from flcav.pipeline.collecting.claims import ask, judge_asked
 from flcav.pipeline.collecting.findings import name_stage
 from flcav.pipeline.collecting.tests import mean_of_tests
+from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.recipe import MAIN
 from flcav.pipeline.results.run import Mean, Run, Summary
 from flcav.pipeline.results.tests import Difference, Test
-from flcav.verdicts import Claim, judge
 
 
 def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
     """Return means over the seeds of a recipe; `works`: the folder of each run's steps, with the outcomes of its tests.
 
-    A seed's number is the mean over its trainings. The claims that the run itself is better, as in its findings, are
-    judged together. Simulated towns have traffic of their own for each seed. Where seeds are tested on the same
+    A seed's number is the mean over its trainings. The claims that the run itself is better are judged as in its
+    findings. Simulated towns have traffic of their own for each seed. Where seeds are tested on the same
     recorded scenes, the intervals include what these scenes vary by; those of closed gaps do not.
     """
     tests = [{_key(test): test for test in run.tested} for run in runs]
@@ -28,9 +30,13 @@ def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
         Mean(rows[0].name, _mean_difference(rows, tests, works))
         for rows in zip(*(run.differences for run in runs), strict=True)
     ]
+    recipe = runs[0].recipe
+    settings = resolve_settings(recipe, {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()})
     own = [number for number, each in enumerate(runs[0].differences) if each.arm == MAIN]
-    for number, one in zip(own, judge([Claim(differences[number].estimate) for number in own]), strict=True):
-        differences[number] = replace(differences[number], judged=one)
+    asked = [ask(runs[0].differences[number], recipe, settings) for number in own]
+    judged = judge_asked(asked, [differences[number].estimate for number in own])
+    for number, about, one in zip(own, asked, judged, strict=True):
+        differences[number] = replace(differences[number], judged=one, kind=about.named)
     closed = [Mean(name, mean_over_seeds([run.gap_closed[name] for run in runs])) for name in runs[0].gap_closed]
     return Summary(
         tuple(run.recipe.seed for run in runs),
