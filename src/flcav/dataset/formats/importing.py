@@ -11,6 +11,7 @@ from flcav.dataset.formats.nuscenes.read import NuscenesSource
 from flcav.dataset.formats.opv2v.read import Opv2vSource
 from flcav.dataset.formats.reading import LogSource
 from flcav.dataset.recording.recorder import drop_unbegun, record
+from flcav.machine.locks import only_writer
 from flcav.progress import Report, ignore_progress
 
 
@@ -46,15 +47,16 @@ def import_dataset(
     shown = [each for each in READABLE if _shows(folder, each)]
     if shown and name not in shown:
         raise InputError(f"{folder}: is no folder of '{name}' but of '{shown[0]}'")
-    try:
-        source = READABLE[name].read(folder, split)
-        record(source, out, progress=progress)
-    except (InputError, OSError):
-        drop_unbegun(out)
-        raise
-    except ValueError as error:  # of names that a dataset cannot hold, or numbers that no measurement has
-        drop_unbegun(out)
-        raise InputError(f"{folder}: cannot be imported ({error})") from None
+    with only_writer(out):
+        try:
+            source = READABLE[name].read(folder, split)
+            record(source, out, progress=progress)
+        except (InputError, OSError):
+            drop_unbegun(out)
+            raise
+        except ValueError as error:  # of names that a dataset cannot hold, or numbers that no measurement has
+            drop_unbegun(out)
+            raise InputError(f"{folder}: cannot be imported ({error})") from None
     return source.notes
 
 

@@ -78,7 +78,8 @@ def _run(
         folder = Path(name)
         (folder / "routes.rou.xml").write_text(demand, encoding="utf-8")
         asked = [scenario.model_dump() for scenario in scenarios]
-        values = {"net": str(net), "routes": str(folder / "routes.rou.xml"), "seed": seed, "steps": steps.tolist()}
+        files = {"net": str(net.absolute()), "routes": str(folder.absolute() / "routes.rou.xml")}
+        values = files | {"seed": seed, "steps": steps.tolist()}
         (folder / "job.json").write_text(json.dumps(values | {"scenarios": asked}))
         try:
             simulate_in(folder)
