@@ -28,6 +28,10 @@ class InputError(ValueError):
     """Invalid user input. The message is one sentence for the user; the command line prints it and exits with 2."""
 
 
+class DamagedFile(InputError):
+    """A file that a program wrote and that is not what it wrote any more, or never was."""
+
+
 class Config(BaseModel):
     """Base class of user-facing configurations: frozen; rejects unknown fields and numbers of implausible magnitude.
 

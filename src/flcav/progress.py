@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 Report = Callable[[int, int, str], None]  # done, total, note (e.g. "loss 0.31")
+DAMAGED = "is damaged"  # in notes that stay on the terminal: a file is not what was written, and is made anew
 
 
 def ignore_progress(done: int, total: int, note: str = "") -> None:
@@ -17,7 +18,8 @@ def ignore_progress(done: int, total: int, note: str = "") -> None:
 def show_progress(title: str) -> Iterator[Report]:
     """Yield a `Report` that draws a progress bar with the estimated time left on stderr, if stderr is a terminal.
 
-    The `done` of the first call is taken as finished earlier and does not count towards the speed.
+    The `done` of the first call is taken as finished earlier and does not count towards the speed. A note that a file
+    is damaged is printed, with a terminal and without.
     """
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -37,5 +39,7 @@ def show_progress(title: str) -> Iterator[Report]:
                 bars.reset(task, completed=done, total=total)
                 begun = True
             bars.update(task, completed=done, total=total, note=note)
+            if DAMAGED in note:
+                console.print(f"{title}: {note}", highlight=False, markup=False, soft_wrap=True)
 
         yield report

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import STALE, Runtime, Stale
-from flcav.cli.terminal import print_json, when_interrupted
+from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ def register(app: typer.Typer) -> None:
 
 
 @when_interrupted()
+@only_writer_of("out")
 def federate(
     recipe: Path = typer.Argument(help="Run recipe (YAML), of which stage II is run; see docs/runs.md."),
     out: Path = typer.Option(

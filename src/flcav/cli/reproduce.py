@@ -10,7 +10,7 @@ import click
 import typer
 
 from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale, join_choices, refuse_unused
-from flcav.cli.terminal import when_interrupted
+from flcav.cli.terminal import only_writer_of, when_interrupted
 from flcav.experiments.studies import STUDIES
 from flcav.machine.threads import use_threads
 
@@ -92,6 +92,7 @@ class Reproducible(click.Choice):
         return value if ":" in value else super().convert(value, param, ctx)
 
 
+@only_writer_of("out")
 def reproduce(
     target: str = typer.Argument(
         ...,

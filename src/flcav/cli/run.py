@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
-from flcav.cli.terminal import print_json, when_interrupted
+from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ def register(app: typer.Typer) -> None:
 
 
 @when_interrupted()
+@only_writer_of("out")
 def run(
     recipe: Path = typer.Argument(help="Run recipe (YAML): tasks, regions, budgets, arms; see docs/runs.md."),
     out: Path = typer.Option(..., "--out", help="Folder of the run; the same command goes on after a stop."),
@@ -40,6 +41,7 @@ def run(
 
 
 @when_interrupted()
+@only_writer_of("out")
 def demo(
     out: Path = typer.Option(
         Path("out/demo"), "--out", help="Folder of the run; the same command goes on after a stop."

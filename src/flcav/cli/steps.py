@@ -9,6 +9,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from flcav.federation.state import FAILED
 from flcav.pipeline.rigs import RIG
 from flcav.pipeline.steps import FINISHED, Notify
+from flcav.progress import DAMAGED
 
 EPSILON = "epsilon"  # in the notes of rounds with differential privacy
 
@@ -39,6 +40,8 @@ def live_steps(title: str) -> Iterator[Notify]:
             if EPSILON in note or FAILED in note:  # what a round cost, and whom it lost, stays on the terminal
                 told = f"{title}: {step}, round {done} of {total}: {note}"
                 console.print(told, highlight=False, soft_wrap=True)
+            if DAMAGED in note:
+                console.print(f"{title}: {step}: {note}", highlight=False, markup=False, soft_wrap=True)
             if note in FINISHED:
                 finished += 1
                 bars.update(rows[step], visible=False)

@@ -1,14 +1,17 @@
 """Terminal output: a plain console, JSON, and messages for Ctrl-C."""
 
 import contextlib
+import functools
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from flcav.files import Json
+from flcav.machine.locks import only_writer
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -47,3 +50,18 @@ def when_interrupted(kept: Callable[[], str] = lambda: GOES_ON) -> Iterator[None
         yield
     except KeyboardInterrupt:
         raise Interrupted(kept()) from None
+
+
+def only_writer_of(option: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator of a command: while it runs, it holds the lock of the path that `option` has, if any."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def locked(**options: Any) -> None:
+            path: Path | None = options[option]
+            with contextlib.nullcontext() if path is None else only_writer(path):
+                command(**options)
+
+        return locked
+
+    return decorate

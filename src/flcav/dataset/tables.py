@@ -3,6 +3,7 @@
 `frames` and `poses` have one row per frame. All other tables have any number of rows per frame, in frame order.
 """
 
+import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from flcav.config import InputError
+from flcav.dataset.layout import FILES, Manifest, table_path
 from flcav.parquet import read_parquet
 from flcav.world.weather import Weather
 
@@ -146,6 +148,18 @@ def read_table(path: Path, name: str) -> pa.Table:
     if any(column.null_count or _null_elements(column) for column in table.columns):
         raise InputError(f"{path}: has empty cells")
     return table.combine_chunks()
+
+
+def list_files(folder: Path, manifest: Manifest) -> dict[str, tuple[int, str]]:
+    """Return path -> (bytes, SHA-256) of every file that the dataset in `folder` lists, all but the manifest.
+
+    Where the listing is damaged, these are the files of the tables, of which it is one.
+    """
+    listed = {name: (entry.bytes, entry.sha256) for name, entry in manifest.tables.items()}
+    with contextlib.suppress(InputError):
+        files = read_table(folder / table_path(FILES), FILES).to_pydict()
+        listed |= {name: (size, digest) for name, size, digest in zip(files["path"], files["bytes"], files["sha256"])}
+    return listed
 
 
 def _null_elements(column: pa.ChunkedArray) -> int:

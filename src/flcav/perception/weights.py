@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
-from flcav.config import InputError
+from flcav.config import DamagedFile, InputError
 from flcav.files import write_bytes
 from flcav.perception.card import CARD_KEY, Card
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
@@ -135,7 +135,7 @@ def _opened(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
             return file.metadata() or {}, tensors
     except (SafetensorError, OSError):
-        raise InputError(f"{path}: not a safetensors file, or a damaged one") from None
+        raise DamagedFile(f"{path}: not a safetensors file, or a damaged one") from None
 
 
 def _read(task: Task[ConfigT, NetworkT, SampleT], path: Path) -> tuple[ConfigT, dict[str, torch.Tensor]]:

@@ -6,16 +6,21 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+import toy_source
 from toy_source import ToySource
 
+from flcav import files
 from flcav.config import InputError
 from flcav.dataset import layout
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.geometry import pose
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -66,6 +71,82 @@ def test_a_finished_recording_is_left_alone(tmp_path: Path):
     before = digests(tmp_path / "data")
     assert not record(ToySource(), tmp_path / "data")
     assert digests(tmp_path / "data") == before
+
+
+def test_a_lock_in_the_folder_is_no_other_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, str]
+):
+    monkeypatch.setattr(os, "access", lambda path, how: path != tmp_path)
+    assert record(ToySource(), tmp_path / "data")
+    assert digests(tmp_path / "data") == uninterrupted
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+def alter(path: Path) -> None:
+    path.write_bytes(b"\0" * path.stat().st_size)
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, cut, alter])
+@pytest.mark.parametrize("file", ["lidar/toy-0-001_0002_pole3.bin", "frames.parquet", "files.parquet"])
+def test_a_damaged_dataset_is_mended(
+    tmp_path: Path, damage: Callable[[Path], None], file: str, uninterrupted: dict[str, str]
+):
+    data, told = tmp_path / "data", []
+    record(ToySource(), data)
+    other = data / "lidar/toy-0-000_0000_cav0.bin"
+    before = other.stat()
+    damage(data / file)
+    if damage is alter and file.endswith(".bin"):
+        assert not record(ToySource(), data)  # its size is right: `flcav validate` compares hashes
+        return
+    assert record(ToySource(), data, progress=lambda done, total, note: told.append(note))
+    assert digests(data) == uninterrupted
+    assert not record(ToySource(), data)
+    if file.endswith(".bin"):
+        assert told[0] == f"{data / file} is damaged, recorded anew"
+        assert (other.stat().st_ino, other.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+
+
+def test_a_file_that_is_lost_while_parts_are_joined_is_recorded_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, str]
+):
+    from flcav.dataset.recording import recorder
+
+    assemble = recorder._assemble
+
+    def lose(source: ToySource, out: Path, header: Any) -> None:
+        next((out / layout.WORK).rglob("*_pole3.bin")).unlink()
+        assemble(source, out, header)
+
+    monkeypatch.setattr(recorder, "_assemble", lose)
+    record(ToySource(), tmp_path / "data")
+    assert digests(tmp_path / "data") == uninterrupted
+
+
+def test_a_dataset_that_is_recorded_otherwise_now_is_not_mended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    record(ToySource(), tmp_path / "data")
+    path = tmp_path / "data/lidar/toy-0-001_0002_pole3.bin"
+    path.unlink()
+    monkeypatch.setattr(toy_source, "MOUNT", pose(0.2, 0.0, 1.8, yaw=0.01))
+    with pytest.raises(InputError, match=rf"{path}: damaged, and not recorded as it was; remove .*data to record it"):
+        record(ToySource(), tmp_path / "data")
+    assert not path.exists()
+
+
+def test_what_is_complete_is_on_the_disk_before_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    events: list[Path] = []
+    flush, replace, rename = files._flush, Path.replace, Path.rename
+    monkeypatch.setattr(files, "_flush", lambda path: (events.append(path), flush(path)))
+    monkeypatch.setattr(Path, "replace", lambda path, to: (events.append(to), replace(path, to))[1])
+    monkeypatch.setattr(Path, "rename", lambda path, to: (events.append(to), rename(path, to))[1])
+    record(ToySource(scene_count=1), tmp_path / "data")
+    part = tmp_path / "data" / layout.WORK / "toy-0-000" / "00000"
+    payload = part.with_suffix(".part") / "payloads/lidar/toy-0-000_0002_pole3.bin"
+    assert events.index(payload) < events.index(part) < events.index(tmp_path / "data/lidar") < len(events) - 2
+    assert events[-2:] == [tmp_path / "data/manifest.json", tmp_path / "data"]
 
 
 def test_another_recipe_is_refused_by_name(tmp_path: Path):

@@ -74,13 +74,25 @@ def test_a_checkpoint_of_another_run_is_refused(samples, tmp_path):
     train(OBJECTS, tiny(), samples, steps=1, seed=0, checkpointing=checkpointing)
     with pytest.raises(InputError, match="other settings"):
         train(OBJECTS, tiny(), samples, steps=1, seed=1, checkpointing=checkpointing)
-    state = torch.load(checkpointing.path, weights_only=True)
+
+
+def test_a_damaged_checkpoint_is_told_and_the_training_begins_anew(samples, tmp_path):
+    def report(done, total, note):
+        told.append((done, note))
+
+    told = []
+    checkpointing, whole = Checkpointing(tmp_path / "checkpoint.pt", every=1), tiny()
+    train(OBJECTS, whole, samples, steps=2, seed=0, checkpointing=checkpointing)
+    data, state = checkpointing.path.read_bytes(), torch.load(checkpointing.path, weights_only=True)
     torch.save(state | {"optimizer": {"state": {}, "param_groups": []}}, checkpointing.path)
-    with pytest.raises(InputError, match="not a checkpoint"):
-        train(OBJECTS, tiny(), samples, steps=1, seed=0, checkpointing=checkpointing)
-    checkpointing.path.write_bytes(b"garbage")
-    with pytest.raises(InputError, match="not a checkpoint"):
-        train(OBJECTS, tiny(), samples, steps=1, seed=0, checkpointing=checkpointing)
+    for damaged in (checkpointing.path.read_bytes(), b"garbage", b"", data[: len(data) // 2]):
+        checkpointing.path.write_bytes(damaged)
+        again = tiny()
+        told.clear()
+        train(OBJECTS, again, samples, steps=2, seed=0, checkpointing=checkpointing, progress=report)
+        assert told[0] == (0, f"{checkpointing.path} is damaged, training begins anew")
+        assert [done for done, _ in told] == [0, 1, 2]
+        assert same(whole, again)
 
 
 def test_no_samples_and_unknown_schedules_are_refused(samples):

@@ -18,12 +18,19 @@ from flcav.federation.rules import Rules
 from flcav.federation.state import SERVER
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Budget, BudgetExceeded, Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.federations.secrets import SECRETS, SECRETS_HASH
+from flcav.pipeline.federations.secrets import (
+    PART,
+    SECRETS,
+    SECRETS_HASH,
+    read_secrets,
+    remove_secrets,
+    write_secrets,
+)
 from flcav.pipeline.recipe import Training
-from flcav.pipeline.results.saved import WEIGHTS
+from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
@@ -31,7 +38,7 @@ from flcav.pipeline.stages.learning import Learning
 from flcav.progress import ignore_progress
 
 ROUNDS, VEHICLES = 6, 3
-Federate = Callable[[Path, Rules, int], None]
+Federate = Callable[..., None]
 
 
 class Killed(BaseException):
@@ -59,18 +66,18 @@ def vehicles(learning: Learning, region: str, dies_at: int) -> Any:
     return {name: Mortal(each, dies_at) for name, each in make_clients(learning, Slope(), samples).items()}
 
 
-def edge(folder: Path, rules: Rules, dies_at: int = 0, report: Any = ignore_progress) -> None:
+def edge(folder: Path, rules: Rules, dies_at: int = 0, report: Any = ignore_progress, wireless_mb: float = 1.0) -> None:
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
-    schedule, book = learning.schedule(ROUNDS, 1, "edge", "a"), Ledger(Budget(1.0, 1.0))
+    schedule, book = learning.schedule(ROUNDS, 1, "edge", "a"), Ledger(Budget(wireless_mb, 1.0))
     how = (learning.build_network(), vehicles(learning, "a", dies_at), schedule, FEDAVG, 0, book, folder, report)
     federate_edge(EdgeFederation(learning, *how), rules)
 
 
-def cloud(folder: Path, rules: Rules, dies_at: int = 0) -> None:
+def cloud(folder: Path, rules: Rules, dies_at: int = 0, wireless_mb: float = 1.0) -> None:
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
     network = learning.build_network()
     regions = {name: RegionStart(vehicles(learning, name, dies_at), to_arrays(network), earlier=0) for name in "ab"}
-    how = (2, Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), folder, ignore_progress)
+    how = (2, Strategies(FEDAVG, FEDAVG), Ledger(Budget(wireless_mb, 1.0)), folder, ignore_progress)
     federate_cloud(CloudFederation(learning, network, regions, *how), 2, rules)
 
 
@@ -185,3 +192,39 @@ def test_secrets_that_were_drawn_right_before_a_kill_are_kept(tmp_path: Path) ->
     for name in ("whole", "halved"):
         edge(tmp_path / name, rules("local"))
     assert (tmp_path / "whole" / WEIGHTS).read_bytes() == (tmp_path / "halved" / WEIGHTS).read_bytes()
+
+
+@pytest.mark.parametrize("updates", [0, 4])
+@pytest.mark.parametrize("federate", [edge, cloud])
+def test_a_refused_federation_leaves_no_secrets(federate: Federate, updates: int, tmp_path: Path) -> None:
+    federate(tmp_path / "measured", rules("local"))
+    book = Ledger.load(tmp_path / "measured" / LEDGER)
+    sent = [each.bytes for each in book.entries if (each.link, each.direction) == ("wireless", "up")]
+    how = {"wireless_mb": (updates + 0.5) * sent[0] / 1e6}
+    with pytest.raises(BudgetExceeded):
+        federate(tmp_path / "refused", rules("local"), **how)
+    left = {path.name for path in (tmp_path / "refused").iterdir() if "secrets" in path.name}
+    assert left == ({SECRETS_HASH} if updates else set())
+    told = rf"{SECRETS} is missing or not complete: .* have other noise" if updates else "budget exceeded"
+    with pytest.raises(InputError, match=told):  # no update is sent a second time with other noise
+        federate(tmp_path / "refused", rules("local"), **how)
+
+
+def test_two_that_begin_at_once_do_not_both_go_on(tmp_path: Path) -> None:
+    one, other = ({"edge|server": np.full(32, byte, np.uint8)} for byte in (1, 2))
+    assert not read_secrets(tmp_path, one, False)
+    assert not read_secrets(tmp_path, other, False)  # both have looked before either wrote
+    write_secrets(tmp_path, one)
+    (tmp_path / SECRETS_HASH).unlink()  # the first has not come so far
+    with pytest.raises(InputError, match="of another process"):
+        write_secrets(tmp_path, other)
+    write_secrets(tmp_path, one)
+    assert [*map(bytes, read_secrets(tmp_path, one, False).values())] == [bytes([1]) * 32]
+    assert {path.name for path in tmp_path.iterdir()} == {SECRETS, SECRETS_HASH}
+
+
+def test_what_killed_processes_left_of_secrets_is_removed(tmp_path: Path) -> None:
+    write_secrets(tmp_path, {"edge|server": np.zeros(32, np.uint8)})
+    (tmp_path / f"{PART}left").touch()
+    remove_secrets(tmp_path)
+    assert not [*tmp_path.iterdir()]

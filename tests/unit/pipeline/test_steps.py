@@ -330,6 +330,38 @@ def test_folders_of_before_code_was_recorded_are_read_as_asked(own, tmp_path):
         told([Step("apart", own.apart, {"more": 1})], out, stale="keep")
 
 
+def keep_two(work: Work, start: int) -> int:
+    """Return a number; where the step is done anew, `kept` tells what was there."""
+    (work.folder / "below").mkdir(exist_ok=True)
+    here = sorted(path.name for path in work.folder.rglob("*") if path.is_file() and path.name != "started.json")
+    (work.folder / "kept").write_text(" ".join(here))
+    (work.folder / "below" / "numbers").write_text(str(start))
+    return start
+
+
+@pytest.mark.parametrize(("file", "text"), [
+    ("below/numbers", None), ("below/numbers", ""), ("done.json", ""), ("done.json", "{"), ("done.json", "[1]"),
+    ("done.json", '{"value": 7}'), ("done.json", '{"fingerprint": "of it"}'),
+])  # fmt: skip
+def test_a_damaged_step_is_told_and_done_anew_and_no_other(tmp_path, file, text):
+    after = Step("c", add, {"names": ["a"]}, ("a",))
+    steps = [Step("a", keep_two, {"start": 7}), Step("b", count, {"start": 2}), after]
+    whole = run_steps(steps, tmp_path, jobs=1, notify=quiet)
+    path, told = tmp_path / "a" / file, []
+    path.unlink()
+    if text is not None:
+        path.write_text(text)
+    note = lambda step, done, total, note: told.append((step, note)) if done in (0, total) and note else None  # noqa: E731
+    assert run_steps(steps, tmp_path, jobs=1, notify=note) == whole
+    damage = [("a", f"{path} is damaged, the step is done anew")]
+    assert sorted(told) == sorted([*damage, ("a", "done"), ("b", "done before"), ("c", "done before")])
+    assert (tmp_path / "a" / "below" / "numbers").read_text() == "7"
+    assert (tmp_path / "a" / "kept").read_text() == ("kept" if text is None else "kept numbers")
+    told.clear()
+    assert run_steps(steps, tmp_path, jobs=1, notify=note) == whole
+    assert told == [(name, "done before") for name in "abc"]
+
+
 @pytest.mark.parametrize("text", ["[1]", '{"value": 1}', "{", ""])
 def test_a_record_that_is_none_is_refused(tmp_path, text):
     (tmp_path / "a").mkdir()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -95,6 +96,24 @@ def test_an_interrupted_simulation_leaves_no_answer_to_the_next(tmp_path: Path, 
     with pytest.raises(RuntimeError):
         sumo.simulate_in(bad)
     assert pid() != before
+
+
+def test_it_imports_nothing_from_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "json.py").write_text("raise SystemExit('a file of the user')")
+    sumo._stop()
+    monkeypatch.chdir(tmp_path)
+    sumo.simulate_in(asked(tmp_path / "job", [50]))
+
+
+@pytest.mark.parametrize("name", ["one,two", "one;two", "${HOME}", "\N{GREEK SMALL LETTER LAMDA} .x", "-x"])
+def test_names_of_folders_do_not_matter(name: str, tmp_path: Path):
+    plain, odd = asked(tmp_path / "plain", [50]), asked(tmp_path / name, [50])
+    job = json.loads((odd / "job.json").read_text())
+    net = shutil.copy(job["net"], odd / "town.net.xml")
+    (odd / "job.json").write_text(json.dumps(job | {"net": str(net)}))
+    for folder in (plain, odd):
+        sumo.simulate_in(folder)
+    assert states(odd) == states(plain)
 
 
 @pytest.mark.parametrize("when", ["idle", "killed idle", "killed at work"])

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device, check_finite, refuse_unused
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import only_writer_of, print_json
 from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ def register(app: typer.Typer) -> None:
     app.command()(infer)
 
 
+@only_writer_of("pictures")
 def infer(
     task: str = typer.Argument(metavar="TASK", help=f"What to find: {ANY_TASK}."),
     inputs: list[Path] = typer.Argument(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from flcav.cli.options import check_all_finite, check_finite, refuse_unused
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import only_writer_of, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,6 +41,7 @@ def register(app: typer.Typer) -> None:
     app.command("fit")(fit)
 
 
+@only_writer_of("problem")
 def fit(
     history: Path = typer.Argument(
         ..., help="CSV: task, stage (pretrain, edge, cloud), resource, accuracy[, weight]; or [task,] samples, "

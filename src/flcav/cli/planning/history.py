@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
-from flcav.cli.terminal import when_interrupted
+from flcav.cli.terminal import only_writer_of, when_interrupted
 from flcav.config import InputError
 from flcav.machine.threads import use_threads
 
@@ -16,6 +16,7 @@ def register(app: typer.Typer) -> None:
 
 
 @when_interrupted()
+@only_writer_of("out")
 def history(
     recipe: Path = typer.Argument(help="Run recipe (YAML) with the towns, sizes and training of the history."),
     task: str = typer.Option(..., "--task", help="A task of the recipe."),

@@ -3,7 +3,6 @@
 The files are checked against the manifest (size, checksum), then their contents by the checks of this package.
 """
 
-import contextlib
 import os
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -16,9 +15,9 @@ from flcav.dataset.checks.copies import find_copies
 from flcav.dataset.checks.frames import check_measurements, check_points, check_sweeps, check_traffic, check_values
 from flcav.dataset.checks.images import check_images
 from flcav.dataset.checks.scenes import BlockedViews, check_motion
-from flcav.dataset.layout import FILES, MANIFEST, FrameKey, Manifest, read_manifest, table_path, trace_path
+from flcav.dataset.layout import MANIFEST, FrameKey, Manifest, read_manifest, trace_path
 from flcav.dataset.store import Dataset
-from flcav.dataset.tables import read_table
+from flcav.dataset.tables import list_files
 from flcav.files import sha256
 from flcav.progress import Report, ignore_progress
 from flcav.sensors.calibration import CalibrationError
@@ -37,7 +36,7 @@ def validate(path: Path | str, *, progress: Report = ignore_progress) -> list[st
     """
     folder = Path(path)
     manifest = read_manifest(folder)
-    listed = _listed_files(folder, manifest)
+    listed = list_files(folder, manifest)
     damaged = {name: problem for name, entry in listed.items() if (problem := _damage(folder, name, *entry))}
     problems = [f"{folder / name}: {problem}" for name, problem in damaged.items()]
     problems += _extra_files(folder, listed)
@@ -101,15 +100,6 @@ def check_order(keys: Sequence[FrameKey]) -> list[str]:
         agents[key.scene, key.index].add(key.agent)
         last[key.scene] = key
     return problems
-
-
-def _listed_files(folder: Path, manifest: Manifest) -> dict[str, tuple[int, str]]:
-    """Return path -> (bytes, SHA-256) of every file that the dataset lists, all but the manifest."""
-    listed = {name: (entry.bytes, entry.sha256) for name, entry in manifest.tables.items()}
-    with contextlib.suppress(InputError):  # a damaged listing is among `manifest.tables` and reported there
-        files = read_table(folder / table_path(FILES), FILES).to_pydict()
-        listed |= {name: (size, digest) for name, size, digest in zip(files["path"], files["bytes"], files["sha256"])}
-    return listed
 
 
 def _damage(folder: Path, name: str, recorded_bytes: int, recorded_hash: str) -> str | None:

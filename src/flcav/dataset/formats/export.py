@@ -15,6 +15,8 @@ from flcav.dataset.formats.nuscenes import export_nuscenes
 from flcav.dataset.formats.opv2v.write import export_opv2v
 from flcav.dataset.formats.yolo import export_yolo
 from flcav.dataset.store import Dataset
+from flcav.files import flush_tree
+from flcav.machine.locks import LOCK, only_writer
 from flcav.progress import Report, ignore_progress
 
 DEFAULTS = ExportOptions()
@@ -52,7 +54,7 @@ def export(
     if refused := options.model_fields_set.difference(taken):
         flags = [f"--{option.replace('_', '-')}" for option in (min(refused), *taken)]
         raise InputError(f"format '{name}': has no use for {flags[0]}; it takes {', '.join(flags[1:])}")
-    with _new_folder(out) as folder:
+    with only_writer(out), _new_folder(out) as folder:
         return FORMATS[name].write(dataset, folder, options, progress)
 
 
@@ -64,13 +66,14 @@ def _new_folder(path: Path) -> Iterator[Path]:
     """
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; an export needs a folder")
-    if path.is_dir() and any(path.iterdir()):
+    if path.is_dir() and any(each.name != LOCK for each in path.iterdir()):
         raise InputError(f"{path}: holds other files; export into a new or empty folder")
     part = path.absolute().with_name(f".{path.absolute().name}.part")
     shutil.rmtree(part, ignore_errors=True)  # leftover of a killed export
     part.mkdir(parents=True)
     try:
         yield part
+        flush_tree(part)
         if path.is_dir():
             path.rmdir()
         part.rename(path)

@@ -12,6 +12,7 @@ from flcav.dataset.formats.opv2v.read import Opv2vSource
 from flcav.dataset.formats.reading import LogSource
 from flcav.dataset.layout import WORK
 from flcav.dataset.recording.recorder import drop_unbegun, record
+from flcav.machine.locks import only_writer
 from flcav.progress import Report, ignore_progress
 
 
@@ -47,16 +48,17 @@ def import_dataset(
     shown = [each for each in READABLE if _shows(folder, each)]
     if shown and name not in shown:
         raise InputError(f"{folder}: is no folder of '{name}' but of '{shown[0]}'")
-    begun = (out / WORK).exists()  # by an earlier call, or another command
-    try:
-        source = READABLE[name].read(folder, split)
-        record(source, out, progress=progress)
-    except (ValueError, OSError) as error:
-        if not begun:
-            drop_unbegun(out)
-        if isinstance(error, InputError | OSError):
-            raise
-        raise InputError(f"{folder}: cannot be imported ({error})") from None  # names that a dataset cannot hold
+    with only_writer(out):
+        begun = (out / WORK).exists()  # by an earlier call
+        try:
+            source = READABLE[name].read(folder, split)
+            record(source, out, progress=progress)
+        except (ValueError, OSError) as error:
+            if not begun:
+                drop_unbegun(out)
+            if isinstance(error, InputError | OSError):
+                raise
+            raise InputError(f"{folder}: cannot be imported ({error})") from None  # names that a dataset cannot hold
     return source.notes
 
 

@@ -22,7 +22,7 @@ from flcav.dataset.layout import CALIBRATION, FILES, MANIFEST, TOWN, TRACES, pay
 from flcav.dataset.payloads import PICTURES, POINTS, check_image, encode_payloads
 from flcav.dataset.rows import build_table, encode_frame
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
-from flcav.files import sha256, write_bytes, write_in_pieces
+from flcav.files import flush_all, flush_tree, sha256, write_bytes, write_in_pieces
 from flcav.sensors.frame import LONGEST_NAME, Frame, LinkedFrame
 from flcav.sources.source import Replayable, Source
 from flcav.world.trace import Trace
@@ -98,7 +98,9 @@ def perform(source: Source, task: Job, work: Path, wrote_frame: Callable[[], Non
         raise
     if not isinstance(source, Replayable) and (trace := source.trace(task.scene)) is not None:
         trace.save(work / task.scene / TRAFFIC)
+    flush_tree(part)
     part.rename(task.folder(work))
+    flush_all([part.parent])
 
 
 def _frames(source: Source, task: Part, work: Path) -> Iterator[Frame]:

@@ -2,19 +2,21 @@
 
 Parts of scenes are first written below the hidden folder `.recording`. When all are complete, their files are moved
 into the dataset, their tables are concatenated, and the manifest is written last. An interruption at any point loses
-only the parts that were under way.
+only the parts that were under way. A part is on the disk before it counts as complete, and all before the manifest.
 """
 
 import json
 import shutil
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from flcav.config import InputError
+from flcav.config import InputError, read_json
 from flcav.dataset.layout import (
     CALIBRATION,
     FILES,
@@ -38,11 +40,13 @@ from flcav.dataset.recording.jobs import (
     record_scenes,
     split_scene,
 )
+from flcav.dataset.recording.mending import find_damage, has_damaged_table, mend
 from flcav.dataset.recording.ray_engine import start_ray_engine
 from flcav.dataset.recording.workers import start_processes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, write_table
-from flcav.files import Json, sha256, write_bytes, write_json
-from flcav.progress import Report, ignore_progress
+from flcav.files import Json, flush_all, sha256, write_bytes, write_json
+from flcav.machine.locks import LOCK, only_writer
+from flcav.progress import DAMAGED, Report, ignore_progress
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.sources.source import Source, TownSource
@@ -63,9 +67,11 @@ def record(
     """Record a source, or the built-in simulator with a recipe, into the folder `out`.
 
     `jobs` workers of the `engine`, one of ENGINES, do the work. Returns True if anything was recorded, False if `out`
-    already held this very dataset. An interrupted recording of the same source is resumed. Raises `InputError` where
-    `out` holds anything else, or `jobs`, `engine` or the recipe is wrong; ValueError where scenes have names that no
-    folder may have, before anything is touched; OSError where `out` cannot be written.
+    already held this very dataset. An interrupted recording of the same source is resumed. A dataset is mended, see
+    `flcav.dataset.recording.mending`, where files are missing or have another size, or tables another hash. Raises
+    `InputError` where `out` holds anything else, is written by another process or cannot be mended, or `jobs`, `engine`
+    or the recipe is wrong; ValueError where scenes have names that no folder may have, before anything is touched;
+    OSError where `out` cannot be written.
 
     >>> from flcav import Recipe, record
     >>> recipe = Recipe(town="ring", cavs=1, spins_per_scene=1, warmup_s=5.0)
@@ -82,15 +88,20 @@ def record(
     check_scenes(source.scenes())
     header: Header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))
     try:
-        if not _claim(out, header):
-            return False
-        _write(source, out / WORK, jobs, engine, progress)
-        _assemble(source, out, header)
+        with only_writer(out):
+            write = partial(_write, source, out / WORK, jobs, engine, progress)
+            if begun := _claim(out, header):
+                write()
+                _assemble(source, out, header)
+            if damaged := find_damage(out):
+                more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
+                progress(0, 1, f"{out / min(damaged)}{more} {DAMAGED}, recorded anew")
+                mend(source, out, damaged, write)
     except OSError as error:
         if error.strerror and error.filename is None:  # errors of writes have no file name
             error.filename = str(out)
         raise
-    return True
+    return begun or bool(damaged)
 
 
 def drop_unbegun(out: Path) -> None:
@@ -117,24 +128,36 @@ def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report)
 
 
 def _claim(out: Path, header: Header) -> bool:
-    """Prepare `out` for this recording; return False if it holds the finished dataset already.
+    """Prepare `out` for this recording; return False if it holds the finished dataset already, with whole tables.
 
-    Raises `InputError` where `out` is a file, or holds another dataset, another recording or other files.
+    Where a table is damaged, the dataset is a recording that has just begun. Raises `InputError` where `out` is a file,
+    or holds another dataset, another recording or other files.
     """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; a dataset needs a folder")
     if (out / MANIFEST).exists():
         _refuse_other(out, "holds another dataset", {"recipe": read_manifest(out).recipe}, header)
         shutil.rmtree(out / WORK, ignore_errors=True)
-        return False
+        if not has_damaged_table(out):
+            return False
+        write_json(out / WORK / HEADER, header)
+        (out / MANIFEST).unlink()
+        return True
     begun = out / WORK / HEADER
     if begun.exists():
-        _refuse_other(out, "holds the unfinished recording of another", json.loads(begun.read_text()), header)
-    elif out.exists() and any(path.name != WORK for path in out.iterdir()):
+        _refuse_other(out, "holds the unfinished recording of another", _read_header(begun), header)
+    elif out.exists() and any(path.name not in (WORK, LOCK) for path in out.iterdir()):
         raise InputError(f"{out}: holds other files; record into a new or empty folder")
     else:
         write_json(begun, header)
     return True
+
+
+def _read_header(path: Path) -> Header:
+    held: Any = read_json(path)
+    if not isinstance(held, dict) or not all(isinstance(part, dict) for part in held.values()):
+        raise InputError(f"{path}: not the recipe of a recording; remove {path.parent} to begin anew")
+    return held
 
 
 def _refuse_other(out: Path, what: str, held: Header, wanted: Header) -> None:
@@ -192,8 +215,10 @@ def _assemble(source: Source, out: Path, header: Header) -> None:
     }
     for name in names:
         _move(joined / name, out / name)
+    flush_all([*(out / name for name in names), out, *(path for path in out.iterdir() if path.is_dir())])
     write_json(work / MANIFEST, manifest)
     _move(work / MANIFEST, out / MANIFEST)
+    flush_all([out])
     shutil.rmtree(work)
 
 

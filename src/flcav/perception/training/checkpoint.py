@@ -11,11 +11,12 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from flcav.config import Config, InputError
+from flcav.config import Config, DamagedFile, InputError
 from flcav.files import write_bytes
 from flcav.perception.card import Card, DataEntry
 from flcav.perception.training.adamw import AdamW
 from flcav.perception.weights import read_card
+from flcav.progress import DAMAGED
 
 TRAINED = ("device", "epochs", "patience", "batch", "learning_rate", "schedule")  # settings in `Card.training`
 DataIdentity = tuple[
@@ -69,13 +70,16 @@ def part_of(entry: DataEntry) -> DataIdentity:
 
 
 def find_finished_card(path: Path, asked: Settings) -> Card | None:
-    """Return the card of the weights at `path`; None if there is no such file.
+    """Return the card of the weights at `path`; None if there is no such file, or a damaged one.
 
     Raises `InputError` if they were trained with other settings than `asked`, so that they are not overwritten.
     """
     if not path.exists():
         return None
-    card = read_card(path)
+    try:
+        card = read_card(path)
+    except DamagedFile:
+        return None
     if different := asked.differences(settings_of(card)):
         raise InputError(f"{path}: weights of a training with other settings ({different}); choose another folder")
     return card
@@ -108,11 +112,12 @@ def save_checkpoint(path: Path, identity: str, progress: RunState, network: nn.M
 def load_checkpoint(path: Path, identity: str, network: nn.Module, optimizer: AdamW) -> RunState:
     """Restore network and optimiser in place and return the progress; without a file, an empty progress.
 
-    Raises `InputError` if the file is not a checkpoint, or one of another run. No code in the file is executed.
+    Raises `DamagedFile` if the file is not a checkpoint, network and optimiser may be any then, and `InputError` if it
+    is one of another run. No code in the file is executed.
     """
     if not path.exists():
         return RunState()
-    broken = InputError(f"{path}: not a checkpoint; remove it to start afresh")
+    broken = DamagedFile(f"{path} {DAMAGED}, training begins anew")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
         found = str(state["identity"])

@@ -3,6 +3,7 @@
 Training is deterministic in its seed, and a run resumed from a checkpoint ends with the same weights.
 """
 
+import copy
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from flcav.config import InputError
+from flcav.config import DamagedFile, InputError
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 from flcav.perception.training.adamw import AdamW
 from flcav.perception.training.checkpoint import RunState, load_checkpoint, save_checkpoint
@@ -106,8 +107,8 @@ def train(
     Each epoch goes through the samples in a new random order. With the `patience` of `validation`, training may stop
     early, and the network gets the weights of the best validation. With `checkpointing`, an interrupted run is resumed
     from its file and ends with the same weights. `watch` receives loss, learning rate and validation score; `correct`
-    changes the gradients before they are clipped. Raises `InputError` without samples, for an unknown schedule, and if
-    the checkpoint is of another run.
+    changes the gradients before they are clipped. A damaged checkpoint is told, and training begins anew. Raises
+    `InputError` without samples, for an unknown schedule, and if the checkpoint is of another run.
     """
     batch = task.practice.batch if batch is None else batch
     learning_rate = task.practice.learning_rate if learning_rate is None else learning_rate
@@ -121,7 +122,14 @@ def train(
     waits = None if validation is None else (validation.every, validation.patience)
     settings = [task.name, repr(network.config), steps, batch, learning_rate, schedule, seed, waits]
     identity = f"{json.dumps(settings)} on {len(samples)} samples {checkpointing.of if checkpointing else ''}"
-    done = load_checkpoint(checkpointing.path, identity, network, optimizer) if checkpointing else RunState()
+    done, begun = RunState(), copy.deepcopy(network.state_dict()) if checkpointing else {}
+    if checkpointing:
+        try:
+            done = load_checkpoint(checkpointing.path, identity, network, optimizer)
+        except DamagedFile as error:
+            progress(0, steps, str(error))
+            network.load_state_dict(begun)
+            optimizer = AdamW(network, learning_rate)
     order = batches(len(samples), batch, steps, seed)
     config: Any = network.config  # an attribute of every network of a task
     for number in range(len(done.losses), steps):

@@ -14,6 +14,7 @@ from torch.utils.data import ConcatDataset
 
 from flcav.dataset.store import Dataset
 from flcav.files import check_writable
+from flcav.machine.locks import only_writer
 from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card, DataEntry, data_entry, write_card
 from flcav.perception.device import CPU, processor_of
@@ -21,7 +22,7 @@ from flcav.perception.task import Calibrates, Evaluated, Task, build_network, fi
 from flcav.perception.training.checkpoint import Settings, find_finished_card, part_of
 from flcav.perception.training.loop import Checkpointing, Validation, Watch, train
 from flcav.perception.weights import save_network
-from flcav.progress import Report, ignore_progress
+from flcav.progress import DAMAGED, Report, ignore_progress
 
 WEIGHTS, CARD, CHECKPOINT, EVENTS = "weights.safetensors", "card.md", "checkpoint.pt", "events"
 
@@ -145,8 +146,18 @@ def prepare(task: Task, request: Request, out: Path) -> Prepared:
 
 def train_prepared(prepared: Prepared, progress: Report = ignore_progress) -> TrainingResult:
     """Perform the training that `prepare` returned, see `train_network`; return its card and evaluation."""
-    if prepared.finished is not None:
-        return TrainingResult(prepared.finished)
+    with only_writer(prepared.out):
+        return _train(prepared, progress)
+
+
+def _train(prepared: Prepared, progress: Report) -> TrainingResult:
+    weights = prepared.out / WEIGHTS
+    if (finished := find_finished_card(weights, prepared.settings)) is not None:
+        if not (prepared.out / CARD).exists():
+            write_card(finished, prepared.out / CARD)
+        return TrainingResult(finished)
+    if weights.exists():
+        progress(0, 1, f"{weights} {DAMAGED}, made anew")
     task, request, out, held = prepared.task, prepared.request, prepared.out, prepared.held
     settings, samples = prepared.settings, prepared.samples
     network = build_network(task, prepared.config, request.seed).to(request.device)

@@ -13,7 +13,7 @@ from typing import Annotated
 from flcav.config import InputError
 from flcav.files import atomic_path
 from flcav.pipeline.arms import check_federations
-from flcav.pipeline.federations.checkpoint import DAMAGED, LAST, Checkpoint
+from flcav.pipeline.federations.checkpoint import LAST, Checkpoint
 from flcav.pipeline.federations.rounds import LOSS
 from flcav.pipeline.federations.spent import Training, compose_trainings
 from flcav.pipeline.federations.timing import TrainTimes, read_times, summarise_times
@@ -29,6 +29,7 @@ from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.steps import Notify, Stale, Step, ignore_steps, run_steps
 from flcav.pipeline.work.edge import EdgeSettings, edge_step
 from flcav.pipeline.work.settings import make_step
+from flcav.progress import DAMAGED
 from flcav.records import LEFT_OUT
 
 WORK, RESULTS, TRAIN_TIMES = "work", "federation.json", "times.json"

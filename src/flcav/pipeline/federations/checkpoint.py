@@ -12,10 +12,11 @@ from pathlib import Path
 from flcav.config import InputError, read_json
 from flcav.federation.state import RoundRecord
 from flcav.files import Json, sha256, write_bytes, write_json
+from flcav.progress import DAMAGED
 from flcav.records import Record
 
 LAST, BEFORE = "round.json", "round-before.json"  # the last checkpoint, and the one before
-DAMAGED, OWN = "is damaged", "own_sha256"  # the latter of all other fields of the record
+OWN = "own_sha256"  # of all other fields of the record
 
 
 @dataclass(frozen=True)

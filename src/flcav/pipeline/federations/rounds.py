@@ -1,7 +1,8 @@
 """The files that a federation writes after each round, to go on from, and the network that it comes to."""
 
+import contextlib
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from flcav.federation.state import FederationState, describe_failures
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Weights
 from flcav.files import sha256, write_bytes
-from flcav.network.ledger import Ledger
+from flcav.network.ledger import BudgetExceeded, Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays, save_network, to_arrays
 from flcav.pipeline.federations.checkpoint import Checkpoint, find_checkpoint
@@ -99,6 +100,22 @@ class FederationCheckpoints:
                 self._states[name].secrets[party] = kept[key]
         drawn = {key: self._states[name].keep_secret(party) for key, (name, party) in asked.items()}
         write_secrets(self._folder, drawn)
+
+    @contextlib.contextmanager
+    def refusals(self) -> Iterator[None]:
+        """Remove the secrets where the federation is refused within the context, so that it never goes on.
+
+        That is before it has sent an update; later only where it would exceed a budget, since damaged data can be made
+        good.
+        """
+        begun = len(self._book.entries)
+        try:
+            yield
+        except InputError as error:
+            used = bool(self.losses) or any(entry.direction == "up" for entry in self._book.entries[begun:])
+            if not used or isinstance(error, BudgetExceeded):
+                remove_secrets(self._folder, used=used)
+            raise
 
     def make_saver(self, rounds: int) -> OnRound:
         """Return the callback that saves a checkpoint after each of `rounds` rounds."""

@@ -4,7 +4,10 @@ Before the first message its SHA-256 is written beside it. By that hash a file t
 that has not been written yet. A hash of random bytes does not reveal them.
 """
 
+import contextlib
+import os
 import re
+import tempfile
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -14,9 +17,9 @@ from safetensors.numpy import load_file, save
 
 from flcav.config import InputError
 from flcav.federation.noise import Secret
-from flcav.files import atomic_path, sha256, write_bytes, write_in_pieces
+from flcav.files import flush_all, sha256, write_bytes, write_in_pieces
 
-SECRETS, SECRETS_HASH = "secrets.safetensors", "secrets.sha256"
+SECRETS, SECRETS_HASH, PART = "secrets.safetensors", "secrets.sha256", ".secrets."
 HASH = re.compile(rb"[0-9a-f]{64}")
 
 
@@ -48,17 +51,35 @@ def _lost(path: Path, why: str) -> InputError:
 def write_secrets(folder: Path, secrets: Mapping[str, Secret]) -> None:
     """Write the secrets of a federation, by name, to a file that only its owner may read; then the file's hash.
 
-    Where there is a hash, both were written before, and stay as they are: `read_secrets` has compared them.
+    Where there is a hash, both were written before, and stay as they are: `read_secrets` has compared them. Raises
+    `InputError` where somebody else has written others since.
     """
     if (folder / SECRETS_HASH).exists():
         return
-    with atomic_path(folder / SECRETS) as temporary:
-        temporary.touch(mode=0o600)
-        write_in_pieces(temporary, save(dict(secrets)))
+    folder.mkdir(parents=True, exist_ok=True)
+    file, name = tempfile.mkstemp(prefix=PART, dir=folder)  # that nobody else may read
+    os.close(file)
+    try:
+        write_in_pieces(Path(name), save(dict(secrets)))
+        flush_all([Path(name)])
+        with contextlib.suppress(FileExistsError):
+            os.link(name, folder / SECRETS)  # where a rename would replace the file of another process
+    finally:
+        Path(name).unlink()
+    flush_all([folder])
+    kept = load_file(folder / SECRETS)
+    if kept.keys() != secrets.keys() or not all(np.array_equal(kept[each], secrets[each]) for each in kept):
+        raise InputError(f"{folder / SECRETS}: of another process, which federates here at the same time")
     write_bytes(folder / SECRETS_HASH, sha256(folder / SECRETS).encode())
 
 
-def remove_secrets(folder: Path) -> None:
-    """Remove the secrets of a federation that has ended, the hash first: a hash alone means that they were lost."""
-    (folder / SECRETS_HASH).unlink(missing_ok=True)
-    (folder / SECRETS).unlink(missing_ok=True)
+def remove_secrets(folder: Path, *, used: bool = False) -> None:
+    """Remove the secrets of a federation that has ended, or was refused.
+
+    Where they are `used`, and the federation is not at its end, their hash stays: alone it means that they are gone, so
+    that no round is repeated with others.
+    """
+    if not used:
+        (folder / SECRETS_HASH).unlink(missing_ok=True)
+    for path in (folder / SECRETS, *folder.glob(f"{PART}*")):  # the latter of processes that were killed
+        path.unlink(missing_ok=True)

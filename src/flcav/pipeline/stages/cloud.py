@@ -152,7 +152,7 @@ def federate_cloud(
         return keep_whole
 
     everybody = {name: client for region in own.regions for name, client in own.vehicles(region).items()}
-    with open_processes(everybody, processes) as runtime:
+    with checkpoints.refusals(), open_processes(everybody, processes) as runtime:
         servers = own.open_servers(rules, wireless, done, own_states, runtime)
         if replanning is None:
             federate(servers, start, schedule, wireline, **how, done=done, on_round=make_saver(rounds))

@@ -101,7 +101,7 @@ def federate_edge(
         else (partial(federate_outputs, own.shared), give_outputs(own.clients, own.shared, to_arrays(own.network)))
     )
     clients = time_clients(clients, own.folder) if timed and not rules.hides_draws else clients
-    with open_runtime(runtime, clients, processes) as where:
+    with checkpoints.refusals(), open_runtime(runtime, clients, processes) as where:
         how["runtime"] = where
 
         def begin(number: int, weights: Weights) -> None:

@@ -21,6 +21,7 @@ from queue import Queue, SimpleQueue
 from types import ModuleType
 from typing import IO, Any
 
+from flcav.files import flush_tree
 from flcav.machine.processes import ray_session
 from flcav.machine.threads import use_threads
 from flcav.pipeline.provenance import provenance
@@ -153,8 +154,10 @@ class _Worker:
         try:
             step, record = pickle.loads(pickled)  # within try: the end is told even if this fails
             sender = _Sender(self._folder / step.name, self._told)
-            perform(step, self._folder, record, provenance(), sender.report)
-            sender.send()
+            try:
+                perform(step, self._folder, record, provenance(), sender.report)
+            finally:
+                sender.send()  # of a refused federation, too, that it has removed its secrets
         finally:
             self._told.put(None)
 
@@ -242,5 +245,6 @@ def replace_folder(folder: Path, names: Collection[str] | None, archive: IO[byte
             (new / name).mkdir(exist_ok=True)
         else:
             os.link(folder / name, new / name)
+    flush_tree(new)
     remove(folder)
     new.rename(folder)

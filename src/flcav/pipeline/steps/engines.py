@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flcav.config import Config
+from flcav.machine.locks import only_writer
 from flcav.machine.processes import exit_with_parent, start_server
 from flcav.machine.threads import use_threads
 from flcav.pipeline.provenance import Provenance, provenance
@@ -72,12 +73,14 @@ class Processes:
 def perform(step: Step, folder: Path, record: Record, made_by: Provenance, report: Report) -> Any:
     """Execute a step in its folder below `folder`, where those it needs lie too; write its record, return its value."""
     own = folder / step.name
-    own.mkdir(parents=True, exist_ok=True)
-    report(0, 1, "")
-    write_started(own, record)
-    value = step.run(Work(own, {name: folder / name for name in step.needs}, report), **step.arguments, **step.means)
-    write_done(own, record, value, asdict(replace(made_by, seed=find_seed(step.arguments))))
-    return read_value(own)
+    with only_writer(own):  # as long as this process lives, which the one that asked may not
+        own.mkdir(parents=True, exist_ok=True)
+        report(0, 1, "")
+        write_started(own, record)
+        needs = {name: folder / name for name in step.needs}
+        value = step.run(Work(own, needs, report), **step.arguments, **step.means)
+        write_done(own, record, value, asdict(replace(made_by, seed=find_seed(step.arguments))))
+        return read_value(own)
 
 
 def find_seed(arguments: Any) -> int | None:

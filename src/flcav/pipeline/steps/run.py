@@ -1,6 +1,7 @@
 """Execution of steps in dependency order, by processes or on a cluster, resuming from those that are finished.
 
-A step is finished when its folder has a `done.json`: value, fingerprint, hash of the code it reaches, and provenance.
+A step is finished when its folder has a `done.json`: value, fingerprint, hash of the code it reaches, sizes of its
+files, and provenance. One with a file that is missing or of another size is done anew.
 That is written last, so an interrupted run resumes after its last finished step; a step may also keep checkpoints of
 its own. `started.json` has fingerprint and code before, so that a checkpoint is not resumed with other arguments.
 
@@ -19,6 +20,7 @@ from typing import Any
 
 from flcav.config import InputError, read_json
 from flcav.files import write_json
+from flcav.machine.locks import only_writer
 from flcav.pipeline.steps.engines import Engine, Processes
 from flcav.pipeline.steps.source_hash import Sources, find_definitions
 from flcav.pipeline.steps.step import (
@@ -30,6 +32,7 @@ from flcav.pipeline.steps.step import (
     Notify,
     Record,
     Step,
+    find_damage,
     make_stale_error,
     read_record,
     read_value,
@@ -37,6 +40,7 @@ from flcav.pipeline.steps.step import (
     reserve_sibling,
     take_over,
 )
+from flcav.progress import DAMAGED
 
 
 @contextlib.contextmanager
@@ -73,13 +77,15 @@ def run_steps(
     a Ray cluster, see `flcav.pipeline.steps.cluster`. Of the processes, those that no step waits for are lent to steps
     that can make use of several, until these end. Steps begun or finished by other code are refused, done again
     ("redo") or kept ("keep", their records unchanged). Raises `InputError` where `folder` holds steps of other
-    arguments or, where that is refused, of other code; `OSError` where a worker was killed.
+    arguments or, where that is refused, of other code, and where another process runs steps in it; `OSError` where a
+    worker was killed.
     """
-    plan = _plan_steps(steps, folder, notify, stale, Sources())
-    if plan.waiting:
-        with _open_engine(engine, jobs) as workers:
-            _run(plan, workers, jobs, notify)
-    return plan.values
+    with only_writer(folder):
+        plan = _plan_steps(steps, folder, notify, stale, Sources())
+        if plan.waiting:
+            with _open_engine(engine, jobs) as workers:
+                _run(plan, workers, jobs, notify)
+        return plan.values
 
 
 def run_side_by_side(
@@ -102,20 +108,23 @@ def run_side_by_side(
         name = folder.name if names is None else names[folder]
         return lambda step, done, total, note: notify(f"{name}/{step}", done, total, note)
 
-    plans = [_plan_steps(steps, folder, named(folder), stale, sources) for folder, steps in runs.items()]
-    waiting = [plan for plan in plans if plan.waiting]
-    if waiting:
-        with _open_engine(engine, jobs) as workers, ThreadPoolExecutor(jobs) as threads:
-            each = max(1, jobs // len(runs))
-            started = [threads.submit(_run, plan, workers, each, named(plan.folder), [*runs]) for plan in waiting]
-            try:
-                for future in wait(started, return_when=FIRST_EXCEPTION).done:
-                    future.result()
-            except BaseException:
-                threads.shutdown(wait=False, cancel_futures=True)
-                workers.stop()
-                raise
-    return {plan.folder: plan.values for plan in plans}
+    with contextlib.ExitStack() as locks:
+        for folder in runs:
+            locks.enter_context(only_writer(folder))
+        plans = [_plan_steps(steps, folder, named(folder), stale, sources) for folder, steps in runs.items()]
+        waiting = [plan for plan in plans if plan.waiting]
+        if waiting:
+            with _open_engine(engine, jobs) as workers, ThreadPoolExecutor(jobs) as threads:
+                each = max(1, jobs // len(runs))
+                started = [threads.submit(_run, plan, workers, each, named(plan.folder), [*runs]) for plan in waiting]
+                try:
+                    for future in wait(started, return_when=FIRST_EXCEPTION).done:
+                        future.result()
+                except BaseException:
+                    threads.shutdown(wait=False, cancel_futures=True)
+                    workers.stop()
+                    raise
+        return {plan.folder: plan.values for plan in plans}
 
 
 @dataclass(frozen=True)
@@ -136,11 +145,18 @@ def _open_engine(engine: str, jobs: int) -> contextlib.AbstractContextManager[En
 
 
 def _plan_steps(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Plan:
-    """Return the work that is left of `steps`, notifying of those done before; raises `InputError` as `run_steps`."""
+    """Return the work that is left of `steps`, notifying of those done before; raises `InputError` as `run_steps`.
+
+    A finished step that lacks a file is left to do: its own checkpoints, and what else is whole, it goes on from.
+    """
     records, kept = _settle_records(steps, folder, stale, sources)
     values: dict[str, Any] = {}
     for step in steps:
-        if (folder / step.name / DONE).exists():
+        done = folder / step.name / DONE
+        if done.exists() and (damage := find_damage(done.parent)):
+            notify(step.name, 0, 1, f"{done.parent / damage} {DAMAGED}, the step is done anew")
+            done.unlink()
+        if done.exists():
             values[step.name] = read_value(folder / step.name)
             notify(step.name, 1, 1, KEPT if step.name in kept else DONE_BEFORE)
     return _Plan(folder, records, [step for step in steps if step.name not in values], values)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import Config, InputError, read_json
-from flcav.files import write_json
+from flcav.files import flush_tree, write_json
 from flcav.progress import Report
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
@@ -99,10 +99,13 @@ def digest(value: Any, **how: Any) -> str:
 def read_record(folder: Path) -> Record | None:
     """Read the record by which the step in `folder` was done or, if it is not, begun; None where it was neither.
 
-    Without recorded code, `code` is empty and `lineage` is "". Raises `InputError` for a file that is no record.
+    Without recorded code, `code` is empty and `lineage` is "". Where that by which it was done is damaged, it is the
+    one by which it was begun. Raises `InputError` for a file that is no record.
     """
     for path in (folder / DONE, folder / STARTED):
         if path.exists():
+            if path.name == DONE and (folder / STARTED).exists() and find_damage(folder) == DONE:
+                continue
             values: Any = read_json(path)
             if not isinstance(values, dict) or not isinstance(values.get("fingerprint"), str):
                 raise InputError(f"{path}: not the record of a step; choose another folder")
@@ -121,8 +124,35 @@ def write_started(folder: Path, record: Record) -> None:
 
 
 def write_done(folder: Path, record: Record, value: Any, provenance: Mapping[str, Any]) -> None:
-    """Write record, value and provenance of the step in `folder`; it is finished with that."""
-    write_json(folder / DONE, asdict(record) | {"value": value, "provenance": provenance})
+    """Write record, value and provenance of the step in `folder`, and the sizes of its files; it is finished with that.
+
+    The files are on the disk before.
+    """
+    flush_tree(folder)
+    files = {
+        path.relative_to(folder).as_posix(): path.stat().st_size
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != STARTED and not path.name.startswith(".")
+    }
+    write_json(folder / DONE, asdict(record) | {"value": value, "files": files, "provenance": provenance})
+
+
+def find_damage(folder: Path) -> str | None:
+    """Return the name of a file of a finished step that is missing, or not as long as it was; None where none is.
+
+    Its record counts, too: one that cannot be read is damaged. Of a step that was finished before sizes were recorded,
+    the record alone is looked at.
+    """
+    try:
+        done: Any = read_json(folder / DONE)
+    except InputError:
+        return DONE
+    if not isinstance(done, dict) or not {"fingerprint", "value"} <= done.keys():
+        return DONE
+    for name, size in done.get("files", {}).items():
+        if not (folder / name).is_file() or (folder / name).stat().st_size != size:
+            return name
+    return None
 
 
 def changed_modules(held: Record, wanted: Record) -> list[str]:

@@ -21,7 +21,8 @@ from shapely.geometry import LineString
 
 from flcav.config import InputError, shorten
 from flcav.extras import format_install_command
-from flcav.files import find_existing
+from flcav.files import find_existing, flush_tree
+from flcav.machine.locks import only_writer
 from flcav.world.map.parameters import GeoReference, MapSource
 from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet
@@ -82,16 +83,16 @@ def split_map(root: ElementTree.Element, prefix: Path, origin: Path, *, left_han
     xodr = prefix.with_suffix(".xodr")
     ElementTree.ElementTree(plan).write(xodr, encoding="utf-8", xml_declaration=True)
     options = {
-        "opendrive-files": str(xodr),
+        "opendrive-files": xodr.name,
         "opendrive.import-all-lanes": "true",
         "opendrive.internal-shapes": "true",  # lanes inside junctions are the connecting roads
         "opendrive.curve-resolution": "1",  # [m] between the points of a curve
         "flatten": "true",
         "offset.disable-normalization": "true",
-        "plain-output-prefix": str(prefix),
-        "output-file": f"{prefix}.net.xml",
+        "plain-output-prefix": prefix.name,
+        "output-file": f"{prefix.name}.net.xml",
     }
-    _run(options, origin)
+    _run(options, prefix.parent, origin)
     if left_hand:
         mirror_parts(prefix)
 
@@ -104,25 +105,29 @@ def join_parts(
     Without `crosswalks` netconvert guesses where crossings are. Raises `InputError` naming `origin` where that fails.
     """
     side = {"lefthand": "true"} if left_hand else {}
-    plain = prefix.with_name("joined")
-    also = {"plain-output-prefix": str(plain)} if crosswalks else {}
-    _run(_name_parts(prefix) | JOINING | FIRST | side | also | {"output-file": str(net)}, origin)
+    plain, made = prefix.with_name("joined"), prefix.with_name("joined.net.xml")
+    side |= {"output-file": made.name}
+    also = {"plain-output-prefix": plain.name} if crosswalks else {}
+    _run(_name_parts(prefix) | JOINING | FIRST | side | also, prefix.parent, origin)
     taken = 0
     if crosswalks:
-        taken = take_crosswalks(plain, net, crosswalks)
-        _run(_name_parts(plain) | JOINING | side | {"output-file": str(net)}, origin)
-    text = net.read_text(encoding="utf-8")
+        taken = take_crosswalks(plain, made, crosswalks)
+        _run(_name_parts(plain) | JOINING | side, prefix.parent, origin)
+    text = made.read_text(encoding="utf-8")
     net.write_text(re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL), encoding="utf-8")  # no dates and paths
     return taken
 
 
 def _name_parts(prefix: Path) -> dict[str, str]:
     """Return netconvert's options for reading the `PARTS` beside `prefix`."""
-    return {OPTIONS[part]: f"{prefix}.{part}.xml" for part in PARTS}
+    return {OPTIONS[part]: f"{prefix.name}.{part}.xml" for part in PARTS}
 
 
-def _run(options: dict[str, str], origin: Path) -> None:
-    """Run netconvert; raises `InputError` where it is missing, or with its first error where it fails."""
+def _run(options: dict[str, str], folder: Path, origin: Path) -> None:
+    """Run netconvert in `folder`; raises `InputError` where it is missing, or with its first error where it fails.
+
+    Options name files by their names there: in a path it would take a comma for a separator.
+    """
     found = importlib.util.find_spec("sumo")
     if found is None or not found.submodule_search_locations:
         raise InputError(
@@ -132,7 +137,7 @@ def _run(options: dict[str, str], origin: Path) -> None:
     command = [str(binary), *(word for name, value in options.items() for word in (f"--{name}", value))]
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", check=False, timeout=NETCONVERT_S
+            command, cwd=folder, capture_output=True, text=True, errors="replace", check=False, timeout=NETCONVERT_S
         )
     except subprocess.TimeoutExpired:
         raise InputError(f"{origin}: netconvert did not come to an end with this map in {NETCONVERT_S:.0f} s") from None
@@ -185,6 +190,11 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
     netconvert can read, and where the map has no driving lane.
     """
     check_town_name(out.name)
+    with only_writer(out):
+        return _import(xodr, out)
+
+
+def _import(xodr: Path, out: Path) -> ImportedTown:
     if out.exists():
         raise InputError(f"{out}: is there already; give a new folder")
     beside = find_existing(out.parent)
@@ -249,6 +259,7 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
             decks = [Deck([section + offset for section in sections]) for sections in heights.decks]
             Relief(heights.points + offset, decks).save(folder / HEIGHTS)
         town = load_town(folder)
+        flush_tree(folder)
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(folder, out)
     return ImportedTown(replace(town, net=out.absolute() / "town.net.xml"), tuple(notes))

@@ -8,6 +8,7 @@ import threading
 from pathlib import Path
 
 SERVE = "flcav.world.traffic.sumo_process:serve"  # what that process runs
+ROOT = str(Path(__file__).parents[3])  # where flcav is, installed or not
 
 _lock = threading.Lock()
 _process: tuple[int, subprocess.Popen[str]] | None = None  # with the id of its parent: a fork starts its own
@@ -40,7 +41,8 @@ def _running() -> subprocess.Popen[str]:
     global _process
     if _process is None or _process[0] != os.getpid() or _process[1].poll() is not None:
         module, name = SERVE.split(":")
-        command = [sys.executable, "-c", f"from {module} import {name}; {name}()"]
+        code = f"import sys; sys.path.append({ROOT!r}); from {module} import {name}; {name}()"
+        command = [sys.executable, "-P", "-c", code]  # -P: a user's json.py in the working directory is not imported
         started = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         _process = os.getpid(), started
     return _process[1]

@@ -178,8 +178,11 @@ def _simulate(folder: Path) -> NoReturn:
             os.dup2(said.fileno(), sys.stderr.fileno())
         job = json.loads((folder / "job.json").read_text())
         scenarios = [Scenario.model_validate(scenario) for scenario in job["scenarios"]]
-        net, routes, out = Path(job["net"]), Path(job["routes"]), folder / "out.npz"
-        run_sumo(net, routes, job["followers"], job["seed"], job["steps"], out, scenarios)
+        os.chdir(folder)  # in a path SUMO would take a comma for a separator, and ${...} for a variable
+        net, routes = Path("linked.net.xml"), Path("linked.rou.xml")
+        net.symlink_to(job["net"])
+        routes.symlink_to(job["routes"])
+        run_sumo(net, routes, job["followers"], job["seed"], job["steps"], Path("out.npz"), scenarios)
         code = 0
     except BaseException:
         traceback.print_exc()

@@ -82,8 +82,8 @@ def _run(
         folder = Path(name)
         (folder / "routes.rou.xml").write_text(demand.routes, encoding="utf-8")
         asked = [scenario.model_dump() for scenario in scenarios]
-        values = {"net": str(net), "routes": str(folder / "routes.rou.xml"), "seed": seed, "steps": steps.tolist()}
-        values |= {"followers": demand.followers, "scenarios": asked}
+        files = {"net": str(net.absolute()), "routes": str(folder.absolute() / "routes.rou.xml")}
+        values = files | {"seed": seed, "steps": steps.tolist(), "followers": demand.followers, "scenarios": asked}
         (folder / "job.json").write_text(json.dumps(values))
         try:
             simulate_in(folder)

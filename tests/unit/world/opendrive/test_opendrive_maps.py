@@ -41,6 +41,16 @@ def write(root: ElementTree.Element, path: Path) -> Path:
     return path
 
 
+@pytest.mark.parametrize("name", ["one,two", "one;two", "${HOME}", "\N{GREEK SMALL LETTER LAMDA} .x", "-x"])
+def test_names_of_folders_do_not_matter_to_netconvert(name: str, tmp_path: Path) -> None:
+    plain, odd = tmp_path / "plain", tmp_path / name / name
+    for folder in (plain, odd):
+        import_town(OBJECTS, folder)
+    assert {path.name: path.read_bytes() for path in odd.iterdir()} == {
+        path.name: path.read_bytes() for path in plain.iterdir()
+    }
+
+
 def test_left_hand_traffic_is_the_mirror_image(tmp_path: Path) -> None:
     root = read_map(OBJECTS)
     for geometry in root.iter("geometry"):  # the map at its origin, so that both towns are mirrored in the same axis
