@@ -21,6 +21,8 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.fig1b.layers import LAYERS, capture_outputs
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import Schedule, federate
+from flcav.federation.state import FederationState
+from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import Trainable
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.card import CARD_KEY
@@ -215,6 +217,9 @@ def test_two_clients_federate(task, samples):
     assert any(not np.array_equal(result.weights[name], weights[name]) for name in weights)
     assert ledger.used_mb("wireless") > 0
     assert np.isfinite(result.loss)
+    state, account = FederationState(), Account(ledger, "edge", task.name, "wireless")
+    federate(clients, weights, schedule, account, strategy=Scaffold(), state=state)
+    assert not state.records[0].failed  # a gradient of each array that is learned
 
 
 def assert_comes_back(result):

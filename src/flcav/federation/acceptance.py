@@ -4,12 +4,14 @@ Every reply of a round is read here. It has the records that were asked for and 
 and types that the server's own weights give, and numbers within the limits of the rules; or it is refused.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from flwr.app import ArrayRecord, ConfigRecord, MetricRecord, RecordDict
+from numpy.typing import NDArray
 
 from flcav.config import shorten
 from flcav.federation.encoding import count_coordinates, decode, is_local, sent_forms
@@ -27,10 +29,12 @@ from flcav.federation.records import (
     SHARES,
     VECTOR,
     to_numpy,
+    type_name,
 )
 from flcav.federation.rules import Rules
 from flcav.federation.secure.masks import is_public_key
 from flcav.federation.secure.parties import PublicKeys
+from flcav.federation.strategies.fedavg import BLOCK
 from flcav.federation.strategies.strategy import Exchanges, Strategy
 from flcav.federation.trainable import Forms, LocalUpdate, Weights, forms_of, learned_names
 from flcav.federation.upload import Arrays
@@ -171,7 +175,7 @@ def _read_arrays(content: RecordDict, key: str, wanted: Forms) -> Arrays:
     found = {}
     for name, (shape, dtype) in wanted.items():
         array = record[name]
-        if (tuple(array.shape), array.dtype) != (shape, str(dtype)):
+        if (tuple(array.shape), array.dtype) != (shape, type_name(dtype)):
             raise ReplyRefused(
                 f"'{name}' is {array.dtype[:20]} {shorten(tuple(array.shape))} instead of {dtype} {shape}"
             )
@@ -185,13 +189,21 @@ def _read_arrays(content: RecordDict, key: str, wanted: Forms) -> Arrays:
 def _check_change(weights: Weights, start: Weights, rules: Rules) -> None:
     """Raise `ReplyRefused` where the L2 norm of the change of all floating arrays is above the limit, or not finite."""
     total, most = 0.0, rules.limits.norm
-    for name, array in weights.items():
-        if np.issubdtype(array.dtype, np.floating):
-            dtype = np.result_type(array.dtype, np.float32)
-            with np.errstate(over="ignore", invalid="ignore"):
-                change = np.subtract(array, start.get(name, dtype.type(0)), dtype=dtype).ravel()
-                total += float(np.dot(change, change))
-            if not np.isfinite(total) and not np.isfinite(array).all():
-                raise ReplyRefused(f"'{name}' has values that are not finite")
+    with np.errstate(over="ignore", invalid="ignore"):
+        for name, array in weights.items():
+            if array.dtype.kind == "f":
+                total += _squared_norm(array.reshape(-1), start[name].reshape(-1) if start else None)
+                if not total < math.inf and not np.isfinite(array).all():
+                    raise ReplyRefused(f"'{name}' has values that are not finite")
     if not total <= most**2:
         raise ReplyRefused(f"a change of the norm {total**0.5:.3g}, where {most:g} is the largest")
+
+
+def _squared_norm(values: NDArray[np.number], start: NDArray[np.number] | None) -> float:
+    """Return the squared L2 norm of values or of their change, by blocks that stay in the cache."""
+    change, total = np.empty(min(BLOCK, values.size), np.promote_types(values.dtype, np.float32)), 0.0
+    for first in range(0, values.size, BLOCK):
+        part = values[first : first + BLOCK]
+        moved = np.subtract(part, 0 if start is None else start[first : first + BLOCK], out=change[: part.size])
+        total += float(np.dot(moved, moved))
+    return total

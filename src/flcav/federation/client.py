@@ -127,7 +127,7 @@ def client_app(
         if rules.secure is not None:
             peers = len(message.content.config_records[ASK][NAMES]) + 1  # type: ignore[arg-type]
             integers = to_integers(flatten(update, start, rules, seed, key), rules.secure.largest, peers)
-            masked = {VECTOR: mask_update(message, context, integers)}
+            masked = {VECTOR: mask_update(context, integers)}
             about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
             return reply(message, LocalUpdate(masked, *about), {})
         encoded, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)

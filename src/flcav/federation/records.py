@@ -26,7 +26,6 @@ KEYS, SHARES, MASKED, UNMASK = "keys", "shares", "masked", "unmask"  # ask, in t
 NAMES, CIPHERS, MASKS = "names", "ciphers", "masks"  # entries of its messages; that of shares is `SHARES`
 SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
 
-NPY_VERSION_1 = b"\x93NUMPY\x01\x00"
 NUMBERS = {  # types of arrays in messages, by name
     str(np.dtype(code)): np.dtype(code) for code in (*np.typecodes["AllInteger"], *np.typecodes["AllFloat"], "?")
 }
@@ -66,10 +65,23 @@ def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
 
 def _to_array(value: NDArray[np.number]) -> Array:
     """Return an array in C order as Flower does, in NumPy's file format, but copied once instead of twice."""
-    head = BytesIO()
-    np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(value))
-    data = b"".join((head.getvalue(), value.data))
-    return Array(dtype=str(value.dtype), shape=value.shape, stype=SType.NUMPY, data=data)
+    data = b"".join((_header(value.shape, value.dtype, fortran_order=False), value.data))
+    return Array(dtype=type_name(value.dtype), shape=value.shape, stype=SType.NUMPY, data=data)
+
+
+@lru_cache(maxsize=256)
+def type_name(dtype: np.dtype) -> str:
+    """Return the name of a type of numbers, as messages have it."""
+    return str(dtype)
+
+
+@lru_cache(maxsize=4096)
+def _header(shape: tuple[int, ...], dtype: np.dtype, fortran_order: bool) -> bytes:
+    """Return the header of an array in version 1.0 of NumPy's file format."""
+    head, descr = BytesIO(), np.lib.format.dtype_to_descr(dtype)
+    about = {"shape": shape, "fortran_order": fortran_order, "descr": descr}
+    np.lib.format.write_array_header_1_0(head, about)
+    return head.getvalue()
 
 
 def to_numpy(array: Array) -> np.ndarray:
@@ -84,22 +96,16 @@ def to_numpy(array: Array) -> np.ndarray:
     shape, dtype, data = tuple(array.shape), NUMBERS.get(array.dtype), array.data
     if dtype is None:
         raise ValueError(f"{shorten(array.dtype)} is no type of numbers")
-    start = 10 + int.from_bytes(data[8:10], "little")  # of the numbers, in version 1.0 of the format
-    for order in ("C", "F"):
-        if data[:8] == NPY_VERSION_1 and data[10:start].rstrip(b" \n") == _describe(shape, dtype, order):
+    start = 10 + int.from_bytes(data[8:10], "little")  # of the numbers
+    for fortran_order in (False, True):
+        known = _header(shape, dtype, fortran_order)
+        if data[:8] == known[:8] and data[10:start].rstrip() == known[10:].rstrip():  # padded by any number of spaces
             break
     else:
         raise ValueError(f"its header is not that of {dtype} {shape}")
     if len(data) - start != math.prod(shape) * dtype.itemsize:
         raise ValueError(f"it has {len(data) - start} bytes instead of those of {dtype} {shape}")
-    return np.frombuffer(data, dtype, offset=start).reshape(shape, order=order).copy()
-
-
-@lru_cache(maxsize=4096)
-def _describe(shape: tuple[int, ...], dtype: np.dtype, order: str) -> bytes:
-    """Return the header of an array in NumPy's file format, without its length and padding."""
-    descr = np.lib.format.dtype_to_descr(dtype)
-    return f"{{'descr': {descr!r}, 'fortran_order': {order == 'F'}, 'shape': {shape!r}, }}".encode()
+    return np.frombuffer(data, dtype, offset=start).reshape(shape, order="F" if fortran_order else "C").copy()
 
 
 def read_arrays(content: RecordDict, key: str) -> dict[str, np.ndarray]:

@@ -50,6 +50,7 @@ from flcav.federation.trainable import LocalUpdate, Weights, forms_of, learned_n
 
 OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
 AnswerT = TypeVar("AnswerT")
+ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere; Flower's own limit for updates
 Away = Callable[[int], Mapping[str, str]]  # of a round, by client why it is not there when the round begins
 
 
@@ -149,7 +150,9 @@ class Rounds(FlowerStrategy):
             self._draw_unbiased(grid, local)
         if selection.rule == "importance":
             requests = self._address(chosen, {**records, CONFIG: local, ASK: ConfigRecord({ASK: NORM})})
-            self._drawn = selection.draw(self._receive_norms(chosen, grid.send_and_receive(requests)), work.seed)
+            self._drawn = selection.draw(
+                self._receive_norms(chosen, grid.send_and_receive(requests, timeout=ANSWER_S)), work.seed
+            )
             self._here.chosen, records = [*self._drawn], {ASK: ConfigRecord({ASK: SEND})}
         self._here.count(self._rules)
         if self._here.shortage is not None:
@@ -177,9 +180,8 @@ class Rounds(FlowerStrategy):
     def _draw_unbiased(self, grid: Grid, local: ConfigRecord) -> None:
         """Ask all clients for their numbers of samples; note the shares, and the probabilities of those chosen."""
         names = [*self._names.values()]
-        self._receive_norms(
-            names, grid.send_and_receive(self._address(names, {CONFIG: local, ASK: ConfigRecord({ASK: COUNT})}))
-        )
+        requests = self._address(names, {CONFIG: local, ASK: ConfigRecord({ASK: COUNT})})
+        self._receive_norms(names, grid.send_and_receive(requests, timeout=ANSWER_S))
         reported = [name for name in self._here.chosen if name in self._shares]
         self._drawn = dict.fromkeys(reported, self._rules.selection.inclusion_probability(len(names)))
 
@@ -195,7 +197,7 @@ class Rounds(FlowerStrategy):
             asks: Mapping[str, ConfigRecord], read: Callable[[str, RecordDict], AnswerT]
         ) -> dict[str, AnswerT]:
             asked = [each for name, ask in asks.items() for each in self._address([name], {CONFIG: local, ASK: ask})]
-            return dict(self._read([*asks], grid.send_and_receive(asked), read))
+            return dict(self._read([*asks], grid.send_and_receive(asked, timeout=ANSWER_S), read))
 
         local = records[CONFIG]
         self._secure = SecureSum(exchange, how.needed(len(self._here.chosen)))
@@ -321,7 +323,7 @@ class Rounds(FlowerStrategy):
             return received
         here.failed |= settle_complaints(complaints)
         again = self._begin([name for name in peers if name not in here.failed])
-        return Intake(None) if here.shortage else self._receive(self._grid.send_and_receive(again))
+        return Intake(None) if here.shortage else self._receive(self._grid.send_and_receive(again, timeout=ANSWER_S))
 
     def _average_securely(self, updates: Mapping[str, LocalUpdate], how: SecureAggregation) -> Weights:
         """Return start + (sum of the clients' changes) / their number; the sum is all that is unmasked."""

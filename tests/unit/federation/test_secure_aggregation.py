@@ -14,8 +14,8 @@ from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.secure.masks import add_vectors, agree, draw_keys, expand, seal, to_integers, to_values, unseal
 from flcav.federation.secure.messages import TooFewClients
-from flcav.federation.secure.parties import SecureClient, unmask_sum
-from flcav.federation.secure.shamir import join_shares, split_secret
+from flcav.federation.secure.parties import SecureClient, SumLost, settle_complaints, unmask_sum
+from flcav.federation.secure.shamir import find_wrong_shares, join_shares, split_secret
 from flcav.federation.selection import Selection
 from flcav.federation.stages import Schedule, check_federation, federate
 from flcav.federation.state import FederationState
@@ -45,7 +45,8 @@ def protocol(lost_before: tuple[str, ...], lost_after: tuple[str, ...], threshol
     for_one = {name: {other: sealed[other][name] for other in peers if other != name} for name in peers}
     survivors = [name for name in peers if name not in lost_after]
     given = updates()
-    masked = {name: clients[name].mask(given[name], for_one[name]) for name in survivors}
+    assert not any(clients[name].take(for_one[name]) for name in survivors)
+    masked = {name: clients[name].mask(given[name]) for name in survivors}
     held += [*masked.values()]
     dropped = [name for name in peers if name in lost_after]
     shares = {name: clients[name].reveal(survivors, dropped) for name in survivors}
@@ -83,7 +84,8 @@ def test_masks_look_uniform_and_differ_from_round_to_round():
     sealed = {name: each.share(keys, 3) for name, each in client.items()}
     zero = np.zeros(100_000, np.uint32)
     name = NAMES[0]
-    masked = client[name].mask(zero, {other: sealed[other][name] for other in NAMES if other != name})
+    client[name].take({other: sealed[other][name] for other in NAMES if other != name})
+    masked = client[name].mask(zero)
     counts = np.bincount(masked >> 24, minlength=256)
     assert ((counts - len(zero) / 256) ** 2).sum() / (len(zero) / 256) < 360  # chi-squared, 255 degrees: p > 1e-5
     assert SecureClient.draw(name).keys != client[name].keys
@@ -94,7 +96,7 @@ def test_a_client_does_not_reveal_both_masks_of_another():
     keys = {name: client.keys for name, client in clients.items()}
     sealed = {name: client.share(keys, 3) for name, client in clients.items()}
     one = clients[NAMES[0]]
-    one.mask(np.zeros(4, np.uint32), {name: sealed[name][NAMES[0]] for name in NAMES[1:]})
+    one.take({name: sealed[name][NAMES[0]] for name in NAMES[1:]})
     for survivors, dropped in ((NAMES, NAMES[:1]), (NAMES[:2], NAMES[2:]), (NAMES[1:], ()), ([*NAMES[:3], "x"], ())):
         with pytest.raises(ValueError, match="shares are revealed"):
             one.reveal(survivors, dropped)
@@ -105,7 +107,7 @@ def test_a_client_does_not_reveal_both_masks_of_another():
         with pytest.raises(ValueError, match="more than half of them is wanted"):
             one.share(keys, threshold)
     with pytest.raises(ValueError, match="2 clients are left, and 3 are needed"):
-        clients[NAMES[1]].mask(np.zeros(4, np.uint32), {NAMES[0]: b""})
+        clients[NAMES[1]].take({NAMES[0]: b""})
 
 
 def test_any_threshold_of_the_shares_make_the_secret_and_fewer_do_not():
@@ -271,3 +273,40 @@ def test_what_makes_no_sense_is_one_sentence():
     ):
         with pytest.raises(InputError, match=said):
             check_federation(clients, strategy, rules)
+
+
+@pytest.mark.parametrize(("threshold", "count", "wrong"), [(3, 5, 1), (3, 5, 2), (4, 9, 4), (11, 20, 3), (2, 3, 1)])
+def test_wrong_shares_are_found_among_enough_right_ones(threshold: int, count: int, wrong: int):
+    rng = np.random.default_rng(count)
+    shares = dict(enumerate(split_secret(bytes(range(32)), threshold, count)))
+    assert find_wrong_shares(shares, threshold) == set()
+    odd = {*rng.permutation(count)[:wrong].tolist()}
+    told = shares | {place: split_secret(bytes(32), 2, 1)[0] for place in odd}
+    assert find_wrong_shares(told, threshold) == odd
+    with pytest.raises(ValueError, match=f"no {threshold} of {threshold} shares make a secret"):
+        find_wrong_shares({place: told[place] for place in [*odd, *({*shares} - odd)][:threshold]}, threshold)
+
+
+def test_the_fewest_liars_that_explain_all_complaints_are_out_and_of_two_alone_both():
+    for complaints, liars in (
+        ({name: ["a"] for name in "bcde"}, {"a"}),  # a sealed garbage for all
+        ({"a": [*"bcde"]}, {"a"}),  # a complains about all
+        ({"b": ["a"], "c": ["a"]}, {"a"}),
+        ({"b": ["a"]}, {"a", "b"}),  # it cannot be told which
+        ({"b": ["a"], "c": ["a"], "e": ["d"]}, {"a", "d", "e"}),
+        ({"b": ["a"], "a": ["b"]}, {"a", "b"}),
+    ):
+        assert settle_complaints(complaints).keys() == liars
+
+
+def test_a_key_of_another_than_the_client_s_own_is_told_when_it_drops_out():
+    clients = {name: SecureClient.draw(name) for name in NAMES}
+    keys = {name: client.keys for name, client in clients.items()}
+    clients[NAMES[0]].private = draw_keys()[0]  # shares another one than its public key's
+    sealed = {name: client.share(keys, 3) for name, client in clients.items()}
+    for name, client in clients.items():
+        assert not client.take({other: sealed[other][name] for other in NAMES if other != name})
+    total = add_vectors([clients[name].mask(np.zeros(4, np.uint32)) for name in NAMES[1:]])
+    shares = {name: clients[name].reveal(NAMES[1:], NAMES[:1]) for name in NAMES[1:]}
+    with pytest.raises(SumLost, match=f"{NAMES[0]} dropped out, and had shared a key that is not its own"):
+        unmask_sum(total, keys, NAMES[1:], NAMES[:1], shares)

@@ -61,18 +61,19 @@ def answer_secretly(message: Message, context: Context, name: str, how: SecureAg
 
 
 def complain(message: Message, context: Context) -> Message | None:
-    """Return a client's answer to a request for its masked update where others' shares do not open; else None."""
-    if odd := _recall(context).find_unopened(_named(message.content.config_records[ASK])):
-        return Message(RecordDict({ASK: ConfigRecord({NAMES: odd})}), reply_to=message)
-    return None
+    """Return a client's answer to a request for its masked update where others' shares do not open; else None.
 
-
-def mask_update(message: Message, context: Context, update: Vector) -> Vector:
-    """Return a client's update with its masks, from the shares that the server passed on with its request."""
-    asked, client = message.content.config_records[ASK], _recall(context)
-    masked = client.mask(update, _named(asked))
+    The shares are those that the server passed on with the request.
+    """
+    client = _recall(context)
+    odd = client.take(_named(message.content.config_records[ASK]))
     _keep(context, client)
-    return masked
+    return Message(RecordDict({ASK: ConfigRecord({NAMES: odd})}), reply_to=message) if odd else None
+
+
+def mask_update(context: Context, update: Vector) -> Vector:
+    """Return a client's update with its masks, after its shares of others' secrets have opened."""
+    return _recall(context).mask(update)
 
 
 class SecureSum:
@@ -161,7 +162,7 @@ def _recall(context: Context) -> SecureClient:
 
     fields["keys"] = keys(fields["keys"])
     fields["peers"] = {name: keys(values) for name, values in fields["peers"].items()}
-    fields["sealed"] = {name: base64.b64decode(value) for name, value in fields["sealed"].items()}
+    fields["opened"] = {name: base64.b64decode(value) for name, value in fields["opened"].items()}
     return SecureClient(**fields)
 
 

@@ -7,6 +7,7 @@ every other client, which cancel in the sum. Unmask: those who are left send the
 sent an update, and of the keys of clients who did not, so that no client's both masks can be taken off.
 """
 
+import contextlib
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -44,7 +45,7 @@ class SecureClient:
     peers: dict[str, PublicKeys] = field(default_factory=dict)  # of all clients of the round
     threshold: int = 0  # of shares
     own_shares: bytes = b""
-    sealed: dict[str, bytes] = field(default_factory=dict)  # by other client, for this one
+    opened: dict[str, bytes] = field(default_factory=dict)  # by other client, its shares for this one
     revealed: bool = False
 
     @classmethod
@@ -70,29 +71,27 @@ class SecureClient:
         self.own_shares = both.pop(self.name)
         return {name: seal(self._sealing_key(self.name, name), shares) for name, shares in both.items()}
 
-    def mask(self, update: Vector, sealed: Mapping[str, bytes]) -> Vector:
-        """Return the update with its masks.
+    def take(self, sealed: Mapping[str, bytes]) -> list[str]:
+        """Open and keep the shares of those who take part in the masks; return the names of those whose do not open.
 
-        sealed: by name of the other clients who take part in the masks, the shares that they sealed for this one.
+        sealed: by name of the other clients, the shares that they sealed for this one. Raises ValueError where they are
+        too few.
         """
         if len(sealed) + 1 < self.threshold:
             raise ValueError(f"{len(sealed) + 1} clients are left, and {self.threshold} are needed")
-        self.sealed = dict(sealed)
+        self.opened = {}
+        for name, shares in sealed.items():
+            with contextlib.suppress(InvalidTag):
+                self.opened[name] = unseal(self._sealing_key(name, self.name), shares)
+        return [name for name in sealed if name not in self.opened]
+
+    def mask(self, update: Vector) -> Vector:
+        """Return the update with its masks: its own, and those in common with the clients whose shares it has."""
         total = update + expand(self.seed, len(update))
-        for name in sealed:
+        for name in self.opened:
             common = agree(self.private, self.peers[name].mask, "mask")
             total = add_mask(total, common, self.name < name)
         return total
-
-    def find_unopened(self, sealed: Mapping[str, bytes]) -> list[str]:
-        """Return the names of those whose shares for this client do not open: who sealed others than it should."""
-        found = []
-        for name, shares in sealed.items():
-            try:
-                self._open(name, shares)
-            except InvalidTag:
-                found.append(name)
-        return found
 
     def reveal(self, survivors: Sequence[str], dropped: Sequence[str]) -> dict[str, bytes]:
         """Return this client's shares: of the survivors' seeds, and of the keys of masks of those who dropped out.
@@ -101,17 +100,14 @@ class SecureClient:
         """
         if self.revealed or set(survivors) & set(dropped) or len(set(survivors)) < self.threshold:
             raise ValueError("shares are revealed once, one of each client, to a server that has enough updates")
-        if self.name not in survivors or not {*survivors, *dropped} <= {self.name, *self.sealed}:
+        if self.name not in survivors or not {*survivors, *dropped} <= {self.name, *self.opened}:
             raise ValueError("shares are revealed of the clients of the round alone")
         self.revealed = True
         found = {}
         for name in (*survivors, *dropped):
-            both = self.own_shares if name == self.name else self._open(name, self.sealed[name])
+            both = self.own_shares if name == self.name else self.opened[name]
             found[name] = both[:SHARE_BYTES] if name in survivors else both[SHARE_BYTES:]
         return found
-
-    def _open(self, name: str, sealed: bytes) -> bytes:
-        return unseal(self._sealing_key(name, self.name), sealed)
 
     def _sealing_key(self, sender: str, receiver: str) -> bytes:
         other = receiver if sender == self.name else sender

@@ -78,7 +78,11 @@ class Exchanges(Protocol):
         ...
 
     def report(self, update: LocalUpdate, sent: Weights, own: Weights) -> tuple[Weights, Weights]:
-        """Return what a client sends beside its update, and its state after the round; `own` is empty at first."""
+        """Return what a client sends beside its update, and its state after the round; `own` is empty at first.
+
+        The server asks the same of its own weights, with a gradient of zeros: names, shapes and types of the arrays
+        that it then gets are those that clients are held to.
+        """
         ...
 
 
