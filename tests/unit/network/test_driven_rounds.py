@@ -66,6 +66,13 @@ def test_rounds_are_driven_in_the_scenes_in_turn_one_after_another() -> None:
     ]
 
 
+def test_turns_go_on_after_the_rounds_before() -> None:
+    scenes = [made_links(TIMES, dict.fromkeys(("cav0", "cav1", "cav2"), GOOD))]
+    turns = {"selection": {"rule": "round-robin", "clients": 2}}
+    driven = [client.client for record in drive(scenes, turns, 2, earlier=1).records for client in record.clients]
+    assert driven == ["cav0", "cav2", "cav1", "cav2"]  # the first round had 0 and 1
+
+
 def test_vehicles_that_are_lost_have_sent_what_came_before() -> None:
     leaves = np.where(TIMES < 5, GOOD, NAN)  # 2 s down, 1 s training: 2 s of sending, 5 MB
     driven = drive([made_links(TIMES, {"cav0": leaves})])
