@@ -11,6 +11,7 @@ from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.collecting.findings import findings, name_stage
+from flcav.pipeline.collecting.home import list_home_costs
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.plans import RoundPlan
@@ -36,6 +37,7 @@ def tables(run: Run) -> dict[str, str]:
         "differences": _differences(run),
         "plan": _plan(run),
         "budgets": _budgets(run),
+        "home": _home(run),
         **cloud_tables(run),
     }
     own |= {"sensors": _sensors(run)} if any(each.chosen for each in run.arms[MAIN].placed) else {}
@@ -63,6 +65,20 @@ def _tests(run: Run) -> str:
             place = [task, f"{region} ({own.role})", one.measure, f"{one.frames} / {one.scenes}"]
             rows.append([*place, *(reached.get(column, "") for column in columns)])
     return format_table(("task", "region (role)", "measure", "frames / scenes", *columns), rows)
+
+
+def _home(run: Run) -> str:
+    """Return what federated learning costs in the towns of pretraining."""
+    rows = [
+        [
+            *(each.region, each.task, each.measure, f"{each.before:.3f}", f"{each.after:.3f}"),
+            each.difference.describe(sign=True) + ("" if each.difference.low is not None else ", no interval"),
+            each.trainings,
+        ]
+        for each in list_home_costs(run)
+    ]
+    heads = ("town of pretraining", "task", "measure", "pretrained", "after FL", "difference", "trainings")
+    return format_table(heads, rows)
 
 
 def _differences(run: Run) -> str:

@@ -52,6 +52,9 @@ class Outcomes:
             raise InputError(f"{path}: no outcomes of a test ({error})") from None
 
 
+Measure = Callable[[Outcomes, Times], Values]  # a measure of each of n bootstrap samples, see `Measurable.measure`
+
+
 @runtime_checkable
 class Measurable(Protocol):
     """A task whose measure is computed from outcomes, so that it can be bootstrapped over scenes."""
@@ -79,6 +82,21 @@ class Measurable(Protocol):
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
         """Return further numbers by name; None where one is undefined."""
         ...
+
+
+@runtime_checkable
+class MeasuresMore(Protocol):
+    """A task with further measures than its own, computed from the same outcomes."""
+
+    @property
+    def further_measures(self) -> Mapping[str, Measure]:
+        """Return the further measures by the names that they have in `numbers`."""
+        ...
+
+
+def further_measures(task: Task) -> Mapping[str, Measure]:
+    """Return the further measures of a task by name; none where it has none."""
+    return task.further_measures if isinstance(task, MeasuresMore) else {}
 
 
 class SceneScores:
@@ -118,7 +136,12 @@ def as_measurable(task: Task) -> Measurable:
 
 def compute_measure(task: Task, outcomes: Outcomes) -> float:
     """Return the task's measure, each unit counted once; NaN if it is undefined: nothing was to be found."""
-    return float(as_measurable(task).measure(outcomes, np.ones((1, len(outcomes.scene)), dtype=np.int64))[0])
+    return count_once(as_measurable(task).measure, outcomes)
+
+
+def count_once(measure: Measure, outcomes: Outcomes) -> float:
+    """Return a measure, each unit counted once; NaN if it is undefined."""
+    return float(measure(outcomes, np.ones((1, len(outcomes.scene)), dtype=np.int64))[0])
 
 
 def score_network(task: Task, network: nn.Module, data: Dataset, frames: Sequence[int] | None = None) -> float:
@@ -143,39 +166,45 @@ def compute_interval(task: Task, outcomes: Outcomes, seed: int = 0) -> tuple[flo
 
 
 def difference(
-    task: Task, before: Outcomes, after: Outcomes, seed: int = 0
+    task: Task, before: Outcomes, after: Outcomes, seed: int = 0, measure: Measure | None = None
 ) -> tuple[float, float | None, float | None]:
     """Return measure(after) - measure(before) and its paired 95 % bootstrap interval over scenes (low, high).
 
-    Both measures are taken on the same bootstrap samples. Low and high are None for a single scene. Raises `InputError`
-    if the outcomes are not of the same units.
+    `measure`: by default the task's own. Both are taken on the same bootstrap samples. Low and high are None for a
+    single scene. Raises `InputError` if the outcomes are not of the same units.
     """
     if not np.array_equal(before.scene, after.scene):
         raise InputError("two tests are not of the same frames: there is no paired difference")
     own = as_measurable(task)
-    mean = compute_measure(task, after) - compute_measure(task, before)
+    of = measure or own.measure
+    mean = count_once(of, after) - count_once(of, before)
     if len(np.unique(before.scene)) < 2:
         return mean, None, None
     rng = stream(seed, "bootstrap")
 
     def change(times: Times) -> Values:
-        return own.measure(after, times) - own.measure(before, times)
+        return of(after, times) - of(before, times)
 
     return mean, *_known(bootstrap_over_scenes(change, before.scene, own.redraws, rng=rng))
 
 
 def share_test_scenes(
-    task: Task, seeds: Sequence[Sequence[Outcomes]], number: Callable[[Sequence[Values]], Values], seed: int = 0
+    task: Task,
+    seeds: Sequence[Sequence[Outcomes]],
+    number: Callable[[Sequence[Values]], Values],
+    seed: int = 0,
+    measure: Measure | None = None,
 ) -> SharedScenes:
     """Return the spread of a mean over seeds by the test scenes that several seeds share, see `flcav.intervals`.
 
     Each seed has one or several tests of the same frames. `number` computes the seed's number from their measures, such
-    as the difference of two.
+    as the difference of two. `measure`: by default the task's own.
     """
     own = as_measurable(task)
+    of = measure or own.measure
 
     def of_seed(tests: Sequence[Outcomes]) -> Callable[[Times], Values]:
-        return lambda times: number([own.measure(outcomes, times) for outcomes in tests])
+        return lambda times: number([of(outcomes, times) for outcomes in tests])
 
     measures, scenes = [of_seed(tests) for tests in seeds], [tests[0].scene for tests in seeds]
     return share_scenes(measures, scenes, own.redraws, rng=stream(seed, "bootstrap"))

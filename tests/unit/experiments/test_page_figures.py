@@ -21,7 +21,6 @@ import yaml
 from flcav.config import read_json
 from flcav.files import Json
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.running import RESULTS
 from flcav.pipeline.seeds.spread import read_spreads, widen_anew
 
 ROOT = Path(__file__).parents[3]
@@ -59,7 +58,7 @@ def hold(value: Json) -> Any:
 def names_of(file: str) -> Mapping[str, Any]:
     """Return what expressions know: the results `r`, and of a run its tests and differences by stage and region."""
     path = ROOT / "reproductions" / file
-    if path.name != RESULTS:
+    if path.parent.parent.name != "runs":
         return {**NAMES, "r": hold(read_json(path))}
     run = Run.load(path.parent, path.name)
     if run.recipe.spread is not None and not run.recipe.retrainings:

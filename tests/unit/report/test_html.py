@@ -1,19 +1,24 @@
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
 import made_up_run
 import pytest
 from jinja2 import UndefinedError
 
+from flcav.intervals import Estimate
 from flcav.network.plan import Price
 from flcav.pipeline.recipe import EDGE, MAIN
 from flcav.pipeline.results.plans import Plan, RoundPlan
-from flcav.pipeline.results.tests import Finding
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.tests import Finding, HomeCost
 from flcav.pipeline.results.training import StageResult
+from flcav.pipeline.running import RESULTS
 from flcav.report.pages.html import render
 from flcav.report.pages.run_page import page
 
+DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo"
 PIXEL = b"\x89PNG made up"
 PICTURES: dict[str, bytes] = dict.fromkeys(("map_grid", "before_after", "rounds_objects", "megabytes"), PIXEL)
 
@@ -136,3 +141,23 @@ def test_plans_after_rounds_and_the_uploads_of_vehicles_are_on_the_page_where_th
     told = " ".join(" ".join(words).split())
     assert "objects II grid 2 0.457 9.4 7.7 0.0 0.0 17 3 0.530" in told
     assert "suburb/cav0 211 suburb/cav1 109" in told
+
+
+def test_a_placed_pole_is_told_with_what_it_covers_and_with_its_ties() -> None:
+    run = made_up_run.run()
+    assert "put on pole 2 of 9: 19 of 61 registered mistakes are in reach, more than of any other choice." in (
+        Page(render(page(run), PICTURES)).text
+    )
+    tied = Run.load(DEMO, RESULTS)
+    told = Page(render(page(tied), {})).text
+    assert "put on pole 2 of 9: 17 of 109 registered mistakes are in reach, as many as of pole 6." in told
+
+
+def test_what_federated_learning_costs_at_home_is_on_the_page() -> None:
+    run = Run.load(DEMO, RESULTS)
+    told = Page(render(page(run), {})).text
+    assert "AP70 of objects in suburb, the town of pretraining: 0.547 pretrained, 0.125 after" in told
+    cost = HomeCost("suburb", "objects", "AP70", 0.5, 0.1, Estimate(-0.4, -0.5, -0.3), 3)
+    told = Page(render(page(replace(run, home=(cost,))), {})).text
+    assert "0.100 after federated learning, -0.400 (95 % interval -0.500 to -0.300)." in told
+    assert "costs at home" not in Page(render(results(), PICTURES)).text

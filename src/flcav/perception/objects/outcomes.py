@@ -15,7 +15,7 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_frames
 from flcav.perception.objects.truth import select_class
 from flcav.perception.ops.rotated import Kind
-from flcav.perception.outcomes import Outcomes, Times, Values
+from flcav.perception.outcomes import Measure, Outcomes, Times, Values
 from flcav.progress import Report, ignore_progress
 
 CLASSES, HIDDEN = "classes", "hidden"
@@ -59,6 +59,11 @@ class ObjectsOutcomes:
         NaN where no class has targets.
         """
         return self._mean_precision(outcomes, MEASURED, times)
+
+    @property
+    def further_measures(self) -> Mapping[str, Measure]:
+        """Return AP in 3D at IoU 0.7, for which boxes have to be accurate."""
+        return {"AP70": lambda outcomes, times: self._mean_precision(outcomes, "3d70", times)}
 
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
         """Return further metrics by name, means over the classes with targets; None where there are none.

@@ -11,6 +11,7 @@ from flcav.pipeline.collecting.caveats import list_caveats
 from flcav.pipeline.collecting.differences import list_differences
 from flcav.pipeline.collecting.findings import findings
 from flcav.pipeline.collecting.history import gaps_closed
+from flcav.pipeline.collecting.home import collect_home_costs
 from flcav.pipeline.collecting.tests import collect_regional_tests, collect_test, number_retrainings
 from flcav.pipeline.federations.spent import Training, compose_trainings
 from flcav.pipeline.graph.graph import Graph
@@ -51,6 +52,7 @@ def collect_results(graph: Graph, work: Path) -> Run:
         findings=findings(differences, tests, arms, settings, recipe, rests),
         gap_closed=gaps_closed(tests, recipe),
         provenance=provenance(recipe.seed),
+        home=collect_home_costs(graph, work) or None,
         caveats=(*list_caveats(recipe, main.labels.values(), settings.values()), *compare_rigs(graph)),
     )
 

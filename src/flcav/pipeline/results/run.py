@@ -11,7 +11,7 @@ from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.plans import Plan, RoundPlan
 from flcav.pipeline.results.saved import Saved
 from flcav.pipeline.results.spending import PrivacySpent
-from flcav.pipeline.results.tests import Difference, Finding, RegionalTest, Test, Tested
+from flcav.pipeline.results.tests import Difference, Finding, HomeCost, RegionalTest, Test, Tested
 from flcav.pipeline.results.training import Pretrained, StageResult, Watched
 from flcav.records import LEFT_OUT
 from flcav.verdicts import Judged
@@ -82,6 +82,7 @@ class Run(Saved):
     caveats: tuple[str, ...]  # of the kinds of labels, and of rigs unlike those of the training
     provenance: Provenance
     elapsed_s: float = 0.0  # wall time of all starts together
+    home: Annotated[tuple[HomeCost, ...] | None, LEFT_OUT] = None  # of further measures than the tasks' own
 
     def test(self, *, stage: str, region: str, task: str, arm: str = "main") -> Tested:
         """Return the result of a test; raises `KeyError` for one that was not made."""

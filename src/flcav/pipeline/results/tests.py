@@ -84,6 +84,19 @@ class Difference:
 
 
 @dataclass(frozen=True)
+class HomeCost:
+    """What federated learning costs in a town of pretraining: a measure there before it and after it, same frames."""
+
+    region: str
+    task: str
+    measure: str
+    before: float  # mean over the run's trainings
+    after: float
+    difference: Estimate  # after - before, paired over scenes; over trainings too, where there are several
+    trainings: int  # of the run itself
+
+
+@dataclass(frozen=True)
 class Finding:
     """The verdict of a run on one claim, or its estimate of a loss."""
 

@@ -18,6 +18,7 @@ from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.arms import Names, resolve_settings
 from flcav.pipeline.collecting.caveats import PLACED_BARE
 from flcav.pipeline.collecting.findings import WORDS
+from flcav.pipeline.collecting.home import list_home_costs
 from flcav.pipeline.federations.network import CLOCK
 from flcav.pipeline.federations.records import list_rounds
 from flcav.pipeline.frames import Frames
@@ -116,6 +117,7 @@ def page(run: Run) -> dict[str, Any]:
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
+        "home": list_home_costs(run),
         "statistics": [(stage.task, each) for stage in main.stages for each in stage.statistics or ()],
         "caveats": [caveat for caveat in run.caveats if caveat != PLACED_BARE],
         "bare": PLACED_BARE if PLACED_BARE in run.caveats else None,

@@ -1,0 +1,82 @@
+"""What federated learning costs at home: every measure of a task in the towns of pretraining, before and after it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from flcav.intervals import Estimate, mean_over_seeds
+from flcav.perception.outcomes import (
+    Measure,
+    Outcomes,
+    Values,
+    count_once,
+    difference,
+    further_measures,
+    share_test_scenes,
+)
+from flcav.perception.tasks import task_named
+from flcav.pipeline.arms import name_repeat
+from flcav.pipeline.collecting.tests import number_retrainings, test_folder
+from flcav.pipeline.graph.graph import Graph
+from flcav.pipeline.recipe import MAIN, PRETRAIN
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.saved import OUTCOMES
+from flcav.pipeline.results.tests import HomeCost
+
+
+def collect_home_costs(graph: Graph, work: Path) -> tuple[HomeCost, ...]:
+    """Return the costs of further measures than the tasks' own, of which `Difference` tells."""
+    return tuple(
+        _cost(graph, work, (stage, region, task), name, measure)
+        for stage, region, task in graph.tested(graph.settings[MAIN])
+        if stage != PRETRAIN and region in graph.recipe.with_role("pretrain")
+        for name, measure in further_measures(task_named(task)).items()
+    )
+
+
+def _cost(graph: Graph, work: Path, tested: tuple[str, str, str], name: str, measure: Measure) -> HomeCost:
+    stage, region, task = tested
+    arms = [name_repeat(MAIN, number) for number in (0, *number_retrainings(graph))]
+    pairs = [
+        [Outcomes.load(work / test_folder(graph, arm, each, region, task) / OUTCOMES) for each in (PRETRAIN, stage)]
+        for arm in arms
+    ]
+    own, seed = task_named(task), graph.recipe.seed
+    values = [[count_once(measure, outcomes) for outcomes in pair] for pair in pairs]
+    first, last = pairs[0]
+    found = Estimate(*difference(own, first, last, seed, measure))
+    if len(pairs) > 1 and found.low is not None:
+        shared = share_test_scenes(own, pairs, _change, seed, measure)
+        found = mean_over_seeds([after - before for before, after in values], shared=shared).as_estimate()
+    before, after = np.mean(values, axis=0).tolist()
+    return HomeCost(region, task, name, before, after, found, len(pairs))
+
+
+def _change(pair: Sequence[Values]) -> Values:
+    return pair[1] - pair[0]
+
+
+def list_home_costs(run: Run) -> list[HomeCost]:
+    """Return what federated learning costs in the towns of pretraining: of each task's own measure and of further ones.
+
+    Results that were collected before further measures had intervals give those of the first training without one.
+    """
+    tests = {(test.stage, test.region, test.task): test for test in run.tested if test.arm == MAIN}
+    costs = []
+    for each in run.differences:
+        own = (each.arm, each.before_arm, each.before_stage) == (MAIN, MAIN, PRETRAIN)
+        if not own or each.region not in run.recipe.with_role("pretrain"):
+            continue
+        pair = [tests[stage, each.region, each.task] for stage in (PRETRAIN, each.stage)]
+        before, after = (test.estimate.mean for test in pair)
+        trainings = len(each.trainings)
+        costs.append(HomeCost(each.region, each.task, pair[0].result.measure, before, after, each.estimate, trainings))
+        kept = [cost for cost in run.home or () if (cost.region, cost.task) == (each.region, each.task)]
+        for name in () if kept else further_measures(task_named(each.task)):
+            before, after = (test.result.numbers.get(name) for test in pair)
+            if before is not None and after is not None:
+                change = Estimate(after - before, None, None)
+                kept.append(HomeCost(each.region, each.task, name, before, after, change, 1))
+        costs += kept
+    return costs
