@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import read_points
-from flcav.dataset.formats.layout import describe_numbers, is_kitti, is_nuscenes
+from flcav.dataset.formats.layout import describe_numbers, has_kitti_layout, has_nuscenes_layout
 from flcav.dataset.formats.nuscenes.files import encode_lidar
 from flcav.dataset.formats.opv2v.write import encode_pcd
 from flcav.dataset.formats.pcd import read_pcd
@@ -125,7 +125,7 @@ def test_other_layouts_are_refused(tmp_path: Path, layout: str, points: Points) 
             read_sweep(path)
         with pytest.raises(InputError):
             read_points(path)
-    assert not is_kitti(data)
+    assert not has_kitti_layout(data)
 
 
 @given(rows=st.lists(st.tuples(*[st.floats(-80, 80, width=32)] * 3, st.floats(0, 1, width=32)), min_size=1, max_size=6))
@@ -135,6 +135,12 @@ def test_other_layouts_are_refused(tmp_path: Path, layout: str, points: Points) 
 def test_a_few_points_are_a_cloud(tmp_path: Path, rows: list[tuple[float, ...]]) -> None:
     points = np.array([*rows, (20.0, -3.0, -1.5, 0.25)], "<f4")
     points[np.abs(points) < 1e-20] = 0  # no distance that a LiDAR measures
+    (tmp_path / "cloud.bin").write_bytes(points.tobytes())
+    np.testing.assert_array_equal(read_sweep(tmp_path / "cloud.bin"), points)
+
+
+def test_points_of_one_object_are_a_cloud(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform((18, 0.1, -1.5, 0), (22, 0.9, 0, 1), (200, 4)).astype("<f4")
     (tmp_path / "cloud.bin").write_bytes(points.tobytes())
     np.testing.assert_array_equal(read_sweep(tmp_path / "cloud.bin"), points)
 
@@ -243,5 +249,5 @@ def test_real_sweeps_are_read_as_they_are() -> None:
         pytest.skip(f"{REAL} has no KITTI frames: they are not part of the project")
     for path in files:
         data = path.read_bytes()
-        assert not is_nuscenes(data)
+        assert not has_nuscenes_layout(data)
         assert read_sweep(path).tobytes() == data, path

@@ -12,6 +12,7 @@ FARTHEST_M = 1e4  # largest coordinate that a LiDAR is taken to measure
 NEAREST_M = 1.0  # the farthest point of a sweep is beyond
 TINY = 1e-30  # smallest number above 0; what is smaller is of another type
 BRIGHTEST = 255  # largest intensity of nuScenes
+HIGHEST_M = 20.0  # highest point of a sweep beside which none is more than a metre
 BESIDE_M = 1.75  # normals and colours are within
 TYPES = {"<f4": "float32", "<f8": "float64", ">f4": "big-endian float32", ">f8": "big-endian float64"}
 COLUMNS = range(3, 13)
@@ -21,13 +22,13 @@ FEW = 16  # rows of which nothing is told but ranges
 Values = NDArray[np.floating]
 
 
-def is_kitti(data: bytes) -> bool:
+def has_kitti_layout(data: bytes) -> bool:
     """Return whether the bytes are rows of x, y, z, intensity 0 to 1."""
     rows = _rows(data, 4)
     return rows is not None and _is_cloud(rows) and _within(rows[:, 3], 1) and not _mixes(rows)
 
 
-def is_nuscenes(data: bytes) -> bool:
+def has_nuscenes_layout(data: bytes) -> bool:
     """Return whether the bytes are rows of x, y, z, intensity 0 to 255, ring, and some point is brighter than 1."""
     rows = _rows(data, 5)
     if rows is None or not _is_cloud(rows):
@@ -74,13 +75,14 @@ def _mixes(rows: NDArray[np.float32]) -> bool:
     """Return whether rows are of other ones, although every fourth number is an intensity.
 
     Of rows of eight numbers, every second half is no point, but a normal, a colour or padding. Of two-byte numbers y
-    is an intensity, too.
+    is an intensity, too, and z is x.
     """
     halves = [np.linalg.norm(half[half[:, :3].any(axis=1), :3], axis=1) for half in (rows[::2], rows[1::2])]
     if min(map(len, halves)) < FEW:
         return False
     near, far = sorted(halves, key=lambda half: float(np.median(half)))
-    return _within(rows[:, 1], 1) or bool(near.max() < min(BESIDE_M, np.median(far)))
+    high = np.abs(rows[:, 2]).max() > HIGHEST_M
+    return bool(high and _within(rows[:, 1], 1)) or bool(near.max() < min(BESIDE_M, np.median(far)))
 
 
 def _count_columns(values: Values) -> int:
@@ -90,8 +92,8 @@ def _count_columns(values: Values) -> int:
     statistics", J. Statistical Planning and Inference 143, 2013, prop. 1). With a multiple of the right number they
     differ as little: it is the smallest that is better than all numbers but its multiples.
     """
-    some = values[:SAMPLE]
-    if len(some) < FEW * max(COLUMNS):
+    some = np.where(np.isfinite(values[:SAMPLE]), values[:SAMPLE], np.nan)
+    if len(some) < FEW * max(COLUMNS) or np.isnan(some).all():
         return 0
     changes = {count: float(np.nanmean(np.abs(some[count:] - some[:-count]))) for count in COLUMNS}
     for count, change in changes.items():

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.formats.kitti.files import read_points
-from flcav.dataset.formats.layout import is_nuscenes
+from flcav.dataset.formats.layout import has_nuscenes_layout
 from flcav.dataset.formats.nuscenes.files import read_lidar
 from flcav.dataset.formats.pcd import is_pcd, read_pcd
 from flcav.dataset.formats.reading import check_cloud
@@ -44,7 +44,7 @@ def read_sweep(path: Path) -> NDArray[np.float32]:
             raise InputError(f"{path}: {name}; supported are point clouds of KITTI (.bin), nuScenes (.pcd.bin) and PCD")
     if is_pcd(data):
         return _read_fields(path)
-    return read_lidar(path) if is_nuscenes(data) else read_points(path)
+    return read_lidar(path) if has_nuscenes_layout(data) else read_points(path)
 
 
 def list_sweeps(folder: Path) -> list[Path]:

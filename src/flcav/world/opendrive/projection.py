@@ -58,7 +58,7 @@ def read_projection(reference: str) -> Projection | None:
     kind = named.pop("proj", "")
     try:
         return _from_code(int(code[1])) if code else _from_parameters(kind, named)
-    except (ValueError, KeyError):
+    except (ArithmeticError, ValueError, KeyError):
         return None
 
 

@@ -58,6 +58,7 @@ REFUSED = (
     "+proj=utm +datum=WGS84",
     "+proj=utm +zone=61",
     "+proj=utm +zone=32N",
+    "+proj=utm +zone=inf",
     "+proj=tmerc +lat_0=0 +lon_0=9 +x_0=3500000 +ellps=bessel +towgs84=598.1,73.7,418.2,0.202,0.045,-2.455,6.7",
     "+proj=tmerc +lat_0=48 +lon_0=11 +units=us-ft",
     "+proj=tmerc +lat_0=48 +lon_0=11 +axis=neu",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.config import InputError, path_within
-from flcav.dataset.formats.layout import describe_numbers, is_kitti
+from flcav.dataset.formats.layout import describe_numbers, has_kitti_layout
 from flcav.dataset.formats.reading import check_cloud
 from flcav.dataset.payloads import open_image
 from flcav.dataset.upright import turn_upright
@@ -50,7 +50,7 @@ def read_points(path: Path) -> NDArray[np.float32]:
         raise InputError(f"{path}: no such file") from None
     if not data:
         raise InputError(f"{path}: empty; a point cloud holds {POINT_BYTES} bytes for each point")
-    if not is_kitti(data):
+    if not has_kitti_layout(data):
         _refuse_points(data, path)
     return np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4)
 
