@@ -444,3 +444,13 @@ def test_a_row_that_refers_to_nothing(exported: dict[str, Path], tmp_path: Path)
     (path.parent / "scene.json").write_text("[]")
     with pytest.raises(InputError, match="no scenes in it"):
         import_dataset("nuscenes", tmp_path / "odd", tmp_path / "out")
+
+
+def test_a_signalling_nan_is_one_sentence(exported: dict[str, Path], tmp_path: Path, recwarn: pytest.WarningsRecorder):
+    folder = shutil.copytree(exported["opv2v"], tmp_path / "folder")
+    path = _first(folder, "train/*/*/*.pcd")
+    head, data, body = path.read_bytes().partition(b"DATA binary\n")
+    path.write_bytes(head + data + b"\x01\x00\x80\x7f" + body[4:])
+    with pytest.raises(InputError, match="point 0 is not finite"):
+        import_dataset("opv2v", folder, tmp_path / "out")
+    assert not recwarn.list

@@ -148,7 +148,9 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
     except ValueError:
         raise InputError(f"{path}: not a point cloud of OPV2V, which has the fields x, y, z, rgb") from None
     red = (np.ascontiguousarray(colour).view("<u4") >> 16) & 255
-    return check_cloud(np.stack((x, -y, z, red / np.float32(255)), axis=1).astype(np.float32), path)
+    with np.errstate(invalid="ignore"):  # signalling NaNs, which are refused
+        points = np.stack((x, -y, z, red / np.float32(255)), axis=1).astype(np.float32)
+    return check_cloud(points, path)
 
 
 def _calibrate(stem: Path) -> Calibration:
