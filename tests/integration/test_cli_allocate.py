@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from flcav.cli.main import run
+from flcav.optimization.allocation import allocate as allocation
 from flcav.optimization.allocation.problem_file import TERMS
 from flcav.optimization.curves.history import ARTICLE
 
@@ -27,7 +28,8 @@ def test_every_recipe_gives_a_plan_within_its_budgets(recipe, capsys):
     assert called("allocate", recipe, "--json") == 0
     plan = json.loads(capsys.readouterr().out)
     assert set(plan) == {
-        "status", "objective", "lower_bound", "gap", "tasks", "used_mb", "marginal_error_per_gb", "savings",
+        "status", "objective", "lower_bound", "gap", "tasks", "used_mb", "marginal_error_per_gb", "certificate",
+        "savings",
     }  # fmt: skip
     assert all(set(task) == TASK_KEYS for task in plan["tasks"])
     budgets = yaml.safe_load(recipe.read_text())["budgets_mb"]
@@ -50,6 +52,18 @@ def test_a_weighted_error_is_told_with_its_mean(tmp_path, capsys):
     assert called("allocate", tmp_path / "problem.yaml", "--json") == 0
     total = json.loads(capsys.readouterr().out)["objective"]
     assert f"Weighted error: {TERMS['weighted error']} Here they sum to 3, and the mean is {total / 3:.2g}." in told
+
+
+@pytest.mark.parametrize("by", [1.0, 1.02])
+def test_a_certificate_is_verified_and_one_that_does_not_hold_is_exit_1(by, capsys, monkeypatch):
+    prove = allocation._dual
+    monkeypatch.setattr(allocation, "_dual", lambda multipliers, bound: prove(multipliers, by * bound))
+    assert called("allocate", RECIPES[0], "--verify") == (by > 1)
+    told = " ".join(capsys.readouterr().out.split())
+    assert ("does not hold: the duals" in told) == (by > 1), told
+    assert "trusted: the learning curves" in told
+    assert called("allocate", RECIPES[0], "--verify", "--json") == (by > 1)
+    assert bool(json.loads(capsys.readouterr().out)["verification"]["faults"]) == (by > 1)
 
 
 def test_a_graph_is_planned_down_to_its_vehicles(capsys):

@@ -1,6 +1,7 @@
 """`flcav place` from files to JSON."""
 
 import json
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 from flcav.cli.main import run
 from flcav.cli.planning import place_inputs
+from flcav.optimization.placement import solve
 from flcav.world.map.town import Town, load_town
 
 ERRORS = "x,y,z,weight\n0,0,0,1\n1,0,0,1\n50,0,0,5\n"
@@ -51,10 +53,28 @@ def test_place_chooses_by_weight(files, method, parquet, capsys):
     assert json.loads(capsys.readouterr().out) == {
         "chosen": [{"pole": 8, "sensor": None}], "covered": 1, "covered_weight": 5.0, "upper_bound": 5.0,
         "optimal": True, "cost": None, "cost_lower_bound": None, "marginal_gain": [5.0],
+        "certificate": {"values": [1.0, 1.0, 5.0], "price": pytest.approx(2), "bound": 5.0, "search": None},
         "baselines": {"visible-objects": None, "traffic-density": None, "random": at_random()},
     }  # fmt: skip
     assert asked(files) == 0
     assert "poles 8" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("by", [1.0, 0.98])
+def test_a_certificate_is_verified_and_one_that_does_not_hold_is_exit_1(files, by, capsys, monkeypatch):
+    prove = solve.bound_by
+
+    def claimed(*asked):
+        found = prove(*asked)
+        return replace(found, bound=by * found.bound)
+
+    monkeypatch.setattr(solve, "bound_by", claimed)
+    assert asked(files, "--verify") == (by < 1)
+    told = capsys.readouterr().out
+    assert "recomputed: 5 at the cost 1; its dual alone proves 5, a gap of" in told
+    assert ("does not hold: the dual's bound" in told) == (by < 1)
+    assert asked(files, "--verify", "--json") == (by < 1)
+    assert bool(json.loads(capsys.readouterr().out)["verification"]["faults"]) == (by < 1)
 
 
 @pytest.mark.parametrize(

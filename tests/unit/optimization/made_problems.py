@@ -82,7 +82,8 @@ def searched(values: dict) -> float:
         errors = _error(task["curve"], x, y, z, k)
         error = np.max([e for _, e in errors], axis=0) if largest else task["weight"] * sum(w * e for w, e in errors)
         vehicles, servers, model = sum(task["edge_groups"]), len(task["edge_groups"]), task["model_mb"]
-        wireless = x * task["sample_mb"] + (y + k * z) * vehicles * model
+        exchange, labels = task.get("exchange_mb", model), task.get("labels_mb", 0.0)
+        wireless = x * task["sample_mb"] + vehicles * ((y + k * z) * exchange + (y + (z > 0)) * labels)
         wireline = x * task["sample_mb"] + z * servers * model
         kept = z <= (1 if k == 0 else np.inf)
         busy_s = (y + k * z) * task.get("train_s", 0.0)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from flcav.optimization.allocation.budget_sweep import Saving
     from flcav.optimization.allocation.vehicles import Shares
     from flcav.optimization.problem import Problem
+    from flcav.optimization.verification.record import Verification
 
 SHOWN = ".2g"  # predictions: trainings on the same frames differ in the second digit
 
@@ -46,6 +47,9 @@ BASELINE = typer.Option(
     None, "--baseline", metavar="PLAN", help=f"A plan to compare with, in the same call: {join_choices(Compared)}."
 )
 PROGRESS = "YAML: what is spent and observed so far; the plan goes on from there."
+VERIFY = typer.Option(
+    False, "--verify", help="Recompute costs, objective and bound with no code of the solver; exit 1 if one is wrong."
+)
 OUT = typer.Option(None, "--out", help="Write a page about the plan (HTML): where megabytes go, why.")
 
 
@@ -55,9 +59,10 @@ def allocate(
     baseline: Compared | None = BASELINE,
     progress: Path | None = typer.Option(None, "--progress", help=f"{PROGRESS} As `flcav replan`."),
     out: Path | None = OUT,
+    verify: bool = VERIFY,
 ) -> None:
     """Split both uplink budgets over tasks and training stages so that they err least, by the problem's objective."""
-    _plan(problem, progress, as_json, baseline, out)
+    _plan(problem, progress, as_json, baseline, out, verify)
 
 
 def replan(
@@ -66,16 +71,19 @@ def replan(
     as_json: bool = AS_JSON,
     baseline: Compared | None = BASELINE,
     out: Path | None = OUT,
+    verify: bool = VERIFY,
 ) -> None:
     """Plan the rest of a training that is under way, from what it has spent and reached; counts include what is done.
 
     Finished stages stay as they are, learning curves are scaled to pass through the accuracies reached, and what was
     not spent goes back to the budgets.
     """
-    _plan(problem, progress, as_json, baseline, out)
+    _plan(problem, progress, as_json, baseline, out, verify)
 
 
-def _plan(problem: Path, progress: Path | None, as_json: bool, baseline: Compared | None, out: Path | None) -> None:
+def _plan(
+    problem: Path, progress: Path | None, as_json: bool, baseline: Compared | None, out: Path | None, verify: bool
+) -> None:
     from flcav.config import read_config
     from flcav.optimization.allocation.baselines import baseline as compared
     from flcav.optimization.allocation.budget_sweep import compute_savings
@@ -83,6 +91,7 @@ def _plan(problem: Path, progress: Path | None, as_json: bool, baseline: Compare
     from flcav.optimization.allocation.replanning import PlanState, condition_problem
     from flcav.optimization.graph import load_problem, read_graph
     from flcav.optimization.solvers.instance import Infeasible
+    from flcav.optimization.verification.allocation import verify_allocation
     from flcav.sources.recipe import find_recipe
 
     problem = find_recipe(problem)
@@ -104,14 +113,19 @@ def _plan(problem: Path, progress: Path | None, as_json: bool, baseline: Compare
         page = plan_page(compare_plan(asked, plan, shares, more), read_graph(problem))
         write_bytes(out, page.encode())
     beside = None if baseline is None else compared(asked, baseline.value)
+    verified = verify_allocation(asked.model_dump(), _plain(plan)) if verify else None
     if as_json:
         beside_it = {} if beside is None else {"baseline": _plain(beside)}
+        beside_it |= {} if verified is None else {"verification": dataclasses.asdict(verified)}
         print_json(_as_json(plan, shares, more) | beside_it)
-        return
-    _show(asked, plan, more)
-    _show_vehicles(shares)
-    if beside is not None:
-        _show_baseline(beside, plan)
+    else:
+        _show(asked, plan, more)
+        _show_vehicles(shares)
+        if beside is not None:
+            _show_baseline(beside, plan)
+        _show_verification(verified)
+    if verified is not None and verified.faults:
+        raise typer.Exit(1)
 
 
 def _as_json(plan: "Allocation", shares: "Shares", more: "Sequence[Saving]") -> dict[str, Any]:
@@ -129,7 +143,7 @@ def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
     for name in ("used_mb", "marginal_error_per_gb"):
         if name in values:
             values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
-    return _given(values, "busy_s", "note", "warnings")
+    return _given(values, "busy_s", "note", "warnings", "certificate")
 
 
 def _given(values: dict[str, Any], *optional: str) -> dict[str, Any]:
@@ -170,6 +184,13 @@ def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
     console.print(_table(beside))
     note = f" ({beside.note})" if beside.note else ""
     console.print(f"{beside.name}: {beside.objective:{SHOWN}}{note}; the plan above: {plan.objective:{SHOWN}}")
+
+
+def _show_verification(verified: "Verification | None") -> None:
+    from flcav.cli.terminal import plain_console
+
+    for line in () if verified is None else verified.lines():
+        plain_console().print(line)
 
 
 def _table(plan: "Allocation | Baseline") -> "Table":

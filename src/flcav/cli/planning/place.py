@@ -1,5 +1,6 @@
 """`flcav place`: roadside sensors that cover most of the registered errors (VRCSP)."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,9 +10,12 @@ from flcav.cli.options import Method, check_finite
 from flcav.cli.terminal import print_json
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
     from flcav.cli.planning.place_inputs import Given
     from flcav.files import Json
     from flcav.optimization.placement.solve import Candidates, Placement
+    from flcav.optimization.verification.record import Verification
     from flcav.world.map.town import Town
     from flcav.world.trace import Trace
 
@@ -49,6 +53,9 @@ def place(
     ),
     map_: Path | None = typer.Option(None, "--map", help="PNG file of errors, poles and what they cover, in the town."),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
+    verify: bool = typer.Option(
+        False, "--verify", help="Recompute coverage, cost and bound with no code of the solver; exit 1 if one is wrong."
+    ),
 ) -> None:
     """Choose the poles whose sensors cover most of the errors.
 
@@ -78,7 +85,8 @@ def place(
         place_inputs.check_inside(here, given, errors, poles)
     if budget is not None and not given.priced:
         raise InputError(f"--budget: nothing has a cost; give {poles} a column 'cost', or give --sensors")
-    candidates = place_inputs.build_candidates(given, here if line_of_sight else None, traces)
+    seen = place_inputs.find_seen(given, here if line_of_sight else None, traces)
+    candidates = place_inputs.build_candidates(given, seen)
     if count is not None or not given.priced:
         candidates = candidates.at_unit_cost()
     least: float | None = None
@@ -93,6 +101,7 @@ def place(
     if map_ is not None and here is not None:
         _draw(map_, here, given, result, conventional)
     cost = given.cost_of(result)
+    verified = _verify(given, seen, result, least, count, budget, cover) if verify else None
     if as_json:
         random = place_at_random(candidates, limit)
         print_json(
@@ -105,20 +114,36 @@ def place(
                 "cost": cost,
                 "cost_lower_bound": least,
                 "marginal_gain": result.marginal_gain,
+                "certificate": None if result.certificate is None else asdict(result.certificate),
+                **({} if verified is None else {"verification": asdict(verified)}),
                 "baselines": {
                     **{name: _tell(given, placed) for name, placed in conventional.items()},
                     "random": {"covered": random.covered, "covered_weight": random.covered_weight},
                 },
             }
         )
-        return
-    chosen = [f"{each['pole']}" + (f" ({each['sensor']})" if sensors else "") for each in _name(given, result)]
+    else:
+        _show(given, np.diff(candidates.covers.indptr).tolist(), result, conventional, least)
+        typer.echo("\n".join([] if verified is None else verified.lines()), nl=verified is not None)
+    if verified is not None and verified.faults:
+        raise typer.Exit(1)
+
+
+def _show(
+    given: "Given",
+    near: list[int],
+    result: "Placement",
+    conventional: "dict[str, Placement | None]",
+    least: float | None,
+) -> None:
+    """Print the placement; `near` are the numbers of errors within range of each candidate."""
+    cost, by_range = given.cost_of(result), given.names == (None,)
+    chosen = [f"{each['pole']}" + ("" if by_range else f" ({each['sensor']})") for each in _name(given, result)]
     typer.echo(f"poles {', '.join(chosen)}")
-    if not sensors:
-        near = np.diff(candidates.covers.indptr).tolist()
+    if by_range:
         for number, (pole, errors_near) in enumerate(zip(given.ids, near, strict=True)):
             placed = ", placed" if number in result.chosen else ""
-            typer.echo(f"    pole {pole}: {errors_near} errors within {range_m:g} m{placed}")
+            typer.echo(f"    pole {pole}: {errors_near} errors within {given.ranges_m[0]:g} m{placed}")
     proof = "optimal" if result.optimal else f"at most {result.upper_bound:.6g} can be covered"
     if least is not None and not result.optimal:
         proof = f"at least {least:.6g} has to be spent for that"
@@ -129,6 +154,27 @@ def place(
     for name, placed in conventional.items():
         if placed is not None:
             typer.echo(f"by {name.replace('-', ' ')}: weight {placed.covered_weight:.6g}")
+
+
+def _verify(
+    given: "Given",
+    seen: "csr_array | None",
+    result: "Placement",
+    least: float | None,
+    count: int | None,
+    budget: float | None,
+    cover: float | None,
+) -> "Verification":
+    import numpy as np
+
+    from flcav.optimization.verification.placement import Asked, verify_placement
+
+    cost = given.pole_cost[:, None] + given.sensor_cost
+    if count is not None or not given.priced:
+        cost = np.ones_like(cost)
+    visible = None if seen is None else seen.toarray() > 0
+    places = (given.errors, given.weight, given.poles, given.ranges_m)
+    return verify_placement(Asked(*places, cost, count, budget, cover, visible), asdict(result), least)
 
 
 def _place_conventionally(

@@ -114,14 +114,18 @@ def check_inside(town: Town, given: Given, errors: Path, poles: Path) -> None:
             raise InputError(f"{file}: row {rows[0] + 1} lies at {x:g}, {y:g}, {where} {town.name}")
 
 
-def build_candidates(given: Given, town: Town | None, traces: Sequence[Trace]) -> Candidates:
-    """Return every sensor on every pole; with a `town` each covers only what it sees there, past the traffic."""
-    visible = None
-    if town is not None:
-        visible = find_covered(given.errors, given.poles, [given.ranges_m.max()])
-        pole, error = np.repeat(np.arange(len(given.ids)), np.diff(visible.indptr)), visible.indices.astype(np.int64)
-        seen = find_visible(town, traces, given.poles, given.errors, (pole, error))
-        visible = csr_array((seen.astype(np.float64), visible.indices, visible.indptr), shape=visible.shape)
+def find_seen(given: Given, town: Town | None, traces: Sequence[Trace]) -> csr_array | None:
+    """Return (P, E) 1.0 where a pole sees an error in the `town`, past the traffic; None without a town: all do."""
+    if town is None:
+        return None
+    visible = find_covered(given.errors, given.poles, [given.ranges_m.max()])
+    pole, error = np.repeat(np.arange(len(given.ids)), np.diff(visible.indptr)), visible.indices.astype(np.int64)
+    seen = find_visible(town, traces, given.poles, given.errors, (pole, error))
+    return csr_array((seen.astype(np.float64), visible.indices, visible.indptr), shape=visible.shape)
+
+
+def build_candidates(given: Given, visible: csr_array | None) -> Candidates:
+    """Return every sensor on every pole, which covers only what is `visible` (P, E) from there."""
     return find_candidates(
         given.errors,
         given.poles,

@@ -53,6 +53,18 @@ class TaskPlan:
 
 
 @dataclass(frozen=True)
+class Dual:
+    """A solution of the Lagrangian dual over whole plans, which proves a lower bound by itself.
+
+    Of the weighted error the bound is the least Lagrangian, sum of errors + multipliers * (cost - budget). Of the
+    largest error it is a level: at prices equal to the multipliers, no plan of less costs as little as the budgets.
+    """
+
+    multipliers: tuple[float, ...]  # (L,) per unit of each budget: wireless, wireline [MB], then of clocks [s]
+    bound: float
+
+
+@dataclass(frozen=True)
 class Allocation:
     """A plan for all tasks and its certificate."""
 
@@ -68,6 +80,7 @@ class Allocation:
     busy_s: float | None = None  # time of the busiest vehicle, where horizon_s limits what vehicles train
     note: str | None = None
     warnings: tuple[str, ...] = ()
+    certificate: tuple[Dual, ...] = ()  # of each branch that has a plan (`solve_branches`): the least bound holds
 
 
 @dataclass(frozen=True)
@@ -76,6 +89,7 @@ class _Best:
     objective: float
     lower: float | None
     rates: Array
+    dual: Dual | None
 
 
 def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = ()) -> Allocation:
@@ -113,6 +127,7 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
         busy_s=_busy_s(asked, plans),
         note=NO_CERTIFICATE if lower is None else None,
         warnings=(*_idle_horizon(problem), *_beyond(problem, plans)),
+        certificate=tuple(each.dual for each in found if each.dual is not None),
     )
 
 
@@ -210,19 +225,23 @@ def _beyond(problem: Problem, plans: tuple[TaskPlan, ...]) -> tuple[str, ...]:
 
 def _weighted(problem: Problem, made: Instance, gap: float, _clocks: Sequence[Clock]) -> _Best:
     found = minimise_weighted_error(made, gap)
-    return _Best(
-        found.x, weighted_error(problem, build_task_plans(problem, found.x)), found.bound + made.floor, found.rates
-    )
+    objective = weighted_error(problem, build_task_plans(problem, found.x))
+    root = made.minimise_lagrangian(found.multipliers)[1] + made.floor
+    return _Best(found.x, objective, found.bound + made.floor, found.rates, _dual(found.multipliers, root))
 
 
 def _fair(problem: Problem, made: Instance, gap: float, _clocks: Sequence[Clock]) -> _Best:
     found = minimise_largest_error(problem, made, gap)
-    return _Best(found.x, found.level, found.bound, found.rates)
+    return _Best(found.x, found.level, found.bound, found.rates, _dual(found.prices, found.root))
 
 
 def _area(problem: Problem, made: Instance, gap: float, clocks: Sequence[Clock]) -> _Best:
     found = maximise_area(problem, max(gap, AREA_GAP), clocks)
-    return _Best(found.x, found.area, None, found.rates)
+    return _Best(found.x, found.area, None, found.rates, None)
+
+
+def _dual(multipliers: Array, bound: float) -> Dual:
+    return Dual(tuple(map(float, multipliers)), float(bound))
 
 
 _METHODS = {"weighted": _weighted, "max-min": _fair, "area": _area}

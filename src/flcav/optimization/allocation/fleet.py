@@ -15,7 +15,8 @@ Where vehicles also take time to train, time is the third budget (`Clock`) and i
   limited to the horizon, and no split takes less of it than the quickest vehicles by weight would.
 
 The problem without a horizon, and *one joins* at full size, are lower bounds of the error of any feasible plan; the
-larger of the two bounds is kept. The best of the plans is returned, with its gap to that bound.
+larger of the two bounds is kept. The best of the plans is returned, with its gap to that bound; its `certificate` is
+that of the problem without a horizon of vehicles with names.
 """
 
 from collections.abc import Callable, Sequence
@@ -75,7 +76,8 @@ def allocate_fleet(problem: Problem) -> Carried:
                     break  # no plan is better
         if not found:
             raise error
-        return _timed(asked, _certified(asked, found, lower, IN_TIME if training else CARRIED))
+        carried, shares = _certified(asked, found, lower, IN_TIME if training else CARRIED)
+        return _timed(asked, (replace(carried, certificate=plan.certificate), shares))
 
 
 def _within_held(task: AllocationTask) -> AllocationTask:

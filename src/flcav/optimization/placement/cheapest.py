@@ -13,18 +13,21 @@ from flcav.config import InputError
 from flcav.optimization.placement.greedy import extend_greedily
 from flcav.optimization.placement.instance import TIE, Instance
 from flcav.optimization.placement.program import bound_by_highs, minimise_cost
-from flcav.optimization.placement.relaxation import relax
+from flcav.optimization.placement.relaxation import Relaxation, bound_by, relax
 from flcav.optimization.placement.solve import (
     SEARCHED,
     WHOLE,
     Candidates,
+    Found,
     Method,
     Placement,
+    certify,
     describe,
     improve,
     keep_candidates,
 )
 
+NOTHING = 1e-300  # in place of 0, to divide by
 CUTS = 40  # times that a choice is tried to be made at less cost
 
 
@@ -42,43 +45,54 @@ def cover_share(candidates: Candidates, share: float, *, method: Method = "exact
         part = most / total if total else 0.0
         raise InputError(f"cover = {share:g}: sensors on all poles together cover only {part:.4g} of the errors")
     target = min(share * total, most) * (1 - TIE)
-    chosen, least = minimise(instance, target, method)
-    cost = float(instance.cost[chosen].sum())
-    least = min(least, cost)
-    whole = instance.covers.nnz <= WHOLE
-    bound = bound_by_highs(instance, cost) if whole else relax(instance, cost).bound
-    return describe(candidates, chosen, bound, optimal=cost <= least * (1 + TIE) + TIE), least
+    found = minimise(instance, target, method)
+    cost = float(instance.cost[found.chosen].sum())
+    least = min(found.bound, cost)
+    bound = bound_by_highs(instance, cost)[0] if instance.covers.nnz <= WHOLE else relax(instance, cost).bound
+    certificate = certify(candidates, instance, found.root, _least_cost(found.root, target), found.search)
+    optimal = cost <= least * (1 + TIE) + TIE
+    return describe(candidates, found.chosen, bound, certificate, optimal), least
 
 
-def minimise(instance: Instance, target: float, method: Method) -> tuple[list[int], float]:
-    """Return the cheapest candidates, ascending, that cover `target` of the weight, and a lower bound on their cost."""
+def minimise(instance: Instance, target: float, method: Method) -> Found:
+    """Return the cheapest candidates that cover `target` of the weight, with a proven lower bound on their cost."""
     chosen = _drop(instance, target, extend_greedily(instance, np.inf, (), target))
+    cost = float(instance.cost[chosen].sum())
     if method == "exact" and instance.covers.nnz <= WHOLE:
         best, least = minimise_cost(instance, target)
-        return (chosen if best is None else best), least
-    cost = float(instance.cost[chosen].sum())
-    relaxed = relax(instance, cost)
+        chosen = chosen if best is None else best
+        cost = float(instance.cost[chosen].sum())
+        root = bound_by(instance, cost, bound_by_highs(instance, cost)[1], np.zeros(len(instance.cost)))
+        return Found(chosen, least, root, least)
+    root = relax(instance, cost)
     if method == "exact":
         for _ in range(CUTS):
-            tried = improve(instance, cost * (1 - 1e-3), chosen[:0], relaxed)
+            tried = improve(instance, cost * (1 - 1e-3), chosen[:0], root)
             if instance.value(tried) < target:
                 break
             chosen = _drop(instance, target, tried)
             cost = float(instance.cost[chosen].sum())
-        relaxed = relax(instance, cost)
-    price = max(relaxed.price, 1e-300)
-    densest = float((instance.covers @ instance.weight / np.maximum(instance.cost, 1e-300)).max())  # weight per cost
-    by_dual = (target - relaxed.spare) / price
+        root = relax(instance, cost)
+    densest = float((instance.covers @ instance.weight / np.maximum(instance.cost, NOTHING)).max())  # weight per cost
+    by_dual = _least_cost(root, target)
     least = max(by_dual, target / densest)
     if method == "greedy" or cost <= least * (1 + TIE):
-        return chosen, least
-    rest = keep_candidates(instance, by_dual + relaxed.loss / price < cost * (1 - TIE))
-    if rest.covers.nnz > SEARCHED or rest.weight.sum() < target:
-        return chosen, cost if rest.weight.sum() < target else least
+        return Found(chosen, least, root)
+    rest = keep_candidates(instance, by_dual + root.loss / max(root.price, NOTHING) < cost * (1 - TIE))
+    if rest.weight.sum() < target:
+        return Found(chosen, cost, root, cost)
+    if rest.covers.nnz > SEARCHED:
+        return Found(chosen, least, root)
     best, bound = minimise_cost(rest, target, limited=True)
     if best is not None and instance.cost[best].sum() < cost:
         chosen, cost = best, float(instance.cost[best].sum())
-    return chosen, max(least, min(bound, cost))
+    bound = max(least, min(bound, cost))
+    return Found(chosen, bound, root, bound)
+
+
+def _least_cost(root: Relaxation, target: float) -> float:
+    """Return the cost below which, by the dual of `root`, no choice covers the weight `target`."""
+    return (target - root.spare) / max(root.price, NOTHING)
 
 
 def _drop(instance: Instance, target: float, chosen: Sequence[int]) -> list[int]:

@@ -26,6 +26,7 @@ class Instance:
     weight: Array  # (K,) of a group's errors together
     cost: Array  # (N,)
     sensors: int = 1  # kinds of sensors, in the order of their ranges
+    group: NDArray[np.int64] | None = None  # (E,) of each error, -1: nobody covers it; None: each error is a group
 
     def covered_by(self, candidate: int) -> NDArray[np.int32]:
         """Return the numbers of the groups that a candidate covers."""
@@ -81,4 +82,6 @@ def merge_errors(covers: csr_array, weights: Array, cost: Array, sensors: int = 
     total = np.bincount(group.ravel(), weights[seen]).astype(np.float64)
     kept = csr_array(covers.tocsc()[:, seen[first]])
     kept.sort_indices()
-    return Instance(kept, total, cost, sensors)
+    group_of = np.full(count, -1, np.int64)
+    group_of[seen] = group.ravel()
+    return Instance(kept, total, cost, sensors, group_of)

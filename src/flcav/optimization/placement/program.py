@@ -9,12 +9,14 @@ from flcav.optimization.placement.instance import Array, Instance
 NODES = 2000  # of the search tree at most, where a limit is asked for
 
 
-def bound_by_highs(instance: Instance, budget: float) -> float:
-    """Return the bound of the linear relaxation on the weight covered within `budget`."""
-    if not instance.covers.shape[1]:  # pyright: ignore[reportOptionalSubscript]
-        return 0.0
+def bound_by_highs(instance: Instance, budget: float) -> tuple[float, Array]:
+    """Return the bound of the linear relaxation on the weight covered within `budget`, and its dual (K,) by group."""
+    groups = len(instance.weight)
+    if not groups:
+        return 0.0, np.zeros(0)
     objective, rows, limits = _program(instance, budget)
-    return -float(linprog(objective, A_ub=rows, b_ub=limits, bounds=(0, 1), method="highs").fun)
+    result = linprog(objective, A_ub=rows, b_ub=limits, bounds=(0, 1), method="highs")
+    return -float(result.fun), np.clip(-result.ineqlin.marginals[:groups], 0.0, instance.weight)
 
 
 def maximise_coverage(instance: Instance, budget: float, *, limited: bool = False) -> tuple[list[int] | None, float]:

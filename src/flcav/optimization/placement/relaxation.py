@@ -32,6 +32,7 @@ class Relaxation:
     loss: Array  # (N,) by how much the bound falls if a candidate is in the choice
     spare: float  # weight that the bound holds without any sensor: sum_j (w_j - u_j) + sum_poles ...
     price: float  # bound = spare + price * budget, for any budget
+    dual: Array  # (K,) of each group, in [0, weight]
 
 
 def relax(instance: Instance, budget: float, enough: float = 0.0) -> Relaxation:
@@ -96,4 +97,4 @@ def bound_by(instance: Instance, budget: float, u: Array, share: Array) -> Relax
     price = min((low, high), key=lambda each: spare_of(each) + each * budget)
     net, spare = net_of(price), spare_of(price)
     loss = np.maximum(net.max(axis=1, keepdims=True), 0.0) - net
-    return Relaxation(spare + price * budget, share, loss.ravel(), spare, price)
+    return Relaxation(spare + price * budget, share, loss.ravel(), spare, price, u)

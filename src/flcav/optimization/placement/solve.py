@@ -30,6 +30,20 @@ SURE = 0.05  # fractional choice from which a candidate is rounded up
 
 
 @dataclass(frozen=True)
+class Certificate:
+    """A solution of the linear relaxation's dual, which proves a bound by itself, and what a search claims above it.
+
+    For any budget, covered weight <= sum_e (w_e - u_e) + price budget + sum_poles max(0, max_sensors (sum of the u_e
+    that the sensor covers - price cost)).
+    """
+
+    values: tuple[float, ...]  # (E,) u of each error, from 0 to its weight w
+    price: float  # covered weight per unit of cost
+    bound: float  # of the dual: most covered weight within the budget; of `cover_share` the least cost
+    search: float | None = None  # what HiGHS claims of it instead, after a search; None: there was none
+
+
+@dataclass(frozen=True)
 class Placement:
     """The chosen poles and their sensors, the errors they cover, and a certificate of optimality."""
 
@@ -41,6 +55,7 @@ class Placement:
     sensors: tuple[int, ...] = ()  # index into the sensors of each chosen pole
     cost: float = 0.0  # of the chosen
     marginal_gain: tuple[float, ...] = ()  # weight that each of the chosen alone covers: lost if it were left out
+    certificate: Certificate | None = None  # None: nothing is proven
 
 
 def coverage(errors: ArrayLike, poles: ArrayLike, range_m: float) -> NDArray[np.bool_]:
@@ -153,12 +168,13 @@ def place_count(candidates: Candidates, count: int, *, method: Method = "exact")
     if not 1 <= count <= candidates.poles:
         raise InputError(f"count = {count}: must be from 1 to the number of poles, {candidates.poles}")
     instance = candidates.at_unit_cost().instance(method)
-    chosen, bound = maximise(instance, float(count), method)
+    found = maximise(instance, float(count), method)
     kinds = candidates.sensors
-    used = {candidate // kinds for candidate in chosen}
+    used = {candidate // kinds for candidate in found.chosen}
     unused = [pole * kinds for pole in range(candidates.poles) if pole not in used]
-    chosen = sorted(chosen + unused[: count - len(chosen)])
-    return describe(candidates, _prefer_earlier(instance, chosen), bound)
+    chosen = sorted(found.chosen + unused[: count - len(found.chosen)])
+    certificate = certify(candidates, instance, found.root, found.root.bound, found.search)
+    return describe(candidates, _prefer_earlier(instance, chosen), found.bound, certificate)
 
 
 def place_budget(candidates: Candidates, budget: float, *, method: Method = "exact") -> Placement:
@@ -171,34 +187,60 @@ def place_budget(candidates: Candidates, budget: float, *, method: Method = "exa
         raise InputError(f"budget = {budget:g}: the cheapest sensor on a pole costs {candidates.cost.min():g}")
     if not np.isfinite(budget):
         raise InputError(f"budget = {budget}: must be a finite number")
-    chosen, bound = maximise(candidates.instance(method), budget, method)
-    return describe(candidates, chosen, bound)
+    instance = candidates.instance(method)
+    found = maximise(instance, budget, method)
+    certificate = certify(candidates, instance, found.root, found.root.bound, found.search)
+    return describe(candidates, found.chosen, found.bound, certificate)
 
 
-def maximise(instance: Instance, budget: float, method: Method) -> tuple[list[int], float]:
-    """Return the candidates, ascending, that cover most weight within `budget`, and a proven bound on that weight."""
+@dataclass(frozen=True)
+class Found:
+    """A choice of candidates with its proof."""
+
+    chosen: list[int]  # ascending
+    bound: float  # proven: no choice covers more weight, or costs less
+    root: Relaxation  # whose dual proves a bound of its own
+    search: float | None = None  # bound that a search states above it; None: none was made
+
+
+def maximise(instance: Instance, budget: float, method: Method) -> Found:
+    """Return the candidates that cover most weight within `budget`, with a proven bound on that weight."""
     chosen = choose_greedily(instance, budget)
     value = instance.value(chosen)
     if instance.covers.nnz <= WHOLE:
-        bound = bound_by_highs(instance, budget)
+        bound, dual = bound_by_highs(instance, budget)
+        root = bound_by(instance, budget, dual, np.zeros(len(instance.cost)))
         if method == "greedy" or bound <= value * (1 + TIE):
-            return chosen, bound
+            return Found(chosen, bound, root)
         best, bound = maximise_coverage(instance, budget)
-        return (chosen if best is None else best), bound
+        return Found(chosen if best is None else best, bound, root, bound)
     if method == "greedy":
-        return chosen, bound_of_choice(instance, budget, chosen).bound
-    relaxed = relax(instance, budget, value)
-    chosen = improve(instance, budget, chosen, relaxed)
+        root = bound_of_choice(instance, budget, chosen)
+        return Found(chosen, root.bound, root)
+    root = relax(instance, budget, value)
+    chosen = improve(instance, budget, chosen, root)
     value = instance.value(chosen)
-    rest = keep_candidates(instance, relaxed.bound - relaxed.loss > value * (1 + TIE))
-    if relaxed.bound <= value * (1 + TIE) or rest.covers.nnz > SEARCHED:
-        return chosen, relaxed.bound
+    rest = keep_candidates(instance, root.bound - root.loss > value * (1 + TIE))
+    if root.bound <= value * (1 + TIE) or rest.covers.nnz > SEARCHED:
+        return Found(chosen, root.bound, root)
     if not rest.covers.nnz:
-        return chosen, value
+        return Found(chosen, value, root, value)
     best, bound = maximise_coverage(rest, budget, limited=True)
     if best is not None and instance.value(best) > value:
         chosen, value = best, instance.value(best)
-    return chosen, min(relaxed.bound, max(bound, value))
+    bound = min(root.bound, max(bound, value))
+    return Found(chosen, bound, root, bound)
+
+
+def certify(
+    candidates: Candidates, instance: Instance, root: Relaxation, bound: float, search: float | None
+) -> Certificate:
+    """Return the certificate of the `root` relaxation of `instance`; a group's dual is divided over its errors."""
+    values = root.dual
+    if instance.group is not None:
+        share = np.divide(values, instance.weight, out=np.ones(len(values)), where=instance.weight > 0)
+        values = np.minimum(np.r_[share, 1.0][instance.group], 1.0) * candidates.weight
+    return Certificate(tuple(values.tolist()), root.price, bound, search)
 
 
 def bound_of_choice(instance: Instance, budget: float, chosen: Sequence[int]) -> Relaxation:
@@ -229,7 +271,13 @@ def keep_candidates(instance: Instance, kept: NDArray[np.bool_]) -> Instance:
     return merge_errors(covers, instance.weight, instance.cost, instance.sensors)
 
 
-def describe(candidates: Candidates, chosen: Sequence[int], bound: float, optimal: bool | None = None) -> Placement:
+def describe(
+    candidates: Candidates,
+    chosen: Sequence[int],
+    bound: float,
+    certificate: Certificate | None = None,
+    optimal: bool | None = None,
+) -> Placement:
     """Return the placement of the `chosen` candidates, with the proven `bound` on the weight that could be covered."""
     times = np.bincount(candidates.covers[np.asarray(chosen, np.int64)].indices, minlength=len(candidates.weight))
     weight = float(candidates.weight[times > 0].sum())
@@ -244,6 +292,7 @@ def describe(candidates: Candidates, chosen: Sequence[int], bound: float, optima
         sensors=tuple(int(candidates.order[candidate % candidates.sensors]) for candidate in chosen),
         cost=float(candidates.cost[np.asarray(chosen, np.int64)].sum()),
         marginal_gain=tuple((candidates.covers[np.asarray(chosen, np.int64)] @ once).tolist()),
+        certificate=certificate,
     )
 
 

@@ -1,8 +1,9 @@
 """Problems whose first cloud rounds cost accuracy, as problems in which none does.
 
 An additive curve with a `merge` is not convex in the cloud rounds. It is convex without any, and from the first on,
-where the cost is part of its floor. So each task with such a curve has two branches. The best plan of all branches is
-the best plan of the problem, and the least of their lower bounds is one.
+where the cost is part of its floor. Labels that are sent once before the first cloud round (`labels_mb`) cost megabytes
+in the same way. So each such task has two branches. The best plan of all branches is the best plan of the problem, and
+the least of their lower bounds is one.
 """
 
 from collections.abc import Callable
@@ -41,17 +42,16 @@ def _list_branches(problem: Problem) -> list[Problem]:
     branching = sum(len(each) > 1 for each in options)
     if branching > MOST_BRANCHING:
         raise InputError(
-            f"the first cloud round costs accuracy ('merge') in {branching} tasks that may do without it: at most "
-            f"{MOST_BRANCHING} can be planned together"
+            f"the first cloud round costs accuracy ('merge') or labels ('labels_mb') in {branching} tasks that may do "
+            f"without it: at most {MOST_BRANCHING} can be planned together"
         )
     return [problem.model_copy(update={"tasks": tasks}) for tasks in product(*options)]
 
 
 def _branch(task: AllocationTask) -> list[AllocationTask]:
     """Return the task without cloud rounds, and with one or more, as far as its limits and curves allow either."""
-    curves = [task.curve] if task.upper is None else [task.curve, task.upper]
-    own = [each for curve in curves for each in _list_own(curve)]
-    if not any(curve.merge for curve in own):
+    own = _list_own(task.curve)
+    if not (task.labels_mb or any(curve.merge for curve in own)):
         return [task]
     least, most = task.limits.cloud_rounds
     branches = []
@@ -70,8 +70,7 @@ def _list_own(curve: Curve) -> list[Additive]:
 def _limit(task: AllocationTask, cloud_rounds: tuple[int, int], *, merged: bool) -> AllocationTask:
     """Return the task with other limits, and with the cost of the first cloud round paid (`merged`) or left out."""
     limits = task.limits.model_copy(update={"cloud_rounds": cloud_rounds})
-    upper = None if task.upper is None else _settle(task.upper, merged)
-    return task.model_copy(update={"limits": limits, "curve": _settle(task.curve, merged), "upper": upper})
+    return task.model_copy(update={"limits": limits, "curve": _settle(task.curve, merged)})
 
 
 def _settle(curve: Curve, merged: bool) -> Curve:

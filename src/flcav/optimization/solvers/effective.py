@@ -4,10 +4,10 @@ A task's error above its floor is
 
     weight (a n^(-b) + drift part of z),   n = alpha x + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)),
 
-with x samples, t = y + k z rounds and z cloud rounds. Where cloud rounds bring more than edge rounds do, every pair
-(y, z) is tried; for `Effective` curves, and `Federated` ones whose cloud rounds bring nothing, only those with the
-fewest cloud rounds for each t. For each pair the best x has a closed form. No step needs the error to be convex in the
-rounds, or to fall with them.
+with x samples, t = y + k z rounds and z cloud rounds. Where cloud rounds bring more than edge rounds do, or cost less
+(labels go up before each edge round), every pair (y, z) is tried; for other `Effective` curves, and `Federated` ones
+whose cloud rounds bring nothing, only those with the fewest cloud rounds for each t. For each pair the best x has a
+closed form. No step needs the error to be convex in the rounds, or to fall with them.
 """
 
 from collections.abc import Sequence
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from flcav.optimization.curves.curves import Effective, Federated, drift_part, effective_samples
 from flcav.optimization.solvers.rounding import outermost
 from flcav.optimization.solvers.rounds import fewest_cloud_rounds, pair_rounds
+from flcav.optimization.solvers.separable import BUDGET_SLACK
 
 Array = NDArray[np.float64]
 
@@ -120,7 +121,7 @@ def build_effective_tasks(tasks: Sequence[Alone], k: int, low: Array, high: Arra
     """
     numbers = [task.number for task in tasks]
     quantity = 3 * np.array(numbers)[:, None] + np.arange(3)
-    choices = [_choices(task, low[q], high[q], k) for task, q in zip(tasks, quantity)]
+    choices = [_choices(task, low[q], high[q], k, cost[q]) for task, q in zip(tasks, quantity)]
     rounds = np.zeros((len(numbers), max(map(len, choices)), 2))
     rounds_cost = np.full((*rounds.shape[:2], cost.shape[1]), np.inf)
     for row, (pairs, q) in enumerate(zip(choices, quantity)):
@@ -142,7 +143,9 @@ def _held(task: Alone) -> tuple[float, float, float]:
     return curve.beta * curve.group_samples, 0.0, 0.0
 
 
-def _choices(task: Alone, low: Array, high: Array, k: int) -> Array:
+def _choices(task: Alone, low: Array, high: Array, k: int, cost: Array) -> Array:
     if isinstance(task.curve, Federated) and (task.curve.others > 0 or task.curve.drift < 0):
         return pair_rounds(low, high, "a federated curve", task.name)
+    if np.any(k * cost[1] > cost[2] * (1 + BUDGET_SLACK)):
+        return pair_rounds(low, high, "an edge round that costs labels ('labels_mb')", task.name)
     return fewest_cloud_rounds(low, high, k)

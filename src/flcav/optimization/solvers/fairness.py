@@ -39,6 +39,8 @@ class Fair:
     level: float  # the largest predicted error
     bound: float  # proven: no plan has a smaller largest error
     rates: Array  # (L,) decrease of the level per unit of each budget
+    root: float  # the highest level that prices alone exclude, at most `bound`
+    prices: Array  # (L,) per unit of each budget: at them no plan of a smaller largest error than `root` is paid
 
 
 @dataclass(frozen=True)
@@ -73,13 +75,15 @@ def minimise_largest_error(problem: Problem, made: Instance, gap: float) -> Fair
     tasks = _choices(problem, made)
     level = max(map(_largest, tasks, made.low.reshape(-1, 3)))
     bound = max(map(_least, tasks, made.high.reshape(-1, 3)))
-    best, unreached = made.low, level
+    best, unreached, prices = made.low, level, np.zeros(len(made.budget))
     while unreached - bound > 0.1 * gap * bound:
         middle = 0.5 * (unreached + bound)
-        if choose_at_level(tasks, middle, made.budget).out_of_reach:
-            bound = middle
+        choices = choose_at_level(tasks, middle, made.budget)
+        if choices.out_of_reach:
+            bound, prices = middle, choices.prices
         else:
             unreached = middle
+    root = bound
     tried, stride = bound, 0.1 * gap * bound
     while level - tried > 0.1 * gap * tried:
         trial = min(0.5 * (level + tried), tried + stride)
@@ -94,7 +98,7 @@ def minimise_largest_error(problem: Problem, made: Instance, gap: float) -> Fair
     rates = SMALL * level / dearer * held.prices if 0 < dearer < np.inf else np.zeros(len(made.budget))
     best = fill(made, best, made.cost @ held.prices + 1e-300)
     level = max(map(_largest, tasks, best.reshape(-1, 3)))
-    return Fair(best, level, min(bound, level), rates)
+    return Fair(best, level, min(bound, level), rates, root, prices)
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ def pair_rounds(low: Array, high: Array, reason: str, task: str) -> Array:
 def fewest_cloud_rounds(low: Array, high: Array, k: int) -> Array:
     """Return the choices of edge and cloud rounds (T, 2): for each t = y + k z the one with the fewest cloud rounds.
 
-    A cloud round costs as much as k edge rounds on the wireless link, and more on the wireline one. So for a curve that
-    depends on t alone no other choice is better. `low` and `high` (3,) are the least and most of the quantities.
+    For a curve that depends on t alone no other choice is better, as long as a cloud round costs no less than k edge
+    rounds under any budget. `low` and `high` (3,) are the least and most of the quantities.
     """
     if k == 0:
         edge = np.arange(low[1], high[1] + 1)

@@ -1,0 +1,53 @@
+"""The record of a verification: what was recomputed, what does not hold, and what had to be trusted."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+NEAR = 1e-9  # relative tolerance of what a plan states
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What a verifier that shares no code with the solvers recomputed of a plan or a placement."""
+
+    objective: float  # error or area, or covered weight
+    cost: tuple[float, ...]  # wireless, wireline [MB] and time [s]; or of the sensors
+    bound: float | None  # that the dual alone proves; None: the objective has none
+    gap: float | None  # between the two, relative to the smaller one
+    faults: tuple[str, ...]  # what is stated and does not hold; none: the certificate holds
+    trusted: tuple[str, ...]  # on what the certificate rests beside the dual
+
+    def lines(self) -> list[str]:
+        """Return the verification in words."""
+        proof = "there is no bound for this objective: nothing is proven"
+        if self.bound is not None:
+            proof = f"its dual alone proves {self.bound:.9g}, a gap of {100 * (self.gap or 0.0):.3g} %"
+        cost = " and ".join(f"{each:.9g}" for each in self.cost)
+        return [
+            f"recomputed: {self.objective:.9g} at the cost {cost}; {proof}",
+            *(f"trusted: {each}" for each in self.trusted),
+            *(f"does not hold: {each}" for each in self.faults),
+        ]
+
+
+def judge(
+    objective: float, cost: Iterable[Fraction], bound: float | None, claims: Mapping[str, bool], trusted: Sequence[str]
+) -> Verification:
+    """Return the verification in which the `claims` that are not true are the faults."""
+    gap = None
+    if bound is not None:
+        apart, least = abs(objective - bound), min(abs(objective), abs(bound))
+        gap = apart / least if least > 0 else float(apart > 0)
+    faults = tuple(claim for claim, holds in claims.items() if not holds)
+    return Verification(objective, tuple(map(float, cost)), bound, gap, faults, tuple(trusted))
+
+
+def exact(number: float) -> Fraction:
+    """Return the decimal that a float is written with."""
+    return Fraction(repr(float(number)))
+
+
+def near(one: float, other: float) -> bool:
+    """Return whether two numbers are equal to a relative `NEAR`."""
+    return abs(one - other) <= NEAR * max(abs(one), abs(other))

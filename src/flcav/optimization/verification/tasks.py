@@ -1,0 +1,102 @@
+"""An allocation problem as the verifier reads it: costs, limits, branches and learning curves of its tasks.
+
+Costs are exact, of the decimals that the problem's floats are written with.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from itertools import product
+from math import fsum, inf
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flcav.optimization.verification.record import exact
+
+Data = Mapping[str, Any]  # JSON values
+Array = np.ndarray[Any, np.dtype[Any]]  # of floats, or (L,) of Fractions
+
+QUANTITIES, STAGES = ("samples", "edge_rounds", "cloud_rounds"), ("pretrain", "edge", "cloud")
+SLACK = 1 + Fraction(1, 10**12)  # of a budget: the rounding of a sum that is within it
+
+
+class Task(NamedTuple):
+    """A task under L budgets."""
+
+    curves: list[tuple[float, Data]]  # weight and curve of each member
+    limits: list[list[int]]  # least and most samples, edge rounds, cloud rounds
+    unit: Array  # (3, L) cost of one of each
+    once: Array  # (L,) cost of the first cloud round
+
+    def cost(self, counts: Sequence[int]) -> Array:
+        """Return the cost (L,) of samples, edge rounds and cloud rounds."""
+        return np.array(counts, dtype=object) @ self.unit + self.once * (counts[2] > 0)
+
+
+def least_cost(tasks: Sequence[Task]) -> Array:
+    """Return the cost (L,) of the least that the limits allow."""
+    return sum((task.cost([low for low, _ in task.limits]) for task in tasks), np.zeros(1, dtype=object))
+
+
+def read_tasks(problem: Data, k: int) -> tuple[list[Task], Array]:
+    """Return the tasks, and the budgets (L,) with the rounding that the sums of a plan within them may have."""
+    tasks, budgets, horizon_s = [], list(problem["budgets_mb"].values()), problem["horizon_s"]
+    gains = [max((problem["performance"] or 0) - (each["performance_without"] or 0), 0) for each in problem["tasks"]]
+    for task, gain in zip(problem["tasks"], gains):
+        weight = task["weight"] if problem["performance"] is None else gain / sum(gains)
+        curve = task["upper" if problem["robust"] else "curve"]
+        members = curve.get("members") or [{"weight": 1.0, "curve": curve}]
+        curves = [(weight * each["weight"] / sum(m["weight"] for m in members), each["curve"]) for each in members]
+        names = task["uplink_mbps"] or task["vehicle_train_s"]
+        limits = [[*task["limits"][name]] for name in QUANTITIES]
+        limits[0][1] = min(limits[0][1], sum(task["samples_held"].get(name, inf) for name in names) if names else inf)
+        limits[2][1] = min(limits[2][1], 1 if k == 0 else inf)
+        for limit, stage in zip(limits, STAGES):  # where an error is infinite at 0
+            infinite = (own[stage]["a"] > 0 == own[stage]["x0"] for _, own in curves if stage in own)
+            limit[0] = max(limit[0], any(infinite))
+        sent = task.get("exchange_mb") or task["model_mb"]
+        sizes = (task["sample_mb"], task["model_mb"], sent, task.get("labels_mb") or 0, 0 if names else task["train_s"])
+        sample, model, sent, labels, train_s = map(exact, sizes)
+        cars, servers = sum(task["edge_groups"]), len(task["edge_groups"])
+        rounds = [[cars * (sent + labels), 0, train_s], [k * cars * sent, servers * model, k * train_s]]
+        costs = np.array([[sample, sample, 0], *rounds, [cars * labels, 0, 0]], dtype=object)
+        tasks.append(Task(curves, limits, costs[:3], costs[3]))
+    budgets += [horizon_s] * (horizon_s is not None and any(task.unit[1, 2] for task in tasks))
+    kept = slice(len(budgets))
+    tasks = [task._replace(unit=task.unit[:, kept], once=task.once[kept]) for task in tasks]
+    return tasks, np.array([exact(budget) * SLACK for budget in budgets])
+
+
+def list_branches(tasks: Sequence[Task]) -> Iterator[tuple[Task, ...]]:
+    """Yield the tasks with limits without and with cloud rounds, where the first of these is paid for once."""
+    options = []
+    for task in tasks:
+        *others, (least, most) = task.limits
+        once = any(task.once) or any(curve.get("merge") for _, curve in task.curves)
+        parts = [[0, 0], [1, most]] if once and least == 0 < most else [[least, most]]
+        options.append([task._replace(limits=[*others, part]) for part in parts])
+    yield from product(*options)
+
+
+def error(curve: Data, counts: Sequence[Any], k: int) -> Any:
+    """Return a curve's error after `counts` = samples, edge rounds, cloud rounds, elementwise."""
+    x, y, z = counts
+    if curve["model"] == "additive":
+        powers = ((curve[stage], each) for stage, each in zip(STAGES, counts))
+        parts = [own["a"] * np.asarray(each + own["x0"], float) ** -own["b"] for own, each in powers if own["a"] > 0]
+        return curve["floor"] + curve["merge"] * (z > 0) + sum(parts)
+    effective = curve["alpha"] * x + held_samples(curve, y, z, k)
+    return curve["floor"] + drift_part(curve, z) + curve["a"] * np.asarray(effective, float) ** -curve["b"]
+
+
+def held_samples(curve: Data, y: Any, z: Any, k: int) -> Any:
+    """Return the effective samples that rounds bring."""
+    groups, t = np.atleast_1d(curve["group_samples"]), y + k * z
+    own = fsum(groups) / len(groups)
+    return curve["beta"] * (own * t / (t + 1) + curve.get("gamma", 0.0) * own * (len(groups) - 1) * z / (z + 1))
+
+
+def drift_part(curve: Data, z: Any) -> Any:
+    """Return the part of the error that averaging over regions costs or brings."""
+    drift = curve.get("drift", 0.0)
+    return drift * z / (z + 1) if drift > 0 else -drift / (z + 1)
