@@ -152,6 +152,23 @@ def test_weights_of_another_task_or_without_a_card_are_left_alone(drives, finish
     assert (tmp_path / "weights.safetensors").read_bytes() == b"mine"
 
 
+def test_damaged_weights_of_a_training_are_told_and_made_anew(drives, tmp_path, call):
+    assert call(*weather(drives, tmp_path, "--epochs", 2)).code == 0
+    before, path = bytes_in(tmp_path), tmp_path / "weights.safetensors"
+    path.write_bytes(path.read_bytes()[:-9])
+    (tmp_path / "checkpoint.pt").write_bytes(b"")
+    code, _, err = call(*weather(drives, tmp_path, "--epochs", 2))
+    assert (code, [line.partition(": ")[2] for line in err.splitlines()]) == (
+        0,
+        [f"{path} is damaged, made anew", f"{tmp_path / 'checkpoint.pt'} is damaged, training begins anew"],
+    )
+    after = bytes_in(tmp_path)
+    assert all(after[name] == before[name] for name in ("weights.safetensors", "card.md"))
+    (tmp_path / "card.md").unlink()
+    assert call(*weather(drives, tmp_path, "--epochs", 2)).out.endswith("nothing to do\n")
+    assert bytes_in(tmp_path)["card.md"] == before["card.md"]
+
+
 def test_ctrl_c_says_what_is_kept_and_the_same_command_goes_on(drives, tmp_path, call, interrupted_at):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert call(*weather(drives, whole, "--epochs", STEPS)).code == 0

@@ -1,6 +1,7 @@
 """`flcav record` and `flcav birdseye` as a user runs them."""
 
 import hashlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -197,6 +198,21 @@ def test_validate_counts_or_complains(reference: Path, tmp_path: Path, capsys: p
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 1
     assert "leakage, they share 1 scenes, the first is 'suburb-4-000'" in said[0]
+
+
+def test_damaged_files_are_recorded_again_from_their_traffic(
+    reference: Path, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    data = tmp_path / "data"
+    shutil.copytree(reference, data)
+    (data / "traces/suburb-4-000.parquet").unlink()
+    (data / "lidar/suburb-4-001_0001_cav1.bin").write_bytes(b"")
+    assert flcav("record", recipe, "--out", data) == 0
+    said = capsys.readouterr()
+    first = data / "lidar/suburb-4-001_0001_cav1.bin"
+    assert said.err == f"record {data}: {first} is damaged (and 1 more), recorded anew\n"
+    assert "recorded 8 frames" in said.out
+    assert digests(data) == digests(reference)
 
 
 def test_birdseye_draws_the_frame_asked_for(reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -62,6 +62,7 @@ def train(
     with when_interrupted(kept):
         prepared = prepare(learner, request, out)
         if prepared.finished is not None:
+            train_prepared(prepared)  # its card may be missing
             typer.echo(f"{out / WEIGHTS}: trained with these settings before, nothing to do")
             return
         typer.echo("\n".join(prepared.lines()))

@@ -94,8 +94,8 @@ def record(
                 write()
                 _assemble(source, out, header)
             if damaged := find_damage(out):
-                more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
-                progress(0, 1, f"{out / min(damaged)}{more} {DAMAGED}, recorded anew")
+                more = f" (and {len(damaged) - 1} more)" if len(damaged) > 1 else ""
+                progress(0, 1, f"{out / min(damaged)} {DAMAGED}{more}, recorded anew")
                 mend(source, out, damaged, write)
     except OSError as error:
         if error.strerror and error.filename is None:  # errors of writes have no file name

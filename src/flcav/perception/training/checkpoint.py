@@ -70,16 +70,13 @@ def part_of(entry: DataEntry) -> DataIdentity:
 
 
 def find_finished_card(path: Path, asked: Settings) -> Card | None:
-    """Return the card of the weights at `path`; None if there is no such file, or a damaged one.
+    """Return the card of the weights at `path`; None if there is no such file.
 
     Raises `InputError` if they were trained with other settings than `asked`, so that they are not overwritten.
     """
     if not path.exists():
         return None
-    try:
-        card = read_card(path)
-    except DamagedFile:
-        return None
+    card = read_card(path)
     if different := asked.differences(settings_of(card)):
         raise InputError(f"{path}: weights of a training with other settings ({different}); choose another folder")
     return card

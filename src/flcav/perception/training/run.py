@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.utils.data import ConcatDataset
 
+from flcav.config import DamagedFile
 from flcav.dataset.store import Dataset
 from flcav.files import check_writable
 from flcav.machine.locks import only_writer
@@ -134,7 +135,7 @@ def prepare(task: Task, request: Request, out: Path) -> Prepared:
         patience=request.patience if held else None,
         **vars(task.practice),
     )
-    finished = find_finished_card(out / WEIGHTS, settings)
+    finished = _find_finished(out, settings)
     samples: Any = ()
     if finished is None:
         found = [task.samples(part.data, config, part.chosen.frames) for part in parts]
@@ -151,12 +152,11 @@ def train_prepared(prepared: Prepared, progress: Report = ignore_progress) -> Tr
 
 
 def _train(prepared: Prepared, progress: Report) -> TrainingResult:
-    weights = prepared.out / WEIGHTS
-    if (finished := find_finished_card(weights, prepared.settings)) is not None:
+    if (finished := _find_finished(prepared.out, prepared.settings)) is not None:
         if not (prepared.out / CARD).exists():
             write_card(finished, prepared.out / CARD)
         return TrainingResult(finished)
-    if weights.exists():
+    if (weights := prepared.out / WEIGHTS).exists():
         progress(0, 1, f"{weights} {DAMAGED}, made anew")
     task, request, out, held = prepared.task, prepared.request, prepared.out, prepared.held
     settings, samples = prepared.settings, prepared.samples
@@ -196,6 +196,16 @@ def _train(prepared: Prepared, progress: Report) -> TrainingResult:
     save_network(task, network, out / WEIGHTS, card)
     write_card(card, out / CARD)
     return TrainingResult(card, evaluation)
+
+
+def _find_finished(out: Path, settings: Settings) -> Card | None:
+    """Return `find_finished_card` of the weights in `out`; None for damaged ones of a training, with a checkpoint."""
+    try:
+        return find_finished_card(out / WEIGHTS, settings)
+    except DamagedFile:
+        if (out / CHECKPOINT).exists():
+            return None
+        raise
 
 
 def _part(task: Task, config: Any, data: Dataset, agents: str | None) -> Part:
