@@ -163,10 +163,16 @@ class _Shallow(ElementTree.TreeBuilder):
 
 
 def read_xml(path: Path, kind: str) -> ElementTree.Element:
-    """Return the root of the XML file at `path`; raises `InputError` if it is missing or not XML, so no `kind`."""
+    """Return the root of the XML file at `path`; comments may stand before its declaration.
+
+    Raises `InputError` if it is missing or not XML, so no `kind`.
+    """
     _check_exists(path)
+    parser = ElementTree.XMLParser(target=_Shallow())
     try:
-        return ElementTree.parse(path, ElementTree.XMLParser(target=_Shallow())).getroot()
+        text = path.read_bytes()
+        parser.feed(text[max(text.find(b"<?xml "), 0) :])
+        return parser.close()
     except (ElementTree.ParseError, IsADirectoryError, LookupError, ValueError) as error:
         raise InputError(f"{path}: not {kind} ({error})") from None
 
