@@ -143,7 +143,7 @@ def test_a_test_of_one_training_is_widened_by_the_spread_of_its_own_figure(tmp_p
 
 
 def test_a_difference_of_one_training_is_widened_by_the_spread_of_its_own(tmp_path: Path) -> None:
-    before, after = named(1), named(1, 0.05)
+    before, after = named(1), named(2, 0.05)
     save_test(tmp_path, f"test-{PRETRAIN}-weather-ring", before)
     save_test(tmp_path, "test-edge-main-ring-ring", after)
     spreads = {
