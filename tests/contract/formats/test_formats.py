@@ -168,6 +168,14 @@ def test_kitti_splits_by_scene_and_has_what_openpcdet_expects(dataset: Dataset, 
         assert 0 <= left < right <= painted_source.WIDTH - 1
 
 
+def test_kitti_s_imu_stands_where_it_is_mounted(dataset: Dataset, exported: dict[str, Path]):
+    mounts = dataset.frame(0).calibration.agent_from_sensor
+    line = (exported["kitti"] / "training" / "calib" / "000000.txt").read_text().splitlines()[-1]
+    lidar_from_imu = np.vstack((np.array(line.split()[1:], np.float64).reshape(3, 4), (0, 0, 0, 1)))
+    np.testing.assert_allclose(mounts["lidar"] @ lidar_from_imu, mounts["imu"], atol=1e-6)
+    assert not np.allclose(mounts["lidar"], mounts["imu"], atol=0.1)
+
+
 def test_kitti_grades_occlusion(dataset: Dataset, seen: dict[str, dict[str, Seen]], exported: dict[str, Path]):
     """The second car stands behind the first; what shows no pixel is of unknown occlusion."""
     from flcav.dataset.formats.kitti import KittiFolder

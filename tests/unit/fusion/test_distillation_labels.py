@@ -296,12 +296,20 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
         to_arrays(second_tiny()),
         (how, errors, CONFIG, 0.6, split, (0, 1), (3,)),
     )
+    given: list[Any] = []
+
+    def distil(*arguments: Any) -> Sample:
+        given.append(arguments[3])
+        return distil_sample(*arguments)
+
+    monkeypatch.setattr(road_average, "distil_sample", distil)
     labels = RoadAverageLabels(*about, "grid", book, folder=tmp_path)
     labels.send_views()
     assert {entry.bytes for entry in book.entries} == {len(seen.message())}
     assert [(entry.direction, entry.round) for entry in book.entries] == [("down", 0)] * 2
     own = labels["grid/cav0"]
     labels.renew(1, weights)
+    assert [[view.message() for view in views] for views in given] == [[seen.message()]] * 2, "for the free ground"
     assert sorted(labels) == ["grid/cav0", "grid/cav1"]
     assert labels["grid/cav0"] is own  # a client holds it
     assert near(own[0].boxes, BOTH)

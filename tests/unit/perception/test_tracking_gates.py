@@ -21,7 +21,7 @@ def pairs(own: State, place: tuple[float, float], after_s: float, yaw: float = 0
 def test_a_pair_is_within_the_99_percent_ellipse_of_the_prediction(angle: float) -> None:
     variance = np.array((4.0, 0.25))
     spread = np.sqrt(variance + LEAST_VARIANCE[:2])
-    limit = np.sqrt(round(stats.chi2.ppf(0.99, 2), 2))
+    limit = np.sqrt(round(float(stats.chi2.ppf(0.99, 2)), 2))
     direction = np.array((np.cos(angle), np.sin(angle))) * spread
     own = state((4.0, 0.25))
     for factor, wanted in ((0.999, [(0, 0)]), (1.001, [])):

@@ -73,3 +73,20 @@ def test_a_seed_counts_with_the_mean_of_its_trainings(tmp_path: Path) -> None:
     differences = np.subtract(kept[1], kept[0]).mean(axis=1)
     assert row.difference.mean == pytest.approx(differences.mean())
     assert row.first == pytest.approx(np.mean(kept[0]))
+
+
+def test_seeds_are_compared_with_themselves_and_only_those_that_both_have(tmp_path: Path) -> None:
+    few = {"first": {1: 4, 2: 10, 3: 8}, "second": {2: 5, 3: 6, 4: 1}}
+    kept = {
+        (run, seed): save_run(tmp_path / run / f"seed{seed}", [wrong], seed)[0]
+        for run, own in few.items()
+        for seed, wrong in own.items()
+    }
+    (row,) = compare(tmp_path / "first", tmp_path / "second")
+    differences = [kept["second", seed] - kept["first", seed] for seed in (2, 3)]
+    theirs = stats.ttest_1samp(differences, 0.0).confidence_interval()
+    assert row.difference.mean == pytest.approx(np.mean(differences))
+    assert (row.difference.low, row.difference.high) == pytest.approx((theirs.low, theirs.high))
+    assert (row.first, row.second) == pytest.approx((0.55, 0.725))
+    assert row.judged is not None
+    assert row.judged.p == pytest.approx(stats.ttest_1samp(differences, 0.0)[1])

@@ -136,6 +136,16 @@ def test_two_lidars_add_up(street: Scene):
     np.testing.assert_array_equal(both.annotations.returns, sum(one.annotations.returns for one in each))
 
 
+def test_two_lidars_in_one_place_see_the_occlusion_of_one(street: Scene):
+    one = RIGS["lidar32"].lidars["lidar"]
+    alone, both = (
+        observe(street, Rig(lidars=dict.fromkeys(names, one)), "cav0", 0, scene_name="s", seed=1).annotations
+        for names in (("left",), ("left", "right"))
+    )
+    assert ((alone.occlusion > 0.15) & (alone.occlusion < 0.85)).any()
+    np.testing.assert_allclose(both.occlusion, alone.occlusion, atol=0.03)
+
+
 @pytest.mark.parametrize(
     ("agent", "message"),
     [("cav9", "no such vehicle"), ("pole9", "no such pole; it has pole4"), ("", "no such vehicle")],
