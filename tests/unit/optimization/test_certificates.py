@@ -86,6 +86,8 @@ def test_any_dual_bounds_what_every_choice_covers(tried: Any, seed: int) -> None
             with_each = [weight[affordable & has[:, k]].max() for k in range(POLES)]
             assert np.all(with_each <= (found.bound - found.loss) * (1 + 1e-12))
             gain = instance.covers @ u
+            net = gain - found.price * instance.cost
+            assert found.loss == pytest.approx(np.maximum(-net, 0), abs=1e-9)
             formula = [
                 (instance.weight - u).sum() + np.maximum(gain - price * instance.cost, 0).sum() + price * budget
                 for price in np.r_[0.0, gain / instance.cost]

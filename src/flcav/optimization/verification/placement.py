@@ -67,7 +67,7 @@ def verify_placement(asked: Asked, placed: Mapping[str, Any], least: float | Non
         [*zip(placed["chosen"], placed["sensors"])],
     )
     covered = np.unique(np.concatenate([reached[pole][sensor] for pole, sensor in on]))
-    cost, value = sum((exact(asked.cost[each]) for each in on), Fraction(0)), fsum(weight[covered])
+    cost, value = sum((exact(float(asked.cost[each])) for each in on), Fraction(0)), fsum(weight[covered])
     limit = exact(asked.budget) if asked.budget is not None else Fraction(asked.count or 0) or cost
     spare, densest = _sum_up((*weight, *-u)), Fraction(0)
     for own, prices in zip(reached, asked.cost.tolist()):
