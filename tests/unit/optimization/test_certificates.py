@@ -97,6 +97,17 @@ def test_any_dual_bounds_what_every_choice_covers(tried: Any, seed: int) -> None
             assert other <= (found.spare + found.price * (budget + 1)) * (1 + 1e-12)
 
 
+def test_a_choice_proves_that_the_rest_is_what_could_be_afforded_of_it(tried: Any) -> None:
+    instance = tried(0)[0].instance()
+    for chosen in ([1, 5], [0, 3, 9]):
+        left = np.where(instance.covers[chosen].toarray().any(axis=0), 0.0, instance.weight)
+        bound = min(
+            instance.value(chosen) + np.maximum(instance.covers @ left - price * instance.cost, 0).sum() + 3.3 * price
+            for price in np.r_[0.0, instance.covers @ left / instance.cost]
+        )
+        assert solve.bound_of_choice(instance, 3.3, chosen).bound == pytest.approx(bound, rel=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_the_relaxation_is_that_of_the_linear_program(tried: Any, seed: int) -> None:
     instance = tried(seed)[0].instance()
