@@ -1,5 +1,6 @@
 """Every plan and placement that these tests make is verified, with no code of the solvers."""
 
+import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
@@ -20,7 +21,7 @@ from flcav.optimization.verification.placement import Asked, verify_placement
 
 
 def check_plan(problem: Problem, plan: Allocation, optimal: float) -> None:
-    found = verify_allocation(problem.model_dump(), asdict(plan), optimal)
+    found = verify_allocation(problem.model_dump_json(), json.dumps(asdict(plan)), optimal)
     assert not found.faults, (found, plan)
 
 
@@ -72,7 +73,7 @@ def _verified_placement(name: str, place: Callable[..., Any]) -> Callable[..., A
         placed, least = found if name == "cover" else (found, None)
         by_range = candidates.cost.reshape(candidates.poles, candidates.sensors)
         asked = replace(ASKED[id(candidates.covers)], cost=by_range[:, np.argsort(candidates.order)], **{name: limit})
-        checked = verify_placement(asked, asdict(placed), least)
+        checked = verify_placement(asked, json.dumps(asdict(placed)), least)
         assert not checked.faults, (checked, placed)
         return found
 

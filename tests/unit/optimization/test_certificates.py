@@ -1,9 +1,10 @@
 """Bounds, statuses and stops of the solvers against trying everything: random duals, unsolved roots, coarse gaps."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any
 
+import cvxpy as cp
 import numpy as np
 import pytest
 from made_problems import SMALL, parsed, searched, written
@@ -16,8 +17,15 @@ from flcav.optimization.placement.instance import find_covered
 from flcav.optimization.placement.program import bound_by_highs
 from flcav.optimization.placement.relaxation import bound_by, relax
 from flcav.optimization.placement.solve import Candidates, describe, find_candidates, place_budget, place_count
+from flcav.optimization.solvers import fairness
 from flcav.optimization.solvers.cutting_planes import Cuts, Program, outer_approximation
-from flcav.optimization.solvers.fairness import _choices, choose_at_level, combine_choices
+from flcav.optimization.solvers.fairness import (
+    LevelChoices,
+    _choices,
+    choose_at_level,
+    combine_choices,
+    minimise_largest_error,
+)
 from flcav.optimization.solvers.instance import Instance as Arrays
 from flcav.optimization.solvers.instance import build_instance
 from flcav.optimization.solvers.separable import relax as relax_separable
@@ -86,6 +94,8 @@ def test_any_dual_bounds_what_every_choice_covers(tried: Any, seed: int) -> None
             with_each = [weight[affordable & has[:, k]].max() for k in range(POLES)]
             assert np.all(with_each <= (found.bound - found.loss) * (1 + 1e-12))
             gain = instance.covers @ u
+            net = gain - found.price * instance.cost
+            assert found.loss == pytest.approx(np.maximum(-net, 0), abs=1e-9)
             formula = [
                 (instance.weight - u).sum() + np.maximum(gain - price * instance.cost, 0).sum() + price * budget
                 for price in np.r_[0.0, gain / instance.cost]
@@ -93,6 +103,17 @@ def test_any_dual_bounds_what_every_choice_covers(tried: Any, seed: int) -> None
             assert found.bound == pytest.approx(min(formula), rel=1e-9)
             other = weight[cost <= budget + 1].max()
             assert other <= (found.spare + found.price * (budget + 1)) * (1 + 1e-12)
+
+
+def test_a_choice_proves_that_the_rest_is_what_could_be_afforded_of_it(tried: Any) -> None:
+    instance = tried(0)[0].instance()
+    for chosen in ([1, 5], [0, 3, 9]):
+        left = np.where(instance.covers[chosen].toarray().any(axis=0), 0.0, instance.weight)
+        bound = min(
+            instance.value(chosen) + np.maximum(instance.covers @ left - price * instance.cost, 0).sum() + 3.3 * price
+            for price in np.r_[0.0, instance.covers @ left / instance.cost]
+        )
+        assert solve.bound_of_choice(instance, 3.3, chosen).bound == pytest.approx(bound, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -241,22 +262,84 @@ def test_a_search_that_stops_at_a_coarse_gap_tells_its_dual_bound(monkeypatch: p
     assert stopped
 
 
-@pytest.mark.parametrize(("model", "seed"), [*product(("additive", "effective", "federated", "shared"), range(4))])
-def test_levels_are_out_of_reach_only_below_the_least_largest_error(model: str, seed: int) -> None:
-    values = written(seed, 2, model, SMALL, 250.0) | {"objective": "max-min"}
-    problem, best = parsed(values), searched(values)
+@pytest.mark.parametrize("horizon_s", [None, 25.0])
+@pytest.mark.parametrize(("model", "seed"), [*product(("additive", "effective", "federated", "shared"), range(5))])
+def test_levels_are_out_of_reach_only_below_the_least_largest_error(
+    model: str, seed: int, horizon_s: float | None
+) -> None:
+    values: dict[str, Any] = written(seed, 3, model, SMALL, 200.0) | {"objective": "max-min", "horizon_s": horizon_s}
+    for number, task in enumerate(values["tasks"]):
+        task["train_s"] = 2.0 + number
+    problem, best = parsed(values), searched(values | ({"horizon_s": np.inf} if horizon_s is None else {}))
     made = build_instance(problem)
     tasks = _choices(problem, made)
     for share in (1 + 1e-9, 1 + 1e-6, 1.001, 1.02, 1.2):
         held = choose_at_level(tasks, best * share, made.budget)
         plan, excluded = combine_choices(held)
-        assert not held.out_of_reach
-        assert not excluded
+        assert (held.out_of_reach, excluded) == (False, False)
         assert plan is not None
         assert np.all(plan.ravel() @ made.cost <= made.budget * (1 + 1e-9))
-    plan, excluded = combine_choices(choose_at_level(tasks, best * (1 - 1e-6), made.budget))
-    assert plan is None
-    assert excluded
+    for share in (0.7, 0.9, 0.97, 1 - 1e-6):
+        held = choose_at_level(tasks, best * share, made.budget)
+        assert held.prices @ made.budget == pytest.approx(1)
+        assert held.out_of_reach == (held.total(held.prices) > 1 + 1e-9)
+        assert combine_choices(held) == (None, True)
+
+
+@pytest.mark.parametrize("merged", [1, 4000])
+def test_a_level_that_too_few_partial_plans_were_kept_for_is_not_excluded(
+    monkeypatch: pytest.MonkeyPatch, merged: int
+) -> None:
+    monkeypatch.setattr(fairness, "MOST_MERGED", merged)
+    costs = np.array([[0.5, 0.5], [0.39, 0.85]]), np.array([[0.6, 0.1], [0.1, 0.6]])  # only the dearer first one fits
+    counts = np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    held = LevelChoices((counts, counts), costs, np.ones(2), np.array([0.5, 0.5]), out_of_reach=False)
+    plan, excluded = combine_choices(held)
+    assert not excluded
+    assert (None if plan is None else plan[:, 0].tolist()) == (None if merged == 1 else [2.0, 1.0])
+
+
+def dearest(costs: Sequence[np.ndarray], budget: np.ndarray) -> float:
+    """Return the largest sum of the tasks' least costs, over prices at which all budgets together cost 1."""
+    prices, least = cp.Variable(len(budget), nonneg=True), cp.Variable(len(costs))
+    limits = [own @ prices >= least[task] for task, own in enumerate(costs)]
+    return float(cp.Problem(cp.Maximize(cp.sum(least)), [prices @ budget == 1, *limits]).solve(solver=cp.CLARABEL))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("horizon_s", [None, 25.0])
+def test_a_level_is_out_of_reach_just_where_it_costs_more_than_the_budgets(horizon_s: float | None) -> None:
+    values: dict[str, Any] = written(1, 3, "additive", SMALL, 200.0) | {"objective": "max-min", "horizon_s": horizon_s}
+    for task in values["tasks"]:
+        task["train_s"] = 2.0
+    made = build_instance(parsed(values))
+    tasks = _choices(parsed(values), made)
+    level = 0.9 * searched(values | {"horizon_s": horizon_s or np.inf})
+    costs = choose_at_level(tasks, level, made.budget).costs
+    total = dearest(costs, made.budget)
+    for share, out in ((0.99, False), (0.99999, False), (1.00001, True), (1.01, True)):
+        scaled = choose_at_level(tasks, level, made.budget * total / share)
+        assert scaled.out_of_reach == out
+
+
+@pytest.mark.parametrize("answers", [(False,), (False, True)])
+def test_a_bound_is_not_raised_past_a_level_that_is_not_excluded(
+    monkeypatch: pytest.MonkeyPatch, answers: tuple[bool, ...]
+) -> None:
+    left = list(answers)
+    monkeypatch.setattr(fairness, "combine_choices", lambda _: (None, left.pop(0) if len(left) > 1 else left[0]))
+    problem = parsed(written(0, 3, "additive", SMALL, 200.0) | {"objective": "max-min"})
+    found = minimise_largest_error(problem, build_instance(problem), 1e-6)
+    assert found.bound == found.root < found.level
+
+
+@pytest.mark.parametrize("gap", [1e-9, 0.05])
+def test_the_bound_of_a_plan_is_that_of_its_solver(monkeypatch: pytest.MonkeyPatch, gap: float) -> None:
+    monkeypatch.setattr(allocation, "EXACT", gap)
+    for seed in range(4):
+        problem = parsed(written(seed, 3, "additive", SMALL, 250.0))
+        made = build_instance(problem)
+        plan, found = allocate(problem, gap=gap), minimise_weighted_error(made, gap)
+        assert plan.lower_bound == pytest.approx(min(found.bound + made.floor, plan.objective), rel=1e-12)
 
 
 @pytest.mark.parametrize("objective", ["weighted", "max-min"])
@@ -286,3 +369,22 @@ def test_an_edge_round_dearer_than_its_part_of_a_cloud_round_is_not_taken_for_ch
         values["budgets_mb"]["wireless"] = wireless
         plan = allocate(parsed(values))
         assert plan.objective == pytest.approx(searched(values), rel=1e-9)
+
+
+def test_labels_before_an_only_cloud_round_are_paid_with_it() -> None:
+    values: dict[str, Any] = written(2, 1, "additive", SMALL | {"cloud_rounds": [0, 1]}, 300.0)
+    values["tasks"][0] |= {"labels_mb": 8.0, "exchange_mb": 2.0}
+    for wireless in (40.0, 47.0, 60.0, 75.0, 90.0, 130.0):
+        values["budgets_mb"]["wireless"] = wireless
+        plan = allocate(parsed(values))
+        assert plan.objective == pytest.approx(searched(values), rel=1e-9)
+        assert plan.used_mb.wireless_mb <= wireless * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cloud_rounds_that_bring_accuracy_but_no_samples_are_tried(seed: int) -> None:
+    values: dict[str, Any] = written(seed, 2, "federated", SMALL, 200.0)
+    for task in values["tasks"]:
+        task["curve"] |= {"gamma": 0.0, "drift": -0.3}
+    plan = allocate(parsed(values))
+    assert plan.objective == pytest.approx(searched(values), rel=1e-9)

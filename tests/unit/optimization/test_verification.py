@@ -1,5 +1,6 @@
 """The verifier: its bounds hold for any dual, and it refuses plans and placements that were tampered with."""
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict
 from itertools import product
@@ -108,36 +109,39 @@ def scale_dual(_: Data, plan: Data) -> None:
 )
 def test_a_plan_that_was_tampered_with_is_refused(tamper: Callable[[Data, Data], None], named: str) -> None:
     problem, plan = made_plan()
-    assert not verify_allocation(problem, plan).faults
+    assert not verify_allocation(json.dumps(problem), json.dumps(plan)).faults
     tamper(problem, plan)
-    assert named in verify_allocation(problem, plan).faults
+    assert named in verify_allocation(json.dumps(problem), json.dumps(plan)).faults
 
 
 def test_a_negative_multiplier_proves_nothing() -> None:
     problem, plan = made_plan()
     plan["certificate"][0]["multipliers"] = [-1.0, 0.0]
-    assert "the duals" in verify_allocation(problem, plan).faults
+    assert "the duals" in verify_allocation(json.dumps(problem), json.dumps(plan)).faults
 
 
 def test_a_level_that_was_raised_is_refused() -> None:
     problem, plan = made_plan("max-min")
-    assert not verify_allocation(problem, plan).faults
+    assert not verify_allocation(json.dumps(problem), json.dumps(plan)).faults
     plan["certificate"][0]["bound"] *= 1.02
-    assert "the duals" in verify_allocation(problem, plan).faults
+    assert "the duals" in verify_allocation(json.dumps(problem), json.dumps(plan)).faults
 
 
 def test_an_area_has_no_bound_and_says_so() -> None:
     problem, plan = made_plan("area")
-    found = verify_allocation(problem, plan)
+    found = verify_allocation(json.dumps(problem), json.dumps(plan))
     assert (found.faults, found.bound, found.gap) == ((), None, None)
     assert "there is no bound for this objective: nothing is proven" in found.lines()[0]
-    assert "that there is no bound" in verify_allocation(problem, plan | {"lower_bound": 0.1, "gap": 0.0}).faults
+    assert (
+        "that there is no bound"
+        in verify_allocation(json.dumps(problem), json.dumps(plan | {"lower_bound": 0.1, "gap": 0.0})).faults
+    )
 
 
 def test_what_rests_on_a_search_is_said() -> None:
     values = written(1, 3, "additive", SMALL, 300.0)
     plan = allocate(parsed(values))
-    found = verify_allocation(parsed(values).model_dump(), asdict(plan))
+    found = verify_allocation(parsed(values).model_dump_json(), json.dumps(asdict(plan)))
     assert found.bound is not None
     assert plan.lower_bound is not None
     assert found.bound < plan.lower_bound * (1 - 1e-3)
@@ -188,15 +192,15 @@ def other_pole(placed: Data) -> None:
 def test_a_placement_that_was_tampered_with_is_refused(tamper: Callable[[Data], None], named: str) -> None:
     asked, placed, _ = made_placement(budget=11.0)
     assert placed["certificate"]["search"] is not None
-    assert not verify_placement(asked, placed).faults
+    assert not verify_placement(asked, json.dumps(placed)).faults
     tamper(placed)
-    assert named in verify_placement(asked, placed).faults
+    assert named in verify_placement(asked, json.dumps(placed)).faults
 
 
 def test_a_placement_beyond_its_budget_is_refused() -> None:
     _, placed, _ = made_placement(budget=11.0)
     asked, _, _ = made_placement(budget=6.0)
-    assert "the limit" in verify_placement(asked, placed).faults
+    assert "the limit" in verify_placement(asked, json.dumps(placed)).faults
 
 
 @pytest.mark.parametrize(("by", "named"), [(1.02, "the bound on the cost"), (0.98, "whether it is optimal")])
@@ -205,7 +209,7 @@ def test_a_bound_on_the_cost_that_was_changed_is_refused(by: float, named: str) 
     assert least is not None
 
     def verified(bound: float) -> Verification:
-        return verify_placement(asked, placed, bound)
+        return verify_placement(asked, json.dumps(placed), bound)
 
     assert not verified(least).faults
     assert named in verified(by * least).faults
@@ -218,5 +222,5 @@ def test_errors_on_the_sphere_of_a_range_are_covered_and_those_beyond_are_not() 
     placed = place_budget(given, 1.0)
     assert placed.covered == 2
     assert not verify_placement(
-        Asked(errors, np.ones(3), poles, ranges, np.ones((1, 1)), budget=1.0), asdict(placed)
+        Asked(errors, np.ones(3), poles, ranges, np.ones((1, 1)), budget=1.0), json.dumps(asdict(placed))
     ).faults

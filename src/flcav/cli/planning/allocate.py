@@ -1,6 +1,7 @@
 """`flcav allocate` and `flcav replan`: samples and rounds per task under both uplink budgets (MLGRA)."""
 
 import dataclasses
+import json
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -113,7 +114,7 @@ def _plan(
         page = plan_page(compare_plan(asked, plan, shares, more), read_graph(problem))
         write_bytes(out, page.encode())
     beside = None if baseline is None else compared(asked, baseline.value)
-    verified = verify_allocation(asked.model_dump(), _plain(plan)) if verify else None
+    verified = verify_allocation(asked.model_dump_json(), json.dumps(_plain(plan))) if verify else None
     if as_json:
         beside_it = {} if beside is None else {"baseline": _plain(beside)}
         beside_it |= {} if verified is None else {"verification": dataclasses.asdict(verified)}

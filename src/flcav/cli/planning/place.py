@@ -1,5 +1,6 @@
 """`flcav place`: roadside sensors that cover most of the registered errors (VRCSP)."""
 
+import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -174,7 +175,7 @@ def _verify(
         cost = np.ones_like(cost)
     visible = None if seen is None else seen.toarray() > 0
     places = (given.errors, given.weight, given.poles, given.ranges_m)
-    return verify_placement(Asked(*places, cost, count, budget, cover, visible), asdict(result), least)
+    return verify_placement(Asked(*places, cost, count, budget, cover, visible), json.dumps(asdict(result)), least)
 
 
 def _place_conventionally(

@@ -4,6 +4,7 @@ Nothing of it is the solvers'. Costs are exact, of the decimals that the problem
 or accuracy are paid once with the first cloud round, plans without and with one are branches, each with its own dual.
 """
 
+import json
 from collections.abc import Sequence
 from fractions import Fraction
 from math import fsum
@@ -28,11 +29,12 @@ FLEET = "the split over vehicles with names, their time within horizon_s, and a 
 SEARCH = "the search above the dual (its leaves, HiGHS' word): that no plan is below {:.9g}"
 
 
-def verify_allocation(problem: Data, plan: Data, optimal: float = 1e-4) -> Verification:
-    """Return the verification of `plan` (an `Allocation`) for `problem`, both as JSON values.
+def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) -> Verification:
+    """Return the verification of a plan (`Allocation`) for a `Problem`, both as JSON text.
 
     `optimal`: largest gap of a plan whose status is optimal.
     """
+    problem, plan = json.loads(problem_json), json.loads(plan_json)
     k, kind = problem["edge_rounds_per_cloud_round"], problem["objective"]
     lower, duals = plan["lower_bound"], plan.get("certificate", ())
     tasks, budgets = read_tasks(problem, k)

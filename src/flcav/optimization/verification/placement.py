@@ -10,11 +10,11 @@ Sums are correctly rounded, then outward; costs are exact, of the decimals that 
 distances where they decide.
 """
 
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 from math import fsum, inf, nextafter
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +58,9 @@ def find_reached(asked: Asked) -> list[list[NDArray[np.intp]]]:
     return found
 
 
-def verify_placement(asked: Asked, placed: Mapping[str, Any], least: float | None = None) -> Verification:
-    """Return the verification of a `Placement` as a JSON value, with `cover` also of the bound `least` on its cost."""
+def verify_placement(asked: Asked, placed_json: str, least: float | None = None) -> Verification:
+    """Return the verification of a `Placement` as JSON text, with `cover` also of the bound `least` on its cost."""
+    placed = json.loads(placed_json)
     reached, proof, weight, upper = find_reached(asked), placed["certificate"], asked.weight, placed["upper_bound"]
     u, price, on = (
         np.asarray(proof["values"], np.float64),
@@ -67,7 +68,7 @@ def verify_placement(asked: Asked, placed: Mapping[str, Any], least: float | Non
         [*zip(placed["chosen"], placed["sensors"])],
     )
     covered = np.unique(np.concatenate([reached[pole][sensor] for pole, sensor in on]))
-    cost, value = sum((exact(asked.cost[each]) for each in on), Fraction(0)), fsum(weight[covered])
+    cost, value = sum((exact(float(asked.cost[each])) for each in on), Fraction(0)), fsum(weight[covered])
     limit = exact(asked.budget) if asked.budget is not None else Fraction(asked.count or 0) or cost
     spare, densest = _sum_up((*weight, *-u)), Fraction(0)
     for own, prices in zip(reached, asked.cost.tolist()):
