@@ -30,8 +30,10 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
-# The site, out/docs/index.html. Only pages that changed are read anew; whatever Sphinx warns of is an error.
-docs: $(STAMP)
+# The site, out/docs/index.html. Only pages that changed are read anew; whatever Sphinx warns of is an error. It installs
+# only where there is nothing yet: an environment that other checkouts share keeps its install.
+docs:
+	test -x $(BIN)/sphinx-build || $(MAKE) $(STAMP)
 	rm -rf out/docs
 	$(BIN)/python -m sphinx -b html -c docs -d out/doctrees --fail-on-warning --keep-going --quiet . out/docs
 	$(BIN)/python tools/check_site.py out/docs

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 Report = Callable[[int, int, str], None]  # done, total, note (e.g. "loss 0.31")
 DAMAGED = "is damaged"  # in notes that stay on the terminal: a file is not what was written, and is made anew
@@ -24,13 +24,13 @@ def show_progress(title: str) -> Iterator[Report]:
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        MofNCompleteColumn(),
+        TextColumn("{task.fields[count]}", markup=False),  # nothing until the total is known
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}", markup=False),
     )
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
-        task = bars.add_task(title, total=None, note="")
+        task = bars.add_task(title, total=None, note="", count="")
         begun = False
 
         def report(done: int, total: int, note: str = "") -> None:
@@ -38,7 +38,7 @@ def show_progress(title: str) -> Iterator[Report]:
             if not begun:
                 bars.reset(task, completed=done, total=total)
                 begun = True
-            bars.update(task, completed=done, total=total, note=note)
+            bars.update(task, completed=done, total=total, note=note, count=f"{done}/{total}")
             if DAMAGED in note:
                 console.print(f"{title}: {note}", highlight=False, markup=False, soft_wrap=True)
 

@@ -34,3 +34,12 @@ def test_nothing_is_drawn_where_nobody_looks(monkeypatch):
     with progress.show_progress("train") as report:
         report(1, 2, "loss 0.31")
     assert out.getvalue() == ""
+
+
+def test_a_bar_has_no_count_before_its_total_is_known(shown):
+    with progress.show_progress("train") as report:
+        time.sleep(0.3)
+        assert "train" in shown.getvalue()
+        assert "?" not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue())
+        report(3, 7)
+    assert "3/7" in shown.getvalue()

@@ -102,10 +102,9 @@ def federate(
     strategy needs.
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
-    no update, and fewer are left than `rules` ask for (by default half of those asked) or, though `account` lost none,
-    than `strategy` needs, `TooFewClients` where fewer are left than secure aggregation needs, though `account` lost
-    none, `InputError` where there are no clients, or `rules` or `strategy` ask for what they cannot do, ValueError
-    where `strategy` changes names, shapes or types of the arrays.
+    no update, and fewer are left than `rules` ask for (by default half of those asked), `TooFewClients` where fewer are
+    left than secure aggregation needs, though `account` lost none, `InputError` where there are no clients, or `rules`
+    or `strategy` ask for what they cannot do, ValueError where `strategy` changes names, shapes or types of the arrays.
 
     >>> import numpy as np
     >>> from flcav import Ledger, federate

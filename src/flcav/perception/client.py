@@ -13,6 +13,7 @@ from torch import nn
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.files import Json
+from flcav.machine.threads import use_threads
 from flcav.network.messages import from_names, pack
 from flcav.perception.images import pack_pictures
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task, find_configuration
@@ -114,7 +115,7 @@ class TrainedWeights:
 
 
 class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
-    """A federated client: local training of a task's network on the client's own samples.
+    """A federated client: local training of a task's network on the client's own samples, by so many `threads`.
 
     It satisfies the protocol `Trainable` of `flcav.federation`, which this layer does not import. Raises `InputError`
     without samples.
@@ -127,11 +128,13 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
         samples: Sequence[SampleT],
         *,
         batch: int | None = None,
+        threads: int = 1,
     ) -> None:
         if not samples:
             raise InputError("a client with 0 samples cannot train")
         self.task, self.config, self.samples = task, config, samples
         self.batch = task.practice.batch if batch is None else batch
+        self.threads = threads
 
     def train(
         self,
@@ -151,6 +154,7 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
         `weights`. With a `shift` the result has the mean of g. With `layers`, patterns of names, all other parameters
         stay as they are. Raises `InputError` if `weights` do not fit the network, or no parameter is named by `layers`.
         """
+        use_threads(self.threads)
         network = self.task.build(self.config)
         from_arrays(network, weights)
         freeze_others(network, layers)

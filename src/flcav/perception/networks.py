@@ -1,7 +1,8 @@
 """Training, evaluation and inference of a task's networks, and registration of their mistakes.
 
 In all functions a task is a `Task` or its name on the command line (`flcav.perception.tasks`), data are a dataset or
-its folder, and a network is one in memory, a file of weights, or None for the task's own weights in the package.
+its folder, and a network is one in memory, a file of weights, or None for the task's own weights in the package. They
+compute on one thread unless `threads` says otherwise: with another number the last bits of weights differ.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ from flcav.config import InputError
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.files import Json
+from flcav.machine.threads import use_threads
 from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card, join_lidars, read_lidar
 from flcav.perception.device import select_device
@@ -82,6 +84,7 @@ def train(
     seed: int = 0,
     device: str = "auto",
     agents: str | None = None,
+    threads: int = 1,
     progress: Report = ignore_progress,
 ) -> TrainedNetwork:
     """Train a network on recorded frames with their ground truth; weights, card and curves are written to `out`.
@@ -97,6 +100,7 @@ def train(
     >>> trained.card.samples, trained.weights.name
     (4, 'weights.safetensors')
     """
+    use_threads(threads)
     folders = data if isinstance(data, Sequence) and not isinstance(data, str) else [data]
     held = None if validation is None else open_data(validation)
     place = select_device(device)
@@ -116,6 +120,7 @@ def evaluate(
     around: bool = False,
     tracks: bool = False,
     device: str = "auto",
+    threads: int = 1,
     progress: Report = ignore_progress,
 ) -> Evaluation:
     """Evaluate a network on recorded frames by the metrics of its task.
@@ -130,6 +135,7 @@ def evaluate(
     >>> dict(found.chosen.used), 0 <= found.score <= 1
     ({'vehicle': 4}, True)
     """
+    use_threads(threads)
     learned = resolve_task(task)
     if tracks and not isinstance(learned, ObjectsTask):
         raise InputError(f"--tracks: only objects have tracks, not '{learned.name}'")
@@ -171,6 +177,7 @@ def infer(
     around: bool = False,
     agents: str | None = None,
     device: str = "auto",
+    threads: int = 1,
 ) -> Inference:
     """Run a network on files, folders of files, or dataset folders: point clouds or images, by task.
 
@@ -183,6 +190,7 @@ def infer(
     >>> first.path.name, type(first.marks[0].boxes).__name__  # in the LiDAR's frame
     ('grid-0-000_0000_cav0', 'Boxes')
     """
+    use_threads(threads)
     learned = resolve_task(task)
     _check_around(learned, around)
     paths = [Path(inputs)] if isinstance(inputs, Path | str) else list(map(Path, inputs))
@@ -208,6 +216,7 @@ def register_errors(
     around: bool = False,
     agents: str | None = None,
     device: str = "auto",
+    threads: int = 1,
     progress: Report = ignore_progress,
 ) -> Registry:
     """Return the mistakes of a network on recorded frames with their positions in the town, each once.
@@ -223,6 +232,7 @@ def register_errors(
     >>> set(errors.kinds) <= {"miss", "false_positive"}
     True
     """
+    use_threads(threads)
     learned = resolve_task(task)
     _check_around(learned, around)
     dataset = open_data(data)

@@ -11,10 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+import flcav
 from flcav.cli.main import run
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.perception.client import TaskClient
 from flcav.perception.objects import calibrate
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
@@ -182,3 +185,18 @@ def test_a_killed_training_ends_where_an_uninterrupted_one_does(data, tmp_path):
         to_arrays(load_network(OBJECTS, tmp_path / name / "weights.safetensors")) for name in ("whole", "cut")
     )
     assert all(np.array_equal(whole[name], cut[name]) for name in whole)
+
+
+def test_python_trains_the_same_weights_as_the_shell(data: Path, tmp_path: Path):
+    """One thread by default, in both: threads decide the order of sums, and so the last bits."""
+    torch.set_num_threads(2)
+    trained = flcav.train("objects", data, out=tmp_path / "python", network="tiny", epochs=1, seed=1)
+    assert torch.get_num_threads() == 1
+    how = ("--data", data, "--network", "tiny", "--epochs", 1, "--seed", 1)
+    assert called("train", "objects", *how, "--out", tmp_path / "shell") == 0
+    assert trained.weights.read_bytes() == (tmp_path / "shell" / "weights.safetensors").read_bytes()
+    torch.set_num_threads(2)
+    config = second_tiny().config
+    client = TaskClient(OBJECTS, config, OBJECTS.samples(Dataset.open(data), config, [0]))
+    client.train(to_arrays(trained.network), steps=1, learning_rate=1e-3, seed=1)
+    assert torch.get_num_threads() == 1

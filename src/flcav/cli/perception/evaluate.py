@@ -55,6 +55,7 @@ def evaluate(
             around=around,
             tracks=tracks,
             device=device,
+            threads=threads,
             progress=report,
         )
     origin = networks.origin_of(learned, weights)

@@ -59,7 +59,9 @@ def infer(
     learned = task_named(task)
     if not isinstance(learned, Scores):
         refuse_unused(f"infer {task}", "threshold")
-    found = networks.infer(learned, inputs, weights, threshold=threshold, around=around, agents=agents, device=device)
+    found = networks.infer(
+        learned, inputs, weights, threshold=threshold, around=around, agents=agents, device=device, threads=threads
+    )
     findings = []
     for number, finding in enumerate(found):
         findings.append((str(finding.path), finding.result))
