@@ -23,7 +23,8 @@ from cpu_time import cpu_ms
 
 from flcav.config import InputError
 from flcav.dataset.formats.nuscenes.files import encode_radar
-from flcav.dataset.formats.nuscenes.read import NuscenesSource, read_cloud
+from flcav.dataset.formats.nuscenes.files import read_lidar
+from flcav.dataset.formats.nuscenes.read import NuscenesSource
 from flcav.world.opendrive.importing import import_town
 
 POINTS, ECHOES, BOXES = 34_720, 125, 35
@@ -162,7 +163,7 @@ def main() -> None:
         megabytes = sum(path.stat().st_size for path in clouds) / 1e6
         source = NuscenesSource(short / KEYS)
         works = [
-            lambda: [read_cloud(path) for path in clouds],
+            lambda: [read_lidar(path) for path in clouds],
             lambda: [frame.key for frame in source.frames("scene-0001")],
             lambda: NuscenesSource(short / KEYS),
         ]

@@ -87,8 +87,8 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--map": ALWAYS,
         **RUNS,
     },
-    "allocate": {"--baseline": ALWAYS, "--progress": ALWAYS},
-    "replan": {"--baseline": ALWAYS},
+    "allocate": {"--baseline": ALWAYS, "--progress": ALWAYS, "--verify": ALWAYS},
+    "replan": {"--baseline": ALWAYS, "--verify": ALWAYS},
     "place": {
         "--errors": ALWAYS,
         "--poles": ALWAYS,
@@ -98,6 +98,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--method": ALWAYS,
         "--town": ALWAYS,
         "--map": ALWAYS,
+        "--verify": ALWAYS,
     },
     "fit": {
         **dict.fromkeys(("--model", "--at", "--problem", "--level", "--repeats", "--seed", "--held-out"), ALWAYS),

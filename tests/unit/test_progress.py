@@ -41,5 +41,5 @@ def test_a_bar_has_no_count_before_its_total_is_known(shown):
         time.sleep(0.3)
         assert "train" in shown.getvalue()
         assert "?" not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue())
-        report(3, 7)
+        report(3, 7, "")
     assert "3/7" in shown.getvalue()

@@ -116,7 +116,7 @@ def test_an_export_is_imported_as_it_was(name: str, source: Dataset, imported: d
 
 @pytest.mark.parametrize(("share", "scenes", "held_out"), [(0.07, 100, 7), (0.28, 25, 7), (0.2, 11, 3), (0.0, 5, 0)])
 def test_a_share_of_the_scenes_is_the_number_that_it_says(share: float, scenes: int, held_out: int) -> None:
-    keys, manifest = [SimpleNamespace(scene=f"s{i}") for i in range(scenes)], SimpleNamespace(recipe={})
+    keys, manifest = [SimpleNamespace(scene=f"s{i}") for i in range(scenes)], SimpleNamespace(recipe={}, split_of={})
     dataset = cast(Dataset, SimpleNamespace(keys=keys, manifest=manifest))
     assert [*split_scenes(dataset, ExportOptions(validation=share)).values()].count("val") == held_out
 

@@ -35,7 +35,7 @@ def find_copies(folders: Sequence[Path]) -> list[str]:
         with contextlib.suppress(InputError):
             for digest, cloud in _list_clouds(folder):
                 one = first.setdefault(digest, cloud)
-                if one.split != cloud.split:
+                if one.split != cloud.split and one.scene != cloud.scene:  # else the name says it
                     shared[one[:2], cloud[:2]].append((one.scene, cloud.scene))
     return [
         f"{one} (split '{split}') and {other} (split '{other_split}'): leakage, they share {len(scenes)} point clouds, "
