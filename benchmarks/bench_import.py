@@ -22,8 +22,7 @@ import numpy as np
 from cpu_time import cpu_ms
 
 from flcav.config import InputError
-from flcav.dataset.formats.nuscenes.files import encode_radar
-from flcav.dataset.formats.nuscenes.files import read_lidar
+from flcav.dataset.formats.nuscenes.files import encode_radar, read_lidar
 from flcav.dataset.formats.nuscenes.read import NuscenesSource
 from flcav.world.opendrive.importing import import_town
 
