@@ -51,7 +51,7 @@ def test_a_weighted_error_is_told_with_its_mean(tmp_path, capsys):
     assert re.search(r"weighted error 0\.\d\d, optimal for the fitted curves \(proven within", told)
     assert called("allocate", tmp_path / "problem.yaml", "--json") == 0
     total = json.loads(capsys.readouterr().out)["objective"]
-    assert f"Weighted error: {TERMS['weighted error']} Here they sum to 3, and the mean is {total / 3:.2g}." in told
+    assert f"Weighted error: {TERMS['weighted error']} Here they sum to 3, and the mean is {total / 3:#.2g}." in told
 
 
 @pytest.mark.parametrize("by", [1.0, 1.02])

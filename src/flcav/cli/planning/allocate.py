@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from flcav.optimization.problem import Problem
     from flcav.optimization.verification.record import Verification
 
-SHOWN = ".2g"  # predictions: trainings on the same frames differ in the second digit
+SHOWN = "#.2g"  # predictions: trainings on the same frames differ in the second digit
 
 
 class Compared(StrEnum):
@@ -184,7 +184,9 @@ def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
     console = plain_console()
     console.print(_table(beside))
     note = f" ({beside.note})" if beside.note else ""
-    console.print(f"{beside.name}: {beside.objective:{SHOWN}}{note}; the plan above: {plan.objective:{SHOWN}}")
+    one, other = f"{beside.objective:{SHOWN}}", f"{plan.objective:{SHOWN}}"
+    apart = f", {abs(plan.objective - beside.objective):{SHOWN}} apart" if one == other else ""
+    console.print(f"{beside.name}: {one}{note}; the plan above: {other}{apart}")
 
 
 def _show_verification(verified: "Verification | None") -> None:

@@ -58,7 +58,7 @@ def explain_objective(problem: Problem, objective: float) -> str:
     weights = sum(task.weight for task in resolve_problem(problem).tasks)
     if problem.objective != "weighted" or abs(weights - 1) < 1e-9:
         return sentence
-    return f"{sentence} Here they sum to {weights:.3g}, and the mean is {objective / weights:.2g}."
+    return f"{sentence} Here they sum to {weights:.3g}, and the mean is {objective / weights:#.2g}."
 
 
 @dataclass(frozen=True)
