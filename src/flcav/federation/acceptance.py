@@ -46,7 +46,7 @@ class ReplyRefused(ValueError):
 
 @dataclass(frozen=True)
 class Expected:
-    """What the server expects of the updates of a round."""
+    """The form that updates of a round must have: rules, weights at its start, and arrays beside them."""
 
     rules: Rules
     start: Weights  # that the round began with

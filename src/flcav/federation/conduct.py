@@ -37,7 +37,7 @@ def agreed_requests(rules: Rules) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Answered:
-    """What a client answered last."""
+    """The last request that a client answered."""
 
     round: int = 0
     place: int = 0  # of the request among those that are agreed on

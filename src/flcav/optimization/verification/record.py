@@ -9,7 +9,7 @@ NEAR = 1e-9  # relative tolerance of what a plan states
 
 @dataclass(frozen=True)
 class Verification:
-    """What a verifier that shares no code with the solvers recomputed of a plan or a placement."""
+    """The verification of a plan or a placement: cost, objective and bound, recomputed without code of the solvers."""
 
     objective: float  # error or area, or covered weight
     cost: tuple[float, ...]  # wireless, wireline [MB] and time [s]; or of the sensors

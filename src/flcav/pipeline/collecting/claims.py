@@ -1,4 +1,4 @@
-"""What a run's differences are asked: claims that they are positive, primary or not, or what is lost to a bound.
+"""Claims about a run's differences: primary and secondary ones, and estimates of what is lost to an upper bound.
 
 A recipe may name its primary claims (`primary_claims`) before it is run. They are corrected for one another, and all
 others, exploratory ones, apart from them. Nobody claims that the run beats an upper bound, such as an arm with an ideal

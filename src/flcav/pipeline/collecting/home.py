@@ -1,4 +1,4 @@
-"""What federated learning costs at home: every measure of a task in the towns of pretraining, before and after it."""
+"""Cost at home: the loss of accuracy by federated learning in the towns of pretraining, in every measure of a task."""
 
 from collections.abc import Sequence
 from pathlib import Path

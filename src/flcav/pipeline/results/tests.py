@@ -85,7 +85,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class HomeCost:
-    """What federated learning costs in a town of pretraining: a measure there before it and after it, same frames."""
+    """The cost of federated learning in a town of pretraining: a measure there before it and after it, same frames."""
 
     region: str
     task: str
