@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from flcav.geometry import (
     Boxes,
+    concatenate,
     count_points_in_boxes,
     inverse,
     is_rigid,
@@ -93,3 +94,10 @@ def test_points_in_boxes_are_counted_as_they_are_found():
     assert counts.sum() > 100
     assert len(count_points_in_boxes(cloud, boxes[:0], moved)) == 0
     assert count_points_in_boxes(cloud[:0], boxes, moved).tolist() == [0] * 30
+
+
+def test_no_boxes_of_several_parts_keep_their_scores():
+    none = Boxes.from_array(np.zeros((0, 7)), [], score=[])
+    assert concatenate([none, none]).score is not None
+    assert concatenate([Boxes.empty(), Boxes.empty()]).score is None
+    assert len(concatenate([])) == 0

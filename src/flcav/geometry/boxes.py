@@ -212,8 +212,11 @@ def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> NDA
 
 
 def concatenate(parts: Sequence[Boxes]) -> Boxes:
-    """Return the boxes of all `parts` in order, with scores and variances if every non-empty part has them."""
-    parts = [part for part in parts if len(part)]
+    """Return the boxes of all `parts` in order, with scores and variances if every non-empty part has them.
+
+    Where all are empty, it is the first: no boxes, which have scores or not.
+    """
+    parts = [part for part in parts if len(part)] or parts[:1]
     if not parts:
         return Boxes.empty()
 

@@ -28,6 +28,7 @@ from flcav.perception.metrics.kitti import (
     label_states,
 )
 from flcav.perception.networks import evaluate
+from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import KnownLidar
 
@@ -234,3 +235,9 @@ def test_another_implementation_comes_to_the_same(peer: ModuleType):
                 px = rectangle[:, 3] - rectangle[:, 1]
                 assert label_states(name, label, px, occlusion, truncation, level).tolist() == ignored
                 assert detection_states(name, label, px, level).tolist() == other
+
+
+@pytest.mark.skipif(not (SHARED / "kitti_frame").is_dir(), reason="no real KITTI frame: set FLCAV_REAL_DATA")
+def test_a_network_that_finds_nothing_has_an_average_precision_of_0():
+    found = evaluate("objects", SHARED / "kitti_frame", second_tiny())
+    assert found.score == 0
