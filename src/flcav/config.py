@@ -6,7 +6,7 @@ aliases stand for are bounded before anything is built of them, and names lead n
 
 import json
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PureWindowsPath
 from typing import Any, ClassVar, TypeVar, get_args
 
@@ -45,10 +45,19 @@ class Config(BaseModel):
     @classmethod
     def _check_magnitude(cls, value: Any) -> Any:
         least, most = cls.magnitudes
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, float) and number and not least <= abs(number) <= most:
+        for number in _list_floats(value):
+            if number and not least <= abs(number) <= most:
                 raise ValueError(f"a number's size, sign apart, must be from {least:g} to {most:g}, or 0")
         return value
+
+
+def _list_floats(value: object) -> Iterator[float]:
+    """Yield the floats in a value, those in tuples and mappings included."""
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, tuple | Mapping):
+        for each in value.values() if isinstance(value, Mapping) else value:
+            yield from _list_floats(each)
 
 
 ConfigT = TypeVar("ConfigT", bound=Config)

@@ -78,3 +78,8 @@ def test_json_that_the_parser_trips_over(text: str, tmp_path: Path) -> None:
 def test_what_is_no_mapping_is_refused() -> None:
     with pytest.raises(InputError, match=r"p.yaml: expected a mapping of fields, found list"):
         parse_config(Picture, [], "p.yaml")
+
+
+def test_numbers_of_mappings_have_a_size_that_can_be_computed_with():
+    with pytest.raises(InputError, match="field 'paint' = .*: a number's size, sign apart, must be from 0 to 1e"):
+        parse_config(Picture, {"shapes": [{"kind": "circle", "radius_m": 1}], "paint": {"a": {"b": 1.7e308}}}, "test")

@@ -180,9 +180,6 @@ def test_infeasible_is_one_sentence() -> None:
     slow = problem([{"edge_groups": [1], "uplink_mbps": links(8)}], horizon_s=20)
     with pytest.raises(Infeasible, match=r"need 30 s .* 10 s more than horizon_s = 20"):
         split_plan(slow, [plan(10, 2)])
-    endless = problem([{"edge_groups": [1], "uplink_mbps": links(8), "train_s": 1.7e308}], horizon_s=20)
-    with pytest.raises(Infeasible, match=r"need far more time for the plan than horizon_s = 20"):
-        split_plan(endless, [plan(10, 2)])
 
 
 def test_tasks_without_links_have_no_shares() -> None:

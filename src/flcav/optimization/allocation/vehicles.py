@@ -212,9 +212,8 @@ def _least(aim: Array, constraints: Sequence[LinearConstraint], high: Array, gap
 
 
 def _too_slow(soonest: Array | None, horizon_s: float | None, subject: str) -> TooSlow:
+    assert soonest is not None
     assert horizon_s is not None
-    if soonest is None:  # times beyond what the solver computes with
-        return TooSlow(f"{subject} need far more time for the plan than horizon_s = {horizon_s:g}")
     return TooSlow(
         f"{subject} need {soonest[-1]:.6g} s for the plan even if stragglers leave out rounds, "
         f"{soonest[-1] - horizon_s:.6g} s more than horizon_s = {horizon_s:g}"

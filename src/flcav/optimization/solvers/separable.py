@@ -126,7 +126,7 @@ class ContinuousOptimum:
 def room(problem: Separable) -> Array:
     """Return how many whole units of each quantity fit the budgets above `low`, the others staying at `low` (n,)."""
     left = problem.budget * (1 + BUDGET_SLACK) - problem.spent(problem.low)
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         return np.floor(np.min(np.where(problem.cost > 0, left / problem.cost, np.inf), axis=1))
 
 
