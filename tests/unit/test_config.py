@@ -81,5 +81,5 @@ def test_what_is_no_mapping_is_refused() -> None:
 
 
 def test_numbers_of_mappings_have_a_size_that_can_be_computed_with():
-    with pytest.raises(InputError, match="field 'paint' = .*: a number's size, sign apart, must be from 0 to 1e"):
+    with pytest.raises(InputError, match=r"field 'paint' = .*: a number's size, sign apart, must be from 0 to 1e"):
         parse_config(Picture, {"shapes": [{"kind": "circle", "radius_m": 1}], "paint": {"a": {"b": 1.7e308}}}, "test")
