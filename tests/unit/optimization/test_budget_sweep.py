@@ -53,7 +53,7 @@ def test_what_more_megabytes_save_is_printed_as_trying_every_plan_finds_it(
     now = searched(values)
     for link, added in itertools.product(("wireless", "wireline"), (0.1, 0.5)):
         best = searched(with_more(values, link, added))
-        saved = f"saves {now - best:.2g}" if now - best > 1e-12 else "saves nothing"
+        saved = f"saves {now - best:#.2g}" if now - best > 1e-12 else "saves nothing"
         own = told.split(f"\n{link}: ")[1]
         budget = f"{added:.0%} more ({added * values['budgets_mb'][link]:.6g} MB)"
         assert f"  {budget}, solved anew: {saved} (proven within 0.00%)" in own.splitlines()[1:3]
