@@ -114,6 +114,7 @@ def test_known_layouts_are_read(tmp_path: Path, points: Points) -> None:
 
 @pytest.mark.parametrize("layout", OTHERS)
 @given(points=SWEEPS)
+@example(points=sweep(41749, 101, 4.0, 0.3, "columns", 0.5))  # of float16, no point is high
 @settings(MANY, max_examples=20)
 def test_other_layouts_are_refused(tmp_path: Path, layout: str, points: Points) -> None:
     path = tmp_path / "cloud.bin"

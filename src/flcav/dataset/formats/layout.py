@@ -12,7 +12,7 @@ FARTHEST_M = 1e4  # largest coordinate that a LiDAR is taken to measure
 NEAREST_M = 1.0  # the farthest point of a sweep is beyond
 TINY = 1e-30  # smallest number above 0; what is smaller is of another type
 BRIGHTEST = 255  # largest intensity of nuScenes
-HIGHEST_M = 20.0  # highest point of a sweep beside which none is more than a metre
+HALF_ONE_M = 2.0**-7  # largest y of a cloud whose numbers are float16: its upper bytes are an intensity's, at most 1
 BESIDE_M = 1.75  # normals and colours are within
 TYPES = {"<f4": "float32", "<f8": "float64", ">f4": "big-endian float32", ">f8": "big-endian float64"}
 COLUMNS = range(3, 13)
@@ -74,15 +74,17 @@ def _within(values: Values, most: float) -> bool:
 def _mixes(rows: NDArray[np.float32]) -> bool:
     """Return whether rows are of other ones, although every fourth number is an intensity.
 
-    Of rows of eight numbers, every second half is no point, but a normal, a colour or padding. Of two-byte numbers y
-    is an intensity, too, and z is x.
+    Of rows of eight numbers, every second half is no point, but a normal, a colour or padding. Of float16, the upper
+    bytes of y are an intensity: no y is negative or as large as a centimetre.
     """
+    y = rows[rows.any(axis=1), 1]
+    if len(y) >= FEW and y.any() and _within(y, HALF_ONE_M):
+        return True
     halves = [np.linalg.norm(half[half[:, :3].any(axis=1), :3], axis=1) for half in (rows[::2], rows[1::2])]
     if min(map(len, halves)) < FEW:
         return False
     near, far = sorted(halves, key=lambda half: float(np.median(half)))
-    high = np.abs(rows[:, 2]).max() > HIGHEST_M
-    return bool(high and _within(rows[:, 1], 1)) or bool(near.max() < min(BESIDE_M, np.median(far)))
+    return bool(near.max() < min(BESIDE_M, np.median(far)))
 
 
 def _count_columns(values: Values) -> int:
