@@ -16,7 +16,7 @@ from flcav.markdown import format_table
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.camera.camera import Camera
 from flcav.sensors.camera.infrared import Infrared
-from flcav.sensors.camera.lens import Lens
+from flcav.sensors.lens import Lens
 from flcav.sensors.lidar.beams import BEAMS, CarlaReturns
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.navigation import Gnss, Imu

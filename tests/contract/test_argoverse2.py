@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.checks.copies import find_copies
-from flcav.dataset.checks.validate import find_leaks, validate
 from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.formats.reading import difference_tracks
 from flcav.dataset.store import Dataset
+from flcav.dataset.validation import find_leaks, validate
 from flcav.geometry import inverse, transform_points
 
 REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[3] / "shared" / "data")) / "argoverse2"

@@ -24,8 +24,8 @@ from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import save_network
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Frame, Views
+from flcav.sensors.lens import BODY_FROM_OPTICAL
 from flcav.world.trace import Trace
 
 DATA = Path(__file__).parents[1] / "data"

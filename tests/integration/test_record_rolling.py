@@ -15,8 +15,8 @@ from test_record_sensors import resign
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.checks.frames import check_points
-from flcav.dataset.checks.validate import validate
 from flcav.dataset.store import Dataset
+from flcav.dataset.validation import validate
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

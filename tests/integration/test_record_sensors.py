@@ -13,13 +13,13 @@ import pytest
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.dataset.checks.validate import validate
 from flcav.dataset.formats.sweeps import read_sweep
 from flcav.dataset.layout import payload_path
 from flcav.dataset.payloads import POINTS
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import FILES_SCHEMA, write_table
+from flcav.dataset.validation import validate
 from flcav.files import sha256, write_json
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource

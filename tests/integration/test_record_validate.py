@@ -13,11 +13,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from flcav.config import InputError
-from flcav.dataset.checks.validate import check_order, find_leaks, validate
 from flcav.dataset.layout import FrameKey, Manifest
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import FILES_SCHEMA, write_table
+from flcav.dataset.validation import check_order, find_leaks, validate
 from flcav.files import sha256, write_json
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from flcav.dataset.checks.validate import validate
     from flcav.dataset.recording.recorder import record
     from flcav.dataset.store import Dataset
+    from flcav.dataset.validation import validate
 
 PLACES = {
-    "validate": "flcav.dataset.checks.validate",
+    "validate": "flcav.dataset.validation",
     "record": "flcav.dataset.recording.recorder",
     "Dataset": "flcav.dataset.store",
 }

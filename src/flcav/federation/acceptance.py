@@ -1,7 +1,8 @@
 """Acceptance of replies: what the server asked for is the measure of what a client sends, before anything is computed.
 
-Every reply of a round is read here. It has the records that were asked for and no others, arrays of the names, shapes
-and types that the server's own weights give, and numbers within the limits of the rules; or it is refused.
+Every update of a round is read here, keys and shares of masks in `secure.messages`. A reply has the records that were
+asked for and no others, arrays of the names, shapes and types that the server's own weights give, and numbers within
+the limits of the rules; or it is refused.
 """
 
 import math
@@ -18,22 +19,17 @@ from flcav.federation.encoding import count_coordinates, decode, is_local, sent_
 from flcav.federation.records import (
     ARRAYS,
     ASK,
-    CIPHERS,
     EXTRA,
     LOSS,
-    MASKS,
     METRICS,
     NAMES,
     NORM,
     SAMPLES,
-    SHARES,
     VECTOR,
     to_numpy,
     type_name,
 )
 from flcav.federation.rules import Rules
-from flcav.federation.secure.masks import is_public_key
-from flcav.federation.secure.parties import PublicKeys
 from flcav.federation.strategies.fedavg import BLOCK
 from flcav.federation.strategies.strategy import Exchanges, Strategy
 from flcav.federation.trainable import Forms, LocalUpdate, Weights, forms_of, learned_names
@@ -97,7 +93,7 @@ def read_masked(content: RecordDict, expected: Expected, peers: Sequence[str]) -
     Masked values cannot be told from others. Raises `ReplyRefused`.
     """
     if ASK in content:
-        accused = _read_entry(content, NAMES)
+        accused = read_entry(content, NAMES)
         if not isinstance(accused, list) or not accused or not set(accused) <= set(peers):
             raise ReplyRefused(f"shares of {shorten(accused)} that do not open")
         return [name for name in peers if name in accused]
@@ -114,38 +110,17 @@ def read_norm(content: RecordDict, rules: Rules) -> tuple[float, int]:
     return norm, samples
 
 
-def read_keys(content: RecordDict) -> PublicKeys:
-    """Return a client's public keys of a round; raises `ReplyRefused`."""
-    found = PublicKeys(*(_read_entry(content, kind) for kind in (CIPHERS, MASKS)))
-    if not (is_public_key(found.cipher) and is_public_key(found.mask)):
-        raise ReplyRefused("keys that nobody can agree on a secret with")
-    return found
-
-
-def read_shares(content: RecordDict, owners: Sequence[str], size: int) -> dict[str, bytes]:
-    """Return the shares of `size` bytes that a client sends, one for each name of `owners`; raises `ReplyRefused`."""
-    names, shares = _read_entry(content, NAMES), _read_entry(content, SHARES)
-    if not isinstance(names, list) or not isinstance(shares, list) or len(names) != len(shares):
-        raise ReplyRefused(f"no shares by name, but {shorten(names)}")
-    found = dict(zip(names, shares, strict=True))
-    if found.keys() != {*owners} or len(names) != len(owners):
-        raise ReplyRefused(f"{len(names)} shares, of {shorten(names)}, where {len(owners)} were asked for")
-    if odd := [name for name, share in found.items() if not isinstance(share, bytes) or len(share) != size]:
-        raise ReplyRefused(f"a share of {odd[0]} that is not of {size} bytes")
-    return found
+def read_entry(content: RecordDict, key: str) -> Any:
+    """Return an entry of an answer's one record, None where it has none; raises `ReplyRefused` for other records."""
+    _check_records(content, [ASK])
+    record = content[ASK]
+    return record.get(key) if isinstance(record, ConfigRecord) else None
 
 
 def _check_records(content: RecordDict, wanted: Sequence[str]) -> None:
     if odd := sorted(set(content) ^ set(wanted)):
         kind = "lacks" if odd[0] in wanted else "has an unknown"
         raise ReplyRefused(f"a reply that {kind} '{odd[0]}'")
-
-
-def _read_entry(content: RecordDict, key: str) -> Any:
-    """Return an entry of the answer's one record; None where it has none."""
-    _check_records(content, [ASK])
-    record = content[ASK]
-    return record.get(key) if isinstance(record, ConfigRecord) else None
 
 
 def _read_numbers(content: RecordDict, key: str, rules: Rules) -> tuple[int, float]:

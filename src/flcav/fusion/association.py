@@ -21,7 +21,7 @@ from scipy.stats import chi2
 
 from flcav.dataset.rectangles import HALF_PX
 from flcav.geometry import Boxes, rotations, transform_points
-from flcav.sensors.camera.lens import project_points
+from flcav.sensors.lens import project_points
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class View:
     camera_from_lidar: Array  # (4, 4), optical frame
     covariance: Array  # (6, 6) of the error `apply_error` takes: rotation [rad], translation [m], optical frame
     intrinsics: Array  # (3, 3) [px]
-    distortion: Array  # (5,) as in `flcav.sensors.camera.lens`
+    distortion: Array  # (5,) as in `flcav.sensors.lens`
     size: tuple[int, int]  # width, height [px]
 
 

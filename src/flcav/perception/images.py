@@ -21,8 +21,8 @@ from flcav.dataset.store import Dataset
 from flcav.dataset.upright import turn_upright
 from flcav.geometry import inverse, transform_points
 from flcav.network.messages import from_names, to_names
-from flcav.sensors.camera.lens import project_points
 from flcav.sensors.frame import Frame
+from flcav.sensors.lens import project_points
 
 Picture = NDArray[np.uint8]  # (H, W, 3) sRGB
 Array = NDArray[np.float64]
@@ -129,7 +129,7 @@ class CameraView:
     picture: Picture  # (H, W, 3) sRGB
     camera_from_points: Array  # (4, 4)
     intrinsics: Array  # (3, 3) [px]
-    distortion: Array  # (5,) Brown-Conrady k1 k2 p1 p2 k3, as `flcav.sensors.camera.lens`
+    distortion: Array  # (5,) Brown-Conrady k1 k2 p1 p2 k3, as `flcav.sensors.lens`
 
     def project(self, points: NDArray) -> Array:
         """Return pixel coordinates (N, 2) u, v of points (N, 3) [m]; NaN behind the near plane or far off the image."""

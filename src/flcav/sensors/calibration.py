@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from flcav.config import Config
 from flcav.seeds import stream
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, Lens
 from flcav.sensors.frame import Array, Calibration
+from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
 from flcav.sensors.rig import Mounted, Rig
 
 

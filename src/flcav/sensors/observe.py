@@ -12,9 +12,9 @@ from flcav.seeds import stream
 from flcav.sensors.calibration import CalibrationError, build_calibration, perturb_calibration
 from flcav.sensors.camera.camera import photograph
 from flcav.sensors.camera.infrared import render_thermal
-from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.frame import Array, Calibration, CameraImage, Frame
 from flcav.sensors.labels.annotate import Sight, Sweep, annotate
+from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.lidar.lidar import Lidar, point_times_s, scan
 from flcav.sensors.navigation import measure_inertia, measure_position
 from flcav.sensors.radar.radar import sweep_radar

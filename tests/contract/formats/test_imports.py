@@ -14,7 +14,6 @@ from painted_source import CATEGORIES, IN_BOX, PaintedSource
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.checks.validate import find_leaks, validate
 from flcav.dataset.formats.export import FORMATS, export
 from flcav.dataset.formats.exporter import ExportOptions, split_scenes
 from flcav.dataset.formats.importing import READABLE, import_dataset
@@ -22,6 +21,7 @@ from flcav.dataset.formats.kitti.read import KittiSource
 from flcav.dataset.formats.nuscenes.rows import COLUMNS
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.dataset.validation import find_leaks, validate
 from flcav.geometry import inverse, wrap_angle
 from flcav.network.ledger import Ledger
 from flcav.pipeline.frames import group_frames

@@ -19,7 +19,7 @@ from flcav.dataset.formats.nuscenes.tables import CAMERAS, Row, attributes, link
 from flcav.dataset.formats.opv2v.write import agent_numbers, carla_pose, encode_pcd
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
+from flcav.sensors.lens import BODY_FROM_OPTICAL
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.world.map.town import load_town
 

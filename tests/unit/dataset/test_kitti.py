@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.dataset.checks.validate import validate
 from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.formats.kitti import (
     Calibration,
@@ -20,6 +19,7 @@ from flcav.dataset.formats.kitti import (
     read_points,
 )
 from flcav.dataset.store import Dataset
+from flcav.dataset.validation import validate
 from flcav.geometry import inverse, points_in_boxes, transform_points
 
 CALIBRATION = """P2: 700 0 600 45 0 700 180 0.2 0 0 1 0.003

@@ -7,9 +7,9 @@ import pytest
 from toy_source import ToySource
 
 from flcav.config import InputError
-from flcav.dataset.checks.validate import validate
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
+from flcav.dataset.validation import validate
 from flcav.files import sha256
 from flcav.world.map.town import load_town
 

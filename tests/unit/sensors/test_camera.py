@@ -8,8 +8,8 @@ from scipy.spatial import Delaunay
 from flcav.geometry import inverse, pose, transform_points
 from flcav.sensors.camera.camera import Camera, Exposure, photograph
 from flcav.sensors.camera.infrared import Infrared, render_thermal
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, compute_pixel_rays, project
 from flcav.sensors.frame import SEMANTICS
+from flcav.sensors.lens import BODY_FROM_OPTICAL, compute_pixel_rays, project
 from flcav.sensors.rendering.render import render
 from flcav.world.map.signals import Signals
 from flcav.world.map.town import Signs, Town

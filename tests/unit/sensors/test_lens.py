@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from flcav.sensors.camera.lens import Lens, compute_pixel_rays, project, unproject
+from flcav.sensors.lens import Lens, compute_pixel_rays, project, unproject
 
 
 def test_projection_is_a_pinhole_s():

@@ -11,7 +11,7 @@ from flcav.dataset.checks.images import check_images
 from flcav.geometry import inverse, points_in_boxes, pose
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.camera.camera import Camera
-from flcav.sensors.camera.lens import project
+from flcav.sensors.lens import project
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern, cast, draw_passes
 from flcav.sensors.lidar.visibility import find_occluded_rays
 from flcav.sensors.observe import observe

@@ -3,7 +3,7 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.sensors.calibration import CalibrationError, build_calibration, perturb_calibration
-from flcav.sensors.camera.lens import Lens, project
+from flcav.sensors.lens import Lens, project
 from flcav.sensors.rig import RIGS, Rig
 
 

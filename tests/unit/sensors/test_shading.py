@@ -11,8 +11,8 @@ from shapely.geometry import MultiPolygon, Point, Polygon
 from flcav.geometry import pose
 from flcav.machine import memory
 from flcav.sensors.camera.camera import Camera, photograph
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays
 from flcav.sensors.camera.tone import develop, grain
+from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays
 from flcav.sensors.rendering import supersampling
 from flcav.sensors.rendering.ambient_occlusion import DARKEST, compute_ambient_occlusion
 from flcav.sensors.rendering.appearance import build_appearance

@@ -24,9 +24,9 @@ def import_(
     """
     from flcav import progress
     from flcav.dataset.checks.copies import find_copies
-    from flcav.dataset.checks.validate import find_leaks
     from flcav.dataset.formats.importing import import_dataset
     from flcav.dataset.layout import read_manifest
+    from flcav.dataset.validation import find_leaks
 
     with progress.show_progress(f"import {out}") as report:
         notes = import_dataset(format, folder, out, split=split, progress=report)

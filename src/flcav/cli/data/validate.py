@@ -16,9 +16,9 @@ def validate(
     """Check datasets: files, tables, boxes against points and traffic, leakage between splits. Exit 1 on a problem."""
     from flcav import progress
     from flcav.dataset.checks.copies import find_copies
-    from flcav.dataset.checks.validate import find_leaks
-    from flcav.dataset.checks.validate import validate as problems_of
     from flcav.dataset.layout import read_manifest
+    from flcav.dataset.validation import find_leaks
+    from flcav.dataset.validation import validate as problems_of
 
     manifests = {folder: read_manifest(folder) for folder in folders}
     problems = find_leaks({str(folder): manifest for folder, manifest in manifests.items()}) + find_copies(folders)

@@ -22,9 +22,9 @@ from flcav.dataset.store import LazyMapping
 from flcav.dataset.upright import measure_upright
 from flcav.files import Json
 from flcav.geometry import Boxes, angles_of, count_points_in_boxes, inverse, transform_points
-from flcav.sensors.camera.lens import Lens, project
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, LinkedFrame, SignViews, Views
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front, compute_truncation
+from flcav.sensors.lens import Lens, project
 
 Array = NDArray[np.float64]
 

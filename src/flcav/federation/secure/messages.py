@@ -2,15 +2,16 @@
 
 import base64
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
 from flwr.app import ConfigRecord, Context, Message, RecordDict
 
-from flcav.federation.acceptance import read_keys, read_shares
+from flcav.config import shorten
+from flcav.federation.acceptance import ReplyRefused, read_entry
 from flcav.federation.records import ASK, CIPHERS, KEYS, MASKED, MASKS, NAMES, SHARES, UNMASK
 from flcav.federation.rules import SecureAggregation
-from flcav.federation.secure.masks import Vector, add_vectors
+from flcav.federation.secure.masks import Vector, add_vectors, is_public_key
 from flcav.federation.secure.parties import SEALED_BYTES, PublicKeys, SecureClient, find_liars, unmask_sum
 from flcav.federation.secure.shamir import SHARE_BYTES
 
@@ -188,3 +189,24 @@ def _number(value: Any) -> int:
 
 def _bytes(value: Any) -> bytes:
     return bytes(value)
+
+
+def read_keys(content: RecordDict) -> PublicKeys:
+    """Return a client's public keys of a round; raises `ReplyRefused`."""
+    found = PublicKeys(*(read_entry(content, kind) for kind in (CIPHERS, MASKS)))
+    if not (is_public_key(found.cipher) and is_public_key(found.mask)):
+        raise ReplyRefused("keys that nobody can agree on a secret with")
+    return found
+
+
+def read_shares(content: RecordDict, owners: Sequence[str], size: int) -> dict[str, bytes]:
+    """Return the shares of `size` bytes that a client sends, one for each name of `owners`; raises `ReplyRefused`."""
+    names, shares = read_entry(content, NAMES), read_entry(content, SHARES)
+    if not isinstance(names, list) or not isinstance(shares, list) or len(names) != len(shares):
+        raise ReplyRefused(f"no shares by name, but {shorten(names)}")
+    found = dict(zip(names, shares, strict=True))
+    if found.keys() != {*owners} or len(names) != len(owners):
+        raise ReplyRefused(f"{len(names)} shares, of {shorten(names)}, where {len(owners)} were asked for")
+    if odd := [name for name, share in found.items() if not isinstance(share, bytes) or len(share) != size]:
+        raise ReplyRefused(f"a share of {odd[0]} that is not of {size} bytes")
+    return found

@@ -13,6 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from flcav.perception.task import Result
+from flcav.records import Class
+
 Array = NDArray[np.float64]
 
 RECALLS = np.arange(1, 41) / 40
@@ -56,6 +59,42 @@ class ClearMot:
     def motp_m(self) -> float:
         """Return the multiple object tracking precision (MOTP): mean distance of the pairs [m]; NaN without pairs."""
         return self.distance_m / self.hits if self.hits else float("nan")
+
+
+@dataclass(frozen=True)
+class TrackScore:
+    """Tracking metrics of one class; None where there are no objects, pairs or velocities to compute one from."""
+
+    label: Class
+    objects: int  # to be tracked, summed over frames
+    mota: float | None
+    amota: float | None
+    motp_m: float | None  # mean distance of an object from its track [m]
+    misses: int
+    false_positives: int
+    id_switches: int
+    velocity_error_mps: float | None  # mean over tracks within 1 m of an object, in the plane [m/s]
+
+
+@dataclass(frozen=True)
+class TracksEvaluation(Result):
+    """Evaluation of tracking on sequences of frames."""
+
+    sequences: int  # one per scene and agent
+    frames: int
+    scores: tuple[TrackScore, ...]  # one per class
+
+    def lines(self) -> list[str]:
+        """Return the evaluation in words: frames and sequences, then a line per class."""
+        lines = [f"tracks in {self.frames} frames of {self.sequences} sequences"]
+        for row in self.scores:
+            if row.mota is None:
+                lines.append(f"{row.label:<12}nothing to follow")
+                continue
+            wrong = f"{row.misses} misses, {row.false_positives} false positives, {row.id_switches} id switches"
+            speed = "" if row.velocity_error_mps is None else f", velocity off by {row.velocity_error_mps:.2f} m/s"
+            lines.append(f"{row.label:<12}MOTA {row.mota:.3f}  AMOTA {row.amota:.3f}  {wrong}{speed}")
+        return lines
 
 
 def count_clear_mot(

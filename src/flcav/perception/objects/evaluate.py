@@ -23,11 +23,11 @@ from flcav.perception.metrics import (
     right_headings,
     round_or_none,
 )
+from flcav.perception.metrics.tracks import TracksEvaluation
 from flcav.perception.objects.calibrate import OVERLAP, Reliability
 from flcav.perception.objects.truth import QUARTERS, FrameTruth, TargetCriteria, select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.perception.task import Evaluated
-from flcav.perception.tracking.evaluate import TracksEvaluation
 from flcav.records import LEFT_OUT, Class
 from flcav.seeds import stream
 from flcav.world.weather import WEATHER_CLASSES

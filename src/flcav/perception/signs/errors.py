@@ -17,8 +17,8 @@ from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.predict import Detections, detect
 from flcav.perception.signs.samples import find_targets, size_px
 from flcav.progress import Report, ignore_progress
-from flcav.sensors.camera.lens import unproject_pixels
 from flcav.sensors.frame import Frame
+from flcav.sensors.lens import unproject_pixels
 from flcav.world.rays.embree import Embree, Solid
 from flcav.world.static import SignsAndSignals, build_static_world, list_signs_and_signals
 

@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,55 +11,17 @@ from flcav.geometry import Boxes, inverse
 from flcav.perception.foreground import frame_reader
 from flcav.perception.metrics import round_or_none
 from flcav.perception.metrics.matching import on_neutral
-from flcav.perception.metrics.tracks import TrackingFrame, amota, count_clear_mot
+from flcav.perception.metrics.tracks import TrackingFrame, TrackScore, TracksEvaluation, amota, count_clear_mot
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
-from flcav.perception.task import Result
 from flcav.perception.tracking.tracker import Tracked, Tracker
 from flcav.progress import Report, ignore_progress
-from flcav.records import Class
 from flcav.sensors.frame import Frame
 
 LONGEST_GAP_S = 1.0  # between two frames of a sequence
 SCORE = 0.3  # lowest score of a detection that is tracked
-
-
-@dataclass(frozen=True)
-class TrackScore:
-    """Tracking metrics of one class; None where there are no objects, pairs or velocities to compute one from."""
-
-    label: Class
-    objects: int  # to be tracked, summed over frames
-    mota: float | None
-    amota: float | None
-    motp_m: float | None  # mean distance of an object from its track [m]
-    misses: int
-    false_positives: int
-    id_switches: int
-    velocity_error_mps: float | None  # mean over tracks within 1 m of an object, in the plane [m/s]
-
-
-@dataclass(frozen=True)
-class TracksEvaluation(Result):
-    """Evaluation of tracking on sequences of frames."""
-
-    sequences: int  # one per scene and agent
-    frames: int
-    scores: tuple[TrackScore, ...]  # one per class
-
-    def lines(self) -> list[str]:
-        """Return the evaluation in words: frames and sequences, then a line per class."""
-        lines = [f"tracks in {self.frames} frames of {self.sequences} sequences"]
-        for row in self.scores:
-            if row.mota is None:
-                lines.append(f"{row.label:<12}nothing to follow")
-                continue
-            wrong = f"{row.misses} misses, {row.false_positives} false positives, {row.id_switches} id switches"
-            speed = "" if row.velocity_error_mps is None else f", velocity off by {row.velocity_error_mps:.2f} m/s"
-            lines.append(f"{row.label:<12}MOTA {row.mota:.3f}  AMOTA {row.amota:.3f}  {wrong}{speed}")
-        return lines
 
 
 def evaluate_tracks(

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flcav.machine.compiled import compiled
-from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.camera.tone import GRAINS, develop, grain
 from flcav.sensors.frame import SEMANTICS
+from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.rendering.rain import add_drops
 from flcav.sensors.rendering.render import Picture, render
 from flcav.world.scene import Scene

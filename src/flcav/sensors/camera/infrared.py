@@ -19,7 +19,7 @@ from pydantic import Field
 from scipy.ndimage import gaussian_filter
 
 from flcav.machine.compiled import compiled
-from flcav.sensors.camera.lens import Lens, compute_pixel_rays
+from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion
 from flcav.sensors.rendering.appearance import Appearance, build_appearance
 from flcav.sensors.rendering.facade import shade_facade

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes
-from flcav.sensors.camera.lens import Lens
 from flcav.sensors.frame import Annotations, Array
 from flcav.sensors.labels.signs import view_signs
 from flcav.sensors.labels.views import find_actor_regions, view_actors
+from flcav.sensors.lens import Lens
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.lidar.visibility import count_occluded_rays
 from flcav.world.scene import Scene

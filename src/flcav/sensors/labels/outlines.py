@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from flcav.geometry import inverse, transform_points
-from flcav.sensors.camera.lens import Lens, project, unproject
+from flcav.sensors.lens import Lens, project, unproject
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
 

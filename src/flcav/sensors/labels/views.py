@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from flcav.geometry import inverse
 from flcav.machine.compiled import compiled
-from flcav.sensors.camera.lens import Lens, compute_pixel_rays
 from flcav.sensors.frame import Array, Views
 from flcav.sensors.labels.outlines import clip_boxes, compute_amodal_boxes, compute_truncation
+from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.world.scene import Scene
 
 OUTER_EDGES = np.array((-0.5, -0.5, 0.5, 0.5))  # from the centres of the outermost pixels

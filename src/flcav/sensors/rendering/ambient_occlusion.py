@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.machine.compiled import compiled
-from flcav.sensors.camera.lens import Lens
+from flcav.sensors.lens import Lens
 from flcav.sensors.rendering.gbuffer import GBuffer
 from flcav.world.scene import Scene
 

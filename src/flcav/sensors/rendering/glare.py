@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import heading_vectors, inverse, transform_points
 from flcav.machine.compiled import compiled
-from flcav.sensors.camera.lens import Lens, project
+from flcav.sensors.lens import Lens, project
 from flcav.sensors.rendering.light import DARK, Light
 from flcav.sensors.rendering.state import AMBER, GREEN, RED, LampState, lamp_places
 from flcav.world.materials import Material

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.machine.memory import keep_freed_memory
-from flcav.sensors.camera.lens import Lens, compute_pixel_rays
+from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.rendering import rain, supersampling
 from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion
 from flcav.sensors.rendering.appearance import Appearance, build_appearance

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import inverse, transform_points
 from flcav.machine.compiled import compiled
-from flcav.sensors.camera.lens import Lens, project
+from flcav.sensors.lens import Lens, project
 from flcav.sensors.rendering.appearance import Appearance
 from flcav.sensors.rendering.gbuffer import GBuffer
 from flcav.world.map.town import Town

@@ -36,8 +36,8 @@ from flcav.dataset.formats.reading import (
     view_boxes,
 )
 from flcav.geometry import Boxes, pose, transform_points
-from flcav.sensors.camera.lens import Lens
 from flcav.sensors.frame import Calibration, LinkedFrame
+from flcav.sensors.lens import Lens
 
 Array = NDArray[np.float64]
 

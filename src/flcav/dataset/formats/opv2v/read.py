@@ -32,8 +32,8 @@ from flcav.dataset.formats.reading import (
     view_boxes,
 )
 from flcav.geometry import Boxes, heading_vectors, inverse
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Calibration, LinkedFrame
+from flcav.sensors.lens import BODY_FROM_OPTICAL
 
 Array = NDArray[np.float64]
 About = Mapping[str, Any]  # OPV2V's file of a frame

@@ -27,8 +27,8 @@ from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import yaw_of
 from flcav.progress import Report
-from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Frame
+from flcav.sensors.lens import BODY_FROM_OPTICAL
 
 Array = NDArray[np.float64]
 

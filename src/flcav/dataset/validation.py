@@ -1,6 +1,6 @@
 """Validation of a dataset folder, and leakage between datasets of different splits.
 
-The files are checked against the manifest (size, checksum), then their contents by the checks of this package.
+The files are checked against the manifest (size, checksum), then their contents by `flcav.dataset.checks`.
 """
 
 import os
