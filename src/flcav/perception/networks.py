@@ -21,7 +21,7 @@ from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card, join_lidars, read_lidar
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
-from flcav.perception.objects.benchmark import compare_kitti_rig, evaluate_kitti, is_kitti
+from flcav.perception.kitti_benchmark import compare_kitti_rig, evaluate_kitti, is_kitti
 from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.objects.predict import look_around
 from flcav.perception.objects.task import ObjectsTask

@@ -14,8 +14,8 @@ from flcav.experiments.attacks.faults import LIES, STRATEGIES, Liar, choose_liar
 from flcav.experiments.attacks.inference import invert, membership_advantage, membership_auc, name_nearest
 from flcav.experiments.attacks.leakage import attack, make_level, split_members
 from flcav.experiments.attacks.tables import fault_tables
-from flcav.federation.reading import read_round
 from flcav.federation.rules import Rules, SecureAggregation
+from flcav.federation.runtimes.reading import read_round
 from flcav.federation.stages import Schedule
 from flcav.intervals import OWN_SCENES
 
@@ -80,8 +80,8 @@ def test_one_picture_is_read_from_an_update_and_not_from_a_masked_one(drives: Dr
     clients = {name: Vehicle(each, 1) for name, each in first.items()}
     known = np.concatenate([each.features for each in drives.vehicles.values()])
     schedule = Schedule(1, 1, 1.0, 1.0, 3)
-    seen, mean = read_round(clients, START, schedule, Rules())
-    masked, same = read_round(clients, START, schedule, Rules(secure=SecureAggregation()))
+    seen, mean = read_round(clients, START, schedule.work, Rules())
+    masked, same = read_round(clients, START, schedule.work, Rules(secure=SecureAggregation()))
     for number, name in enumerate(clients):
         np.testing.assert_allclose(invert(START, seen[name]), first[name].features[0], rtol=1e-3, atol=1e-3)
         assert name_nearest(invert(START, seen[name]), known) == 48 * number

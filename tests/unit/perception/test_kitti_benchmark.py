@@ -15,6 +15,7 @@ from flcav.config import InputError
 from flcav.dataset.formats.kitti import Calibration
 from flcav.geometry import Boxes
 from flcav.perception import networks
+from flcav.perception.kitti_benchmark import BenchmarkEvaluation, compare_kitti_rig, project_boxes
 from flcav.perception.metrics.kitti import (
     COUNTS,
     IGNORED,
@@ -27,7 +28,6 @@ from flcav.perception.metrics.kitti import (
     label_states,
 )
 from flcav.perception.networks import evaluate
-from flcav.perception.objects.benchmark import BenchmarkEvaluation, compare_kitti_rig, project_boxes
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import KnownLidar

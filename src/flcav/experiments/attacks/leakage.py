@@ -30,9 +30,9 @@ from flcav.experiments.attacks.inference import (
     name_nearest,
 )
 from flcav.federation.privacy import SEEDED, Privacy, account_epsilon
-from flcav.federation.reading import read_round
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.metered import Account
+from flcav.federation.runtimes.reading import read_round
 from flcav.federation.selection import Selection
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import Weights
@@ -163,8 +163,8 @@ def attack(drives: Drives, known: Vector, rules: Rules, seed: int) -> Attacked:
     losses = [np.concatenate([measure_losses(final, each) for each in part.values()]) for part in (members, others)]
     right = find_right(final, drives.test)
     told = (float(right.mean()), membership_auc(*losses), membership_advantage(*losses))
-    seen_one, mean_one = read_round(single, start, Schedule(1, 1, LONG_STEP, LONG_STEP, seed), rules)
-    seen, mean = read_round(vehicles, start, schedule, rules)
+    seen_one, mean_one = read_round(single, start, Schedule(1, 1, LONG_STEP, LONG_STEP, seed).work, rules)
+    seen, mean = read_round(vehicles, start, schedule.work, rules)
 
     def tell(sent_one: Mapping[str, Weights], sent: Mapping[str, Weights]) -> Leaked:
         one, whole = share_recognised(start, sent_one, first, known), share_recognised(start, sent, members, known)

@@ -1,6 +1,6 @@
 """A server that reads: the updates of a round as they arrive, for experiments on what they give away."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 from flwr.app import Message
@@ -9,13 +9,12 @@ from flwr.serverapp import Grid
 from flcav.federation.client import client_app
 from flcav.federation.encoding import decode, unflatten
 from flcav.federation.noise import draw_secret
-from flcav.federation.records import ARRAYS, VECTOR, read_arrays, to_arrays, to_weights
+from flcav.federation.records import ARRAYS, VECTOR, LocalWork, read_arrays, to_arrays, to_weights
 from flcav.federation.rounds import Rounds
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.federation.secure.masks import to_values
-from flcav.federation.stages import Schedule
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.trainable import Trainable, Weights
@@ -45,16 +44,17 @@ class ReadGrid(WrappedGrid):
 
 
 def read_round(
-    clients: Mapping[str, Trainable], start: Weights, schedule: Schedule, rules: Rules
+    clients: Mapping[str, Trainable], start: Weights, work: Callable[[int], LocalWork], rules: Rules
 ) -> tuple[dict[str, Weights], Weights]:
     """Return what the server makes of each client's update in the first round, and the weights after it.
 
+    work: of a round, counted from 1 (`Schedule.work`).
     Of a masked update it takes the integers for a change of the weights.
     """
     secrets = {party: draw_secret() for party in rules.secret_parties([*clients]) if party in clients}
     with EmbeddedGrid(client_app(clients, FEDAVG, rules, secrets), [*clients]) as grid:
         reading = ReadGrid(grid, grid.names)
-        app = Rounds(FEDAVG, rules, schedule.work, grid.names, FederationState(), 0, 0, lambda *_: None)
+        app = Rounds(FEDAVG, rules, work, grid.names, FederationState(), 0, 0, lambda *_: None)
         after = to_weights(app.start(reading, to_arrays(start), 1).arrays)
     seen: dict[str, Weights] = {}
     for name, update in reading.updates.items():
