@@ -5,6 +5,7 @@ aliases stand for are bounded before anything is built of them, and names lead n
 """
 
 import json
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PureWindowsPath
@@ -20,8 +21,18 @@ Place = tuple[int | str, ...]  # path to a nested field: names of fields, indice
 
 DEEPEST = 100  # most levels of nesting in a document
 COPIED = 100_000  # most nodes that the aliases of a YAML document stand for
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+SCIENTIFIC = re.compile(r"[-+]?[0-9][0-9_]*[eE][-+]?[0-9]+$")  # 1e-5, which YAML 1.1 takes for text, YAML 1.2 not
 SHOWN = 80  # most characters of a wrong value that an error message quotes
+
+
+SAFE_LOADER: type[yaml.SafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class Loader(SAFE_LOADER):
+    """A safe YAML loader that reads 1e-5 as a number."""
+
+
+Loader.add_implicit_resolver("tag:yaml.org,2002:float", SCIENTIFIC, list("-+0123456789"))
 
 
 class InputError(ValueError):
@@ -84,14 +95,14 @@ def read_config(model: type[ConfigT], path: Path) -> ConfigT:
     return parse_config(model, read_yaml(path), str(path))
 
 
-def read_yaml(path: Path) -> object:
+def read_yaml(path: Path, loader: type[Loader] = Loader) -> object:
     """Return the value in the YAML (or JSON) file at `path`; raises `InputError` if it is missing or not YAML."""
     _check_exists(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
         _check_yaml(text)
-        return yaml.load(text, LOADER)
-    except (IsADirectoryError, yaml.YAMLError, ValueError) as error:
+        return yaml.load(text, loader)
+    except (IsADirectoryError, yaml.YAMLError, ValueError, TypeError) as error:
         raise InputError(f"{path}: not a YAML file ({error})") from None
 
 
@@ -108,7 +119,7 @@ def _check_yaml(text: str) -> None:
     size: dict[str, int] = {}  # by anchor: nodes within, aliases as what they stand for
     within: list[tuple[str | None, int]] = []  # anchors of the open collections, and the nodes before each
     nodes = copied = 0
-    for event in yaml.parse(text, LOADER):
+    for event in yaml.parse(text, Loader):
         if isinstance(event, yaml.AliasEvent):
             copied += size.get(event.anchor, 0)
             nodes += size.get(event.anchor, 0)
@@ -132,7 +143,7 @@ def read_json(path: Path) -> Json:
     """Return the value in the JSON file at `path`; raises `InputError` if it is missing or not JSON."""
     _check_exists(path)
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(path.read_text(encoding="utf-8-sig"))
         _check_depth(value)
     except (IsADirectoryError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error})") from None

@@ -48,7 +48,9 @@ from flcav.federation.strategies.fedavg import RunningMean, average
 from flcav.federation.strategies.strategy import Averages, Exchanges, Stateful, find_weigher
 from flcav.federation.trainable import LocalUpdate, Weights, forms_of, learned_names
 
-OnRound = Callable[[int, Weights, float], None]  # number of the aggregated round, its weights, mean training loss
+OnRound = Callable[
+    [int, Weights, float | None], None
+]  # aggregated round, its weights, mean training loss
 AnswerT = TypeVar("AnswerT")
 ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere; Flower's own limit for updates
 Away = Callable[[int], Mapping[str, str]]  # of a round, by client why it is not there when the round begins
@@ -82,9 +84,9 @@ class Intake:
             return [*self.updates.values()]
         return [LocalUpdate(self._mean.mean(), sum(self.samples.values()), 0.0, extra=self._extra)]
 
-    def mean_loss(self) -> float:
-        """Return the mean loss weighted by samples; 0 where no update came."""
-        return float(np.average([*self.losses.values()], weights=[*self.samples.values()])) if self.samples else 0.0
+    def mean_loss(self) -> float | None:
+        """Return the mean loss weighted by samples; None where no update came."""
+        return float(np.average([*self.losses.values()], weights=[*self.samples.values()])) if self.samples else None
 
 
 class Rounds(FlowerStrategy):
@@ -249,7 +251,7 @@ class Rounds(FlowerStrategy):
             record = RoundRecord(number, (), epsilon=epsilon)
         self._state.records.append(record)
         self._on_round(number, weights, record.loss)
-        return to_arrays(weights), MetricRecord({SAMPLES: record.samples, LOSS: record.loss})
+        return to_arrays(weights), MetricRecord({SAMPLES: record.samples, LOSS: record.loss or 0.0})
 
     def _receive_norms(self, asked: Iterable[str], replies: Iterable[Message]) -> dict[str, float]:
         """Return the norms of the clients' updates times their shares of all samples, by client in node order."""

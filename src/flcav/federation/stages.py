@@ -63,7 +63,7 @@ class Schedule:
         return LocalWork(round_, self.steps, rate, derive_seed(self.seed, "round", round_))
 
 
-def _ignore(round_: int, weights: Weights, loss: float) -> None:
+def _ignore(round_: int, weights: Weights, loss: float | None) -> None:
     pass
 
 
@@ -133,7 +133,7 @@ def federate(
     results: list[Result] = []
 
     def serve(grid: Grid, nodes: Mapping[int, str], read_states: ReadStates) -> None:
-        def keep(round_: int, aggregated: Weights, loss: float) -> None:
+        def keep(round_: int, aggregated: Weights, loss: float | None) -> None:
             if kept:
                 state.clients = read_states(kept)
             on_round(round_, aggregated, loss)
@@ -193,7 +193,7 @@ def federate_outputs(
     """
     network = weights
 
-    def keep(round_: int, outputs: Weights, loss: float) -> None:
+    def keep(round_: int, outputs: Weights, loss: float | None) -> None:
         nonlocal network
         state.server = {name: np.asarray(array) for name, array in outputs.items()}
         work = schedule.work(round_)

@@ -24,14 +24,14 @@ FAILED = "failed or lost"  # begins what is told of clients without an update
 class RoundRecord(Record):
     """One round: whose updates were combined, who failed, and what the updates say of themselves.
 
-    Where epsilon rests on secret draws of clients, it says nothing of them: no names, a loss and a number of 0.
+    Where epsilon rests on secret draws of clients, it says nothing of them: no names, no loss, and a number of 0.
     """
 
     round: int  # from 1
     clients: tuple[str, ...]  # whose updates were combined, by name
     failed: Mapping[str, str] = field(default_factory=dict)  # by client what was wrong
     epsilon: float | None = None  # of differential privacy, of all rounds so far; None: without noise
-    loss: float = 0.0  # mean training loss, weighted by samples
+    loss: float | None = None  # mean training loss, weighted by samples; None: of nobody that is known
     samples: int = 0  # of the clients together
     divergence: Annotated[RoundDivergence | None, LEFT_OUT] = None  # of the regions; None: no cloud round of several
 

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 from torch import nn
 
-from flcav.config import InputError
+from flcav.config import DamagedFile, InputError
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.files import Json
@@ -281,6 +281,8 @@ def find_trained_lidar(task: Task, network: Weights) -> KnownLidar:
         return KnownLidar()
     try:
         card = read_card(Path(network or find_shipped(task)))
+    except DamagedFile:
+        raise
     except InputError:
         return KnownLidar()
     return join_lidars([read_lidar(entry.recipe, entry.agents) for entry in card.data])
@@ -313,6 +315,8 @@ def origin_of(task: Task, weights: Path | None) -> Origin:
     path = weights or find_shipped(task)
     try:
         card = read_card(path)
+    except DamagedFile:
+        raise
     except InputError:
         return Origin(None, None, str(path))
     return Origin(card.network, card.seed, str(path))

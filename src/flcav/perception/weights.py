@@ -72,11 +72,16 @@ def load_network(task: Task[ConfigT, NetworkT, SampleT], path: Path) -> NetworkT
 
 
 def read_card(path: Path) -> Card:
-    """Return the card in a file of weights; raises `InputError` if there is none."""
+    """Return the card in a file of weights; raises `InputError` if there is none, `DamagedFile` if it is damaged."""
     metadata, _ = _opened(path)
     if CARD_KEY not in metadata:
         raise InputError(f"{path}: weights without a card")
-    return Card.model_validate_json(metadata[CARD_KEY])
+    try:
+        return Card.model_validate_json(metadata[CARD_KEY])
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"]))
+        raise DamagedFile(f"{path}: weights with a damaged card ({f'{field}: ' * bool(field)}{first['msg']})") from None
 
 
 def load_weights(task: Task[ConfigT, NetworkT, SampleT], network: NetworkT, path: Path) -> None:

@@ -23,7 +23,7 @@ def read_table(field: str, name: str, noun: str, folder: str, beside: Path) -> s
     own = resources.files("flcav.pipeline") / folder
     known = sorted(entry.name.removesuffix(".csv") for entry in own.iterdir() if ".csv" in entry.name)
     if name in known:
-        return (own / f"{name}.csv").read_text(encoding="utf-8")
+        return (own / f"{name}.csv").read_text(encoding="utf-8-sig")
     path = find_path(name, beside)
     if path is None or not path.is_file():
         raise InputError(
@@ -31,7 +31,7 @@ def read_table(field: str, name: str, noun: str, folder: str, beside: Path) -> s
             f"recipe, in {beside.absolute()}"
         )
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except ValueError as error:
         raise InputError(f"{path}: not a CSV table ({error})") from None
 
@@ -42,7 +42,7 @@ def append_records(path: Path, records: Sequence["DataclassInstance"]) -> None:
         return
     held: list[dict[str, str]] = []
     if path.exists():
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             held = list(csv.DictReader(file))
     told = [{name: _cell(value) for name, value in asdict(record).items()} for record in records]
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:

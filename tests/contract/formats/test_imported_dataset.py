@@ -67,6 +67,19 @@ def test_a_folder_of_kitti_is_evaluated_as_the_benchmark_does(tmp_path: Path, fl
     said = json.loads(flcav("evaluate", "objects", "--data", tmp_path / "kitti", "--json"))
     assert (said["frames"], said["split"]) == (1, "val")
     assert said["targets"]["Car"] == {"easy": 0, "moderate": 1, "hard": 1}
-    assert [row["class"] for row in said["benchmark"]] == [name for name in said["targets"] for _ in range(3)]
-    assert [row["kind"] for row in said["benchmark"]] == ["image", "bev", "3d"] * 3
+    assert [row["class"] for row in said["benchmark"]] == [name for name in said["targets"] for _ in range(5)]
+    assert [row["kind"] for row in said["benchmark"]] == ["image", "bev", "3d", "bev", "3d"] * 3
+    assert [row["iou"] for row in said["benchmark"]] == [0.7, 0.7, 0.7, 0.5, 0.5] + 2 * [0.5, 0.5, 0.5, 0.25, 0.25]
     assert {(row["easy"] is None, row["hard"] is None) for row in said["benchmark"][:3]} == {(True, False)}
+    assert (said["bare"], said["threshold"]) == (0, 0.3)
+    told = flcav("evaluate", "objects", "--data", tmp_path / "kitti")
+    assert f"Car        {said['false_positives']['Car']:.2f} false positives a frame" in told
+    for path in (tmp_path / "kitti" / "training" / "image_2").iterdir():
+        path.unlink()
+    bare = json.loads(flcav("evaluate", "objects", "--data", tmp_path / "kitti", "--json"))
+    assert bare["bare"] == 1
+    for key in ("targets", "split"):
+        assert bare[key] == said[key]
+    assert "1 of them without an image, taken as 1242 x 375 pixels" in flcav(
+        "evaluate", "objects", "--data", tmp_path / "kitti"
+    )

@@ -10,7 +10,9 @@ from typing import cast
 
 import numpy as np
 import pytest
+import yaml
 from painted_source import CATEGORIES, IN_BOX, PaintedSource
+from PIL import Image
 
 from flcav.cli.main import run
 from flcav.config import InputError
@@ -19,6 +21,7 @@ from flcav.dataset.formats.exporter import ExportOptions, split_scenes
 from flcav.dataset.formats.importing import READABLE, import_dataset
 from flcav.dataset.formats.kitti.read import KittiSource
 from flcav.dataset.formats.nuscenes.rows import COLUMNS
+from flcav.dataset.formats.opv2v.read import read_cloud
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import find_leaks, validate
@@ -255,21 +258,21 @@ DAMAGES = {  # format -> pattern of a file, and the sentence where it is missing
     "kitti": [
         ("training/velodyne/*.bin", LOST, "truncated", "empty; a point cloud holds"),
         ("training/calib/*.txt", LOST, "needs 12 numbers|needs 9 numbers", "needs 12 numbers"),
-        ("training/image_2/*.png", LOST, "a truncated image", IMAGE),
+        ("training/image_2/*.png", None, "a truncated image", IMAGE),
         ("training/label_2/*.txt", LOST, "is no KITTI label", None),
     ],
     "nuscenes": [
         *((f"v1.0-flcav/{table}.json", LOST, "not JSON", "not JSON") for table in COLUMNS if table != "sample"),
         ("v1.0-flcav/sample.json", None, "not JSON", "not JSON"),  # without it there are no tables
         ("v1.0-flcav/splits.json", None, "not JSON", "not JSON"),
-        ("samples/LIDAR_TOP/*.bin", LOST, "truncated", "truncated"),
-        ("samples/RADAR_FRONT/*.pcd", LOST, "truncated|not a binary PCD file", "not a binary PCD file"),
-        ("samples/CAM_FRONT/*.png", LOST, "a truncated image", IMAGE),
+        ("samples/LIDAR_TOP/*.bin", None, "truncated", "truncated"),
+        ("samples/RADAR_FRONT/*.pcd", None, "truncated|not a binary PCD file", "not a binary PCD file"),
+        ("samples/CAM_FRONT/*.png", None, "a truncated image", IMAGE),
     ],
     "opv2v": [
-        ("train/*/*/*.pcd", LOST, "truncated", "not a binary PCD file"),
-        ("train/*/*/*_camera0.png", LOST, "a truncated image", IMAGE),
-        ("train/*/*/000000.yaml", LOST, "not a YAML file|not a frame of OPV2V", "not a frame of OPV2V"),
+        ("train/*/*/*.pcd", None, "truncated", "not a binary PCD file"),
+        ("train/*/*/*_camera0.png", None, "a truncated image", None),
+        ("train/*/*/000000.yaml", None, "not a YAML file|not a frame of OPV2V", "not a frame of OPV2V"),
         ("train/*/data_protocol.yaml", None, "not a YAML file", None),  # another's has no names
     ],
 }
@@ -308,6 +311,120 @@ def test_a_missing_or_truncated_file_names_itself(
     assert said.removeprefix("flcav: ").startswith(f"{path}: ")
     assert re.search(sentence, said)
     assert not (tmp_path / "out").exists()
+
+
+LOST_FILES = "files of its tables that are not there: {}, the first is .*; left out with them: {} of 8 key frames"
+LEFT_OUT = [  # format, pattern of the files that are lost (the first of them, or all), frames, pictures, the sentence
+    ("kitti", "training/image_2/*.png", False, 4, 3, "no image_2 of 1 of 4 frames, so LiDAR alone there"),
+    ("kitti", "training/image_2/*.png", True, 4, 0, "no image_2 of 4 of 4 frames, so LiDAR alone there"),
+    ("nuscenes", "samples/LIDAR_TOP/*.bin", False, 7, 6, LOST_FILES.format(1, 1)),
+    ("nuscenes", "samples/RADAR_FRONT/*.pcd", True, 8, 8, LOST_FILES.format(4, 0)),
+    ("nuscenes", "samples/CAM_FRONT/*.png", True, 8, 4, LOST_FILES.format(4, 0)),
+    ("opv2v", "train/*/*/*.pcd", False, 7, 6, "left out 1 of 8 frames: no YAML file or no point cloud"),
+    ("opv2v", "train/*/*/000000.yaml", False, 7, 6, "left out 1 of 8 frames: no YAML file or no point cloud"),
+    ("opv2v", "train/*/*/*_camera0.png", False, 8, 7, "no picture of a camera of 1 of 8 frames, so no image there"),
+]
+
+
+@pytest.mark.parametrize(("name", "pattern", "every", "frames", "pictures", "sentence"), LEFT_OUT)
+def test_what_is_there_is_read_and_what_is_not_is_told(
+    name: str,
+    pattern: str,
+    every: bool,
+    frames: int,
+    pictures: int,
+    sentence: str,
+    exported: dict[str, Path],
+    tmp_path: Path,
+):
+    folder = shutil.copytree(exported[name], tmp_path / "folder")
+    paths = sorted(folder.glob(pattern))
+    for path in paths if every else paths[:1]:
+        path.unlink()
+    notes = import_dataset(name, folder, tmp_path / "out")
+    assert any(re.search(sentence, note) for note in notes), notes
+    data = Dataset.open(tmp_path / "out")
+    assert (len(data), sum(len(data.frame(i).images) for i in range(len(data)))) == (frames, pictures)
+    assert validate(tmp_path / "out") == []
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern", "sentence"),
+    [
+        ("nuscenes", "samples/LIDAR_TOP/*", "no such file, nor is that of any other sweep of LIDAR_TOP"),
+        ("opv2v", "*/*/*/*.pcd", "none of 8 frames has both a YAML file and a point cloud"),
+    ],
+)
+def test_nothing_that_is_there_is_one_sentence(
+    name: str, pattern: str, sentence: str, exported: dict[str, Path], tmp_path: Path
+):
+    folder = shutil.copytree(exported[name], tmp_path / "folder")
+    for path in folder.glob(pattern):
+        path.unlink()
+    with pytest.raises(InputError, match=sentence):
+        import_dataset(name, folder, tmp_path / "out")
+
+
+def test_files_of_v2x_real_are_read(exported: dict[str, Path], imported: dict[str, Dataset], tmp_path: Path):
+    folder = shutil.copytree(exported["opv2v"], tmp_path / "folder")
+    for path in sorted(folder.rglob("*.pcd")):
+        points = read_cloud(path) * np.array([1, -1, 1, 255], np.float32)
+        lost = np.full((3, 4), np.nan, np.float32)
+        path.with_suffix(".bin").write_bytes(np.concatenate((points, lost)).tobytes())
+        path.unlink()
+    for path in sorted(folder.rglob("*_camera*.png")):
+        name = path.name.replace("camera0", "cam1").replace("camera3", "cam4").replace(".png", ".jpeg")
+        with Image.open(path) as picture:
+            picture.convert("RGB").save(path.with_name(name), quality=95)
+        path.unlink()
+    next(folder.rglob("*_cam1.jpeg")).write_bytes(b"")  # as one of V2X-Real is
+    for path in folder.rglob("0*.yaml"):
+        about = yaml.safe_load(path.read_text())
+        about["true_ego_pose"] = [np.float64(each) for each in about.pop("true_ego_pos")]
+        for old, new in (("camera0", "cam1"), ("camera3", "cam4")):
+            if old in about:
+                about[new] = {**about.pop(old), "extrinsic": np.eye(4)}
+        for row in about["vehicles"].values():
+            row["location"] = np.add(row["location"], row.pop("center"))  # an array of NumPy's
+            row["obj_type"] = "Pedestrian"
+        path.write_text(yaml.dump(about) + "noise: 1e-05\n")
+    notes = import_dataset("opv2v", folder, tmp_path / "out")
+    assert notes == ("no picture of a camera of 1 of 8 frames, so no image there",)
+    before, after = imported["opv2v"], Dataset.open(tmp_path / "out")
+    assert len(after) == len(before)
+    for i in range(len(before)):
+        one, other = before.frame(i), after.frame(i)
+        np.testing.assert_allclose(other.lidar["lidar"], one.lidar["lidar"], atol=1e-6)
+        np.testing.assert_allclose(other.annotations.boxes.array(), one.annotations.boxes.array(), atol=1e-9)
+        assert set(other.annotations.boxes.label) <= {"pedestrian"}
+    assert {name for i in range(len(after)) for name in after.cameras(i)} == {"cam1", "cam4"}
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("!!python/object/apply:os.system ['touch owned']", "not a YAML file"),
+        ("!!python/object/apply:numpy.core.multiarray.scalar [1, 2]", "a number of NumPy's without its bytes"),
+        ("!!python/object/apply:numpy.dtype {args: [O8, false, true]}", "numbers of an unknown kind, 'O8'"),
+        ("!!python/object/apply:numpy.core.multiarray._reconstruct {args: [], state: [1]}", "without its state"),
+        ("!!python/name:os.system ''", "not a YAML file"),
+    ],
+)
+def test_other_objects_of_python_are_refused(text: str, sentence: str, exported: dict[str, Path], tmp_path: Path):
+    folder = shutil.copytree(exported["opv2v"], tmp_path / "folder")
+    path = _first(folder, "train/*/*/000000.yaml")
+    path.write_text(f"{path.read_text()}\nextra: {text}\n")
+    with pytest.raises(InputError, match=f"^{re.escape(str(path))}: .*{sentence}"):
+        import_dataset("opv2v", folder, tmp_path / "out")
+    assert not Path("owned").exists()
+
+
+def test_a_byte_order_mark_is_no_part_of_a_name(exported: dict[str, Path], tmp_path: Path):
+    for name, pattern in (("kitti", "**/*.txt"), ("nuscenes", "v1.0-flcav/*.json"), ("opv2v", "**/*.yaml")):
+        folder = shutil.copytree(exported[name], tmp_path / name)
+        for path in folder.glob(pattern):
+            path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+        assert import_dataset(name, folder, tmp_path / f"{name}-out") == ()
 
 
 ODD = [  # format, pattern of a file, what is replaced in it, by what, and the sentence

@@ -59,6 +59,16 @@ def test_a_selection_is_deterministic_resumes_and_books_only_who_takes_part(rule
     assert 0 < len(took_part) < 6 * SCHEDULE.rounds
 
 
+def test_a_round_of_nobody_has_no_loss():
+    losses: list[float | None] = []
+    selection = Selection(rule="poisson", probability=0.05)
+    _, state, _ = run(selection, on_round=lambda round_, weights, loss: losses.append(loss))
+    assert losses == [record.loss for record in state.records]
+    alone = [not record.clients for record in state.records]
+    assert [loss is None for loss in losses] == alone
+    assert set(alone) == {True, False}
+
+
 def test_rules_choose_as_they_say():
     rounds = range(1, 4)
     assert [Selection(**RULES["round-robin"]).choose(NAMES, round_, 1) for round_ in rounds] == [

@@ -1,15 +1,19 @@
 """The card as text: whatever it holds can be read in it."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from flcav.cli.main import run
+from flcav.config import DamagedFile
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.agents import choose_frames
 from flcav.perception.card import Card, data_entry
 from flcav.perception.weather.task import WEATHER
+from flcav.perception.weights import read_card, save_network
 from flcav.sensors.rig import RIGS
 
 from .frames import frame
@@ -53,6 +57,20 @@ def test_it_says_what_its_metrics_are_of():
     validation = card(validation=held).markdown().partition("## Validation")[2]
     assert "- c/held: 3 frames; town ring, weather (classes (clear, fog))" in validation
     assert card(metrics={}).markdown().endswith("## Validation\n\n- none\n")
+
+
+def test_a_damaged_card_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "weights.safetensors"
+    save_network(WEATHER, WEATHER.build(next(iter(WEATHER.configurations.values()))), path, card())
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b'\\"seed\\":1', b'\\"seed\\":?'))
+    assert path.read_bytes() != data
+    with pytest.raises(DamagedFile, match="weights with a damaged card"):
+        read_card(path)
+    with pytest.raises(SystemExit) as ended:
+        run(["infer", "weather", "--weights", str(path), str(tmp_path)])
+    assert ended.value.code == 2
+    assert "weights with a damaged card" in capsys.readouterr().err
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from flcav.perception.metrics.kitti import (
     OTHER,
     ClassFrame,
     average_precision_r40,
+    count_matches,
     detection_states,
     find_thresholds,
     label_states,
@@ -115,6 +116,13 @@ def test_one_of_two_on_the_same_object_is_false_and_an_ignored_one_takes_it_last
     assert average_precision_r40(small, 0.7) == 0  # thresholds are sought by score, and that detection is too low
 
 
+def test_false_positives_are_counted_at_a_threshold():
+    frames = frame([0.9, 0.6, 0.5, 0.2], [COUNTS], [[0.8], [0.4], [0.0], [0.0]], excused=[False, False, True, False])
+    assert count_matches(frames, 0.5, 0.3) == (1, 1)  # the third is excused, the fourth below the threshold
+    assert count_matches(frames, 0.5, 0.1) == (1, 2)
+    assert count_matches(frames, 0.85, 0.3) == (0, 2)
+
+
 def test_thresholds_are_forty_steps_of_recall():
     scores = np.linspace(1, 0, 400, endpoint=False)
     assert find_thresholds(scores, 400)[:3] == pytest.approx([1 - 0 / 400, 1 - 9 / 400, 1 - 19 / 400])
@@ -147,7 +155,9 @@ def test_the_benchmark_has_no_use_for_other_options(tmp_path: Path):
 
 def test_a_lidar_unlike_that_of_the_training_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "training" / "velodyne").mkdir(parents=True)
-    found = BenchmarkEvaluation(frames=1, split=None, targets={}, benchmark=())
+    found = BenchmarkEvaluation(
+        frames=1, split=None, targets={}, benchmark=(), false_positives={}, threshold=0.3, bare=0
+    )
     monkeypatch.setattr(networks, "evaluate_kitti", lambda *given: found)
 
     def told(beams: int, range_m: float) -> str:

@@ -79,11 +79,16 @@ def average_precision_r40(frames: Sequence[ClassFrame], limit: float) -> float |
     scores = np.concatenate(reached) if reached else np.zeros(0)
     precision = np.zeros(RECALLS)
     for place, threshold in enumerate(find_thresholds(scores, targets)):
-        counts = [_match(*_arguments(frame), limit, threshold, True)[:2] for frame in busy]
+        counts = [count_matches(frame, limit, threshold) for frame in busy]
         true, false = (sum(column) for column in zip(*counts, strict=True))
         precision[place] = true / max(true + false, 1)
     falling = np.maximum.accumulate(precision[::-1])[::-1]
     return float(falling[1:].mean())
+
+
+def count_matches(frame: ClassFrame, limit: float, threshold: float) -> tuple[int, int]:
+    """Return the numbers of true and of false positives of a frame, among detections of `threshold` or more."""
+    return _match(*_arguments(frame), limit, threshold, True)[:2]
 
 
 def find_thresholds(scores: Array, targets: int) -> list[float]:

@@ -25,7 +25,7 @@ class Checkpoint(Record):
 
     round: int
     entries: int  # of the ledger then
-    losses: tuple[float, ...]  # of each round
+    losses: tuple[float | None, ...]  # of each round
     by: str  # what the federation is by: strategy and rules
     sha256: Mapping[str, str]  # of each file, by name: weights of all rounds, ledger, and state where there is any
     records: Mapping[str, tuple[RoundRecord, ...]] = field(default_factory=dict)  # of the rounds, by federation

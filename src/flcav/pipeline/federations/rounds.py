@@ -52,7 +52,7 @@ class FederationCheckpoints:
         self._hashes: dict[str, str] = {}  # of the files of weights, by name
         self._told: dict[str, int] = {}  # of how many records failures were told, by state
         self._goes_on = False  # after rounds that were carried out before, to an end that it has not reached
-        self.losses: list[float] = []
+        self.losses: list[float | None] = []
         self.scores: list[Mapping[str, float]] = []
 
     def resume(self, weights: Weights) -> tuple[Weights, int]:
@@ -120,7 +120,7 @@ class FederationCheckpoints:
     def make_saver(self, rounds: int) -> OnRound:
         """Return the callback that saves a checkpoint after each of `rounds` rounds."""
 
-        def keep(round_: int, weights: Weights, loss: float) -> None:
+        def keep(round_: int, weights: Weights, loss: float | None) -> None:
             self.losses.append(loss)
             self._write(round_path(self._folder, round_).name, save(dict(weights)), self._hashes)
             self.scores += [self._score(round_)] if self._score is not None else []
@@ -137,7 +137,7 @@ class FederationCheckpoints:
             Checkpoint(*done, tuple(self.scores)).keep(self._folder)
             for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
                 (self._folder / name).unlink(missing_ok=True)
-            note = [f"{LOSS} {loss:.3f}", *self._tell_privacy()]
+            note = [f"{LOSS} {loss:.3f}" if loss is not None else f"no {LOSS}", *self._tell_privacy()]
             note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self._score else {}).items()]
             self._report(round_, rounds, ", ".join([*note, *self._tell_failures()]))
 

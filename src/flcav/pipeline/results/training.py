@@ -50,7 +50,7 @@ class FederatedRound(Record):
     clients: tuple[str, ...]  # whose updates were combined
     failed: Mapping[str, str]  # by client what was wrong
     samples: int  # of the clients together
-    loss: float  # mean training loss, weighted by samples
+    loss: float | None  # mean training loss, weighted by samples; None: of nobody that is known
     up_bytes: int  # of all clients' messages, on their link
     down_bytes: int
     epsilon: float | None  # of differential privacy, of all rounds so far; None: without noise
@@ -100,7 +100,7 @@ class StageResult(Saved):
     samples: int  # of all clients together
     clients: int
     poles: tuple[int, ...]  # whose sensors contributed labels
-    losses: tuple[float, ...] = ()  # mean training loss of each round
+    losses: tuple[float | None, ...] = ()  # mean training loss of each round
     records: Annotated[tuple[FederatedRound, ...] | None, LEFT_OUT] = None  # of all servers; None: no federation
     plans: Annotated[tuple[RoundPlan, ...] | None, LEFT_OUT] = None  # after each round; None: not made anew by rounds
     labels: Annotated[tuple[LabelQuality, ...] | None, LEFT_OUT] = None  # before each round; None: not measured

@@ -111,7 +111,7 @@ def federate_cloud(
     replanning: Replanning | None = None,
     *,
     processes: int = 1,
-) -> tuple[float, ...]:
+) -> tuple[float | None, ...]:
     """Run stage III; write weights and ledger, return each round's loss.
 
     Edge rounds are run by `rules`, and lose the vehicles that `outages` names; the cloud's rounds need all edge
@@ -139,7 +139,7 @@ def federate_cloud(
     def make_saver(rounds: int) -> OnRound:
         keep = checkpoints.make_saver(rounds)
 
-        def keep_whole(round_: int, weights: Weights, loss: float) -> None:
+        def keep_whole(round_: int, weights: Weights, loss: float | None) -> None:
             if len(servers) > 1:
                 both = ([each.begun for each in servers.values()], [each.trained for each in servers.values()])
                 divergence = RoundDivergence(*(measure_divergence(models) for models in both))

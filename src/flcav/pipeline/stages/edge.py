@@ -76,7 +76,7 @@ def federate_edge(
     processes: int = 1,
     runtime: str = "embedded",
     timed: bool = False,
-) -> tuple[float, ...]:
+) -> tuple[float | None, ...]:
     """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
 
     A privacy budget may end it before the schedule's end. Vehicles train in so many `processes` of a `runtime` of
@@ -113,7 +113,7 @@ def federate_edge(
         if replanning is None:
             save, last = checkpoints.make_saver(schedule.rounds), own.afford(rules, schedule.rounds)
 
-            def keep(round_: int, weights: Weights, loss: float) -> None:
+            def keep(round_: int, weights: Weights, loss: float | None) -> None:
                 save(round_, weights, loss)
                 if round_ < last:
                     begin(round_ + 1, weights)

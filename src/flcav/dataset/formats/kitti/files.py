@@ -25,8 +25,10 @@ POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
 LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
 MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
-SUFFIXES = {"calib": "txt", "velodyne": "bin", "image_2": "png", "label_2": "txt"}
+PICTURES = "image_2"
+SUFFIXES = {"calib": "txt", "velodyne": "bin", PICTURES: "png", "label_2": "txt"}
 LEVELS = (0, 1, 2, 3)  # of occlusion
+ASSUMED_SIZE = (375, 1242)  # height, width [px] of most of KITTI's images: of those that are missing
 MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
 
 
@@ -147,7 +149,7 @@ def read_objects(path: Path, calibration: Calibration) -> Objects:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        return [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: no such file") from None
     except UnicodeDecodeError:
@@ -162,7 +164,8 @@ class KittiFrame:
     points: NDArray[np.float32]  # (N, 4) x, y, z [m], reflectance; LiDAR frame
     calibration: Calibration
     objects: Objects
-    image: NDArray[np.uint8]  # (H, W, 3) red, green, blue
+    image: NDArray[np.uint8]  # (H, W, 3) red, green, blue; (0, 0, 3) where there is none
+    size: tuple[int, int]  # height, width of the image [px]; `ASSUMED_SIZE` where there is none
 
 
 class KittiFolder:
@@ -173,11 +176,11 @@ class KittiFolder:
         self.names = names
 
     @classmethod
-    def open(cls, path: Path | str, split: str | None = None) -> "KittiFolder":
+    def open(cls, path: Path | str, split: str | None = None, *, pictures: bool = True) -> "KittiFolder":
         """Return the frames of the KITTI folder `path` that `ImageSets/<split>.txt` lists, or all of `training`.
 
         The split "test" is read from `testing`, any other from `training`. Raises `InputError` where the folder, the
-        list or a file of a frame is missing.
+        list or a file of a frame is missing; without `pictures`, images may be.
         """
         root, part_of = Path(path), "testing" if split == "test" else "training"
         folder = root / part_of
@@ -189,32 +192,44 @@ class KittiFolder:
             names = read_split(root / "ImageSets" / f"{split}.txt")
         for name in names:
             for part, suffix in SUFFIXES.items():
-                if not (folder / part / f"{name}.{suffix}").is_file():
+                if (pictures or part != PICTURES) and not (folder / part / f"{name}.{suffix}").is_file():
                     raise InputError(f"{folder / part / f'{name}.{suffix}'}: missing; every frame needs one")
         return cls(folder, names)
 
     def __len__(self) -> int:
         return len(self.names)
 
+    def count_bare(self) -> int:
+        """Return the number of frames without an image."""
+        return sum(not (self.folder / PICTURES / f"{name}.{SUFFIXES[PICTURES]}").is_file() for name in self.names)
+
     def frame(self, i: int) -> KittiFrame:
         """Return frame `i`; raises `InputError` for a malformed file, or a label that does not fit the image."""
         paths = {part: self.folder / part / f"{self.names[i]}.{suffix}" for part, suffix in SUFFIXES.items()}
         calibration = read_calibration(paths["calib"])
-        image = _read_image(paths["image_2"])
+        image = _read_image(paths[PICTURES]) if paths[PICTURES].is_file() else np.zeros((0, 0, 3), np.uint8)
         objects = read_objects(paths["label_2"], calibration)
-        check_objects(objects, image.shape[1], image.shape[0], paths["label_2"])
-        return KittiFrame(self.names[i], read_points(paths["velodyne"]), calibration, objects, image)
+        height, width = image.shape[:2] if image.size else (None, None)
+        check_objects(objects, width, height, paths["label_2"])
+        size = ASSUMED_SIZE if height is None or width is None else (height, width)
+        return KittiFrame(self.names[i], read_points(paths["velodyne"]), calibration, objects, image, size)
 
 
-def check_objects(objects: Objects, width: int, height: int, path: Path) -> None:
-    """Raise `InputError` where a label of the file `path` is impossible in an image of `width` x `height` pixels."""
+def check_objects(objects: Objects, width: int | None, height: int | None, path: Path) -> None:
+    """Raise `InputError` where a label of the file `path` is impossible in an image of `width` x `height` pixels.
+
+    Both are None where there is no image.
+    """
     if unknown := sorted(set(objects.boxes.label.tolist()) - CLASSES):
         raise InputError(f"{path}: unknown class '{unknown[0]}'; KITTI has {', '.join(sorted(CLASSES))}, DontCare")
     left, top, right, bottom = objects.rectangle.T
-    inside = (left >= -MARGIN_PX) & (top >= -MARGIN_PX) & (right < width + MARGIN_PX) & (bottom < height + MARGIN_PX)
+    inside = (left >= -MARGIN_PX) & (top >= -MARGIN_PX) & (left < right) & (top < bottom)
+    of = "" if width is None else f" of {width} x {height}"
+    if width is not None and height is not None:
+        inside &= (right < width + MARGIN_PX) & (bottom < height + MARGIN_PX)
     checks = {
         "a size that is not positive": (objects.boxes.size > 0).all(axis=1),
-        f"a rectangle that is not within the image of {width} x {height}": inside & (left < right) & (top < bottom),
+        f"a rectangle that is not within the image{of}": inside,
         "a truncation outside 0 to 1": (objects.truncation >= 0) & (objects.truncation <= 1),
         "an occlusion that is none of 0, 1, 2, 3": np.isin(objects.occlusion, LEVELS),
     }
@@ -229,7 +244,7 @@ def read_split(path: Path) -> list[str]:
     Raises `InputError` where one is there twice, or leads out of the folders of frames.
     """
     try:
-        names = path.read_text(encoding="utf-8").split()
+        names = path.read_text(encoding="utf-8-sig").split()
     except FileNotFoundError:
         raise InputError(f"{path}: no such list of frames") from None
     except UnicodeDecodeError:

@@ -16,6 +16,7 @@ import numpy as np
 
 from flcav.config import InputError
 from flcav.dataset.formats.kitti.files import (
+    PICTURES,
     SUFFIXES,
     Objects,
     check_objects,
@@ -48,7 +49,7 @@ CATEGORIES = {  # KITTI's other classes (Person_sitting, Tram, Misc) keep their 
 }
 OCCLUSION = np.array([0.0, 0.3, 0.75, np.nan])  # share that stands for the levels 0 fully visible, 1, 2, 3 unknown
 HEIGHT_M, BEAMS, RANGE_M = 1.73, 64, 120.0
-LIDAR, CAMERA = "velodyne", "image_2"
+LIDAR, CAMERA = "velodyne", PICTURES
 FOLDERS = ("training", "testing")
 LISTS = ("train", "val", "test")
 
@@ -98,6 +99,8 @@ class KittiSource(LogSource):
         bare = sum(not _path(shot, "label_2").is_file() for shot in every)
         self._labelled = not bare
         self.notes = (f"no label_2 of {bare} of {len(every)} frames, so no boxes there",) if bare else ()
+        if blind := sum(not _path(shot, CAMERA).is_file() for shot in every):
+            self.notes += (f"no {CAMERA} of {blind} of {len(every)} frames, so LiDAR alone there",)
 
     def frame_count(self, scene: str) -> int:
         """Return the number of frames of a scene."""
@@ -122,9 +125,10 @@ def _calibrate(calibrated: KittiCalibration) -> Calibration:
 
 
 def _read_frame(shot: Shot, agent: str, calibration: Calibration) -> LinkedFrame:
-    files = {LIDAR: _path(shot, "velodyne"), CAMERA: _path(shot, "image_2")}
+    pictures = {CAMERA: path} if (path := _path(shot, CAMERA)).is_file() else {}
+    files = {LIDAR: _path(shot, "velodyne"), **pictures}
     points, calibrated = read_points(files[LIDAR]), read_calibration(_path(shot, "calib"))
-    size = measure_picture(files[CAMERA])
+    size = measure_picture(path) if pictures else (None, None)
     label = _path(shot, "label_2")
     objects = read_objects(label, calibrated) if label.is_file() else Objects.none()
     check_objects(objects, *size, label)
@@ -145,10 +149,13 @@ def _read_frame(shot: Shot, agent: str, calibration: Calibration) -> LinkedFrame
             [f"{shot.number}-{row}" for row in range(len(boxes))],  # no track is followed
             Boxes(boxes.center, boxes.size, boxes.yaw, np.array(labels, np.str_)),
             {LIDAR: (points, agent_from_lidar)},
-            {CAMERA: unseen_views(objects.rectangle, objects.truncation, OCCLUSION[objects.occlusion])},
+            {
+                name: unseen_views(objects.rectangle, objects.truncation, OCCLUSION[objects.occlusion])
+                for name in pictures
+            },
         ),
-        images=read_pictures({CAMERA: files[CAMERA]}),
-        agent_at_trigger={} if np.allclose(then, np.eye(4), atol=1e-9) else {CAMERA: then},
+        images=read_pictures(pictures),
+        agent_at_trigger={} if not pictures or np.allclose(then, np.eye(4), atol=1e-9) else {CAMERA: then},
         files=files,
     )
 
@@ -180,11 +187,13 @@ def _find_shots(folder: Path) -> list[Shot]:
 
 
 def _check_complete(shots: list[Shot]) -> None:
-    """Raise `InputError` where a file of a frame is missing; a folder without any labels is complete, too."""
+    """Raise `InputError` where a file of a frame is missing: images may be, and all labels of a folder."""
     labelled = {shot.folder for shot in shots if _path(shot, "label_2").is_file()}
     for shot in shots:
         for part in SUFFIXES:
-            if not _path(shot, part).is_file() and (part != "label_2" or shot.folder in labelled):
+            if part == CAMERA or (part == "label_2" and shot.folder not in labelled):
+                continue
+            if not _path(shot, part).is_file():
                 raise InputError(f"{_path(shot, part)}: no such file; a frame of KITTI has one")
 
 
@@ -194,7 +203,7 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
         return {}
     found = {}
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             for row in csv.DictReader(file):
                 scene, index, _ = row["frame"].removesuffix(row["agent"]).rsplit("_", 2)
                 found[row["number"]] = scene, int(index), row["agent"], float(row["time_s"])

@@ -88,23 +88,36 @@ class NuscenesSource(LogSource):
         table = {name: read_table(self._tables, name) for name in SMALL}
         self._data: dict[str, dict[str, Row]] = defaultdict(dict)  # sample -> channel -> row of sample_data
         self._mounted, self._channel = table["calibrated_sensor"], table["sensor"]
-        listed = self._tables / "sample_data.json"
+        self._lost: dict[str, set[str]] = defaultdict(set)  # sample -> channels whose file is not there
+        listed, first_lost = self._tables / "sample_data.json", None
         for row in stream_table(self._tables, "sample_data", lambda row: row["is_key_frame"]):
             path_within(self._root, row["filename"], listed)
             mounted = self._at(self._mounted, row["calibrated_sensor_token"])
             channel, own = self._at(self._channel, mounted["sensor_token"])["channel"], self._data[row["sample_token"]]
+            if not (file := self._root / row["filename"]).is_file():  # a device, too, would be read without end
+                first_lost = first_lost or file
+                self._lost[row["sample_token"]].add(channel)
+                continue
             if own.setdefault(channel, row) is not row:
                 raise InputError(f"{listed}: {shorten(row['filename'])} is a second one of {channel}")
         used = {row["ego_pose_token"] for rows in self._data.values() for row in rows.values()}
         self._pose = read_table(self._tables, "ego_pose", lambda row: row["token"] in used)
         self._calibration: dict[str, Calibration] = {}  # by agent
         self._spins, split_of = self._order(table["scene"], table["log"], table["sample"])
+        if first_lost is not None and not self._spins:
+            raise InputError(f"{first_lost}: no such file, nor is that of any other sweep of {TOP}")
         self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._read_notes(table)
         if self._tables.name in VERSIONS:
             self._beams, self._range_m = BEAMS, RANGE_M
         self._labelled = bool(self._notes)
         self.notes = () if self._labelled else ("no annotations in its tables, so no boxes",)
+        if lost := sum(map(len, self._lost.values())):
+            whole = sum(TOP not in own for own in self._lost.values())
+            self.notes += (
+                f"files of its tables that are not there: {lost}, the first is {first_lost}; left out with them: "
+                f"{len(self._lost) - whole} of {len(table['sample'])} key frames, which lack {TOP}",
+            )
 
     def _at(self, table: Mapping[str, Row], token: str) -> Row:
         if token not in table:
@@ -161,9 +174,12 @@ class NuscenesSource(LogSource):
         split_of: dict[str, str | None] = {}
         for token, scene in scenes.items():
             log, name = self._at(logs, scene["log_token"]), scene["name"]
+            of_scene[token] = [sample for sample in of_scene[token] if TOP not in self._lost.get(sample, ())]
             for sample in of_scene[token]:
                 if TOP not in self._data[sample]:
                     raise InputError(f"{self._tables / 'sample_data.json'}: no {TOP} of the sample '{sample}'")
+            if not of_scene[token]:
+                continue
             own = log["logfile"] if ours else name
             first: dict[str, Row] = {}  # channel -> its first row in the scene
             for sample in of_scene[token]:
@@ -228,9 +244,6 @@ class NuscenesSource(LogSource):
         poses = {name: _placed(self._at(self._pose, row["ego_pose_token"])) for name, row in data.items()}
         cameras = [name for name in data if kind[name] == "camera"]
         path = {name: self._root / row["filename"] for name, row in data.items()}
-        for file in path.values():
-            if not file.is_file():  # a device, too, would be read without end
-                raise InputError(f"{file}: no such file")
         ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)
         clouds = {name: read_lidar(path[name]) for name in ranging}
         radar = {name: decode_radar(read_pcd(path[name])) for name in data if kind[name] == "radar"}

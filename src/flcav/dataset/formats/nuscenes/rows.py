@@ -80,7 +80,7 @@ def _share(token: object) -> object:
 def _stream_list(path: Path) -> Iterator[object]:
     """Yield the elements of the JSON list in a file, one at a time; raises `InputError` where there is none."""
     try:
-        with path.open(encoding="utf-8") as file:
+        with path.open(encoding="utf-8-sig") as file:
             yield from _decode_list(file, path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None

@@ -1,21 +1,26 @@
 """Reading of OPV2V, as OpenCOOD reads it: scenarios of several agents in CARLA's left-handed frames.
 
 OPV2V has one class, vehicle, which is read as car; no times, but spins at 10 Hz; of a velocity the speed, along the
-heading. Its sensors' poses are those in the world: mounts are those of the agent's first frame.
+heading. V2X-Real (Xiang et al., ECCV 2024) has its files, but raw point clouds, JPEG pictures and classes: its code
+takes clouds and poses as left-handed, too. Sensors' poses are those in the world: mounts are those of the agent's first
+frame.
 """
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError, read_yaml
-from flcav.dataset.formats.opv2v.write import CAMERAS, FOLDERS, KMH, from_carla
+from flcav.dataset.formats.kitti.files import read_points
+from flcav.dataset.formats.layout import BRIGHTEST, has_kitti_layout
+from flcav.dataset.formats.opv2v.about import CAMERAS, EGO, About, read_about
+from flcav.dataset.formats.opv2v.write import FOLDERS, KMH, from_carla
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
-    FARTHEST,
     AgentNames,
     LogSource,
     Picture,
@@ -36,10 +41,12 @@ from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
 
 Array = NDArray[np.float64]
-About = Mapping[str, Any]  # OPV2V's file of a frame
 
 PERIOD_S = 0.1
 LIDAR, CATEGORY = "lidar", "car"
+CATEGORIES = {"policecar": "car", "longvehicle": "car", "motorcyle": "motorcycle"}  # V2X-Real's with another name here
+CLOUDS, PICTURES = (".pcd", ".bin"), (".png", ".jpeg", ".jpg")
+POINT = 4  # numbers of a raw point: x, y, z [m], intensity
 DIGITS = 9  # of mounts, which are computed of poses
 PROTOCOL = "data_protocol.yaml"
 
@@ -68,13 +75,21 @@ class Opv2vSource(LogSource):
         self._track: dict[str, dict[str, str]] = {}
         names = AgentNames()
         self._blind: set[str] = set()  # agents with a camera of which there is no picture
+        self._frames = self._lost = self._unseen = 0  # frames in the folder, without a file, without a picture
         self._shots = {scene: self._open(scene, found[scene], names) for scene in self._split_of}
         blind, agents = len(self._blind), len(self._calibration)
-        self.notes = (f"no pictures of a camera of {blind} of {agents} agents, so no images of it",) if blind else ()
+        if not self._calibration:
+            raise InputError(f"{folder}: none of {self._frames} frames has both a YAML file and a point cloud")
+        told = {
+            f"no pictures of a camera of {blind} of {agents} agents, so no images of it": blind,
+            f"left out {self._lost} of {self._frames} frames: no YAML file or no point cloud": self._lost,
+            f"no picture of a camera of {self._unseen} of {self._frames} frames, so no image there": self._unseen,
+        }
+        self.notes = tuple(note for note, count in told.items() if count)
 
     def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Shot]:
         known = self._track[scene] = _read_names(folder / PROTOCOL)
-        found = {path: _list_stamps(path) for path in sorted(folder.iterdir()) if path.is_dir()}
+        found = {path: self._list_stamps(path) for path in sorted(folder.iterdir()) if path.is_dir()}
         rank = {stamp: number for number, stamp in enumerate(sorted({s for own, _ in found.values() for s in own}))}
         shots = []
         for path, (own, pictured) in found.items():
@@ -90,6 +105,24 @@ class Opv2vSource(LogSource):
                 shots += [Shot(path / stamp, agent, int(stamp), rank[stamp] * PERIOD_S) for stamp in own]
         return sorted(shots, key=lambda shot: (shot.spin, shot.agent))
 
+    def _list_stamps(self, folder: Path) -> tuple[list[str], set[str]]:
+        """Return the times of an agent's whole frames, in order, and its cameras that the folder has pictures of.
+
+        A whole frame has a YAML file and a point cloud; others are counted, and so are those without a picture.
+        """
+        names = {path.name for path in folder.iterdir()}
+        stems = {re.split(r"[_.]", name, maxsplit=1)[0] for name in names}
+        stamps = sorted(stem for stem in stems if stem.isdecimal())
+        whole = [
+            stamp for stamp in stamps if f"{stamp}.yaml" in names and any(f"{stamp}{end}" in names for end in CLOUDS)
+        ]
+        pictured = {camera: sum(_picture(folder / stamp, camera) is not None for stamp in whole) for camera in CAMERAS}
+        cameras = {camera for camera, count in pictured.items() if count}
+        self._frames += len(stamps)
+        self._lost += len(stamps) - len(whole)
+        self._unseen += len(whole) - min((pictured[camera] for camera in cameras), default=len(whole))
+        return whole, cameras
+
     def frame_count(self, scene: str) -> int:
         """Return the number of frames of a scenario, of all agents."""
         return len(self._shots[scene])
@@ -100,14 +133,14 @@ class Opv2vSource(LogSource):
             yield self._frame(scene, shot)
 
     def _frame(self, scene: str, shot: Shot) -> LinkedFrame:
-        calibration, about = self._calibration[shot.agent], _read_about(shot.stem)
+        calibration, about = self._calibration[shot.agent], read_about(shot.stem)
         mounts = calibration.agent_from_sensor
         world_from_lidar = from_carla(about["lidar_pose"])
         world_from_agent = world_from_lidar @ inverse(mounts[LIDAR])
         boxes, velocity = _read_vehicles(about)
         check_sizes(boxes.size, shot.stem.with_suffix(".yaml"))
-        points = read_cloud(shot.stem.with_suffix(".pcd"))
-        files = {name: file for name in mounts if (file := _picture(shot.stem, name)).is_file() and name in about}
+        points = _read_points(shot.stem)
+        files = {name: file for name in mounts if name in about and (file := _picture(shot.stem, name)) is not None}
         placed = {name: from_carla(about[name]["cords"]) @ BODY_FROM_OPTICAL for name in files}
         pictures = {
             name: Picture(
@@ -140,6 +173,29 @@ class Opv2vSource(LogSource):
         )
 
 
+def _read_points(stem: Path) -> NDArray[np.float32]:
+    """Return the point cloud of a frame: see `read_cloud` and `read_raw_cloud`."""
+    path = _find_cloud(stem)
+    if path is None:
+        raise InputError(f"{stem.with_suffix(CLOUDS[0])}: no such file")
+    return read_cloud(path) if path.suffix == CLOUDS[0] else read_raw_cloud(path)
+
+
+def read_raw_cloud(path: Path) -> NDArray[np.float32]:
+    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a raw cloud with y to the right.
+
+    Points that are not finite are left out; intensities may reach 255. Raises `InputError` for other files.
+    """
+    data = path.read_bytes()
+    if not data or len(data) % (4 * POINT):
+        return read_points(path)  # which says what it is
+    rows = np.frombuffer(data, "<f4").reshape(-1, POINT)
+    rows = rows[np.isfinite(rows).all(axis=1)] * np.array([1, -1, 1, 1], np.float32)
+    if len(rows) and 1 < rows[:, 3].max() <= BRIGHTEST:
+        rows[:, 3] /= np.float32(BRIGHTEST)
+    return rows if has_kitti_layout(rows.tobytes()) else read_points(path)
+
+
 def read_cloud(path: Path) -> NDArray[np.float32]:
     """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a PCD file, whose red channel the intensity is."""
     rows = read_pcd(path)
@@ -155,8 +211,8 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
 
 def _calibrate(stem: Path) -> Calibration:
     """Return the calibration of an agent by its first frame: poses of sensors in its frame."""
-    about = _read_about(stem)
-    agent_from_world = inverse(from_carla(about["true_ego_pos"]))
+    about = read_about(stem)
+    agent_from_world = inverse(from_carla(about[EGO[0]]))
     cameras = [name for name in CAMERAS if name in about]
     mounts = {LIDAR: agent_from_world @ from_carla(about["lidar_pose"])}
     mounts |= {name: agent_from_world @ from_carla(about[name]["cords"]) @ BODY_FROM_OPTICAL for name in cameras}
@@ -174,42 +230,12 @@ def _read_vehicles(about: About) -> tuple[Boxes, Array]:
     poses = np.array(placed).reshape(-1, 4, 4)
     size = 2 * np.array([row["extent"] for row in rows], np.float64).reshape(-1, 3)
     speed = np.array([row.get("speed", np.nan) for row in rows]) / KMH
-    boxes = turned_boxes(poses[:, :3, 3], size, poses[:, :3, :3], np.full(len(rows), CATEGORY))
+    named = [row.get("obj_type", CATEGORY).lower() for row in rows]
+    label = np.array([CATEGORIES.get(name, name) for name in named], np.str_)
+    boxes = turned_boxes(poses[:, :3, 3], size, poses[:, :3, :3], label)
     climb = np.zeros(len(rows)) if boxes.tilt is None else -boxes.tilt[:, 0]
     ahead = np.column_stack((heading_vectors(boxes.yaw) * np.cos(climb)[:, None], np.sin(climb)))
     return boxes, ahead * speed[:, None]
-
-
-def _read_about(stem: Path) -> About:
-    """Return the content of a frame's YAML file; raises `InputError` where it is missing, truncated or no frame."""
-    path = stem.with_suffix(".yaml")
-    about: Any = read_yaml(path)
-    try:
-        about["vehicles"].values()
-        for row in about["vehicles"].values():
-            for name in ("location", "center", "extent", "angle"):
-                _check_numbers(row[name], 3)
-            _check_numbers(row.get("speed", 0.0))
-        for name in ("lidar_pose", "true_ego_pos"):
-            _check_numbers(about[name], 6)
-        for name in CAMERAS:
-            if name in about:
-                _check_numbers(about[name]["cords"], 6)
-                _check_numbers(np.ravel(about[name]["intrinsic"]), 9)
-    except KeyError as lost:
-        raise InputError(f"{path}: not a frame of OPV2V, it has no {lost}") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not a frame of OPV2V, {error}") from None
-    except (TypeError, AttributeError):
-        raise InputError(f"{path}: not a frame of OPV2V, its entries are of other kinds") from None
-    return about
-
-
-def _check_numbers(values: Any, *shape: int) -> None:
-    """Raise `ValueError` where values are not numbers of that shape, one number for ()."""
-    numbers = np.array(values)
-    if numbers.shape != shape or numbers.dtype.kind not in "iuf" or not (np.abs(numbers) < FARTHEST).all():
-        raise ValueError(f"{shape[0]} numbers are wanted" if shape else "a number is wanted")
 
 
 def _read_names(path: Path) -> dict[str, str]:
@@ -221,29 +247,14 @@ def _read_names(path: Path) -> dict[str, str]:
     return {str(number): str(name) for name, number in numbers.items()} if isinstance(numbers, dict) else {}
 
 
-def _picture(stem: Path, camera: str) -> Path:
-    return stem.with_name(f"{stem.name}_{camera}.png")
+def _picture(stem: Path, camera: str) -> Path | None:
+    """Return the picture of a camera, None where there is none, or an empty file: V2X-Real has one."""
+    paths = (stem.with_name(f"{stem.name}_{camera}{suffix}") for suffix in PICTURES)
+    return next((path for path in paths if path.is_file() and path.stat().st_size), None)
 
 
-def _list_cameras(folder: Path) -> set[str]:
-    """Return the cameras of an agent's folder that there is a picture of."""
-    return {name for name in CAMERAS if next(folder.glob(f"*_{name}.png"), None) is not None}
-
-
-def _list_stamps(folder: Path) -> tuple[list[str], set[str]]:
-    """Return the times of an agent's frames, in order, and its cameras that the folder has pictures of.
-
-    A frame has a YAML file, a point cloud, and a picture of each of these. Raises `InputError` where a file is missing.
-    """
-    cameras = _list_cameras(folder)
-    endings = [".yaml", ".pcd", *(f"_{name}.png" for name in sorted(cameras))]
-    found = {end: {path.name.removesuffix(end) for path in folder.glob(f"*{end}")} for end in endings}
-    stamps = sorted(stamp for stamp in set().union(*found.values()) if stamp.isdigit())
-    for stamp in stamps:
-        for end in endings:
-            if not (path := folder / f"{stamp}{end}").is_file():
-                raise InputError(f"{path}: no such file; a frame of OPV2V has one")
-    return stamps, cameras
+def _find_cloud(stem: Path) -> Path | None:
+    return next((path for suffix in CLOUDS if (path := stem.with_suffix(suffix)).is_file()), None)
 
 
 def _find_scenarios(folder: Path) -> dict[str, Path]:
