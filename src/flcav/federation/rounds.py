@@ -48,9 +48,7 @@ from flcav.federation.strategies.fedavg import RunningMean, average
 from flcav.federation.strategies.strategy import Averages, Exchanges, Stateful, find_weigher
 from flcav.federation.trainable import LocalUpdate, Weights, forms_of, learned_names
 
-OnRound = Callable[
-    [int, Weights, float | None], None
-]  # aggregated round, its weights, mean training loss
+OnRound = Callable[[int, Weights, float | None], None]  # aggregated round, its weights, mean training loss
 AnswerT = TypeVar("AnswerT")
 ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere; Flower's own limit for updates
 Away = Callable[[int], Mapping[str, str]]  # of a round, by client why it is not there when the round begins

@@ -1,19 +1,31 @@
 """Sensors of a region by each rule of a run's recipe."""
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from flcav.config import InputError, parse_config
+from flcav.dataset.store import Dataset
+from flcav.geometry import pose
 from flcav.perception.errors import PerceptionError
-from flcav.pipeline.recipe import Placement
-from flcav.pipeline.stages.placement import Sites, place_sensors
+from flcav.pipeline.arms import resolve_settings
+from flcav.pipeline.collecting.caveats import list_unreached
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.recipe import EDGE, MAIN, Placement, RunRecipe
+from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.results.run import ArmResult
+from flcav.pipeline.results.training import StageResult
+from flcav.pipeline.stages.placement import Sites, find_passed, place_sensors
 
 SITES = Sites(np.array([2, 5, 7, 9]), np.array([[0, 0, 6], [100, 0, 6], [200, 0, 6], [300, 0, 6]], dtype=np.float64))
 
 
-def place(seed: int = 1, **how: object) -> tuple[int, ...]:
+def place(seed: int = 1, passed: NDArray[np.bool_] | None = None, **how: object) -> tuple[int, ...]:
     settings = parse_config(Placement, {"range_m": 40.0, **how}, "placement")
-    return place_sensors("grid", settings, SITES, {}, {}, [], seed).chosen
+    return place_sensors("grid", settings, SITES, {}, {}, [], seed, passed).chosen
 
 
 def test_named_poles_have_the_sensors() -> None:
@@ -29,6 +41,53 @@ def test_random_poles_are_drawn_by_the_seed_and_fewer_are_the_first_of_more() ->
     assert len(set(three)) == 3
     assert place(rule="random", count=2) == three[:2]
     assert len({place(seed, rule="random") for seed in range(20)}) == 4
+
+
+def test_sensors_stand_where_vehicles_pass() -> None:
+    passed = np.array([False, True, True, False])
+    errors = [
+        PerceptionError(x, 0.0, 0.0, 1.0, "miss", "Car", 3, 0.0, "a", f"car{x}") for x in (0, 1, 2, 100, 101, 200)
+    ]
+    settings = Placement(rule="vrcsp", range_m=40, count=1, tasks=("objects",))
+    rule = (settings, SITES, {"objects": errors}, {"objects": 1.0}, [], 1)
+    assert place_sensors("grid", *rule).chosen == (2,)
+    placed = place_sensors("grid", *rule, passed)
+    assert (placed.chosen, placed.covered) == ((5,), 2)
+    assert place_sensors("grid", *rule, ~passed).chosen == (2,)
+    assert place_sensors("grid", *rule, np.zeros(4, bool)).chosen == (2,)  # nobody passes anywhere: as before
+    assert {place(seed, passed, rule="random") for seed in range(20)} == {(5,), (7,)}
+    assert set(place(1, passed, rule="densest", count=3)) == {5, 7}
+    assert place(1, passed, rule="fixed", poles=[9, 2]) == (9, 2)
+
+
+def test_a_pole_is_passed_by_frames_of_vehicles_within_the_range() -> None:
+    places = {0: (130.0, 0.0), 1: (100.0, 25.0), 2: (0.0, 0.0)}
+
+    def world_from_agent(i: int) -> NDArray[np.float64]:
+        return pose(*places[i], 0.0)
+
+    data = cast(Dataset, SimpleNamespace(world_from_agent=world_from_agent))
+    drive = Frames(data, (0, 1), {2: (2,)})  # frame 2 is a pole's
+    assert find_passed(SITES, drive, 25.0).tolist() == [False, True, False, False]
+    assert find_passed(SITES, drive, 24.9).tolist() == [False, False, False, False]
+    assert find_passed(SITES, drive, 70.0).tolist() == [False, True, True, False]
+
+
+def test_regions_whose_sensors_nobody_passes_are_told() -> None:
+    recipe = RunRecipe.model_validate(
+        {
+            "tasks": {"objects": {"plan": {"samples": 4, "edge_rounds": 1, "cloud_rounds": 1}}},
+            "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate"}, "ring": {"role": "federate"}},
+            "budgets_mb": {"wireless": 9, "wireline": 9},
+        }
+    )
+    settings = resolve_settings(recipe, {"objects": "road"})
+    stages = [StageResult(EDGE, "objects", region, 1, 4, 1, poles) for region, poles in (("grid", ()), ("ring", (3,)))]
+    placed = [Placed(region, "vrcsp", chosen, 1, 1, 40.0, ()) for region, chosen in (("grid", (5,)), ("ring", (3,)))]
+    arms = {MAIN: cast(ArmResult, SimpleNamespace(stages=stages, placed=placed))}
+    (told,) = list_unreached(arms, settings, 60.0)
+    assert told.startswith("no vehicle of 'grid' came within 60 m (placement.group_range_m) of a sensor")
+    assert list_unreached(arms, resolve_settings(recipe, {"objects": "own-detections"}), 60.0) == ()
 
 
 @pytest.mark.parametrize("how", [{"rule": "fixed"}, {"poles": [1]}, {"rule": "fixed", "poles": [1, 1]}])

@@ -1,11 +1,12 @@
 """Caveats of a run's labels and of its privacy, which are stated with its results."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from flcav.fusion.detector import TRAINED_IN
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.labels.sources import LABEL_SOURCES
-from flcav.pipeline.recipe import RunRecipe
+from flcav.pipeline.recipe import EDGE, RunRecipe
+from flcav.pipeline.results.run import ArmResult
 from flcav.world.map.town import HILLY
 
 PLACED_BARE = "vehicles send the places of their errors as they are: neither noise nor masks cover the error registry"
@@ -30,6 +31,20 @@ def list_caveats(recipe: RunRecipe, labels: Iterable[str], settings: Iterable[Se
     told = f"the road detector was trained in {' and '.join(known)}, so that its labels are better there than elsewhere"
     bare = [PLACED_BARE] if any(_places_bare(setting) for setting in settings) else []
     return (*filter(None, own), *([told] if known else []), *bare)
+
+
+def list_unreached(arms: Mapping[str, ArmResult], settings: Mapping[str, Setting], range_m: float) -> tuple[str, ...]:
+    """Return a caveat for each region that has sensors, but no vehicle within `range_m` of one in stage II."""
+    found = {
+        stage.region
+        for name, arm in arms.items()
+        for stage in arm.stages
+        if stage.stage == EDGE and LABEL_SOURCES[settings[name].labels[stage.task]].from_poles and not stage.poles
+        if any(placed.region == stage.region and placed.chosen for placed in arm.placed)
+    }
+    told = "so that all took part, without labels from the road"
+    where = f"within {range_m:g} m (placement.group_range_m) of a sensor in the frames of stage II"
+    return tuple(f"no vehicle of '{region}' came {where}, {told}" for region in sorted(filter(None, found)))
 
 
 def _places_bare(setting: Setting) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting, name_repeat
-from flcav.pipeline.collecting.caveats import list_caveats
+from flcav.pipeline.collecting.caveats import list_caveats, list_unreached
 from flcav.pipeline.collecting.differences import list_differences
 from flcav.pipeline.collecting.findings import findings
 from flcav.pipeline.collecting.history import gaps_closed
@@ -53,7 +53,11 @@ def collect_results(graph: Graph, work: Path) -> Run:
         gap_closed=gaps_closed(tests, recipe),
         provenance=provenance(recipe.seed),
         home=collect_home_costs(graph, work) or None,
-        caveats=(*list_caveats(recipe, main.labels.values(), settings.values()), *compare_rigs(graph)),
+        caveats=(
+            *list_caveats(recipe, main.labels.values(), settings.values()),
+            *list_unreached(arms, settings, recipe.placement.group_range_m),
+            *compare_rigs(graph),
+        ),
     )
 
 

@@ -44,11 +44,13 @@ def place_sensors(
     weights: Mapping[str, float],
     traces: Sequence[Trace],
     seed: int = 0,
+    passed: NDArray[np.bool_] | None = None,
 ) -> Placed:
     """Place a region's sensors by the rule in `how`: VRCSP over errors, the densest traffic, at random, or as named.
 
     `errors` and `weights` are by task: an error weighs its own weight times its task's. `traces` give the traffic.
-    Random poles are a stream of `seed` and the region: fewer are the first of more. Raises `InputError` for a named
+    Random poles are a stream of `seed` and the region: fewer are the first of more. Of poles that are not named, only
+    those are chosen that vehicles have `passed` (P,), if there are any (None: all). Raises `InputError` for a named
     pole that the region does not have.
     """
     every = [replace(error, weight=error.weight * weights[task]) for task in how.tasks for error in errors[task]]
@@ -58,14 +60,20 @@ def place_sensors(
         return Placed(region, "none", (), len(xyz), 0, how.range_m, ())
     actors = measure_traffic_density(sites.position, traces, how.range_m)
     within = coverage(xyz, sites.position, how.range_m)
-    count = min(how.count, len(sites.number))
+    usable = np.ones(len(sites.number), bool) if passed is None or not passed.any() else passed
+    count = min(how.count, int(usable.sum()))
     chosen: list[int] = []
     if how.rule == "vrcsp" and len(xyz):  # without errors there is nothing to cover
-        chosen = list(place(xyz, sites.position, how.range_m, count, weight=weight).chosen)
+        for rows in (np.arange(len(usable)), np.flatnonzero(usable)):
+            chosen = rows[list(place(xyz, sites.position[rows], how.range_m, count, weight=weight).chosen)].tolist()
+            if usable[chosen].all():
+                break
     elif how.rule == "densest":
-        chosen = np.argsort(-actors, kind="stable")[:count].tolist()
+        ranked = np.argsort(-actors, kind="stable")
+        chosen = ranked[usable[ranked]][:count].tolist()
     elif how.rule == "random":
-        chosen = stream(seed, "placement", region).permutation(len(sites.number))[:count].tolist()
+        drawn = stream(seed, "placement", region).permutation(len(sites.number))
+        chosen = drawn[usable[drawn]][:count].tolist()
     elif how.rule == "fixed":
         chosen = [_find_row(region, sites, pole) for pole in how.poles]
     return Placed(
@@ -80,6 +88,13 @@ def place_sensors(
             for number, row, mean in zip(sites.number, within, actors, strict=True)
         ),
     )
+
+
+def find_passed(sites: Sites, drive: Frames, range_m: float) -> NDArray[np.bool_]:
+    """Return (P,) whether a vehicle comes within `range_m` of each site, in the plane, in some frame of a drive."""
+    places = np.array([drive.data.world_from_agent(i)[:2, 3] for i in drive.vehicles]).reshape(-1, 2)
+    apart = np.linalg.norm(sites.position[:, None, :2] - places, axis=2)
+    return (apart <= range_m).any(axis=1)
 
 
 def read_traces(data: Dataset, frames: Sequence[int]) -> list[Trace]:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from flcav.config import InputError
 from flcav.fusion.distillation import Distillation
 from flcav.network.ledger import Ledger
 from flcav.perception.objects.distillation.loss import DistillationTerms, DistilledObjects
@@ -34,20 +33,18 @@ class LabelledSamples:
 def select_group(work: Work, split: Frames, inputs: RegionInputs) -> tuple[int, ...]:
     """Return the vehicles' frames near a roadside sensor of any arm, so that all arms have the same frames.
 
-    Raises `InputError` where there are none.
+    Without such frames the region has no labels from the road, and all frames are those of the group.
     """
+    return _select_near(work, split, inputs) or split.vehicles
+
+
+def _select_near(work: Work, split: Frames, inputs: RegionInputs) -> tuple[int, ...]:
     placed = [Placed.load(work.inputs[step]) for step in inputs.sites]
     numbers = {pole for each in placed for pole in each.chosen}
     if not numbers:
-        return split.vehicles
+        return ()
     sites = find_sites(split, split if inputs.recorded else None)
-    near = select_frames_near(split, sites.position[np.isin(sites.number, list(numbers)), :2], inputs.group_range_m)
-    if not near:
-        raise InputError(
-            f"{split.data.folder.parent.name}: no vehicle comes within {inputs.group_range_m:g} m "
-            f"(placement.group_range_m) of a sensor, so that none can take part"
-        )
-    return near
+    return select_frames_near(split, sites.position[np.isin(sites.number, list(numbers)), :2], inputs.group_range_m)
 
 
 def label_samples(
@@ -63,7 +60,8 @@ def label_samples(
     frames, frozen = select_group(work, split, inputs), load_stage_network(task, work.inputs[inputs.pretrain])
     if not kind.from_detections:
         return LabelledSamples(annotated_samples(task, frozen.config, split, frames, inputs.region), ())
-    poles = Placed.load(work.inputs[inputs.place]).chosen if kind.from_poles else ()
+    near = kind.from_poles and _select_near(work, split, inputs)
+    poles = Placed.load(work.inputs[inputs.place]).chosen if near else ()
     threshold = Pretrained.load(work.inputs[inputs.pretrain]).threshold
     assert threshold is not None  # fixed wherever labels come from detections
     if settings.distillation is not None:

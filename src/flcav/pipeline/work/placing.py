@@ -13,7 +13,7 @@ from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import ERRORS, LEDGER
 from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.stages.learning import load_stage_network
-from flcav.pipeline.stages.placement import find_sites, place_sensors, read_traces
+from flcav.pipeline.stages.placement import find_passed, find_sites, place_sensors, read_traces
 from flcav.pipeline.steps import Work
 from flcav.pipeline.work.budgets import open_region_book, share_plan_budget
 from flcav.pipeline.work.settings import StepSettings
@@ -79,8 +79,10 @@ def errors_step(work: Work, settings: ErrorsSettings) -> None:
 def place_step(work: Work, settings: PlaceSettings) -> None:
     """Place a region's roadside sensors by the errors and weights of each task."""
     drive = Frames.open(work.inputs[settings.registry])
-    sites = find_sites(drive, None if settings.edge is None else Frames.open(work.inputs[settings.edge]))
+    edge = None if settings.edge is None else Frames.open(work.inputs[settings.edge])
+    sites = find_sites(drive, edge)
     found = {task: load_errors(work.inputs[step] / ERRORS) for task, step in settings.errors.items()}
     traces = read_traces(drive.data, drive.vehicles)
-    rule = (settings.how, sites, found, settings.weights, traces, settings.seed or 0)
+    passed = find_passed(sites, edge or drive, settings.how.group_range_m)
+    rule = (settings.how, sites, found, settings.weights, traces, settings.seed or 0, passed)
     place_sensors(settings.region, *rule).save(work.folder)
