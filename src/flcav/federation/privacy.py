@@ -7,6 +7,7 @@ of its own, or, where the noise is `seeded`, by the seed of the round, which all
 """
 
 import bisect
+import itertools
 import logging
 import math
 from collections import Counter
@@ -15,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flcav.config import Config, InputError
 from flcav.federation.noise import Normals, secret_noise
@@ -26,18 +27,37 @@ from flcav.seeds import stream
 
 Arrays = dict[str, NDArray[np.number]]  # by name
 ROUNDING = 1e-12  # relative: more than the sum of squares of a clipped change is off in float64
+MOST_NOISE = 1e6
 SEEDED = "seeded, no guarantee against who knows the seed"  # of epsilon whose noise can be drawn again
 
 
 class Privacy(Config):
-    """Differential privacy of a client's whole data: norm of an update, noise, and the budget that ends the rounds."""
+    """Differential privacy of a client's whole data: norm of an update, noise, and the budget that ends the rounds.
+
+    With a budget alone the noise is the least with which it affords all planned rounds.
+    """
 
     where: Literal["central", "local"] = "central"  # who adds the noise
-    clip: float = Field(gt=0, le=1e6)  # largest L2 norm of a client's change in a round
-    noise: float = Field(gt=0, le=1e6)  # standard deviation of the noise, as a multiple of `clip`
+    clip: float = Field(default=1.0, gt=0, le=1e6)  # largest L2 norm of a client's change in a round
+    noise: float | None = Field(
+        default=None, gt=0, le=MOST_NOISE
+    )  # standard deviation of the noise, as a multiple of `clip`; default: by `epsilon` and the planned rounds
     delta: float = Field(default=1e-5, gt=0, lt=1)
     epsilon: float | None = Field(default=None, gt=0)  # budget: no round is begun that would exceed it
     seeded: bool = False  # noise and draws from the run's seed, to be repeated: no guarantee against who knows the seed
+
+    @model_validator(mode="after")
+    def _check_given(self) -> "Privacy":
+        if self.noise is None and self.epsilon is None:
+            raise ValueError("'noise' or 'epsilon' is needed: a budget alone gives the noise for the planned rounds")
+        return self
+
+    @property
+    def deviation(self) -> float:
+        """Return the standard deviation of the noise; raises ValueError where it is not known yet."""
+        if self.noise is None:
+            raise ValueError("noise that no rounds have been planned for")
+        return self.noise * self.clip
 
     @property
     def local(self) -> bool:
@@ -77,9 +97,8 @@ def add_noise(change: Weights, privacy: Privacy, seed: int, key: bytes | None) -
     if key is None and not privacy.seeded:
         raise ValueError("noise without a secret to draw it by")
     source: Normals = stream(seed, "noise") if privacy.seeded or key is None else secret_noise(key, change)
-    deviation = privacy.noise * privacy.clip
     return {
-        name: (array + source.normal(scale=deviation, size=array.shape)).astype(array.dtype)
+        name: (array + source.normal(scale=privacy.deviation, size=array.shape)).astype(array.dtype)
         for name, array in change.items()
     }
 
@@ -120,11 +139,16 @@ def account_epsilon(privacy: Privacy, selection: Selection, names: Sequence[str]
     return compose_epsilon(privacy, selection, [(len(names), rounds)])
 
 
-def compose_epsilon(privacy: Privacy, selection: Selection, trainings: Iterable[tuple[int, int]]) -> float:
+def compose_epsilon(
+    privacy: Privacy,
+    selection: Selection,
+    trainings: Iterable[tuple[int, int]],
+    noises: Iterable[float | None] = itertools.repeat(None),
+) -> float:
     """Return epsilon at `privacy.delta` of several trainings with one client's data, by Renyi differential privacy.
 
     trainings: of each the number of clients, in the same order, and of rounds; the turns of round-robin go on in all
-    rounds of a training, and begin anew with the next.
+    rounds of a training, and begin anew with the next. noises: of each training (None: that of `privacy`).
 
     Central, Poisson sampling: amplified, neighbours differ by a client that is added or removed. Central, a fixed
     number drawn without replacement: amplified, neighbours differ in the data of one client, which changes a sum by up
@@ -136,15 +160,17 @@ def compose_epsilon(privacy: Privacy, selection: Selection, trainings: Iterable[
 
     logging.getLogger("absl").setLevel(logging.ERROR)  # warns of each order of Renyi divergence that it leaves out
     replaced = privacy.local or selection.rule == "uniform"  # else a client is added or removed
-    gaussian = dp_accounting.GaussianDpEvent(privacy.noise / 2 if replaced else privacy.noise)
     relation = NeighboringRelation.ADD_OR_REMOVE_ONE
     if privacy.amplified(selection) and selection.rule == "uniform":
         relation = NeighboringRelation.REPLACE_ONE
-    times = Counter[int]()  # by number of clients
-    for clients, rounds in trainings:
-        times[clients] += rounds if privacy.amplified(selection) else most_participations(selection, clients, rounds)
+    times = Counter[tuple[int, float]]()  # by number of clients, and noise
+    for (clients, rounds), found in zip(trainings, noises, strict=False):
+        noise = privacy.deviation / privacy.clip if found is None else found
+        taken = rounds if privacy.amplified(selection) else most_participations(selection, clients, rounds)
+        times[clients, noise / 2 if replaced else noise] += taken
     accountant = rdp.RdpAccountant(neighboring_relation=relation)
-    for clients, number in (+times).items():
+    for (clients, noise), number in (+times).items():
+        gaussian = dp_accounting.GaussianDpEvent(noise)
         event: dp_accounting.DpEvent = gaussian
         if privacy.amplified(selection) and selection.rule == "poisson":
             assert selection.probability is not None
@@ -154,6 +180,22 @@ def compose_epsilon(privacy: Privacy, selection: Selection, trainings: Iterable[
             event = dp_accounting.SampledWithoutReplacementDpEvent(clients, selection.clients, gaussian)
         accountant.compose(event, number)
     return float(accountant.get_epsilon(privacy.delta))
+
+
+def find_noise(privacy: Privacy, selection: Selection, clients: int, rounds: int) -> Privacy:
+    """Return privacy with noise: its own or, without, the least with three digits that affords all these rounds."""
+    if privacy.noise is not None or privacy.epsilon is None:
+        return privacy
+
+    def spends(noise: float) -> float:
+        return compose_epsilon(privacy.model_copy(update={"noise": noise}), selection, [(clients, max(rounds, 1))])
+
+    least, most = -2.0, math.log10(MOST_NOISE)  # exponents of 10
+    while most - least > 1e-4:
+        middle = (least + most) / 2
+        least, most = (least, middle) if spends(10**middle) <= privacy.epsilon else (middle, most)
+    place = 10 ** (2 - math.floor(most))
+    return privacy.model_copy(update={"noise": min(math.ceil(10**most * place) / place, MOST_NOISE)})
 
 
 def most_participations(selection: Selection, clients: int, rounds: int) -> int:
@@ -170,21 +212,23 @@ def least_participations(selection: Selection, clients: int, rounds: int) -> int
 
 
 def affordable_rounds(privacy: Privacy, selection: Selection, names: Sequence[str], rounds: int, earlier: int) -> int:
-    """Return how many of `rounds` rounds the privacy budget affords, after `earlier` ones with the same clients.
-
-    Raises `InputError` where it affords none.
-    """
-
-    def exceeds(number: int) -> bool:
-        return account_epsilon(privacy, selection, names, earlier + number) > (privacy.epsilon or math.inf)
-
-    if privacy.epsilon is None or rounds == 0:
-        return rounds
-    afforded = bisect.bisect_left(range(rounds + 1), True, key=exceeds) - 1
-    if afforded < 1:
+    """Return the number of `count_affordable`; raises `InputError` where it is 0 of some rounds."""
+    afforded = count_affordable(privacy, selection, names, rounds, earlier)
+    if afforded < min(rounds, 1):
         told = f"{account_epsilon(privacy, selection, names, earlier + 1):.4g} at delta = {privacy.delta:g}"
         raise InputError(
             f"privacy: {'a first' if not earlier else 'another'} round comes to epsilon = {told}, above the budget of "
             f"{privacy.epsilon:g}; more noise, or fewer clients in a round, cost less"
         )
     return afforded
+
+
+def count_affordable(privacy: Privacy, selection: Selection, names: Sequence[str], rounds: int, earlier: int) -> int:
+    """Return how many of `rounds` rounds the privacy budget affords, after `earlier` ones with the same clients."""
+
+    def exceeds(number: int) -> bool:
+        return account_epsilon(privacy, selection, names, earlier + number) > (privacy.epsilon or math.inf)
+
+    if privacy.epsilon is None or rounds == 0:
+        return rounds
+    return max(bisect.bisect_left(range(rounds + 1), True, key=exceeds) - 1, 0)

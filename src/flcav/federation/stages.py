@@ -17,7 +17,7 @@ from flwr.serverapp.strategy import Result
 
 from flcav.config import InputError
 from flcav.federation.client import check_arguments, client_app, kept_records
-from flcav.federation.privacy import affordable_rounds, least_participations
+from flcav.federation.privacy import affordable_rounds, count_affordable, find_noise, least_participations
 from flcav.federation.records import LOSS, SAMPLES, LocalWork, to_arrays, to_weights
 from flcav.federation.rounds import OnRound, Rounds
 from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
@@ -93,9 +93,10 @@ def federate(
     `on_round` was given, and the state after it. Noise that is not seeded is drawn by secrets, which are kept in
     `state`: without it no federation can be repeated, nor gone on with to the same weights.
 
-    Under a privacy budget the last rounds are those that it affords. `earlier` is the number of rounds of federations
-    before this one, with the same clients and rules, which count against that budget, and after which the turns of
-    round-robin go on. Where epsilon rests on secret draws of clients, records and ledger do not name them. Clients
+    Under a privacy budget the last rounds are those that it affords; without noise it is that for all of them.
+    `earlier` is the number of rounds of federations before this one, with the same clients and rules, which count
+    against that budget, and after which the turns of round-robin go on. Where epsilon rests on secret draws of
+    clients, records and ledger do not name them. Clients
     train in this process, or several at a time in a `runtime`: `ClientProcesses` of the same clients, or Flower's
     simulation on Ray; the weights are the same. Clients are pulled to `centre`, where there is one, by the `personal`
     of the rules. `clients` is asked for a client when it is to train; of updates no more are in memory than the
@@ -125,7 +126,9 @@ def federate(
     rules.upload.check_layers(weights)
     rounds, names = schedule.rounds, [*clients]
     if rules.privacy is not None:
-        rounds = affordable_rounds(rules.privacy, rules.selection, names, rounds, earlier)
+        privacy = find_noise(rules.privacy, rules.selection, len(names), earlier + rounds)
+        rules = rules.model_copy(update={"privacy": privacy})
+        rounds = affordable_rounds(privacy, rules.selection, names, rounds, earlier)
     if rounds <= done:
         return LocalUpdate(weights, 0, 0.0)
     state = FederationState() if state is None else state
@@ -307,14 +310,11 @@ def _check_secure(told: str, rules: Rules, secure: SecureAggregation, chosen: in
 def afford_cloud_rounds(rules: Rules, names: Sequence[str], rounds: int, edge_rounds: int, earlier: int) -> int:
     """Return how many of `rounds` cloud rounds, of `edge_rounds` edge rounds each, a region's privacy budget affords.
 
-    names: the region's clients, who took part in `earlier` rounds. Raises `InputError` where it affords none.
+    names: the region's clients, who took part in `earlier` rounds.
     """
     if rules.privacy is None or rounds == 0:
         return rounds
-    afforded = affordable_rounds(rules.privacy, rules.selection, names, rounds * edge_rounds, earlier) // edge_rounds
-    if afforded == 0:
-        raise InputError(f"privacy: the budget does not afford the {edge_rounds} edge rounds of a cloud round")
-    return afforded
+    return count_affordable(rules.privacy, rules.selection, names, rounds * edge_rounds, earlier) // edge_rounds
 
 
 def edge_seeds(schedule: Schedule, cloud_round: int, region: str, edge_rounds: int) -> list[int]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from flcav.config import InputError
-from flcav.federation.privacy import affordable_rounds
+from flcav.federation.privacy import affordable_rounds, find_noise
 from flcav.federation.stages import check_rules
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
 from flcav.federation.strategies.fedmd import FedMD
@@ -183,7 +183,7 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
             names = [f"{region}/cav{i}" for i in range(recipe.vehicles(region))]
             check_rules(edge, how, names)
             if privacy is not None:
-                affordable_rounds(privacy, selection, names, 1, 0)
+                affordable_rounds(find_noise(privacy, selection, len(names), 1), selection, names, 1, 0)
     if CLOUD in setting.stages:
         try:
             check_rules(cloud, how.of_servers(), setting.regions)

@@ -27,6 +27,7 @@ from flcav.federation.privacy import (
     change_norm,
     clip_change,
     compose_epsilon,
+    find_noise,
     most_participations,
 )
 from flcav.federation.rules import Rules
@@ -309,3 +310,39 @@ def test_what_makes_no_sense_is_one_sentence():
     for wrong in ({"epsilon": 0}, {"noise": 0}, {"clip": -1}, {"delta": 1}):
         with pytest.raises(ValidationError, match="Input should be"):
             Privacy(**{"clip": 1.0, "noise": 1.0, **wrong})
+
+
+@pytest.mark.parametrize("where", ["central", "local"])
+@pytest.mark.parametrize("selection", [EVERY, POISSON, UNIFORM, Selection(rule="round-robin", clients=4)])
+@pytest.mark.parametrize(("epsilon", "rounds"), [(0.5, 3), (8.0, 12), (60.0, 1)])
+def test_a_budget_alone_gives_the_least_noise_for_the_rounds(
+    where: Any, selection: Selection, epsilon: float, rounds: int
+):
+    found = find_noise(Privacy(where=where, epsilon=epsilon), selection, len(NAMES), rounds)
+    assert found.noise is not None
+    assert account_epsilon(found, selection, NAMES, rounds) <= epsilon
+    assert affordable_rounds(found, selection, NAMES, rounds, 0) == rounds
+    less = found.model_copy(update={"noise": found.noise * 0.99})
+    assert account_epsilon(less, selection, NAMES, rounds) > epsilon
+    assert f"{found.noise:.3g}" == f"{found.noise:g}"
+
+
+def test_noise_that_is_given_stays_and_a_budget_without_noise_affords_all_rounds():
+    given = Privacy(noise=0.7, epsilon=3.0)
+    assert find_noise(given, EVERY, 10, 99) is given
+    with pytest.raises(ValidationError, match="'noise' or 'epsilon' is needed"):
+        Privacy(clip=1.0)
+    alone, noise = Privacy(epsilon=8.0, seeded=True), find_noise(Privacy(epsilon=8.0), EVERY, 10, SCHEDULE.rounds)
+    weights, state = run(alone)
+    assert len(state.records) == SCHEDULE.rounds
+    assert state.records[-1].epsilon is not None
+    assert 7.5 < state.records[-1].epsilon <= 8
+    again, _ = run(alone.model_copy(update={"noise": noise.noise}))
+    np.testing.assert_array_equal(weights["w"], again["w"])
+
+
+def test_several_noises_are_composed():
+    privacy = Privacy(noise=1.0)
+    accountant = rdp.RdpAccountant().compose(GaussianDpEvent(1.0), 3).compose(GaussianDpEvent(2.0), 4)
+    found = compose_epsilon(privacy, EVERY, [(10, 3), (10, 4)], [None, 2.0])
+    assert found == pytest.approx(accountant.get_epsilon(privacy.delta))

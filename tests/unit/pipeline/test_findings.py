@@ -1,5 +1,6 @@
 """Sentences of a run, from its numbers."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference
+from flcav.pipeline.results.training import diverges
 from flcav.verdicts import ESTIMATE, HELD, NOT_HELD, UNDECIDED
 
 CAVEAT = "trained road detector"
@@ -189,3 +191,23 @@ def test_gaps_are_closed_of_every_stage_where_there_is_an_oracle() -> None:
         "grid, objects: edge FL (densest)",
     }
     assert gaps_closed(TESTS, parsed()) == {}
+
+
+@pytest.mark.parametrize(
+    ("losses", "expected"),
+    [
+        ((), False),
+        ((None,), False),
+        ((0.5, 0.4, 0.6), False),
+        ((0.001, 0.5), False),
+        ((0.5, 1254.0), True),
+        ((0.5, None, 1254.0, None), True),
+        ((0.5, 1254.0, 0.4), False),
+        ((20.0, 150.0), False),
+        ((20.0, 250.0), True),
+        ((0.5, math.nan), True),
+        ((math.inf,), True),
+    ],
+)
+def test_a_training_diverges_where_its_loss_is_far_above_the_first(losses: Sequence[float | None], expected: bool):
+    assert diverges(losses) is expected

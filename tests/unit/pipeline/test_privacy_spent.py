@@ -6,12 +6,13 @@ from pathlib import Path
 import pytest
 from dp_accounting import GaussianDpEvent, rdp
 
+from flcav.config import InputError
 from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
 from flcav.pipeline.arms import name_repeat
 from flcav.pipeline.collecting.collect import list_trainings
-from flcav.pipeline.federations.spent import Training, compose_trainings
+from flcav.pipeline.federations.spent import Training, compose_trainings, plan_private_rounds
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, RunRecipe
 from flcav.pipeline.results.spending import PrivacySpent
@@ -69,3 +70,38 @@ def test_a_run_composes_all_that_its_vehicles_took_part_in(selection: Selection,
     spent = compose_trainings(setting.federation, list_trainings(graph, tmp_path, setting))
     assert spent is not None
     assert spent.epsilon == pytest.approx(composed(taken))
+
+
+def test_a_budget_is_shared_by_both_stages() -> None:
+    rules = Rules(privacy=Privacy(noise=1.0))
+    budgets = {n: composed(n) + 1e-6 for n in (12, 8, 7, 3, 1)}
+
+    def plan(epsilon: float | None, edge: int, further: int, at_once: int) -> tuple[int, int]:
+        asked = Rules(privacy=Privacy(noise=1.0, epsilon=epsilon))
+        planned = plan_private_rounds(asked, [4, 3], edge, further, at_once)
+        assert planned.rules == asked
+        return planned.edge, planned.further
+
+    assert plan_private_rounds(rules, [4], 6, 6, 2) == (rules, 6, 6)
+    assert plan_private_rounds(Rules(), [4], 6, 6, 2) == (Rules(), 6, 6)
+    assert plan(budgets[12], 6, 6, 2) == (6, 6)
+    assert plan(budgets[8], 6, 6, 2) == (4, 4)
+    assert plan(budgets[7], 6, 6, 2) == (5, 2)  # whole cloud rounds
+    assert plan(budgets[3], 6, 6, 2) == (3, 0)
+    assert plan(budgets[3], 2, 10, 1) == (1, 2)
+    with pytest.raises(InputError, match="a first round comes to epsilon"):
+        plan(budgets[1] / 2, 6, 6, 2)
+
+
+def test_a_budget_alone_gives_one_noise_for_all_regions() -> None:
+    asked = Rules(privacy=Privacy(epsilon=6.0), selection=Selection(rule="uniform", clients=2))
+    planned = plan_private_rounds(asked, [8, 4], 3, 4, 2)
+    few, many = (plan_private_rounds(asked, [number], 3, 4, 2).rules.privacy for number in (4, 8))
+    assert (planned.edge, planned.further, planned.rules.privacy) == (3, 4, few)  # each of four is drawn more often
+    assert few is not None
+    assert many is not None
+    assert few.deviation > many.deviation
+    spent = compose_trainings(asked, [Training("grid", 8, 7, few.noise), Training("ring", 4, 7, few.noise)])
+    assert spent is not None
+    assert spent.epsilon <= 6
+    assert spent.describe().endswith(f"at delta 1e-05, noise {few.noise:g} x clip")

@@ -5,10 +5,12 @@ from collections.abc import Iterable, Mapping
 from flcav.fusion.detector import TRAINED_IN
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.labels.sources import LABEL_SOURCES
-from flcav.pipeline.recipe import EDGE, RunRecipe
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MORE_EDGE, RunRecipe
 from flcav.pipeline.results.run import ArmResult
+from flcav.pipeline.results.training import StageResult, diverges
 from flcav.world.map.town import HILLY
 
+STAGES = {EDGE: "stage II", CLOUD: "stage III", MORE_EDGE: "further edge rounds", CENTRAL: "centralised training"}
 PLACED_BARE = "vehicles send the places of their errors as they are: neither noise nor masks cover the error registry"
 
 
@@ -45,6 +47,39 @@ def list_unreached(arms: Mapping[str, ArmResult], settings: Mapping[str, Setting
     told = "so that all took part, without labels from the road"
     where = f"within {range_m:g} m (placement.group_range_m) of a sensor in the frames of stage II"
     return tuple(f"no vehicle of '{region}' came {where}, {told}" for region in sorted(filter(None, found)))
+
+
+def list_diverged(arms: Mapping[str, ArmResult]) -> tuple[str, ...]:
+    """Return a caveat for each arm and task whose training diverged, with its first and last loss."""
+    found = []
+    for name, arm in arms.items():
+        first: dict[str, float | None] = {}  # by task
+        for stage in arm.stages:
+            losses = (first.get(stage.task), *stage.losses) if stage.stage == CLOUD else stage.losses
+            first.setdefault(stage.task, next((loss for loss in losses if loss is not None), None))
+            known = [loss for loss in losses if loss is not None]
+            if diverges(losses):
+                at = f"{stage.task} in {_name_stage(name, stage)}"
+                found.append(f"the training diverged: {at}, its loss went from {known[0]:.3g} to {known[-1]:.3g}")
+    return tuple(found)
+
+
+def list_cut(arms: Mapping[str, ArmResult], settings: Mapping[str, Setting]) -> tuple[str, ...]:
+    """Return a caveat for each arm and task of whose planned rounds the privacy budget afforded fewer."""
+    found = []
+    for name, arm in arms.items():
+        privacy = settings[name].federation.privacy
+        for stage in arm.stages if privacy is not None and privacy.epsilon is not None else ():
+            plan = arm.plan.tasks[stage.task]
+            planned = plan.cloud_rounds if stage.stage == CLOUD else plan.edge_rounds
+            if stage.stage in (EDGE, CLOUD) and stage.rounds < planned:
+                at = _name_stage(name, stage)
+                found.append(f"privacy affords {stage.rounds} of {planned} planned rounds of {stage.task} in {at}")
+    return tuple(found)
+
+
+def _name_stage(arm: str, stage: StageResult) -> str:
+    return f"{STAGES[stage.stage]} of '{arm}'" + (f" on {stage.region}" if stage.region else "")
 
 
 def _places_bare(setting: Setting) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting, name_repeat
-from flcav.pipeline.collecting.caveats import list_caveats, list_unreached
+from flcav.pipeline.collecting.caveats import list_caveats, list_cut, list_diverged, list_unreached
 from flcav.pipeline.collecting.differences import list_differences
 from flcav.pipeline.collecting.findings import findings
 from flcav.pipeline.collecting.history import gaps_closed
@@ -56,6 +56,8 @@ def collect_results(graph: Graph, work: Path) -> Run:
         caveats=(
             *list_caveats(recipe, main.labels.values(), settings.values()),
             *list_unreached(arms, settings, recipe.placement.group_range_m),
+            *list_cut(arms, settings),
+            *list_diverged(arms),
             *compare_rigs(graph),
         ),
     )
@@ -118,7 +120,7 @@ def list_trainings(graph: Graph, work: Path, arm: Setting) -> Iterator[Training]
                     stage: StageResult.load(work / graph.names.stage(name, stage, region, task)) for stage in arm.stages
                 }
                 rounds = sum(own.rounds * (per_cloud_round if at == CLOUD else 1) for at, own in stages.items())
-                yield Training(region, stages[EDGE].clients, rounds)
+                yield Training(region, stages[EDGE].clients, rounds, stages[EDGE].noise)
 
 
 def _retrained(graph: Graph, work: Path, arm: Setting) -> tuple[StageResult, ...] | None:

@@ -95,7 +95,8 @@ def federate_regions(
 
     run_steps([*before, *alone.values()], out / WORK, jobs=1, notify=tell, stale=stale)
     found = tuple(_collect(graph, out, name, about[1]) for name, about in asked.items())
-    trainings = [Training(each.result.region or "", each.result.clients, each.result.rounds) for each in found]
+    trained = [each.result for each in found]
+    trainings = [Training(own.region or "", own.clients, own.rounds, own.noise) for own in trained]
     spent = compose_trainings(graph.settings[arm].federation, trainings)
     results = Federations(recipe, arm, found, provenance(recipe.seed), spent)
     results.save(out, RESULTS)

@@ -22,6 +22,7 @@ from flcav.pipeline.federations.checkpoint import Checkpoint, find_checkpoint
 from flcav.pipeline.federations.secrets import read_secrets, remove_secrets, write_secrets
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.spending import PrivacySpent
+from flcav.pipeline.results.training import diverges
 from flcav.progress import Report
 
 LOSS = "loss"  # begins the note of a round
@@ -138,6 +139,7 @@ class FederationCheckpoints:
             for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
                 (self._folder / name).unlink(missing_ok=True)
             note = [f"{LOSS} {loss:.3f}" if loss is not None else f"no {LOSS}", *self._tell_privacy()]
+            note += ["the training diverges"] if diverges(self.losses) else []
             note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self._score else {}).items()]
             self._report(round_, rounds, ", ".join([*note, *self._tell_failures()]))
 

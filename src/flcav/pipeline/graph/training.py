@@ -43,7 +43,7 @@ def list_edge_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
                 continue
             name, inputs = outline.names.edge(arm.name, region, task), outline.inputs(arm, region, task, EDGE)
             about = _federate(outline, arm, task, EDGE, _replan(outline, arm, task, EDGE, region, name))
-            settings = EdgeSettings(**about, inputs=inputs, scored=averaged)
+            settings = EdgeSettings(**about, inputs=inputs, scored=averaged, last=arm.stages[-1] == EDGE)
             yield make_step(name, edge_step, settings, outline.vehicles[region])
 
 

@@ -11,6 +11,8 @@ from flcav.pipeline.results.plans import RoundPlan
 from flcav.pipeline.results.saved import Saved
 from flcav.records import LEFT_OUT, Record
 
+DIVERGED = 10.0  # loss of no training that gets anywhere, by this factor above the first, and above 1
+
 
 @dataclass(frozen=True)
 class Validated:
@@ -104,7 +106,14 @@ class StageResult(Saved):
     records: Annotated[tuple[FederatedRound, ...] | None, LEFT_OUT] = None  # of all servers; None: no federation
     plans: Annotated[tuple[RoundPlan, ...] | None, LEFT_OUT] = None  # after each round; None: not made anew by rounds
     labels: Annotated[tuple[LabelQuality, ...] | None, LEFT_OUT] = None  # before each round; None: not measured
+    noise: Annotated[float | None, LEFT_OUT] = None  # that the privacy budget gave for the planned rounds; None: none
     statistics: Annotated[tuple[StatisticsScore, ...] | None, LEFT_OUT] = None  # of stage III; None: not asked for
+
+
+def diverges(losses: Sequence[float | None]) -> bool:
+    """Return whether the last known loss of a training is no number, or `DIVERGED` times the first, and 1, or more."""
+    known = [loss for loss in losses if loss is not None]
+    return bool(known) and (not np.isfinite(known[-1]) or known[-1] > DIVERGED * max(known[0], 1.0))
 
 
 @dataclass(frozen=True)

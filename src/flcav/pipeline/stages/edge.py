@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flcav.federation.privacy import affordable_rounds
+from flcav.federation.privacy import count_affordable
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.choice import open_runtime
 from flcav.federation.runtimes.metered import Account, Outage
@@ -64,7 +64,7 @@ class EdgeFederation:
         """Return as many of `rounds` as the privacy budget affords; without one all."""
         if rules.privacy is None:
             return rounds
-        return affordable_rounds(rules.privacy, rules.selection, [*self.clients], rounds, self.earlier)
+        return count_affordable(rules.privacy, rules.selection, [*self.clients], rounds, self.earlier)
 
 
 def federate_edge(
@@ -120,7 +120,7 @@ def federate_edge(
 
             if done < last:
                 begin(done + 1, start)
-            run(clients, start, schedule, account, **how, rules=rules, done=done, on_round=keep)
+                run(clients, start, schedule, account, **how, rules=rules, done=done, on_round=keep)
         else:
             course = replanning.course
 

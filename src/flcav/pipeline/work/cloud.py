@@ -13,6 +13,7 @@ from flcav.pipeline.arms import find_strategies
 from flcav.pipeline.federations.network import DrivenCloud, join_regions
 from flcav.pipeline.federations.outputs import send_region_network, share_frames
 from flcav.pipeline.federations.records import read_rounds
+from flcav.pipeline.federations.spent import take_noise
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.planning.course import Replanning, mean_by_frames
@@ -81,6 +82,8 @@ def cloud_step(work: Work, settings: CloudSettings, processes: int = 1) -> None:
     Vehicles train in so many `processes`.
     """
     first, task, learning = settings.first, settings.learning.task, settings.learning.resolve()
+    noise = StageResult.load(work.inputs[next(iter(settings.edges.values()))]).noise
+    settings = settings.model_copy(update={"federation": take_noise(settings.federation, noise)})
     plan, start = Plan.load(work.inputs[first.plan]), load_stage_network(learning.task, work.inputs[first.pretrain])
     share = share_plan_budget(plan, settings.budgets_mb, task)
     book = Ledger(share, read_entries(work, first.pretrain, *settings.edges.values()))
@@ -109,6 +112,7 @@ def cloud_step(work: Work, settings: CloudSettings, processes: int = 1) -> None:
         losses=losses,
         records=read_rounds(work.folder, None, before, driven.seconds),
         plans=made,
+        noise=noise,
         statistics=_score_statistics(work, settings, federation) if settings.validation else None,
     ).save(work.folder)
 

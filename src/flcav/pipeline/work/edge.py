@@ -12,11 +12,12 @@ from flcav.pipeline.arms import find_strategies
 from flcav.pipeline.federations.network import DrivenRounds
 from flcav.pipeline.federations.outputs import send_region_network, share_frames
 from flcav.pipeline.federations.records import read_rounds
+from flcav.pipeline.federations.spent import PrivateRounds, plan_private_rounds, take_noise
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.planning.course import Course, Replanning
 from flcav.pipeline.planning.updates import follow_plan
-from flcav.pipeline.recipe import EDGE, MORE_EDGE
+from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.stages.clients import make_clients
@@ -36,6 +37,7 @@ class EdgeSettings(FederationSettings):
     inputs: RegionInputs
     validation: Mapping[str, str] = {}  # recordings of the frames that each round is scored on, by region
     scored: bool = False  # whether the labels are compared with ground truth
+    last: bool = False  # whether the arm ends with it
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -69,6 +71,8 @@ def edge_step(
     before, labelled = len(book.entries), label_samples(work, settings, inputs, book, EDGE)
     if stage == MORE_EDGE and isinstance(labelled.samples, RoadAverageLabels):
         _label_once(work, settings, plan, labelled.samples)
+    noise = _find_noise(work, settings, plan)
+    settings = settings.model_copy(update={"federation": take_noise(settings.federation, noise)})
     rounds = _count_rounds(work, settings, plan, book)
     federation = _open_federation(work, settings, labelled, rounds, book)
     drive = _open_drive(work, settings, federation)
@@ -95,6 +99,7 @@ def edge_step(
         records=read_rounds(work.folder, inputs.region, before, {inputs.region: driven.seconds}),
         plans=None if rounds.course is None else tuple(rounds.course.made),
         labels=labels,
+        noise=noise,
     ).save(work.folder)
 
 
@@ -120,10 +125,28 @@ def _count_rounds(work: Work, settings: EdgeSettings, plan: Plan, book: Ledger) 
     rest = None if settings.replan is None else Rest(work, settings, settings.replan, plan, book)
     if settings.stage == EDGE:
         course = None if rest is None else rest.open_edge(inputs.region, inputs.pretrain)
-        return _Rounds(own.edge_rounds, course)
+        return _Rounds(_plan_private(settings, plan).edge if course is None else own.edge_rounds, course)
     if rest is not None:
         return _Rounds(rest.count_further(inputs.region, inputs.pretrain), None)
     return _Rounds(own.cloud_rounds * settings.federation.edge_rounds_per_cloud_round, None)
+
+
+def _plan_private(settings: EdgeSettings, plan: Plan) -> PrivateRounds[Federation]:
+    """Return the rounds of stage II and of what follows that the privacy budget affords."""
+    own, k = plan.tasks[settings.learning.task], settings.federation.edge_rounds_per_cloud_round
+    further = 0 if settings.last else own.cloud_rounds * k
+    return plan_private_rounds(settings.federation, settings.vehicles.values(), own.edge_rounds, further, k)
+
+
+def _find_noise(work: Work, settings: EdgeSettings, plan: Plan) -> float | None:
+    """Return the noise that the privacy budget gives for the planned rounds; None where it is given, or none is."""
+    privacy, before = settings.federation.privacy, settings.inputs.edge
+    if privacy is None or privacy.noise is not None:
+        return None
+    if before is not None:
+        return StageResult.load(work.inputs[before]).noise
+    private = _plan_private(settings, plan).rules.privacy
+    return None if private is None else private.noise
 
 
 def _open_federation(
