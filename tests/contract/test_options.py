@@ -41,7 +41,7 @@ CHOICES: dict[str, dict[str, str]] = {
 RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads", "--device"), ALWAYS)
 # command -> option -> what of CHOICES takes it; `--out` and `--json` are always taken
 TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
-    "run": dict.fromkeys(("--jobs", "--seeds", "--engine", "--stale"), ALWAYS),
+    "run": dict.fromkeys(("--dry", "--jobs", "--seeds", "--engine", "--stale"), ALWAYS),
     "demo": dict.fromkeys(("--seed", "--recipe", "--jobs", "--engine", "--stale"), ALWAYS),
     "compare": {},
     "federate": dict.fromkeys(("--arm", "--jobs", "--runtime", "--stale"), ALWAYS),

@@ -11,9 +11,11 @@ from performed_steps import in_mb, perform, uplinks
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
+from flcav.federation.privacy import Privacy
 from flcav.network.ledger import Ledger
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.pipeline.forecast import forecast_run
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.planning.histories import parse_history
@@ -24,6 +26,7 @@ from flcav.pipeline.recipe import (
     PRETRAIN,
     SPLITS_OF,
     Arm,
+    Budgets,
     Federation,
     Role,
     RunRecipe,
@@ -80,6 +83,32 @@ def three_tasks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
     """Return the folder of a run of three tasks, and what it gave."""
     folder = tmp_path_factory.mktemp("runs") / "three_tasks"
     return folder, run(shrunk("three_tasks"), folder)
+
+
+def test_a_forecast_is_what_the_run_then_plans(
+    three_tasks: tuple[Path, Run], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    told = forecast_run(shrunk("three_tasks"))
+    assert [*tmp_path.iterdir()] == []
+    main, found = three_tasks[1].arms[MAIN], told.arms[MAIN]
+    for task, plan in main.plan.tasks.items():
+        own = found.tasks[task]
+        assert (own.samples, own.edge_rounds, own.cloud_rounds) == (plan.samples, plan.edge_rounds, plan.cloud_rounds)
+    for link, use in main.links.items():
+        assert found.uplink_mb[link] == pytest.approx(use.planned_mb, rel=0.05)
+        assert found.uplink_mb[link] == pytest.approx(use.used_mb, rel=0.05)
+    assert 0 < told.minutes < 20
+    assert any("MB wireless" in line for line in told.lines())
+
+
+def test_a_forecast_refuses_what_the_run_would(tmp_path: Path) -> None:
+    recipe = shrunk("three_tasks")
+    with pytest.raises(InputError, match="budgets_mb"):
+        forecast_run(recipe.model_copy(update={"budgets_mb": Budgets(wireless=0.1, wireline=0.1)}))
+    federation = recipe.federation.model_copy(update={"privacy": Privacy(noise=0.5, epsilon=0.1)})
+    with pytest.raises(InputError, match="a first round comes to epsilon"):
+        forecast_run(recipe.model_copy(update={"federation": federation}))
 
 
 def test_three_tasks_share_a_plan_and_a_ledger(three_tasks: tuple[Path, Run]) -> None:

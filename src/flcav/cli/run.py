@@ -8,6 +8,7 @@ import typer
 
 from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
+from flcav.config import InputError
 from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 
 SEEDS = typer.Option(1, "--seeds", min=1, help="Number of seeds, from the recipe's on; above 1, a folder each.")
+DRY = typer.Option(False, "--dry", help="Say what the run would take, and do nothing of it.")
 AS_JSON = typer.Option(False, "--json", help="Print one JSON object instead of sentences.")
 
 
@@ -29,7 +31,8 @@ def register(app: typer.Typer) -> None:
 @only_writer_of("out")
 def run(
     recipe: Path = typer.Argument(help="Run recipe (YAML): tasks, regions, budgets, arms; see docs/runs.md."),
-    out: Path = typer.Option(..., "--out", help="Folder of the run; the same command goes on after a stop."),
+    out: Path | None = typer.Option(None, "--out", help="Folder of the run; the same command goes on after a stop."),
+    dry: bool = DRY,
     jobs: int = JOBS,
     seeds: int = SEEDS,
     engine: Engine = ENGINE,
@@ -37,7 +40,29 @@ def run(
     as_json: bool = AS_JSON,
 ) -> None:
     """Run a recipe through the three stages; write report.html, results.json and history.csv."""
-    _run(recipe, None, out, jobs, seeds, engine, stale, as_json, "run")
+    if dry:
+        _forecast(recipe, as_json)
+    elif out is None:
+        raise InputError("--out is missing: the folder of the run; --dry says what it would take")
+    else:
+        _run(recipe, None, out, jobs, seeds, engine, stale, as_json, "run")
+
+
+def _forecast(path: Path, as_json: bool) -> None:
+    use_threads(1)
+    from flcav.pipeline.forecast import forecast_run
+    from flcav.pipeline.recipe import load_run_recipe
+    from flcav.progress import show_progress
+    from flcav.sources.recipe import find_recipe
+
+    found = find_recipe(path)
+    with show_progress(f"forecast {path}") as report:
+        forecast = forecast_run(load_run_recipe(found), beside=found.parent, progress=report)
+    if as_json:
+        print_json(forecast.as_json())
+        return
+    for line in forecast.lines():
+        typer.echo(line)
 
 
 @when_interrupted()

@@ -120,7 +120,18 @@ def plan_step(work: Work, settings: FirstPlanSettings) -> None:
     """Allocate both budgets to all tasks."""
     scenes = {} if settings.air is None else _link_drives(work, settings.air, settings.seed)
     asked = tuple(_request(work, settings, name, scenes) for name in settings.tasks)
-    frame = PlanSettings(
+    plan, problem = make_plan(asked, frame_plan(settings), settings.rule)
+    if problem is not None:
+        write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
+    if settings.uploads is not None:
+        pools = {name: own.pools for name, own in settings.tasks.items()}
+        plan = plan_uploads(work, plan, pools, settings.uploads, settings.seed)
+    plan.save(work.folder)
+
+
+def frame_plan(settings: FirstPlanSettings) -> PlanSettings:
+    """Return budgets, bounds and topology of a run's first plan."""
+    return PlanSettings(
         budgets_mb=Price(settings.budgets_mb.wireless, settings.budgets_mb.wireline),
         headroom=settings.headroom,
         limits=settings.limits,
@@ -130,13 +141,6 @@ def plan_step(work: Work, settings: FirstPlanSettings) -> None:
         horizon_s=settings.horizon_s,
         speeds=settings.speeds,
     )
-    plan, problem = make_plan(asked, frame, settings.rule)
-    if problem is not None:
-        write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
-    if settings.uploads is not None:
-        pools = {name: own.pools for name, own in settings.tasks.items()}
-        plan = plan_uploads(work, plan, pools, settings.uploads, settings.seed)
-    plan.save(work.folder)
 
 
 def _request(
