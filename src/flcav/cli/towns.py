@@ -62,6 +62,8 @@ def show(
         write_bytes(out, town_map(loaded))
         typer.echo(f"{out}: map of {loaded.name}")
     typer.echo(f"{loaded.name}: {summary(summarise_town(loaded))}")
+    if out is None:
+        typer.echo(f"its map: flcav towns show {town} --out {loaded.name}.png")
 
 
 @towns.command("import")

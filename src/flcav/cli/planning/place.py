@@ -73,6 +73,9 @@ def place(
     from flcav.optimization.placement.baselines import place_at_random
     from flcav.optimization.placement.cheapest import cover_share
 
+    for file in (errors, poles, sensors):
+        if file is not None and not file.exists():
+            raise InputError(f"{file}: no such file")
     if (sensors is None) == (range_m is None):
         raise InputError("--sensors and --range: one of the two says how far sensors cover errors")
     if sum(limit is not None for limit in (count, budget, cover)) != 1:

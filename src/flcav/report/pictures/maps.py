@@ -157,7 +157,12 @@ def _plot_poles(axes: Axes, scene: ErrorMap) -> None:
         chosen = number in scene.chosen
         small = crowded and not chosen and number not in ruled
         face, ink, label = (style.BLUE, "white", "sensor") if chosen else ("white", style.INK, "candidate pole")
-        look: dict[str, Any] = {"color": face, "markeredgecolor": style.INK, "zorder": 4 if small else 5, "linestyle": "none"}
+        look: dict[str, Any] = {
+            "color": face,
+            "markeredgecolor": style.INK,
+            "zorder": 4 if small else 5,
+            "linestyle": "none",
+        }
         shape, size = "s" if number in ruled else "o", 4 if small else 13
         axes.plot(x, y, shape, markersize=size, **look)
         if not small:
