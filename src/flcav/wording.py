@@ -20,9 +20,9 @@ def suggest(name: str, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-def count(number: int | float, noun: str) -> str:
+def plural(number: int, noun: str) -> str:
     """Return "1 scene" or "2 scenes"."""
-    return f"{number:g} {noun}{'' if number == 1 else 's'}"
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def describe_number(text: str, field: str) -> str:

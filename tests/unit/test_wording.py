@@ -1,8 +1,12 @@
 """Names that were meant, numbers with units, and plurals."""
 
+import re
+from pathlib import Path
+
 import pytest
 
-from flcav.wording import count, describe_number, hint_share, suggest
+import flcav
+from flcav.wording import describe_number, hint_share, plural, suggest
 
 
 def test_the_closest_known_name_is_suggested_if_it_is_close() -> None:
@@ -34,4 +38,12 @@ def test_a_share_in_per_cent_is_told_as_a_fraction() -> None:
 
 
 def test_one_of_a_thing_is_singular() -> None:
-    assert [count(number, "scene") for number in (0, 1, 2)] == ["0 scenes", "1 scene", "2 scenes"]
+    assert [plural(number, "scene") for number in (0, 1, 2)] == ["0 scenes", "1 scene", "2 scenes"]
+
+
+def test_no_command_counts_one_of_a_thing_in_the_plural() -> None:
+    counted = re.compile(r"\{[^{}]*\} (?:scenes|frames|poles|points|images|annotations|steps|rounds|seeds|vehicles)\b")
+    commands = sorted((Path(flcav.__file__).parent / "cli").rglob("*.py"))
+    commands = [file for file in commands if file.name != "export.py"]  # which prints what formats count
+    found = {file.name: counted.findall(file.read_text(encoding="utf-8")) for file in commands}
+    assert {name: lines for name, lines in found.items() if lines} == {}

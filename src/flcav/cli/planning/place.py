@@ -9,6 +9,7 @@ import typer
 
 from flcav.cli.options import Method, check_finite
 from flcav.cli.terminal import print_json
+from flcav.wording import plural
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -149,13 +150,14 @@ def _show(
     if by_range:
         for number, (pole, errors_near) in enumerate(zip(given.ids, near, strict=True)):
             placed = ", placed" if number in result.chosen else ""
-            typer.echo(f"    pole {pole}: {errors_near} errors within {given.ranges_m[0]:g} m{placed}")
+            typer.echo(f"    pole {pole}: {plural(errors_near, 'error')} within {given.ranges_m[0]:g} m{placed}")
     proof = "optimal" if result.optimal else f"at most {result.upper_bound:.6g} can be covered"
     if least is not None and not result.optimal:
         proof = f"at least {least:.6g} has to be spent for that"
     told = "" if cost is None else f", cost {cost:.6g}"
     typer.echo(
-        f"cover {result.covered} of {len(given.errors)} errors, weight {result.covered_weight:.6g}{told} ({proof})"
+        f"cover {result.covered} of {plural(len(given.errors), 'error')}, "
+        f"weight {result.covered_weight:.6g}{told} ({proof})"
     )
     for name, placed in conventional.items():
         if placed is not None:
@@ -278,7 +280,7 @@ def _note(given: "Given", placed: "Placement") -> list[str]:
         return f", cost {own:.6g}" if given.priced else ""
 
     pairs = list(zip(placed.chosen, placed.sensors, strict=True))
-    lines = [f"{placed.covered} of {len(given.errors)} errors covered{cost(pairs)}"]
+    lines = [f"{placed.covered} of {plural(len(given.errors), 'error')} covered{cost(pairs)}"]
     for kind, (sensor_name, range_m) in enumerate(zip(given.names, given.ranges_m, strict=True)):
         if own := [(pole, sensor) for pole, sensor in pairs if sensor == kind]:
             poles = name_poles([name(pole) for pole, _ in own])

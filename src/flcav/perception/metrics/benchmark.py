@@ -34,6 +34,7 @@ from flcav.perception.task import Evaluated, KnownLidar
 from flcav.progress import Report, ignore_progress
 from flcav.records import Class
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front
+from flcav.wording import plural
 
 Array = NDArray[np.float64]
 BenchmarkKind = Literal["image", "bev", "3d"]  # rectangles in the image, footprints, boxes
@@ -73,7 +74,7 @@ class BenchmarkEvaluation(Evaluated):
     def lines(self) -> list[str]:
         """Return a line on the frames and one for each class and kind."""
         which = f"of ImageSets/{self.split}.txt" if self.split else "with labels"
-        lines = [f"{self.frames} frames {which}, AP R40 as KITTI's benchmark counts it: easy, moderate, hard"]
+        lines = [f"{plural(self.frames, 'frame')} {which}, AP R40 as KITTI's benchmark counts it: easy, moderate, hard"]
         for row in self.benchmark:
             each = "  ".join("    -" if ap is None else f"{ap:.3f}" for ap in (row.easy, row.moderate, row.hard))
             counted = ", ".join(str(number) for number in self.targets[row.label].values())

@@ -22,6 +22,7 @@ from flcav.perception.tracking.tracker import Tracked, Tracker
 from flcav.progress import Report, ignore_progress
 from flcav.records import Class
 from flcav.sensors.frame import Frame
+from flcav.wording import plural
 
 LONGEST_GAP_S = 1.0  # between two frames of a sequence
 SCORE = 0.3  # lowest score of a detection that is tracked
@@ -52,7 +53,7 @@ class TracksEvaluation(Result):
 
     def lines(self) -> list[str]:
         """Return the evaluation in words: frames and sequences, then a line per class."""
-        lines = [f"tracks in {self.frames} frames of {self.sequences} sequences"]
+        lines = [f"tracks in {plural(self.frames, 'frame')} of {plural(self.sequences, 'sequence')}"]
         for row in self.scores:
             if row.mota is None:
                 lines.append(f"{row.label:<12}nothing to follow")

@@ -34,6 +34,7 @@ from flcav.dataset.formats.reading import (
 from flcav.geometry import Boxes, heading_vectors, inverse
 from flcav.sensors.camera.lens import BODY_FROM_OPTICAL
 from flcav.sensors.frame import Calibration, LinkedFrame
+from flcav.wording import plural
 
 Array = NDArray[np.float64]
 About = Mapping[str, Any]  # OPV2V's file of a frame
@@ -70,7 +71,9 @@ class Opv2vSource(LogSource):
         self._blind: set[str] = set()  # agents with a camera of which there is no picture
         self._shots = {scene: self._open(scene, found[scene], names) for scene in self._split_of}
         blind, agents = len(self._blind), len(self._calibration)
-        self.notes = (f"no pictures of a camera of {blind} of {agents} agents, so no images of it",) if blind else ()
+        self.notes = (
+            (f"no pictures of a camera of {blind} of {plural(agents, 'agent')}, so no images of it",) if blind else ()
+        )
 
     def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Shot]:
         known = self._track[scene] = _read_names(folder / PROTOCOL)
