@@ -108,6 +108,17 @@ def test_a_viewshed_takes_the_place_of_the_filled_range() -> None:
     assert [each.x0 for each in extents] == [pytest.approx(site[0] - 40)]
 
 
+@pytest.mark.parametrize("name", ["town_map", "overview"])
+def test_the_key_of_a_map_has_room(name: str) -> None:
+    figure = DRAWN[name]()
+    figure.draw_without_rendering()
+    owner = figure.subfigs[0] if figure.subfigs else figure
+    (key,) = owner.legends
+    box = key.get_window_extent()
+    assert owner.bbox.x0 <= box.x0
+    assert box.x1 <= owner.bbox.x1
+
+
 def test_zones_stand_on_the_map_with_their_density() -> None:
     scene = replace(made_up_run.error_map(), zones={"3": 49.6}, zone_m=30.0)
     axes = figures.town_map(scene).axes[0]

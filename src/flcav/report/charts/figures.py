@@ -23,8 +23,7 @@ def town_map(scene: maps.ErrorMap, width_in: float = WIDTH) -> Figure:
     figure = style.canvas(width_in + bar, width_in * (y_high - y_low) / (x_high - x_low) + 0.8)
     axes = figure.add_subplot()
     maps.draw_errors(axes, scene)
-    handles = axes.get_legend_handles_labels()[0]
-    style.key(figure, handles, ncols=min(len(handles), ACROSS))
+    style.key(figure, axes.get_legend_handles_labels()[0], ncols=ACROSS)
     return figure
 
 
@@ -84,7 +83,7 @@ def overview(
     axes = left.add_subplot()
     maps.draw_errors(axes, scene)
     axes.set_title(f"{scene.town.name}: mistakes, and the pole placed for them", fontweight="bold")
-    style.key(left, axes.get_legend_handles_labels()[0])
+    style.key(left, axes.get_legend_handles_labels()[0], ncols=ACROSS)
     for axes, found in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
         clouds.draw_detections(axes, sweep, found, EXTENT)
         axes.set_title(found.title, fontweight="bold")
