@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from pydantic_core import ErrorDetails
 
 from flcav.files import Json
+from flcav.wording import describe_number, hint_share, suggest
 
 Place = tuple[int | str, ...]  # path to a nested field: names of fields, indices and keys, as pydantic's `loc`
 
@@ -50,6 +51,7 @@ class Config(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    document: ClassVar[str | None] = None  # key of DOCUMENTS: the kind of file that holds this configuration
     magnitudes: ClassVar[tuple[float, float]] = (0.0, 1e15)  # limits of |x| of every float x other than 0
 
     @field_validator("*", mode="after")
@@ -71,6 +73,28 @@ def _list_floats(value: object) -> Iterator[float]:
             yield from _list_floats(each)
 
 
+DOCUMENTS = {  # kinds of files that users write, by what they are called: the command that reads one
+    "a dataset recipe": "flcav record {} --out DIR",
+    "a run recipe": "flcav run {} --out DIR",
+    "an allocation problem": "flcav allocate {}",
+    "the progress of a plan": "flcav replan PROBLEM {}",
+}
+
+
+def recognise_document(values: Mapping[str, object]) -> str | None:
+    """Return the kind of a document, a key of DOCUMENTS, by its fields; None where they do not tell."""
+    tasks = values.get("tasks")
+    if "regions" in values:
+        return "a run recipe"
+    if "town" in values:
+        return "a dataset recipe"
+    if isinstance(tasks, list) or "networks" in values or "nodes" in values:
+        return "an allocation problem"
+    if isinstance(tasks, dict) and any(isinstance(each, dict) and "samples" in each for each in tasks.values()):
+        return "the progress of a plan"
+    return None
+
+
 ConfigT = TypeVar("ConfigT", bound=Config)
 
 
@@ -80,10 +104,15 @@ def parse_config(model: type[ConfigT], values: object, origin: str) -> ConfigT:
     Raises `InputError` that names `origin`, the field, its value and the violated rule.
     """
     if not isinstance(values, dict):
-        raise InputError(f"{origin}: expected a mapping of fields, found {type(values).__name__}")
+        found = "text" if isinstance(values, str) else type(values).__name__
+        raise InputError(f"{origin}: expected a mapping of fields, found {found}")
     try:
         return model.model_validate(values)
     except ValidationError as error:
+        kind = recognise_document(values)
+        if model.document is not None and kind is not None and kind != model.document:
+            use = f"`{DOCUMENTS[kind].format(origin)}` reads it"
+            raise InputError(f"{origin}: is {kind}, and {model.document} is wanted; {use}") from None
         raise InputError(f"{origin}: {describe_error(error, model)}") from None
 
 
@@ -226,12 +255,12 @@ def describe_error(error: ValidationError, model: type[BaseModel]) -> str:
     """
     errors = error.errors()
     deepest = [each for each in errors if not any(_is_deeper(other, each) for other in errors)]
-    first = deepest[0]
+    first = next((each for each in deepest if _misspelt(each, model)), deepest[0])
     field = ".".join(str(part) for part in first["loc"] if "[" not in str(part)) or "(whole)"  # tags of unions
     more = f" (and {len(deepest) - 1} more)" if len(deepest) > 1 else ""
     if first["type"] == "extra_forbidden":
-        known = sorted({name for owner in _models_at(model, first["loc"][:-1]) for name in owner.model_fields})
-        return f"unknown field '{field}'; known fields: {', '.join(known)}{more}"
+        known = _known_fields(model, first)
+        return f"unknown field '{field}'; known fields: {', '.join(known)}{_misspelt(first, model)}{more}"
     if first["input"] is None:
         return f"field '{field}' is empty{more}"
     if first["type"] == "missing":
@@ -241,7 +270,23 @@ def describe_error(error: ValidationError, model: type[BaseModel]) -> str:
         models = _models_at(model, first["loc"])
         known = sorted({name for owner in models for name in owner.model_fields} if models != [model] else ())
         message = f"must be a mapping{' of the fields ' + ', '.join(known) if known else ''}"
+    if first["type"] in ("float_parsing", "int_parsing"):
+        message = describe_number(str(first["input"]), field)
+    elif first["type"] in ("less_than", "less_than_equal") and 1 in first.get("ctx", {}).values():
+        message += hint_share(float(first["input"]))
     return f"field '{field}' = {shorten(first['input'])}: {message}{more}"
+
+
+def _known_fields(model: type[BaseModel], error: ErrorDetails) -> list[str]:
+    """Return the fields that `model` has where an unknown one was found."""
+    return sorted({name for owner in _models_at(model, error["loc"][:-1]) for name in owner.model_fields})
+
+
+def _misspelt(error: ErrorDetails, model: type[BaseModel]) -> str:
+    """Return " (did you mean 'budgets_mb'?)" of an unknown field that is close to a known one, else ""."""
+    if error["type"] != "extra_forbidden":
+        return ""
+    return suggest(str(error["loc"][-1]), _known_fields(model, error))
 
 
 def _is_deeper(one: ErrorDetails, other: ErrorDetails) -> bool:

@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from flcav.config import InputError
+from flcav.wording import suggest
 
 Wanted = TypeVar("Wanted")
 
@@ -48,7 +49,8 @@ def _load_known(known: str | type) -> Any:
 def _load_own(name: str, told: str, known: Iterable[str]) -> Any:
     place, colon, attribute = name.partition(":")
     if not colon:
-        raise InputError(f"{told}: choose one of {', '.join(known)}, or name your own as module:NAME")
+        closest = suggest(name, known)
+        raise InputError(f"{told}: choose one of {', '.join(known)}, or name your own as module:NAME{closest}")
     if not PLACE.fullmatch(name):
         raise InputError(f"{told}: a module, a colon and a name in it are wanted, as in my_package.my_module:NAME")
     module = _imported(place, told)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import chdtri, ndtr, ndtri, stdtrit
 
 from flcav.intervals import MOST_SEEDS, POWER, MeanOverSeeds, OneTraining, SharedScenes, power_of_seeds
+from flcav.wording import plural
 
 MOST_SCENES = 10_000  # test scenes that are sought up to
 QUANTILES = (np.arange(99) + 0.5) / 99  # of an estimated variance
@@ -31,11 +32,11 @@ class SampleSize:
 
     def describe(self, word: str) -> str:
         """Return the numbers as text, and which of them alone cannot do; `word`: the plural of a training."""
-        if self.trainings is None:
+        if self.trainings is None or self.scenes is None:
             return f"more than {MOST_SEEDS} {word} on {MOST_SCENES} scenes"
         trainings, scenes = self.now
         own = f"{self.trainings} {word if self.trainings > 1 else word[:-1]}"
-        said = f"about {own} on {'these ' if self.scenes == scenes else ''}{self.scenes} scenes"
+        said = f"about {own} on {'these ' if self.scenes == scenes else ''}{plural(self.scenes, 'scene')}"
         cannot = [] if self.by_trainings else [f"no number of {word} does on these {scenes} scenes"]
         if not self.by_scenes:
             these = f"one {word[:-1]}" if trainings == 1 else f"these {trainings} {word}"

@@ -282,7 +282,7 @@ def test_a_log_of_one_name_in_datasets_of_two_splits_is_a_leak(tmp_path: Path):
         import_dataset("argoverse2", tmp_path / "logs", tmp_path / split, split=split)
     manifests = {split: Dataset.open(tmp_path / split).manifest for split in ("test", "val")}
     assert find_leaks(manifests) == [
-        "test (split 'test') and val (split 'val'): leakage, they share 1 scenes, the first is 'one'"
+        "test (split 'test') and val (split 'val'): leakage, they share 1 scene, the first is 'one'"
     ]
 
 

@@ -361,3 +361,68 @@ def test_a_listed_file_with_a_name_too_long_is_missing(data: Path, capsys: pytes
     told = capsys.readouterr()
     assert (ended.value.code, told.err) == (1, "")
     assert "xxx: missing" in told.out
+
+
+RECIPES = {
+    "dataset recipe": "recipes/weather.yaml",
+    "run recipe": "recipes/runs/demo.yaml",
+    "allocation problem": "recipes/allocation/objects.yaml",
+}
+READERS = {
+    "dataset recipe": ("record", "--out", "out"),
+    "run recipe": ("run", "--out", "out"),
+    "allocation problem": ("allocate",),
+}
+
+
+@pytest.mark.parametrize("given", RECIPES)
+@pytest.mark.parametrize("wanted", READERS)
+def test_a_recipe_of_another_kind_is_named_with_the_command_that_reads_it(wanted, given, refused):
+    if given != wanted:
+        command, *more = READERS[wanted]
+        assert (
+            f" {given}, and a{'n' * (wanted[0] == 'a')} {wanted} is wanted; `flcav {READERS[given][0]} {RECIPES[given]}"
+            in (refused(command, RECIPES[given], *more))
+        )
+
+
+@pytest.mark.parametrize(
+    ("command", "meant"),
+    [
+        (("towns", "show", "subrub"), "suburb"),
+        (("trian",), "train"),
+        (("towns", "shwo"), "show"),
+        (("train", "weathr", "--data", "d", "--out", "o"), "weather"),
+        (("train", "weather", "--daat", "d"), "--data"),
+        (("place", "--errors", "e", "--poles", "p", "--method", "exakt"), "exact"),
+        (("export", "kiti", "d", "--out", "o"), "kitti"),
+        (("reproduce", "fig3", "--out", "o"), "fig3b"),
+    ],
+)
+def test_a_misspelt_name_is_suggested_once(command, meant, refused):
+    told = refused(*command).lower()
+    assert told.count("did you mean") == 1
+    assert f"'{meant}'" in told.split("did you mean")[1]
+
+
+def test_missing_files_of_place_are_told_before_its_options(refused):
+    assert "nowhere.csv: no such file" in refused("place", "--errors", "nowhere.csv", "--poles", "nowhere.csv")
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "told"),
+    [
+        ("budgets_mb", "budget_mb", "(did you mean 'budgets_mb'?)"),
+        ("wireless: 4000", "wireless: 4 GB", "must be a number of MB, without the unit: 4000"),
+    ],
+)
+def test_fields_and_numbers_that_users_guess_are_told_as_they_are_written(right, wrong, told, tmp_path, refused):
+    text = Path("recipes/allocation/objects.yaml").read_text(encoding="utf-8")
+    (tmp_path / "problem.yaml").write_text(text.replace(right, wrong), encoding="utf-8")
+    assert told in refused("allocate", tmp_path / "problem.yaml")
+
+
+@pytest.mark.parametrize(("accuracy", "told"), [("55", "55 % is 0.55"), ("55%", "without the unit: 0.55")])
+def test_accuracies_in_per_cent_are_told_as_shares(accuracy, told, tmp_path, refused):
+    (tmp_path / "history.csv").write_text(f"task,stage,resource,accuracy\na,pretrain,10,{accuracy}\n")
+    assert told in refused("fit", tmp_path / "history.csv")

@@ -10,10 +10,12 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
+from matplotlib.figure import Figure
 
 from flcav.cli.main import run
 from flcav.cli.planning import place_inputs
 from flcav.optimization.placement import solve
+from flcav.report.charts import figures
 from flcav.world.map.town import Town, load_town
 
 ERRORS = "x,y,z,weight\n0,0,0,1\n1,0,0,1\n50,0,0,5\n"
@@ -193,3 +195,24 @@ def test_a_wrong_price_or_limit_is_one_sentence(more, change, named, files, caps
     err = capsys.readouterr().err
     assert named in err
     assert err.count("\n") == 1
+
+
+def test_the_map_tells_what_is_covered_what_was_bought_and_what_it_sees(tmp_path, monkeypatch):
+    town = load_town("grid")
+    at = [pole.tolist() for pole in town.poles.position[:2]]
+    rows = [f"mast-{number},{x},{y},{z},{number}" for number, (x, y, z) in enumerate(at, start=1)]
+    (tmp_path / "poles.csv").write_text("\n".join(["id,x,y,z,cost", *rows]))
+    spots = [f"{x + 5},{y},{z}" for x, y, z in at] + [f"{at[0][0]},{at[0][1] + 200},1"]
+    (tmp_path / "errors.csv").write_text("\n".join(["x,y,z", *spots]))
+    (tmp_path / "sensors.csv").write_text("name,range_m,cost\ncamera,10,1\nlidar,20,9\n")
+    drawn = []
+    monkeypatch.setattr(figures, "town_map", lambda scene, width: drawn.append(scene) or Figure())
+    files = [f"--{name}={tmp_path / name}.csv" for name in ("errors", "poles", "sensors")]
+    assert called("place", *files, "--budget=5", "--town=grid", "--line-of-sight", f"--map={tmp_path / 'a.png'}") == 0
+    (scene,) = drawn
+    assert scene.covered.tolist() == [True, True, False]
+    assert set(scene.viewsheds) == {"1", "2"}
+    assert scene.notes[:2] == [
+        "2 of 3 errors covered, cost 5",
+        "camera, range 10 m, on poles mast-1 (1), mast-2 (2)",
+    ]

@@ -197,7 +197,7 @@ def test_validate_counts_or_complains(reference: Path, tmp_path: Path, capsys: p
     assert flcav("validate", reference, tmp_path / "test") == 1
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 1
-    assert "leakage, they share 1 scenes, the first is 'suburb-4-000'" in said[0]
+    assert "leakage, they share 1 scene, the first is 'suburb-4-000'" in said[0]
 
 
 def test_damaged_files_are_recorded_again_from_their_traffic(

@@ -47,8 +47,8 @@ def test_the_recipes_of_the_readme_are_installed(installed: Path, tmp_path: Path
     plan = json.loads(ran(installed, [command, "allocate", "recipes/allocation/three_tasks.yaml", "--json"], tmp_path))
     assert [task["name"] for task in plan["tasks"]] == ["weather", "signs", "objects"]
     record = [command, "record", "recipes/suburb.yaml", "--frames", "1", "--out", "data"]
-    assert "1 frames of 1 scenes" in ran(installed, record, tmp_path)
-    assert "1 frames" in ran(installed, [command, "validate", "data"], tmp_path)
+    assert "1 frame of 1 scene," in ran(installed, record, tmp_path)
+    assert "1 frame, no problems" in ran(installed, [command, "validate", "data"], tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data"]
 
 

@@ -36,8 +36,12 @@ class Picture(Config):
             "unknown field 'shapes.0.circle.red'; known fields: .*radius_m",
         ),
         (
-            {"shapes": [{"kind": "square", "side_m": 1}], "frame": {"sides": 1}},
+            {"shapes": [{"kind": "square", "side_m": 1}], "frame": {"extent": 1}},
             r"'frame.side_m' is missing \(and 1 mor",
+        ),
+        (
+            {"shapes": [{"kind": "square", "side_m": 1}], "frame": {"sides": 1}},
+            r"unknown field 'frame.sides'; known fields: kind, side_m \(did you mean 'side_m'\?\) \(and 1 more\)$",
         ),
         (
             {"shapes": [{"kind": "square", "side_m": 1}], "colour": 1},

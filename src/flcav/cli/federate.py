@@ -8,6 +8,7 @@ import typer
 from flcav.cli.options import STALE, Runtime, Stale
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.machine.threads import use_threads
+from flcav.wording import plural
 
 if TYPE_CHECKING:
     from flcav.pipeline.results.training import StageResult
@@ -73,8 +74,8 @@ def _describe(result: "StageResult") -> str:
     """Return a federation in words, with the vehicles that failed or were lost; on a network with its time."""
     from flcav.federation.state import describe_failures
 
-    told = f"{result.task} in {result.region}, {result.rounds} rounds"
-    told += f", {result.clients} vehicles, {result.samples} samples"
+    told = f"{result.task} in {result.region}, {plural(result.rounds, 'round')}"
+    told += f", {plural(result.clients, 'vehicle')}, {plural(result.samples, 'sample')}"
     records = result.records or ()
     seconds = [record.seconds for record in records if record.seconds is not None]
     told += f", {sum(seconds):.1f} s on the network" if seconds else ""

@@ -3,6 +3,7 @@
 import atexit
 import errno
 import gc
+import re
 import sys
 
 import click
@@ -20,6 +21,7 @@ from flcav.cli.perception import errors, evaluate, infer, train
 from flcav.cli.planning import allocate, fit, history, place
 from flcav.cli.terminal import Interrupted
 from flcav.config import InputError
+from flcav.wording import describe_number, suggest
 
 INTERRUPTED = 130
 LONGEST = 1000  # characters of a message
@@ -88,7 +90,7 @@ def run(arguments: list[str] | None = None) -> None:
         _say("interrupted")
         code = INTERRUPTED
     except click.ClickException as error:
-        _say(error.format_message())
+        _say(_describe(error))
         code = 2
     except InputError as error:
         _say(str(error))
@@ -98,6 +100,21 @@ def run(arguments: list[str] | None = None) -> None:
         missing = isinstance(error, FileNotFoundError | IsADirectoryError) or error.errno == errno.ELOOP
         code = 2 if missing else 1  # a named file is missing
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _describe(error: click.ClickException) -> str:
+    """Return the message of a wrong call, which suggests a name once, and says how a number is written."""
+    if "Did you mean" in error.message:  # Typer has added what Click adds when it formats the message
+        return error.message
+    given = re.match(r"'(.*)' is not ", error.message)
+    if not isinstance(error, click.BadParameter) or error.param is None or given is None:
+        return error.format_message()
+    kind, told = error.param.type, error.format_message()
+    if isinstance(kind, click.Choice):
+        return told.removesuffix(".") + suggest(given[1], map(str, kind.choices))
+    if isinstance(kind, click.types.FloatParamType):
+        return told.replace("is not a valid float.", describe_number(given[1], error.param.name or ""))
+    return told
 
 
 def _say(message: str) -> None:

@@ -13,6 +13,7 @@ from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale, join_choices, 
 from flcav.cli.terminal import only_writer_of, when_interrupted
 from flcav.experiments.studies import STUDIES
 from flcav.machine.threads import use_threads
+from flcav.wording import plural
 
 if TYPE_CHECKING:
     from flcav.files import Json
@@ -142,7 +143,7 @@ def reproduce(
         _task(target, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
         COMPARISONS[target](out, count, "quick" if quick else "paper", jobs, engine, stale)
-    typer.echo(f"{out / 'result.json'}: the numbers of {count} seeds")
+    typer.echo(f"{out / 'result.json'}: the numbers of {plural(count, 'seed')}")
 
 
 @when_interrupted()

@@ -10,6 +10,7 @@ from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.config import InputError
 from flcav.machine.threads import use_threads
+from flcav.wording import plural
 
 if TYPE_CHECKING:
     from flcav.pipeline.results.run import Run, Summary
@@ -141,7 +142,7 @@ def _tell(results: "list[Run]", summary: "Summary | None") -> None:
     for row in (*summary.measures, *summary.differences):
         kind = f" ({row.kind} claim)" if row.kind else ""
         judged = f": {row.judged.verdict}{kind}, {row.judged.describe()}" if row.judged else ""
-        typer.echo(f"{row.name}: {row.estimate.describe()} over {len(summary.seeds)} seeds{judged}")
+        typer.echo(f"{row.name}: {row.estimate.describe()} over {plural(len(summary.seeds), 'seed')}{judged}")
 
 
 def compare(

@@ -10,6 +10,7 @@ from flcav.federation.state import FAILED
 from flcav.pipeline.rigs import RIG
 from flcav.pipeline.steps import FINISHED, Notify
 from flcav.progress import DAMAGED
+from flcav.wording import plural
 
 EPSILON = "epsilon"  # in the notes of rounds with differential privacy
 
@@ -45,7 +46,7 @@ def live_steps(title: str) -> Iterator[Notify]:
             if note in FINISHED:
                 finished += 1
                 bars.update(rows[step], visible=False)
-                bars.update(whole, note=f"{finished} steps done, {step} {note}")
+                bars.update(whole, note=f"{plural(finished, 'step')} done, {step} {note}")
                 if not console.is_terminal:
                     console.print(f"{title}: {step} {note}", highlight=False)
 

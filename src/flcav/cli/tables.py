@@ -27,6 +27,8 @@ def read_table(path: Path, columns: Sequence[str], names: Sequence[str] = ()) ->
 
 
 def _read_csv(path: Path, names: Sequence[str]) -> pa.Table:
+    if path.suffix.lower() in (".yaml", ".yml", ".json"):
+        raise InputError(f"{path}: a table is wanted, .csv or .parquet, and no {path.suffix[1:].upper()} file")
     written = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(names, pa.string()))
     try:
         table = pyarrow.csv.read_csv(path, convert_options=written)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.terminal import print_json
+from flcav.wording import plural
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -57,11 +58,13 @@ def show(
     loaded = load_town(town)
     if poles is not None:
         write_table(_poles_table(loaded), poles)
-        typer.echo(f"{poles}: {len(loaded.poles.id)} candidate poles of {loaded.name}")
+        typer.echo(f"{poles}: {plural(len(loaded.poles.id), 'candidate pole')} of {loaded.name}")
     if out is not None:
         write_bytes(out, town_map(loaded))
         typer.echo(f"{out}: map of {loaded.name}")
     typer.echo(f"{loaded.name}: {summary(summarise_town(loaded))}")
+    if out is None:
+        typer.echo(f"its map: flcav towns show {town} --out {loaded.name}.png")
 
 
 @towns.command("import")
@@ -91,5 +94,5 @@ def summary(counts: dict[str, float]) -> str:
     """Return a town's extent and counts as one line."""
     extent = f"{counts['width_m']:.0f} m x {counts['height_m']:.0f} m"
     lengths = f"{counts['driving_km']:g} km of lanes"
-    shown = ("junctions", "lights", "crossings", "buildings", "trees", "signs", "poles", "vehicles", "pedestrians")
-    return ", ".join((extent, lengths, *(f"{counts[name]:g} {name}" for name in shown)))
+    nouns = ("junction", "light", "crossing", "building", "tree", "sign", "pole", "vehicle", "pedestrian")
+    return ", ".join((extent, lengths, *(plural(int(counts[f"{noun}s"]), noun) for noun in nouns)))

@@ -122,6 +122,8 @@ def read_manifest(folder: Path) -> Manifest:
     Raises `InputError` where the folder is missing, holds no finished dataset, or one of another format version.
     """
     path = folder / MANIFEST
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file, and a dataset is a folder; `flcav record RECIPE --out DIR` makes one")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such dataset folder")
     if not path.is_file():

@@ -22,6 +22,7 @@ from flcav.files import sha256
 from flcav.progress import Report, ignore_progress
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Frame
+from flcav.wording import plural
 from flcav.world.trace import Trace
 
 
@@ -127,7 +128,7 @@ def _other_counts(dataset: Dataset) -> Iterator[str]:
     if scenes != dataset.manifest.scenes:
         yield f"{dataset.folder / MANIFEST}: its scenes are not those of the frames"
     if len(dataset) != dataset.manifest.counts.frames:
-        yield f"{dataset.folder / MANIFEST}: counts {dataset.manifest.counts.frames} frames of {len(dataset)}"
+        yield f"{dataset.folder / MANIFEST}: counts {plural(dataset.manifest.counts.frames, 'frame')} of {len(dataset)}"
 
 
 def _trace(dataset: Dataset, scene: str, damaged: Collection[str]) -> Trace | None:
@@ -172,7 +173,7 @@ def _shared(one: tuple[str, Manifest], other: tuple[str, Manifest]) -> Iterator[
     where = f"{name} (split '{split}') and {other_name} (split '{other_split}')"
     scenes = sorted(_recordings(manifest).keys() & _recordings(other_manifest).keys())
     if scenes:
-        yield f"{where}: leakage, they share {len(scenes)} scenes, the first is '{scenes[0]}'"
+        yield f"{where}: leakage, they share {plural(len(scenes), 'scene')}, the first is '{scenes[0]}'"
     elif "seed" in recipe and (recipe.get("town"), recipe["seed"]) == (
         other_recipe.get("town"),
         other_recipe.get("seed"),

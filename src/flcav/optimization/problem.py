@@ -199,6 +199,8 @@ class Problem(Quantities):
     (100, 5000)
     """
 
+    document: ClassVar = "an allocation problem"
+
     budgets_mb: Budgets
     edge_rounds_per_cloud_round: Count = 1  # k: each cloud round runs, and pays, k edge rounds in every region
     horizon_s: Positive | None = None  # longest time that each vehicle may be busy, on its own link and training

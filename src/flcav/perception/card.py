@@ -17,6 +17,7 @@ from flcav.perception.task import KnownLidar
 from flcav.records import LEFT_OUT, Record
 from flcav.sensors.rig import RIGS
 from flcav.sources.randomisation import DRAWN_BEAMS
+from flcav.wording import plural
 
 CARD_KEY = "flcav.card"  # key of the card in the metadata of a safetensors file
 LICENCE = "Apache-2.0"
@@ -153,7 +154,7 @@ def _rig_name(rig: Any) -> str | None:
 
 def _entry(entry: DataEntry) -> str:
     recipe = {name: value for name, value in entry.recipe.items() if value not in ([], {}, None)}
-    frames = f"{entry.frames} frames" + (f" of {', '.join(entry.agents)}" if entry.agents is not None else "")
+    frames = plural(entry.frames, "frame") + (f" of {', '.join(entry.agents)}" if entry.agents is not None else "")
     return f"{entry.name}: {frames}; {_text(recipe)}; SHA-256 of its manifest {entry.manifest}"
 
 

@@ -37,6 +37,7 @@ from flcav.perception.task import Evaluated, KnownLidar
 from flcav.progress import Report, ignore_progress
 from flcav.records import Class
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front
+from flcav.wording import plural
 
 Array = NDArray[np.float64]
 BenchmarkKind = Literal["image", "bev", "3d"]  # rectangles in the image, footprints, boxes
@@ -91,7 +92,7 @@ class BenchmarkEvaluation(Evaluated):
     def lines(self) -> list[str]:
         """Return a line on the frames and one for each class and kind."""
         which = f"of ImageSets/{self.split}.txt" if self.split else "with labels"
-        lines = [f"{self.frames} frames {which}, AP R40 as KITTI's benchmark counts it: easy, moderate, hard"]
+        lines = [f"{plural(self.frames, 'frame')} {which}, AP R40 as KITTI's benchmark counts it: easy, moderate, hard"]
         if self.bare:
             lines.append(f"{self.bare} of them without an image, taken as {ASSUMED_SIZE[1]} x {ASSUMED_SIZE[0]} pixels")
         for row in self.benchmark:

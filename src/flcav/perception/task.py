@@ -22,6 +22,7 @@ from flcav.perception.marks import Mark
 from flcav.progress import Report, ignore_progress
 from flcav.records import Record
 from flcav.seeds import derive_seed
+from flcav.wording import suggest
 
 if TYPE_CHECKING:
     from flcav.perception.images import CameraView
@@ -196,7 +197,7 @@ def find_configuration(task: Task[ConfigT, NetworkT, SampleT], name: str | None)
     if name is None:
         return next(iter(known.values()))
     if name not in known:
-        raise InputError(f"network '{name}': choose one of {', '.join(known)}")
+        raise InputError(f"network '{name}': choose one of {', '.join(known)}{suggest(name, known)}")
     return known[name]
 
 

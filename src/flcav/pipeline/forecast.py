@@ -33,6 +33,7 @@ from flcav.pipeline.stages.clients import make_clients
 from flcav.pipeline.work.planning import FirstPlanSettings, frame_plan
 from flcav.progress import Report, ignore_progress
 from flcav.records import Record
+from flcav.wording import plural
 
 STEPS = 3  # that are timed
 SCENE_SD = 0.1  # of a paired difference of AP50 or accuracy in one test scene: .08 to .14 in reproductions/runs
@@ -73,7 +74,8 @@ class Forecast(Record):
         ]
         for name, arm in self.arms.items():
             for task, own in arm.tasks.items():
-                rounds = f"{own.samples} samples, {own.edge_rounds} edge rounds, {own.cloud_rounds} cloud rounds"
+                counts = {"sample": own.samples, "edge round": own.edge_rounds, "cloud round": own.cloud_rounds}
+                rounds = ", ".join(plural(count, what) for what, count in counts.items())
                 lines.append(f"{name}, {task}: {rounds}")
             sent = " and ".join(f"{megabytes:.1f} MB {link}" for link, megabytes in arm.uplink_mb.items())
             lines.append(f"{name}: about {sent} of uplink")
@@ -82,7 +84,7 @@ class Forecast(Record):
         told = f"tell a difference of {self.effect:.2f} with a power of 0.8"
         by = f"by a standard deviation of {SCENE_SD:g} between scenes, of AP50 and accuracy in earlier runs"
         lines.append(
-            f"tests: of one training, {self.scenes} scenes of a region {told} ({by}); retraining varies besides"
+            f"tests: of one training, {plural(self.scenes, 'scene')} of a region {told} ({by}); retraining varies besides"
         )
         return lines
 

@@ -6,7 +6,7 @@
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
@@ -244,6 +244,8 @@ class RunRecipe(Config):
     >>> recipe.with_role("federate"), recipe.vehicles("grid"), recipe.placement.rule
     (('grid',), 3, 'vrcsp')
     """
+
+    document: ClassVar = "a run recipe"
 
     seed: int = Field(default=1, ge=0, lt=2**31)  # of all random draws
     retrainings: int = Field(default=0, ge=0, le=100)  # of every arm, on the same frames with other random numbers

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from flcav.config import Config, InputError, read_config, shorten
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
+from flcav.wording import suggest
 from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
 from flcav.world.weather import WEATHERS, WeatherSchedule
@@ -67,6 +68,8 @@ class Recipe(Config):
     >>> recipe.scenes * recipe.spins_per_scene * recipe.cavs  # frames of the vehicles
     240
     """
+
+    document: ClassVar = "a dataset recipe"
 
     town: str  # name of a town of flcav, or folder of an imported one
     seed: int = Field(
@@ -154,7 +157,9 @@ def recipe_path(name: str) -> Path:
     folder = next(filter(Path.is_dir, (package / "recipes", package.parents[1] / "recipes")))
     known = {file.relative_to(folder).with_suffix("").as_posix(): file for file in sorted(folder.rglob("*.yaml"))}
     if name not in known:
-        raise InputError(f"unknown recipe {shorten(name)}; those that come with flcav: {', '.join(known)}")
+        raise InputError(
+            f"unknown recipe {shorten(name)}; those that come with flcav: {', '.join(known)}{suggest(name, known)}"
+        )
     return known[name]
 
 

@@ -4,6 +4,7 @@ A ray starts START_M from the pole's mount, outside its own mast, and ends befor
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,17 @@ Array = NDArray[np.float64]
 START_M = 0.6  # from the mount to the start of a ray
 END_M = 2.5  # from an error's position to the end of a ray: half of a long car may lie between
 INSTANTS = 20  # at which traffic is looked at, over all traces
+FINE = 60  # points of a viewshed from its site to the range
+EYE_M = 1.0  # height above the ground of a viewshed's points: middle of a car
+
+
+@dataclass(frozen=True)
+class Viewshed:
+    """Points of a square grid around a site, and which of them the site sees within its range."""
+
+    x: Array  # (N,) world [m], ascending
+    y: Array  # (N,)
+    seen: NDArray[np.bool_]  # (N, N): rows by y, columns by x
 
 
 def find_visible(
@@ -37,6 +49,20 @@ def find_visible(
         seen += ~scene.find_occluded(origins, directions, far)
         instants += 1
     return 2 * seen >= instants
+
+
+def find_viewshed(town: Town, traces: Sequence[Trace], site: Array, range_m: float) -> Viewshed:
+    """Return the viewshed of a site (3,): points EYE_M above the ground that it sees within `range_m`.
+
+    Seen is what `find_visible` calls so.
+    """
+    x, y = site[:2, None] + np.linspace(-range_m, range_m, 2 * FINE + 1)
+    across, along = (each.ravel() for each in np.meshgrid(x, y))
+    places = np.c_[across, along, town.grounds(across, along) + EYE_M]
+    near = np.flatnonzero(np.linalg.norm(places - site, axis=1) <= range_m)
+    seen = np.zeros(len(places), np.bool_)
+    seen[near] = find_visible(town, traces, site[None], places, (np.zeros_like(near), near))
+    return Viewshed(x, y, seen.reshape(len(y), len(x)))
 
 
 def count_visible_actors(town: Town, traces: Sequence[Trace], sites: Array, ranges_m: Sequence[float]) -> Array:

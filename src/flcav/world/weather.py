@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from flcav.config import Config
+from flcav.wording import suggest
 
 NO_FOG_M = 20_000.0  # from this visibility on, the air is clear
 NIGHT_DEG = -6.0  # sun elevation at the end of civil twilight: below it, street lamps and headlamps are on
@@ -133,7 +134,7 @@ def _expand_preset(value: Any) -> Any:
 def _preset(name: Any) -> dict[str, Any]:
     """Return the fields of a preset; raises `ValueError` for an unknown one."""
     if not isinstance(name, str) or name not in WEATHERS:
-        raise ValueError(f"unknown weather; known weathers: {', '.join(WEATHERS)}")
+        raise ValueError(f"unknown weather; known weathers: {', '.join(WEATHERS)}{suggest(str(name), WEATHERS)}")
     return WEATHERS[name].model_dump()
 
 

@@ -64,4 +64,5 @@ def test_a_federation_s_last_line_names_who_failed_or_was_lost(timed: str):
         rounds = enumerate(given, start=1)
         records = tuple(FederatedRound("ring", i, (), each, 0, 0.0, 0, 0, None, seconds) for i, each in rounds)
         stage = StageResult("edge", "weather", "ring", len(records), 16, 2, (), records=records)
-        assert _describe(stage) == f"weather in ring, {len(records)} rounds, 2 vehicles, 16 samples{timed}{words}"
+        rounds = f"{len(records)} round{'s' if len(records) > 1 else ''}"
+        assert _describe(stage) == f"weather in ring, {rounds}, 2 vehicles, 16 samples{timed}{words}"

@@ -5,6 +5,7 @@ import made_up_run
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
@@ -13,6 +14,7 @@ from flcav.intervals import MeanOverSeeds
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE
+from flcav.world.line_of_sight import Viewshed
 
 TESTED, ROUNDS = made_up_run.chart_rows(), made_up_run.rounds()
 BUDGETS, SENT = made_up_run.BUDGETS, made_up_run.sent()
@@ -57,15 +59,64 @@ def test_the_map_shows_every_error_once_and_the_reach_of_the_chosen_pole() -> No
     assert rim.get_center() == pytest.approx((x, y))
     assert rim.get_radius() == pytest.approx(np.sqrt(scene.chosen["2"] ** 2 - z**2))
     words = {text.get_text() for text in axes.texts}
-    assert {str(number) for number in scene.town.poles.id} <= words
-    assert {"placed", "densest traffic"} <= words
+    assert words == {*map(str, scene.town.poles.id), "50 m"}  # no notes over the town
 
 
-def test_a_chosen_pole_says_which_conventional_rules_choose_it_too() -> None:
+def test_below_the_map_stands_what_is_placed_and_where_conventional_rules_place_it() -> None:
     both = {DENSEST: ("2",), MOST_VISIBLE: ("2", "3")}
     axes = figures.town_map(replace(made_up_run.error_map(), conventional=both)).axes[0]
-    notes = {text.get_text() for text in axes.texts}
-    assert {"placed, densest traffic\nand most visible objects", "most visible objects"} <= notes
+    assert axes.get_xlabel() == "placed: pole 2\ndensest traffic: pole 2\nmost visible objects: poles 2, 3"
+
+
+def test_covered_errors_are_drawn_apart_from_uncovered_ones() -> None:
+    scene = made_up_run.error_map()
+    covered = np.arange(len(scene.errors)) < 20
+    lines = figures.town_map(replace(scene, covered=covered)).axes[0].get_lines()
+    shown = {str(line.get_label()): line for line in lines}
+    for state, own in (("covered", covered), ("uncovered", ~covered)):
+        missed = own & (scene.kind == "miss")
+        line = shown[f"missed, {state} ({missed.sum()})"]
+        np.testing.assert_allclose(np.column_stack(line.get_data()), scene.errors[missed, :2])
+        assert (line.get_color() == style.BLUE) == (state == "covered")
+
+
+def test_kinds_of_a_users_own_have_marks_of_their_own() -> None:
+    scene = made_up_run.error_map()
+    kind = np.where(np.arange(len(scene.errors)) < 9, "late", "wrong class")
+    lines = figures.town_map(replace(scene, kind=kind)).axes[0].get_lines()
+    marks = {str(line.get_label()): line.get_marker() for line in lines}
+    assert marks["late (9)"] != marks[f"wrong class ({len(kind) - 9})"]
+
+
+def test_of_many_poles_only_those_that_are_named_below_have_their_ids_on_the_map() -> None:
+    scene = made_up_run.error_map()
+    masts = {str(number): scene.errors[number] for number in range(40)}
+    crowd = replace(scene, poles=masts, chosen={"7": 40.0}, conventional={DENSEST: ("9",)})
+    assert {text.get_text() for text in figures.town_map(crowd).axes[0].texts} == {"7", "9", "50 m"}
+
+
+def test_a_viewshed_takes_the_place_of_the_filled_range() -> None:
+    scene = made_up_run.error_map()
+    site = scene.poles["2"]
+    axis = np.linspace(-40, 40, 41)
+    seen = Viewshed(site[0] + axis, site[1] + axis, np.broadcast_to(axis < 0, (41, 41)))  # the west
+    axes = figures.town_map(replace(scene, viewsheds={"2": seen})).axes[0]
+    assert not [patch for patch in axes.patches if isinstance(patch, Circle) and patch.get_fill()]
+    drawn = [area for area in axes.collections if isinstance(area, QuadContourSet) and area.filled]
+    extents = [area.get_paths()[0].get_extents() for area in drawn]
+    assert [each.x1 for each in extents] == [pytest.approx(site[0], abs=2.0)]
+    assert [each.x0 for each in extents] == [pytest.approx(site[0] - 40)]
+
+
+@pytest.mark.parametrize("name", ["town_map", "overview"])
+def test_the_key_of_a_map_has_room(name: str) -> None:
+    figure = DRAWN[name]()
+    figure.draw_without_rendering()
+    owner = figure.subfigs[0] if figure.subfigs else figure
+    (key,) = owner.legends
+    box = key.get_window_extent()
+    assert owner.bbox.x0 <= box.x0
+    assert box.x1 <= owner.bbox.x1
 
 
 def test_zones_stand_on_the_map_with_their_density() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flcav.world.line_of_sight import count_visible_actors, find_visible
+from flcav.world.line_of_sight import count_visible_actors, find_viewshed, find_visible
 
 HOUSE = np.array([[20.0, 0.0, 0.0, 10.0, 10.0, 10.0]])  # x 15-25, y -5-5, 10 m high
 SITES = np.array([[0.0, 0.0, 5.0], [20.0, 30.0, 5.0]])
@@ -14,6 +14,16 @@ PAIRS = (np.array([0, 0, 0, 1, 1, 1]), np.array([0, 1, 2, 0, 1, 2]))
 def test_a_building_hides_what_is_behind_it(small_town):
     seen = find_visible(small_town(buildings=HOUSE), [], SITES, PLACES, PAIRS)
     assert seen.reshape(2, 3).tolist() == [[False, True, True], [True, True, True]]
+
+
+def test_a_viewshed_is_the_ground_within_range_that_no_building_hides(small_town):
+    found = find_viewshed(small_town(buildings=HOUSE), [], SITES[0], 50.0)
+    x, y = np.meshgrid(found.x, found.y)
+    within = np.sqrt(x**2 + y**2 + 4.0**2) <= 50.0  # from 5 m height to 1 m
+    shadow = (x > 28.0) & (np.abs(y) < x / 3)  # between the lines through the corners (15, -5) and (15, 5)
+    open_ = (x < 15.0) | (np.abs(y) > x / 3 + 1.0)
+    assert not found.seen[~within | shadow].any()
+    assert found.seen[within & open_].mean() > 0.99  # a mast hides a line
 
 
 def test_traffic_hides_where_it_stands_at_half_of_the_instants(small_town, standing):

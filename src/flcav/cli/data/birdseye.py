@@ -5,6 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import check_finite
+from flcav.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -53,4 +54,4 @@ def birdseye(
         agent_size=None if kind_of(seen.agent) == POLE else (sedan.length, sedan.width),
     )
     write_bytes(out, style.png(birdseye(view)))
-    typer.echo(f"{out}: {seen.key}, {len(points)} points, {len(seen.annotations)} annotated actors")
+    typer.echo(f"{out}: {seen.key}, {plural(len(points), 'point')}, {plural(len(seen.annotations), 'annotated actor')}")

@@ -5,6 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import ImportFormat, join_choices
+from flcav.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -33,8 +34,8 @@ def import_(
     manifest = read_manifest(out)
     counts = manifest.counts
     typer.echo(
-        f"{out}: imported {counts.scenes} scenes, {counts.frames} frames, {counts.annotations} objects, "
-        f"{counts.points} points, {counts.images} images"
+        f"{out}: imported {plural(counts.scenes, 'scene')}, {plural(counts.frames, 'frame')}, "
+        f"{plural(counts.annotations, 'object')}, {plural(counts.points, 'point')}, {plural(counts.images, 'image')}"
     )
     for note in notes:
         typer.echo(f"{folder}: {note}")

@@ -6,6 +6,7 @@ import typer
 
 from flcav.cli.options import ENGINE, Engine
 from flcav.cli.terminal import when_interrupted
+from flcav.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -44,8 +45,9 @@ def record(
     done = "recorded" if written else "already recorded, nothing to do:"
     size_mb = (counts.payload_bytes + sum(entry.bytes for entry in manifest.tables.values())) / 1e6
     typer.echo(
-        f"{out}: {done} {counts.frames} frames of {counts.scenes} scenes, "
-        f"{counts.annotations} annotations, {counts.points} points, {counts.images} images, {size_mb:.1f} MB"
+        f"{out}: {done} {plural(counts.frames, 'frame')} of {plural(counts.scenes, 'scene')}, "
+        f"{plural(counts.annotations, 'annotation')}, {plural(counts.points, 'point')}, "
+        f"{plural(counts.images, 'image')}, {size_mb:.1f} MB"
     )
     if source.recipe.scenarios:
         happened = [event.kind for scene in manifest.scenes for event in Trace.load(out / trace_path(scene)).events]

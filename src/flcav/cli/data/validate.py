@@ -4,6 +4,8 @@ from pathlib import Path
 
 import typer
 
+from flcav.wording import plural
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -29,4 +31,4 @@ def validate(
         typer.echo(problem)
     if problems:
         raise typer.Exit(1)
-    typer.echo(f"{sum(manifest.counts.frames for manifest in manifests.values())} frames, no problems")
+    typer.echo(f"{plural(sum(manifest.counts.frames for manifest in manifests.values()), 'frame')}, no problems")

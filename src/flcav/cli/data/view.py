@@ -7,6 +7,8 @@ from pathlib import Path
 
 import typer
 
+from flcav.wording import plural
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -64,4 +66,4 @@ def view(
         recording.save(temporary, default_blueprint=layout)
         log()
         recording.disconnect()
-    typer.echo(f"{save}: scene {shown}, {len(selected)} frames, {save.stat().st_size / 1e6:.1f} MB")
+    typer.echo(f"{save}: scene {shown}, {plural(len(selected), 'frame')}, {save.stat().st_size / 1e6:.1f} MB")

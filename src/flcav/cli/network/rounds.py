@@ -7,6 +7,7 @@ import typer
 from flcav.cli.network.radio import NETWORK, POLES, SCENE, SEED
 from flcav.cli.options import check_all_finite, check_finite
 from flcav.cli.terminal import print_json
+from flcav.wording import plural
 
 BYTES_PER_MB = 1_000_000
 
@@ -110,4 +111,4 @@ def rounds(
             typer.echo(f"    {client.client} at {client.server}: {spent}{lost}")
     for path in (out, timeline):
         if path is not None:
-            typer.echo(f"{path}: {len(records)} rounds")
+            typer.echo(f"{path}: {plural(len(records), 'round')}")

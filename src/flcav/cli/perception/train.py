@@ -7,6 +7,7 @@ import typer
 from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device
 from flcav.cli.terminal import when_interrupted
 from flcav.machine.threads import use_threads
+from flcav.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -69,7 +70,7 @@ def train(
         with progress.show_progress(f"train {task}") as report:
             trained = train_prepared(prepared, report)
     card = trained.card
-    told = f"{out / WEIGHTS}: trained on {card.samples} samples, {card.learning.steps} steps"
+    told = f"{out / WEIGHTS}: trained on {plural(card.samples, 'sample')}, {plural(card.learning.steps, 'step')}"
     typer.echo(f"{told}, mean loss of the last epoch {card.learning.loss:.3f}")
     if trained.evaluation is not None:
         typer.echo("\n".join(["on the validation data:", *trained.evaluation.lines()]))

@@ -9,6 +9,7 @@ import typer
 
 from flcav.cli.options import check_all_finite, check_finite, refuse_unused
 from flcav.cli.terminal import only_writer_of, print_json
+from flcav.wording import plural
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -234,7 +235,8 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
         if "held_out" in answer:
             checked = answer["held_out"]
             told = (
-                f"{checked['runs']} runs held out, {checked['points']} points: mean error of the prediction "
+                f"{plural(checked['runs'], 'run')} held out, {plural(checked['points'], 'point')}: "
+                f"mean error of the prediction "
                 f"{checked['mean_error']:.4f}, rank correlation {checked['rank_correlation']:.3f}",
                 f"runs differ by {checked['between_runs']:.4f}, their points by {checked['within_runs']:.4f} (standard"
                 f" deviations): the true curve would reach a rank correlation of {checked['attainable']:.3f}",
@@ -246,7 +248,7 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
                 )
             if new := checked["new_seeds"]:
                 told += (
-                    f"seeds held out whole, {new['points']} points after pretraining: mean error "
+                    f"seeds held out whole, {plural(new['points'], 'point')} after pretraining: mean error "
                     f"{new['mean_error']:.4f}, rank correlation {new['rank_correlation']:.3f} before the run; scaled to"
                     f" what its run reached by pretraining {new['mean_error_pretrained']:.4f} and "
                     f"{new['rank_correlation_pretrained']:.3f}",

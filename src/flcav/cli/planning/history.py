@@ -8,6 +8,7 @@ from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
 from flcav.cli.terminal import only_writer_of, when_interrupted
 from flcav.config import InputError
 from flcav.machine.threads import use_threads
+from flcav.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -54,7 +55,7 @@ def history(
             recipes, out, beside=found.parent, jobs=jobs, notify=notify, stale=stale.value, engine=engine.value
         )
     save_origin(asked, task, runs, out)
-    typer.echo(f"{out / HISTORY}: {len(runs)} runs; next: flcav fit {out / HISTORY}")
+    typer.echo(f"{out / HISTORY}: {plural(len(runs), 'run')}; next: flcav fit {out / HISTORY}")
 
 
 def _parse_counts(text: str) -> tuple[int, ...]:

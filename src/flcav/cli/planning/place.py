@@ -9,6 +9,7 @@ import typer
 
 from flcav.cli.options import Method, check_finite
 from flcav.cli.terminal import print_json
+from flcav.wording import plural
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from flcav.optimization.verification.record import Verification
     from flcav.world.map.town import Town
     from flcav.world.trace import Trace
+
+MAP_IN = 6.4  # width of the map [inch]
 
 
 def register(app: typer.Typer) -> None:
@@ -71,6 +74,9 @@ def place(
     from flcav.optimization.placement.baselines import place_at_random
     from flcav.optimization.placement.cheapest import cover_share
 
+    for file in (errors, poles, sensors):
+        if file is not None and not file.exists():
+            raise InputError(f"{file}: no such file")
     if (sensors is None) == (range_m is None):
         raise InputError("--sensors and --range: one of the two says how far sensors cover errors")
     if sum(limit is not None for limit in (count, budget, cover)) != 1:
@@ -100,7 +106,7 @@ def place(
     limit = budget if budget is not None else float(count or result.cost)
     conventional = _place_conventionally(candidates, given, limit, here, traces)
     if map_ is not None and here is not None:
-        _draw(map_, here, given, result, conventional)
+        _draw(map_, here, given, result, conventional, seen, traces)
     cost = given.cost_of(result)
     verified = _verify(given, seen, result, least, count, budget, cover) if verify else None
     if as_json:
@@ -144,13 +150,14 @@ def _show(
     if by_range:
         for number, (pole, errors_near) in enumerate(zip(given.ids, near, strict=True)):
             placed = ", placed" if number in result.chosen else ""
-            typer.echo(f"    pole {pole}: {errors_near} errors within {given.ranges_m[0]:g} m{placed}")
+            typer.echo(f"    pole {pole}: {plural(errors_near, 'error')} within {given.ranges_m[0]:g} m{placed}")
     proof = "optimal" if result.optimal else f"at most {result.upper_bound:.6g} can be covered"
     if least is not None and not result.optimal:
         proof = f"at least {least:.6g} has to be spent for that"
     told = "" if cost is None else f", cost {cost:.6g}"
     typer.echo(
-        f"cover {result.covered} of {len(given.errors)} errors, weight {result.covered_weight:.6g}{told} ({proof})"
+        f"cover {result.covered} of {plural(len(given.errors), 'error')}, "
+        f"weight {result.covered_weight:.6g}{told} ({proof})"
     )
     for name, placed in conventional.items():
         if placed is not None:
@@ -213,22 +220,70 @@ def _tell(given: "Given", placed: "Placement | None") -> "Json":
 
 
 def _draw(
-    path: Path, town: "Town", given: "Given", placed: "Placement", conventional: "dict[str, Placement | None]"
+    path: Path,
+    town: "Town",
+    given: "Given",
+    placed: "Placement",
+    conventional: "dict[str, Placement | None]",
+    seen: "csr_array | None",
+    traces: "list[Trace]",
 ) -> None:
-    """Write the map of the errors, the poles and the placement, with the poles of conventional rules that are known."""
+    """Write the map of the errors, the poles and the placement, with the poles of conventional rules that are known.
+
+    Where the placement is by line of sight (`seen` is given), the map shows what each sensor sees.
+    """
     from flcav.files import write_bytes
     from flcav.report import style
     from flcav.report.charts.figures import town_map
-    from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE, ErrorMap
+    from flcav.report.pictures.maps import DENSEST, LONGEST, MOST_VISIBLE, ErrorMap
+    from flcav.world.line_of_sight import find_viewshed
 
     names = [str(pole) for pole in given.ids]
+    notes = _note(given, placed)
+    if max(map(len, names)) > LONGEST:
+        names = [str(row) for row in range(1, len(names) + 1)]
+        notes.append("in brackets, and on the map: a pole's row in the table")
     ranges = {names[pole]: float(given.ranges_m[sensor]) for pole, sensor in zip(placed.chosen, placed.sensors)}
+    sites = dict(zip(names, given.poles, strict=True))
     noted = {
         note: [names[pole] for pole in own.chosen]
         for note, rule in ((DENSEST, "traffic-density"), (MOST_VISIBLE, "visible-objects"))
         if (own := conventional[rule]) is not None
     }
     scene = ErrorMap(
-        town, given.errors, given.kind, dict(zip(names, given.poles, strict=True)), ranges, noted, heat=True
+        town,
+        given.errors,
+        given.kind,
+        sites,
+        ranges,
+        given.covered_by(placed, seen),
+        {}
+        if seen is None
+        else {name: find_viewshed(town, traces, sites[name], range_m) for name, range_m in ranges.items()},
+        notes,
+        noted,
+        heat=True,
     )
-    write_bytes(path, style.png(town_map(scene)))
+    write_bytes(path, style.png(town_map(scene, MAP_IN)))
+
+
+def _note(given: "Given", placed: "Placement") -> list[str]:
+    """Return lines on what is placed: errors covered and cost, and the poles and the cost of each kind of sensor."""
+    from flcav.report.pictures.maps import LONGEST, name_poles
+
+    def name(pole: int) -> str:
+        own = str(given.ids[pole])
+        return own if max(len(str(each)) for each in given.ids) <= LONGEST else f"{own} ({pole + 1})"
+
+    def cost(chosen: "list[tuple[int, int]]") -> str:
+        own = sum(given.pole_cost[pole] + given.sensor_cost[sensor] for pole, sensor in chosen)
+        return f", cost {own:.6g}" if given.priced else ""
+
+    pairs = list(zip(placed.chosen, placed.sensors, strict=True))
+    lines = [f"{placed.covered} of {plural(len(given.errors), 'error')} covered{cost(pairs)}"]
+    for kind, (sensor_name, range_m) in enumerate(zip(given.names, given.ranges_m, strict=True)):
+        if own := [(pole, sensor) for pole, sensor in pairs if sensor == kind]:
+            poles = name_poles([name(pole) for pole, _ in own])
+            told = f"{sensor_name or 'sensor'}, range {range_m:g} m, on {poles}"
+            lines.append(told + (cost(own) if len(own) < len(pairs) else ""))
+    return lines

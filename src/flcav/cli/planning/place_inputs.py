@@ -51,6 +51,15 @@ class Given:
             return None
         return float(self.pole_cost[list(placed.chosen)].sum() + self.sensor_cost[list(placed.sensors)].sum())
 
+    def covered_by(self, placed: Placement, visible: csr_array | None) -> NDArray[np.bool_]:
+        """Return (E,) which errors a placement covers: within a sensor's range, and `visible` (P, E) from its pole."""
+        covered = np.zeros(len(self.errors), np.bool_)
+        for pole, sensor in zip(placed.chosen, placed.sensors, strict=True):
+            near = find_covered(self.errors, self.poles[[pole]], self.ranges_m[[sensor]])
+            own = near if visible is None else near.multiply(visible[[pole]])
+            covered |= own.toarray()[0] > 0
+        return covered
+
 
 def read_given(
     errors: Path, poles: Path, sensors: Path | None, range_m: float | None, class_weights: Sequence[str]

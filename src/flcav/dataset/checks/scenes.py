@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from flcav.sensors.frame import Frame
+from flcav.wording import plural
 from flcav.world.trace import Trace
 
 CLOSE_M = 1.0  # points closer to the LiDAR are from its mount or an obstruction
@@ -33,7 +34,7 @@ class BlockedViews:
         """Yield a sentence for each LiDAR with more than a share MOST of its points closer than CLOSE_M."""
         for (agent, name), count in self._points.items():
             share = self._close[agent, name] / max(count, 1)
-            told = f"{share:.1%} of its {count} points lie within {CLOSE_M:g} m of it"
+            told = f"{share:.1%} of its {plural(count, 'point')} lie within {CLOSE_M:g} m of it"
             if share >= ALMOST_ALL:
                 yield f"{agent}: '{name}' sees almost nothing but its own mount: {told}"
             elif share > MOST:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from flcav.config import InputError
 from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.trainable import Trainable
+from flcav.wording import suggest
 
 if TYPE_CHECKING:
     from flcav.federation.runtimes.simulation import RaySimulation
@@ -43,4 +44,4 @@ def open_runtime(
 
             yield RaySimulation(count)
         case _:
-            raise InputError(f"runtime '{name}': choose one of {', '.join(RUNTIMES)}")
+            raise InputError(f"runtime '{name}': choose one of {', '.join(RUNTIMES)}{suggest(name, RUNTIMES)}")

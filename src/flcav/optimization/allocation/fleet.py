@@ -38,6 +38,7 @@ from flcav.optimization.allocation.allocate import (
 from flcav.optimization.allocation.vehicles import Shares, TooSlow, split_plan, sum_busy, trains
 from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Clock, Infeasible
+from flcav.wording import plural
 
 HALVINGS = 9  # steps of the bisection over the share of a budget
 ROUNDING = 1e-9  # relative tolerance of budgets and objectives
@@ -92,7 +93,8 @@ def _within_held(task: AllocationTask) -> AllocationTask:
     least, most = task.limits.samples
     if held < least:
         raise Infeasible(
-            f"task {task.name!r}: its vehicles hold {held} samples (samples_held), and limits.samples starts at {least}"
+            f"task {task.name!r}: its vehicles hold {plural(held, 'sample')} (samples_held), "
+            f"and limits.samples starts at {least}"
         )
     limits = task.limits.model_copy(update={"samples": (least, min(most, held))})
     return task.model_copy(update={"limits": limits})

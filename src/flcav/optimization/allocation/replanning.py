@@ -4,7 +4,7 @@ Stages follow each other: after the first edge round no sample is added, after t
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -45,6 +45,8 @@ class Sent(Config):
 
 class PlanState(Config):
     """The state of a plan's execution: resources spent by task, and megabytes sent."""
+
+    document: ClassVar = "the progress of a plan"
 
     tasks: Annotated[Mapping[str, TaskState], Field(min_length=1)]  # resources spent, by task
     used_mb: Sent | None = None  # megabytes sent; None: the counts times the problem's message sizes

@@ -27,6 +27,7 @@ from scipy.sparse import coo_array, csr_array
 from flcav.optimization.allocation.allocate import TaskPlan
 from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible
+from flcav.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -87,7 +88,7 @@ def split_plan(problem: Problem, plans: Sequence[TaskPlan]) -> Shares:
         held = sum(_held(task, plan, vehicle) for vehicle in task.vehicles)
         if held < plan.samples:
             raise Infeasible(
-                f"task {task.name!r}: its vehicles hold {held} samples (samples_held), and the plan uploads "
+                f"task {task.name!r}: its vehicles hold {plural(held, 'sample')} (samples_held), and the plan uploads "
                 f"{plan.samples}"
             )
     parts = [part for task, plan in planned for part in _parts(problem, task, plan)]

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flcav.config import InputError, shorten
 from flcav.optimization.curves.curves import STAGES
+from flcav.wording import describe_number, hint_share
 
 Array = NDArray[np.float64]
 
@@ -139,5 +140,10 @@ def _numbers(columns: Table, name: str, origin: str, most: float = MOST) -> Arra
         except (TypeError, ValueError, OverflowError):
             values[row] = np.nan
         if not (values[row] == 0 or LEAST <= values[row] <= most):
-            raise InputError(f"{origin}: row {row + 1}: {name} = {shorten(value)} must be a number from 0 to {most:g}")
+            wanted = f"must be a number from 0 to {most:g}"
+            if most == 1:
+                wanted += hint_share(values[row])
+            if isinstance(value, str):
+                wanted = describe_number(value, name)
+            raise InputError(f"{origin}: row {row + 1}: {name} = {shorten(value)} {wanted}")
     return values

@@ -26,6 +26,7 @@ from flcav.optimization.placement.solve import (
     improve,
     keep_candidates,
 )
+from flcav.wording import hint_share
 
 NOTHING = 1e-300  # in place of 0, to divide by
 CUTS = 40  # times that a choice is tried to be made at less cost
@@ -38,7 +39,9 @@ def cover_share(candidates: Candidates, share: float, *, method: Method = "exact
     least. Raises `InputError` where the share is not in (0, 1], or all candidates together cover less.
     """
     if not 0 < share <= 1:
-        raise InputError(f"cover = {share}: must be a share of the errors, more than 0 and at most 1")
+        raise InputError(
+            f"cover = {share}: must be a share of the errors, more than 0 and at most 1{hint_share(share)}"
+        )
     instance, total = candidates.instance(), float(candidates.weight.sum())
     most = float(instance.weight.sum())
     if most < share * total * (1 - TIE) or not most:

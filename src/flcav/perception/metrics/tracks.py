@@ -15,6 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from flcav.perception.task import Result
 from flcav.records import Class
+from flcav.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -86,7 +87,7 @@ class TracksEvaluation(Result):
 
     def lines(self) -> list[str]:
         """Return the evaluation in words: frames and sequences, then a line per class."""
-        lines = [f"tracks in {self.frames} frames of {self.sequences} sequences"]
+        lines = [f"tracks in {plural(self.frames, 'frame')} of {plural(self.sequences, 'sequence')}"]
         for row in self.scores:
             if row.mota is None:
                 lines.append(f"{row.label:<12}nothing to follow")

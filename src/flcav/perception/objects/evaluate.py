@@ -30,6 +30,7 @@ from flcav.perception.ops.rotated import Kind
 from flcav.perception.task import Evaluated
 from flcav.records import LEFT_OUT, Class
 from flcav.seeds import stream
+from flcav.wording import plural
 from flcav.world.weather import WEATHER_CLASSES
 
 OVERLAPS: tuple[tuple[Kind, float], ...] = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
@@ -113,7 +114,10 @@ class ObjectsEvaluation(Evaluated):
         Frames and target criteria; a line per class, kind of overlap and IoU; cars near by; a line per class and part
         of the breakdown; calibration errors; tracking.
         """
-        lines = [f"{self.frames} frames of {self.scenes} scenes", *(self.rules.lines() if self.rules else ())]
+        lines = [
+            f"{plural(self.frames, 'frame')} of {plural(self.scenes, 'scene')}",
+            *(self.rules.lines() if self.rules else ()),
+        ]
         for row in self.scores:
             found = "nothing to find"
             if row.ap is not None:

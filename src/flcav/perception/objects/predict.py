@@ -22,6 +22,7 @@ from flcav.perception.task import Result
 from flcav.progress import Report, ignore_progress
 from flcav.records import Class
 from flcav.sensors.frame import Frame
+from flcav.wording import plural
 
 LOWEST_SCORE = 0.05  # of detections that are evaluated; lower ones change AP by less than its interval
 CANDIDATES = 256  # anchors of highest score per class that enter non-maximum suppression
@@ -50,7 +51,7 @@ class ObjectsFound(Result):
 
     def lines(self) -> list[str]:
         """Return the number of objects, then one line per box."""
-        lines = [f"{len(self.boxes)} objects"]
+        lines = [plural(len(self.boxes), "object")]
         for box in self.boxes:
             place = f"at ({box.x:.1f}, {box.y:.1f}, {box.z:.1f}) m, yaw {box.yaw:.2f} rad"
             size = f"{box.length:.1f} x {box.width:.1f} x {box.height:.1f} m"

@@ -28,6 +28,7 @@ from flcav.perception.objects.truth import (
 )
 from flcav.perception.task import KnownLidar
 from flcav.sensors.frame import Frame
+from flcav.wording import plural
 
 RANGE_SLACK = 0.2  # difference of a LiDAR's range from the one of the training that is not worth a word
 HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one that a network expects
@@ -103,7 +104,9 @@ class RecordedSweeps(Sequence[Sample]):
     def __init__(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> None:
         data.check_labelled("objects")
         if blind := [data.name(number) for number in frames if not data.lidars(number)]:
-            raise InputError(f"{data.folder}: no LiDAR in {len(blind)} of {len(frames)} frames, as in {blind[0]}")
+            raise InputError(
+                f"{data.folder}: no LiDAR in {len(blind)} of {plural(len(frames), 'frame')}, as in {blind[0]}"
+            )
         self._read, self._config, self._frames = frame_reader(data, config.foreground), config, frames
 
     def __len__(self) -> int:
@@ -216,7 +219,7 @@ def validate_points(points: NDArray[np.float32], origin: str | Path) -> NDArray[
         raise InputError(f"{origin}: the point cloud is empty")
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points)).any(1).sum())
-        raise InputError(f"{origin}: {bad} of {len(points)} points are not finite numbers")
+        raise InputError(f"{origin}: {bad} of {plural(len(points), 'point')} are not finite numbers")
     if bad := int(((points[:, 3] < 0) | (points[:, 3] > 1)).sum()):
-        raise InputError(f"{origin}: {bad} of {len(points)} points have an intensity outside 0 to 1")
+        raise InputError(f"{origin}: {bad} of {plural(len(points), 'point')} have an intensity outside 0 to 1")
     return points

@@ -14,6 +14,7 @@ from flcav.perception.signs.predict import Detections
 from flcav.perception.signs.samples import size_px
 from flcav.perception.task import Evaluated
 from flcav.records import Class
+from flcav.wording import plural
 
 EDGES_PX = (12.0, 24.0)  # borders between small, medium and large, as roots of a box's area
 LARGEST_PX = 1e5
@@ -85,7 +86,7 @@ class SignsEvaluation(Evaluated):
 
     def lines(self) -> list[str]:
         """Return mAP, then AP by class and by size."""
-        seen = f"{self.pictures} pictures of {self.scenes} scenes"
+        seen = f"{plural(self.pictures, 'picture')} of {plural(self.scenes, 'scene')}"
         lines = [f"{seen}: mAP50 {_known(self.map50)}, mAP50-95 {_known(self.map50_95)}"]
         for row in self.classes:
             lines.append(f"{row.label:<14}AP50 {_known(row.ap50)}  ({row.targets} to find)")

@@ -55,7 +55,7 @@ class BoxesFound(Result):
 
     def lines(self) -> list[str]:
         """Return the number of boxes, then one line per box."""
-        lines = [f"{len(self.boxes)} boxes"]
+        lines = [f"{len(self.boxes)} box{'' if len(self.boxes) == 1 else 'es'}"]
         for box in self.boxes:
             corners = f"({box.x1:.1f}, {box.y1:.1f}) to ({box.x2:.1f}, {box.y2:.1f}) px"
             lines.append(f"{box.label:<14}{box.score:.2f}  {corners}")

@@ -22,6 +22,7 @@ from flcav.perception.training.adamw import AdamW
 from flcav.perception.training.checkpoint import RunState, load_checkpoint, save_checkpoint
 from flcav.progress import Report, ignore_progress
 from flcav.seeds import stream
+from flcav.wording import suggest
 
 CLIP_NORM = 10.0  # largest norm of the gradient
 Watch = Callable[[int, Mapping[str, float]], None]  # called with the number of steps taken and scalars by name
@@ -116,7 +117,7 @@ def train(
     if not samples:
         raise InputError("training on 0 samples: at least one is wanted")
     if schedule not in SCHEDULES:
-        raise InputError(f"schedule '{schedule}': choose one of {', '.join(SCHEDULES)}")
+        raise InputError(f"schedule '{schedule}': choose one of {', '.join(SCHEDULES)}{suggest(schedule, SCHEDULES)}")
     network.train()
     optimizer = AdamW(network, learning_rate)
     waits = None if validation is None else (validation.every, validation.patience)

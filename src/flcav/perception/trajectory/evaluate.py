@@ -11,6 +11,7 @@ from flcav.perception.task import Evaluated
 from flcav.perception.trajectory.predict import find_medoid
 from flcav.perception.trajectory.tracks import constant_velocity
 from flcav.records import LEFT_OUT
+from flcav.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -78,12 +79,12 @@ class TrajectoryEvaluation(Evaluated):
 
     def lines(self) -> list[str]:
         """Return a line per slice, each followed by a line per predictor."""
-        lines = [f"{self.modes} modes, {self.scenes} scenes; errors in m: average / final / missed"]
+        lines = [f"{plural(self.modes, 'mode')}, {plural(self.scenes, 'scene')}; errors in m: average / final / missed"]
         for name, e in self.slices.items():
             if e is None:
                 lines.append(f"{name}: none")
                 continue
-            lines.append(f"{name}: {e.samples} samples")
+            lines.append(f"{name}: {plural(e.samples, 'sample')}")
             plain = e.constant_velocity_FDE
             for label, ade, fde, missed in (
                 ("single path", e.single_ADE, e.single_FDE, e.miss_rate_single),

@@ -17,6 +17,7 @@ from flcav.perception.weather.samples import Sample, label_pictures
 from flcav.progress import Report, ignore_progress
 from flcav.records import LEFT_OUT
 from flcav.seeds import stream
+from flcav.wording import plural
 from flcav.world.weather import find_nearest_class
 
 
@@ -50,7 +51,7 @@ class Classification(Evaluated):
         interval = interval_words(self.low, self.high)
         if self.low is not None:
             interval += f" ({100 * self.confidence:g} %, over scenes)"
-        seen = f"{self.pictures} pictures of {self.scenes} scenes"
+        seen = f"{plural(self.pictures, 'picture')} of {plural(self.scenes, 'scene')}"
         lines = [f"{seen}: accuracy {self.accuracy:.3f} {interval}"]
         for name, row in zip(self.classes, self.confusion, strict=True):
             recall = self.recall[name]

@@ -18,6 +18,7 @@ from flcav.optimization.problem import Problem
 from flcav.pipeline.arms import PlanRule
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
 from flcav.pipeline.results.plans import Plan, TaskPlan
+from flcav.wording import plural
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
 
 def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan:
     if fixed.samples > task.pool:
-        raise InputError(f"tasks.{task.name}.plan: {fixed.samples} samples; the pools hold {task.pool}")
+        raise InputError(f"tasks.{task.name}.plan: {plural(fixed.samples, 'sample')}; the pools hold {task.pool}")
     counts = (fixed.samples, fixed.edge_rounds, fixed.cloud_rounds)
     cost = price(frame.stage_plan(*counts), task.sizes)
     return _task_plan(counts, cost, task.sizes, None)

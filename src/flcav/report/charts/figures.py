@@ -11,18 +11,19 @@ from flcav.report.charts.runs import Row
 from flcav.report.pictures import clouds, maps
 
 WIDTH = 3.8  # [inch] of a figure that a phone shows
+ACROSS = 2  # entries of a map's key in a line
 EXTENT: clouds.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: range of the network `tiny`
 
 
 @style.styled
-def town_map(scene: maps.ErrorMap) -> Figure:
+def town_map(scene: maps.ErrorMap, width_in: float = WIDTH) -> Figure:
     """Return the map of a town with candidate poles, registered errors, and the range of the chosen poles."""
     x_low, y_low, x_high, y_high = scene.town.bounds
     bar = 0.9 if scene.heat else 0.0  # [inch] beside the map
-    figure = style.canvas(WIDTH + bar, WIDTH * (y_high - y_low) / (x_high - x_low) + 0.3)
+    figure = style.canvas(width_in + bar, width_in * (y_high - y_low) / (x_high - x_low) + 0.8)
     axes = figure.add_subplot()
     maps.draw_errors(axes, scene)
-    style.key(figure, axes.get_legend_handles_labels()[0])
+    style.key(figure, axes.get_legend_handles_labels()[0], ncols=ACROSS)
     return figure
 
 
@@ -82,7 +83,7 @@ def overview(
     axes = left.add_subplot()
     maps.draw_errors(axes, scene)
     axes.set_title(f"{scene.town.name}: mistakes, and the pole placed for them", fontweight="bold")
-    style.key(left, axes.get_legend_handles_labels()[0])
+    style.key(left, axes.get_legend_handles_labels()[0], ncols=ACROSS)
     for axes, found in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
         clouds.draw_detections(axes, sweep, found, EXTENT)
         axes.set_title(found.title, fontweight="bold")

@@ -1,5 +1,6 @@
 """The map of a town with registered errors, candidate poles and the chosen ones."""
 
+import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 from flcav.geometry import Boxes
 from flcav.report import style
+from flcav.world.line_of_sight import Viewshed
 from flcav.world.map.town import Town
 
 Array = NDArray[np.float64]
@@ -29,14 +31,17 @@ MISS: dict[str, Any] = {
 }
 FALSE_POSITIVE: dict[str, Any] = {"marker": "x", "markersize": 5, "color": style.FALSE, "markeredgewidth": 1.3}
 FINAL_ERROR: dict[str, Any] = {**MISS, "marker": "^", "color": style.ORANGE}
-OTHER: dict[str, Any] = {**MISS, "marker": "D", "markersize": 4, "color": style.INK}
+OTHERS: tuple[dict[str, Any], ...] = tuple(
+    {**MISS, "marker": marker, "color": style.INK} for marker in ("D", "s", "v", "P", "h")
+)
 KINDS = {
     "miss": ("missed", MISS),
     "false_positive": ("false positive", FALSE_POSITIVE),
     "final_error": ("final error", FINAL_ERROR),
 }
-NOTE_M = 15.0  # approximate distance of a note from its pole
-WIDE = 3.0  # width of a note, divided by its height
+CROWDED = 30  # poles: of more than these, only the chosen ones and those of rules are numbered
+LONGEST = 3  # characters of an id for which a pole's mark has room
+LINE_EM = 0.52  # width of a character of the lines below a map, in ems
 CELL_M = 2.0  # of the map of the errors' density
 BLUR_M = 12.0  # standard deviation of its smoothing: half of a crossing
 HEAT = LinearSegmentedColormap.from_list("heat", ["#fff3e0", "#f6b26b", "#c0392b"])
@@ -53,6 +58,9 @@ class ErrorMap:
     kind: NDArray[np.str_]  # (E,) a key of KINDS, or a kind of a user's own
     poles: Mapping[str, Array]  # candidate sites by id: (3,) world [m]
     chosen: Mapping[str, float] = field(default_factory=dict)  # poles with a sensor: its range [m] by the pole's id
+    covered: NDArray[np.bool_] | None = None  # (E,) whether a sensor covers the error; None: not shown
+    viewsheds: Mapping[str, Viewshed] = field(default_factory=dict)  # of chosen poles, shown in place of their range
+    notes: Sequence[str] = ()  # lines on the placement, written below the map; by default the chosen poles
     conventional: Mapping[str, Collection[str]] = field(default_factory=dict)  # ids of a rule's poles by what they have
     zones: Mapping[str, float] = field(default_factory=dict)  # errors per hectare within `zone_m` of a pole, by its id
     zone_m: float = 0.0
@@ -81,21 +89,16 @@ def draw_town(axes: Axes, town: Town) -> None:
 
 
 def draw_errors(axes: Axes, scene: ErrorMap) -> None:
-    """Draw the town, errors, zones and poles: the chosen ones with their range, those of conventional rules square."""
+    """Draw the town, errors, zones and poles; write below what is placed, and the poles of conventional rules.
+
+    A chosen pole is drawn with its viewshed or its range, a pole of a rule as a square, a covered error in blue.
+    """
     draw_town(axes, scene.town)
     if scene.heat and len(scene.errors):
         draw_density(axes, scene)
     for number, range_m in scene.chosen.items():
-        at = scene.poles[number]
-        reach = np.sqrt(max(range_m**2 - at[2] ** 2, 0.0))  # of the sphere, at ground level
-        axes.add_patch(Circle(tuple(at[:2]), reach, facecolor=style.BLUE, alpha=0.10, linewidth=0, zorder=1.5))
-        axes.add_patch(Circle(tuple(at[:2]), reach, fill=False, edgecolor=style.BLUE, linewidth=1.2, zorder=1.5))
-    for kind in dict.fromkeys([*KINDS, *scene.kind.tolist()]):
-        label, look = KINDS.get(kind, (kind, OTHER))
-        xyz = scene.errors[scene.kind == kind]
-        if not len(xyz):
-            continue
-        axes.plot(*xyz[:, :2].T, linestyle="none", label=f"{label} ({len(xyz)})", **look)
+        draw_reach(axes, scene.poles[number], range_m, scene.viewsheds.get(number))
+    _plot_errors(axes, scene)
     for number, per_hectare in scene.zones.items():
         x, y = scene.poles[number][:2]
         axes.add_patch(
@@ -103,15 +106,70 @@ def draw_errors(axes: Axes, scene: ErrorMap) -> None:
         )
         look = {"fontsize": style.SMALL, "path_effects": HALO, "zorder": 6}
         axes.text(x, y - scene.zone_m, f"{per_hectare:.0f}/ha", ha="center", va="center_baseline", **look)
-    notes: list[Array] = []  # their positions (2,)
+    _plot_poles(axes, scene)
+    placed = scene.notes or ([f"placed: {name_poles(scene.chosen)}"] if scene.chosen else ())
+    rules = [f"{rule}: {name_poles(own)}" for rule, own in scene.conventional.items() if own]
+    width_pt = axes.figure.get_figure(root=True).get_figwidth() * 72 * axes.get_position().width
+    wide = max(int(width_pt / (LINE_EM * style.SMALL)), 20)
+    lines = [line for note in (*placed, *rules) for line in textwrap.wrap(note, wide, subsequent_indent="    ")]
+    axes.set_xlabel("\n".join(lines), loc="left", fontsize=style.SMALL, color=style.INK)
+
+
+def name_poles(ids: Collection[str]) -> str:
+    """Return "pole 2" or "poles 2, 3"."""
+    return f"pole{'' if len(ids) == 1 else 's'} {', '.join(ids)}"
+
+
+def draw_reach(axes: Axes, at: Array, range_m: float, viewshed: Viewshed | None) -> None:
+    """Draw the range of a sensor `at` (3,) on the ground, filled where its viewshed is; all of it without one."""
+    reach = np.sqrt(max(range_m**2 - at[2] ** 2, 0.0))  # of the sphere, at ground level
+    look: dict[str, Any] = {"edgecolor": style.BLUE, "zorder": 1.5}
+    if viewshed is None:
+        axes.add_patch(Circle(tuple(at[:2]), reach, facecolor=style.BLUE, alpha=0.10, linewidth=0, zorder=1.5))
+        axes.add_patch(Circle(tuple(at[:2]), reach, fill=False, linewidth=1.2, **look))
+        return
+    axes.add_patch(Circle(tuple(at[:2]), reach, fill=False, linewidth=0.6, linestyle=":", **look))
+    smooth = gaussian_filter(viewshed.seen.astype(np.float64), 1.0)  # poles and lamps hide specks
+    area = (viewshed.x, viewshed.y, smooth)
+    axes.contourf(*area, [0.5, 1.5], colors=[style.BLUE], alpha=0.2, zorder=1.5)
+    axes.contour(*area, [0.5], colors=[style.BLUE], linewidths=0.8, zorder=1.5)
+
+
+def _plot_errors(axes: Axes, scene: ErrorMap) -> None:
+    """Plot the errors by kind, of those with known coverage the covered ones in blue."""
+    covered = np.zeros(len(scene.errors), np.bool_) if scene.covered is None else scene.covered
+    own_kinds = [kind for kind in dict.fromkeys(scene.kind.tolist()) if kind not in KINDS]
+    looks = KINDS | {kind: (kind, OTHERS[i % len(OTHERS)]) for i, kind in enumerate(own_kinds)}
+    rest = "" if scene.covered is None else ", uncovered"
+    states = ((rest, ~covered, {}), (", covered", covered, {"color": style.BLUE}))
+    for state, chosen, colour in states:
+        for kind, (label, look) in looks.items():
+            if (own := (scene.kind == kind) & chosen).any():
+                name = f"{label}{state} ({own.sum()})"
+                axes.plot(*scene.errors[own, :2].T, linestyle="none", label=name, **{**look, **colour})
+
+
+def _plot_poles(axes: Axes, scene: ErrorMap) -> None:
+    """Plot the poles, with their ids in their marks; of a crowd only the chosen ones and those of rules have ids."""
+    ruled = {number for own in scene.conventional.values() for number in own}
+    crowded, known = len(scene.poles) > CROWDED, {*axes.get_legend_handles_labels()[1]}
     for number, (x, y, _) in scene.poles.items():
-        chosen, rules = number in scene.chosen, [name for name, own in scene.conventional.items() if number in own]
-        face, ink = (style.BLUE, "white") if chosen else ("white", style.INK)
-        axes.plot(x, y, "s" if rules else "o", markersize=13, color=face, markeredgecolor=style.INK, zorder=5)
-        axes.text(x, y, number, ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
-        if note := _join([*(["placed"] if chosen else []), *rules]):
-            others = [xyz[:2] for other, xyz in scene.poles.items() if other != number]
-            notes.append(_write_beside(axes, note, np.array([x, y]), np.array([*others, *notes]).reshape(-1, 2)))
+        chosen = number in scene.chosen
+        small = crowded and not chosen and number not in ruled
+        face, ink, label = (style.BLUE, "white", "sensor") if chosen else ("white", style.INK, "candidate pole")
+        look: dict[str, Any] = {
+            "color": face,
+            "markeredgecolor": style.INK,
+            "zorder": 4 if small else 5,
+            "linestyle": "none",
+        }
+        shape, size = "s" if number in ruled else "o", 4 if small else 13
+        axes.plot(x, y, shape, markersize=size, **look)
+        if not small:
+            axes.text(x, y, number, ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
+        if label not in known:
+            axes.plot([], [], "o", markersize=7, label=label, **look)
+            known.add(label)
 
 
 def draw_density(axes: Axes, scene: ErrorMap) -> None:
@@ -124,24 +182,7 @@ def draw_density(axes: Axes, scene: ErrorMap) -> None:
     per_hectare = gaussian_filter(counts, BLUR_M / CELL_M, mode="constant") * 1e4 / CELL_M**2
     x, y = (low + CELL_M / 2 + CELL_M * np.arange(n) for low, n in ((x_low, columns), (y_low, rows)))
     levels = MaxNLocator(6).tick_values(0.0, float(per_hectare.max()))[1:]  # the least dense zone is left blank
-    zones = axes.contourf(x, y, per_hectare, levels, cmap=HEAT, alpha=0.8, zorder=1.2, extend="neither")
+    zones = axes.contourf(x, y, per_hectare, levels, cmap=HEAT, alpha=0.5, zorder=1.2, extend="neither")
     bar = axes.figure.colorbar(zones, ax=axes, shrink=0.6, pad=0.02, aspect=25)
     bar.set_label("errors per hectare", color=style.MUTED)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-
-
-def _join(words: Sequence[str]) -> str:
-    """Return "a", "a and b", or on two lines "a, b and c"; "" of none."""
-    if len(words) < 3:
-        return " and ".join(words)
-    return f"{', '.join(words[:-1])}\nand {words[-1]}"
-
-
-def _write_beside(axes: Axes, note: str, at: Array, others: Array) -> Array:
-    """Write `note` above or below the pole `at`, whichever is farther from the `others` (N, 2); return where (2,)."""
-    places = [at + np.array((0.0, side * NOTE_M)) for side in (1, -1)]
-    above, below = (np.hypot(*((others - place) / (WIDE, 1.0)).T).min(initial=np.inf) for place in places)
-    look = {"fontsize": style.SMALL, "fontweight": "bold", "path_effects": HALO, "zorder": 6}
-    offset, align = (10, "bottom") if above >= below else (-10, "top")
-    axes.annotate(note, (at[0], at[1]), (0, offset), textcoords="offset points", ha="center", va=align, **look)
-    return places[0] if above >= below else places[1]

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from flcav.config import Config
+from flcav.wording import suggest
 from flcav.world.shapes import SHAPES
 
 LARGEST_M = 1000.0
@@ -55,7 +56,7 @@ def _vehicle_mix(value: dict[str, float]) -> dict[str, float]:
 
 def _mix(value: dict[str, float], allowed: list[str]) -> dict[str, float]:
     if unknown := sorted(set(value) - set(allowed)):
-        raise ValueError(f"unknown {unknown[0]!r}; allowed: {', '.join(allowed)}")
+        raise ValueError(f"unknown {unknown[0]!r}; allowed: {', '.join(allowed)}{suggest(unknown[0], allowed)}")
     if not 1e-6 <= sum(value.values()) <= 1e6 or min(value.values(), default=0.0) < 0:
         raise ValueError("weights must be >= 0 and not all zero, and their sum at most 1e+06")
     return value

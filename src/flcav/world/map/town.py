@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, read_config, shorten
 from flcav.seeds import stream
+from flcav.wording import suggest
 from flcav.world.map import boundaries, imported, street_furniture
 from flcav.world.map.parameters import GeoReference, TownParameters
 from flcav.world.map.relief import Relief
@@ -157,6 +158,7 @@ def _folder(name: str, beside: Path | None) -> Path:
     places = " nor ".join(map(str, dict.fromkeys(folder.absolute() for folder in sought)))
     raise InputError(
         f"unknown town {shorten(name)}; known towns: {', '.join(PACKAGED)}, or a folder, and there is no {places}"
+        + suggest(name, PACKAGED)
     )
 
 

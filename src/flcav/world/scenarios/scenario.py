@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from flcav.config import Config
+from flcav.wording import suggest
 from flcav.world.shapes import SHAPES
 
 Kind = Literal[
@@ -44,8 +45,8 @@ class Scenario(Config):
     def _known_actors(self) -> "Scenario":
         for role, name in self.actors.items():
             if role not in ROLES:
-                raise ValueError(f"unknown role {role!r}; known roles: {', '.join(ROLES)}")
+                raise ValueError(f"unknown role {role!r}; known roles: {', '.join(ROLES)}{suggest(role, ROLES)}")
             kinds = [f"{category}.{shape.name}" for category in ROLES[role] for shape in SHAPES[category]]
             if name not in kinds:
-                raise ValueError(f"{role}: unknown {name!r}; allowed: {', '.join(kinds)}")
+                raise ValueError(f"{role}: unknown {name!r}; allowed: {', '.join(kinds)}{suggest(name, kinds)}")
         return self

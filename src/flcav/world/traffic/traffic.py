@@ -65,7 +65,9 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: S
     trace = _build_trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
     under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
     if under_way.sum() < cavs * len(times_s):
-        raise InputError(f"not all of {cavs} CAVs are under way at {times_s[0]} s: begin later, or take fewer")
+        told = "the CAV is not" if cavs == 1 else f"not all of {cavs} CAVs are"
+        fewer = ", or take fewer" if cavs > 1 else ""
+        raise InputError(f"{told} under way at {times_s[0]} s: begin later{fewer}")
     return trace
 
 

@@ -39,6 +39,7 @@ from flcav.dataset.formats.reading import (
 )
 from flcav.geometry import Boxes, inverse, pose
 from flcav.sensors.frame import Calibration, LinkedFrame
+from flcav.wording import plural
 
 CATEGORIES = {  # KITTI's other classes (Person_sitting, Tram, Misc) keep their names
     "Car": "car",
@@ -98,9 +99,9 @@ class KittiSource(LogSource):
             self._beams, self._range_m = BEAMS, RANGE_M
         bare = sum(not _path(shot, "label_2").is_file() for shot in every)
         self._labelled = not bare
-        self.notes = (f"no label_2 of {bare} of {len(every)} frames, so no boxes there",) if bare else ()
+        self.notes = (f"no label_2 of {bare} of {plural(len(every), 'frame')}, so no boxes there",) if bare else ()
         if blind := sum(not _path(shot, CAMERA).is_file() for shot in every):
-            self.notes += (f"no {CAMERA} of {blind} of {len(every)} frames, so LiDAR alone there",)
+            self.notes += (f"no {CAMERA} of {blind} of {plural(len(every), 'frame')}, so LiDAR alone there",)
 
     def frame_count(self, scene: str) -> int:
         """Return the number of frames of a scene."""

@@ -39,6 +39,7 @@ from flcav.dataset.formats.reading import (
 from flcav.geometry import Boxes, heading_vectors, inverse
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
+from flcav.wording import plural
 
 Array = NDArray[np.float64]
 
@@ -79,11 +80,13 @@ class Opv2vSource(LogSource):
         self._shots = {scene: self._open(scene, found[scene], names) for scene in self._split_of}
         blind, agents = len(self._blind), len(self._calibration)
         if not self._calibration:
-            raise InputError(f"{folder}: none of {self._frames} frames has both a YAML file and a point cloud")
+            raise InputError(
+                f"{folder}: none of {plural(self._frames, 'frame')} has both a YAML file and a point cloud"
+            )
         told = {
-            f"no pictures of a camera of {blind} of {agents} agents, so no images of it": blind,
-            f"left out {self._lost} of {self._frames} frames: no YAML file or no point cloud": self._lost,
-            f"no picture of a camera of {self._unseen} of {self._frames} frames, so no image there": self._unseen,
+            f"no pictures of a camera of {blind} of {plural(agents, 'agent')}, so no images of it": blind,
+            f"left out {self._lost} of {plural(self._frames, 'frame')}: no YAML file or no point cloud": self._lost,
+            f"no picture of a camera of {self._unseen} of {plural(self._frames, 'frame')}, so no image there": self._unseen,
         }
         self.notes = tuple(note for note, count in told.items() if count)
 
