@@ -83,9 +83,8 @@ class Forecast(Record):
                 lines.append(f"{name}: {arm.privacy.describe()}")
         told = f"tell a difference of {self.effect:.2f} with a power of 0.8"
         by = f"by a standard deviation of {SCENE_SD:g} between scenes, of AP50 and accuracy in earlier runs"
-        lines.append(
-            f"tests: of one training, {plural(self.scenes, 'scene')} of a region {told} ({by}); retraining varies besides"
-        )
+        told += f" ({by}); retraining varies besides"
+        lines.append(f"tests: of one training, {plural(self.scenes, 'scene')} of a region {told}")
         return lines
 
 

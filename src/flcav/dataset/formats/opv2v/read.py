@@ -78,15 +78,13 @@ class Opv2vSource(LogSource):
         self._blind: set[str] = set()  # agents with a camera of which there is no picture
         self._frames = self._lost = self._unseen = 0  # frames in the folder, without a file, without a picture
         self._shots = {scene: self._open(scene, found[scene], names) for scene in self._split_of}
-        blind, agents = len(self._blind), len(self._calibration)
-        if not self._calibration:
-            raise InputError(
-                f"{folder}: none of {plural(self._frames, 'frame')} has both a YAML file and a point cloud"
-            )
+        blind, agents, frames = len(self._blind), len(self._calibration), plural(self._frames, "frame")
+        if not agents:
+            raise InputError(f"{folder}: none of {frames} has both a YAML file and a point cloud")
         told = {
             f"no pictures of a camera of {blind} of {plural(agents, 'agent')}, so no images of it": blind,
-            f"left out {self._lost} of {plural(self._frames, 'frame')}: no YAML file or no point cloud": self._lost,
-            f"no picture of a camera of {self._unseen} of {plural(self._frames, 'frame')}, so no image there": self._unseen,
+            f"left out {self._lost} of {frames}: no YAML file or no point cloud": self._lost,
+            f"no picture of a camera of {self._unseen} of {frames}, so no image there": self._unseen,
         }
         self.notes = tuple(note for note, count in told.items() if count)
 
