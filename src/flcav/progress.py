@@ -1,17 +1,31 @@
 """Progress reporting: the callback type of long-running functions, and a progress bar on stderr."""
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 Report = Callable[[int, int, str], None]  # done, total, note (e.g. "loss 0.31")
+WIDTH = 79  # of the line
 DAMAGED = "is damaged"  # in notes that stay on the terminal: a file is not what was written, and is made anew
 
 
 def ignore_progress(done: int, total: int, note: str = "") -> None:
-    """Do nothing: the default `Report`, without a display."""
+    """Do nothing: a `Report` without a display."""
+
+
+def print_progress(done: int, total: int, note: str = "") -> None:
+    """Write progress on one line of stderr where somebody watches, in a terminal or a notebook: the `Report` of Python.
+
+    A note that a file is damaged stays there.
+    """
+    if not (sys.stderr.isatty() or "ipykernel" in sys.modules):
+        return
+    end = "\n" if done >= total or DAMAGED in note else ""
+    sys.stderr.write(f"\r{f'{done}/{total} {note}'[:WIDTH]:<{WIDTH}}{end}")
+    sys.stderr.flush()
 
 
 @contextlib.contextmanager

@@ -2,12 +2,16 @@
 
 import io
 import re
+import sys
 import time
+from types import ModuleType
 
 import pytest
 from rich.console import Console
 
 from flcav import progress
+from flcav.pipeline.steps import print_steps
+from flcav.progress import DAMAGED, print_progress
 
 
 @pytest.fixture
@@ -43,3 +47,43 @@ def test_a_bar_has_no_count_before_its_total_is_known(shown):
         assert "?" not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue())
         report(3, 7, "")
     assert "3/7" in shown.getvalue()
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def unwatched(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
+    return monkeypatch
+
+
+def test_progress_is_one_line_of_a_terminal(unwatched: pytest.MonkeyPatch):
+    stream = Terminal()
+    unwatched.setattr(sys, "stderr", stream)
+    for done in range(3):
+        print_progress(done + 1, 3, "loss 0.5")
+    print_steps("plan", 1, 1, "done")
+    print_steps("plan", 1, 2, "half")
+    written = stream.getvalue()
+    assert [line.strip() for line in written.replace("\n", "").split("\r")[1:]] == [
+        "1/3 loss 0.5",
+        "2/3 loss 0.5",
+        "3/3 loss 0.5",
+        "1/1 plan done",
+    ]
+    assert written.count("\n") == 2
+    print_progress(1, 9, f"file {DAMAGED}")
+    assert stream.getvalue().count("\n") == 3
+
+
+def test_progress_shows_in_a_notebook_and_nowhere_else(unwatched: pytest.MonkeyPatch):
+    stream = io.StringIO()
+    unwatched.setattr(sys, "stderr", stream)
+    print_progress(1, 2)
+    assert stream.getvalue() == ""
+    unwatched.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
+    print_progress(1, 2)
+    assert stream.getvalue().strip() == "1/2"

@@ -19,14 +19,14 @@ from flcav.dataset.layout import MANIFEST, FrameKey, Manifest, read_manifest, tr
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import list_files
 from flcav.files import sha256
-from flcav.progress import Report, ignore_progress
+from flcav.progress import Report, print_progress
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Frame
 from flcav.wording import plural
 from flcav.world.trace import Trace
 
 
-def validate(path: Path | str, *, progress: Report = ignore_progress) -> list[str]:
+def validate(path: Path | str, *, progress: Report = print_progress) -> list[str]:
     """Return the problems of the dataset in the folder `path`, one sentence each; empty for a valid dataset.
 
     Raises `InputError` where `path` holds no finished dataset, or one whose recipe has a wrong `calibration_error`.

@@ -31,7 +31,7 @@ from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.tracking.evaluate import evaluate_tracks, group_sequences
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import find_shipped, load_network, read_card
-from flcav.progress import Report, ignore_progress
+from flcav.progress import Report, print_progress
 
 Named = str | Task
 Data = Dataset | Path | str
@@ -85,7 +85,7 @@ def train(
     device: str = "auto",
     agents: str | None = None,
     threads: int = 1,
-    progress: Report = ignore_progress,
+    progress: Report = print_progress,
 ) -> TrainedNetwork:
     """Train a network on recorded frames with their ground truth; weights, card and curves are written to `out`.
 
@@ -121,7 +121,7 @@ def evaluate(
     tracks: bool = False,
     device: str = "auto",
     threads: int = 1,
-    progress: Report = ignore_progress,
+    progress: Report = print_progress,
 ) -> Evaluation:
     """Evaluate a network on recorded frames by the metrics of its task.
 
@@ -217,7 +217,7 @@ def register_errors(
     agents: str | None = None,
     device: str = "auto",
     threads: int = 1,
-    progress: Report = ignore_progress,
+    progress: Report = print_progress,
 ) -> Registry:
     """Return the mistakes of a network on recorded frames with their positions in the town, each once.
 

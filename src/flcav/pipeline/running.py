@@ -15,7 +15,7 @@ from flcav.pipeline.results.run import Run, Summary
 from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.seeds.spread import list_spreads
 from flcav.pipeline.seeds.summary import summarise
-from flcav.pipeline.steps import Notify, Stale, ignore_steps, run_side_by_side, run_steps, stopwatch
+from flcav.pipeline.steps import Notify, Stale, print_steps, run_side_by_side, run_steps, stopwatch
 from flcav.pipeline.tables import append_records
 
 WORK, RESULTS, SUMMARY, HISTORY, SPREAD = "work", "results.json", "summary.json", "history.csv", "spread.csv"
@@ -27,7 +27,7 @@ def run(
     *,
     beside: Path | str | None = None,
     jobs: int = 1,
-    notify: Notify = ignore_steps,
+    notify: Notify = print_steps,
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> Run:
@@ -78,7 +78,7 @@ def run_seeds(
     seeds: int,
     beside: Path | str | None = None,
     jobs: int = 1,
-    notify: Notify = ignore_steps,
+    notify: Notify = print_steps,
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> tuple[tuple[Run, ...], Summary]:
@@ -101,7 +101,7 @@ def run_several(
     *,
     beside: Path | str | None = None,
     jobs: int = 1,
-    notify: Notify = ignore_steps,
+    notify: Notify = print_steps,
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> tuple[Run, ...]:

@@ -46,7 +46,7 @@ from flcav.dataset.recording.workers import start_processes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, write_table
 from flcav.files import Json, flush_all, sha256, write_bytes, write_json
 from flcav.machine.locks import LOCK, only_writer
-from flcav.progress import DAMAGED, Report, ignore_progress
+from flcav.progress import DAMAGED, Report, print_progress
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.sources.source import Source, TownSource
@@ -62,7 +62,7 @@ def record(
     *,
     jobs: int = 1,
     engine: str = "processes",
-    progress: Report = ignore_progress,
+    progress: Report = print_progress,
 ) -> bool:
     """Record a source, or the built-in simulator with a recipe, into the folder `out`.
 

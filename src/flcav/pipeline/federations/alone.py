@@ -26,7 +26,7 @@ from flcav.pipeline.results.saved import WEIGHTS, Saved
 from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.results.training import Round, StageResult, Watched
 from flcav.pipeline.rigs import tell_rigs
-from flcav.pipeline.steps import Notify, Stale, Step, ignore_steps, run_steps
+from flcav.pipeline.steps import Notify, Stale, Step, print_steps, run_steps
 from flcav.pipeline.work.edge import EdgeSettings, edge_step
 from flcav.pipeline.work.settings import make_step
 from flcav.progress import DAMAGED
@@ -64,7 +64,7 @@ def federate_regions(
     beside: Path | str | None = None,
     jobs: int = 2,
     runtime: str = "embedded",
-    notify: Notify = ignore_steps,
+    notify: Notify = print_steps,
     stale: Stale = "refuse",
 ) -> Federations:
     """Run or finish stage II of a recipe's arm in the folder `out`; return its results, federation.json there.

@@ -1,7 +1,7 @@
 """Resumable workflows of named steps: finished steps are kept, independent ones run in parallel."""
 
 from flcav.pipeline.steps.run import run_side_by_side, run_steps, stopwatch
-from flcav.pipeline.steps.step import FINISHED, STALE, Notify, Stale, Step, Work, ignore_steps
+from flcav.pipeline.steps.step import FINISHED, STALE, Notify, Stale, Step, Work, ignore_steps, print_steps
 
 __all__ = [
     "FINISHED",
@@ -11,6 +11,7 @@ __all__ = [
     "Step",
     "Work",
     "ignore_steps",
+    "print_steps",
     "run_side_by_side",
     "run_steps",
     "stopwatch",

@@ -15,7 +15,7 @@ from typing import Any
 
 from flcav.config import Config, InputError, read_json
 from flcav.files import flush_tree, write_json
-from flcav.progress import Report
+from flcav.progress import Report, print_progress
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
 DONE_NOW, DONE_BEFORE, KEPT = FINISHED = ("done", "done before", "kept, of other code")  # notes of finished steps
@@ -23,6 +23,12 @@ DONE, STARTED = "done.json", "started.json"
 Stale = str  # one of STALE
 STALE = ("refuse", "redo", "keep")  # what to do with steps begun or done by other code
 NAMED = 3  # most steps, or modules, that a message lists
+
+
+def print_steps(step: str, done: int, total: int, note: str) -> None:
+    """Write each finished step on stderr where somebody watches: the `Notify` of Python."""
+    if note in FINISHED:
+        print_progress(1, 1, f"{step} {note}")
 
 
 def ignore_steps(step: str, done: int, total: int, note: str) -> None:
