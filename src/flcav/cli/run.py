@@ -146,11 +146,18 @@ def _tell(results: "list[Run]", summary: "Summary | None") -> None:
 
 
 def compare(
-    first: Path = typer.Argument(help="Folder of a run, of one seed or several."),
-    second: Path = typer.Argument(help="Folder of another, with the same test frames."),
+    first: Path = typer.Argument(help="Folder of a run, of one seed or several; with --data, a file of weights."),
+    second: Path = typer.Argument(help="Folder of another, with the same test frames; or a file of weights."),
+    data: Path | None = typer.Option(None, "--data", help="Dataset that two networks are compared on."),
+    task: str | None = typer.Option(None, "--task", help="Task of the networks, if not that of the first one's card."),
     as_json: bool = AS_JSON,
 ) -> None:
-    """Compare two runs: differences, second minus first, of every test that both made on the same frames."""
+    """Compare two runs, or two networks on a dataset: differences, second minus first, on the same frames."""
+    if data is not None:
+        _compare_networks(first, second, data, task, as_json)
+        return
+    if task is not None:
+        raise InputError("--task: only two networks have one, and without --data two runs are compared")
     from flcav.pipeline.seeds.comparing import compare as compare_runs
 
     rows = compare_runs(first, second)
@@ -165,3 +172,17 @@ def compare(
             f"{row.region}, {row.task}, {row.stage}{arm}: {row.measure} {row.first:.3f} -> {row.second:.3f}, "
             f"{change.mean:+.3f} ({interval}): {row.verdict}{f', p {row.judged.p_cell}' if row.judged else ''}"
         )
+
+
+def _compare_networks(first: Path, second: Path, data: Path, task: str | None, as_json: bool) -> None:
+    from flcav.perception.networks import compare_networks
+    from flcav.perception.weights import read_card
+    from flcav.progress import show_progress
+
+    with show_progress(f"compare on {data}") as report:
+        found = compare_networks(task or read_card(first).task, data, first, second, progress=report)
+    if as_json:
+        print_json(found.as_json())
+        return
+    for line in found.lines():
+        typer.echo(line)

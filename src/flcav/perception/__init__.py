@@ -8,7 +8,17 @@ if TYPE_CHECKING:
     from flcav.perception.client import TaskClient
     from flcav.perception.errors import PerceptionError, Registry, load_errors, save_errors
     from flcav.perception.marks import Bars, CloudBoxes, Paths, PictureBoxes
-    from flcav.perception.networks import Evaluation, Inference, TrainedNetwork, evaluate, infer, register_errors, train
+    from flcav.perception.networks import (
+        Evaluation,
+        Inference,
+        TrainedNetwork,
+        compare_networks,
+        evaluate,
+        infer,
+        register_errors,
+        train,
+    )
+    from flcav.perception.outcomes import NetworkComparison
     from flcav.perception.study import StudyRecipe
     from flcav.perception.task import Evaluated, Finding, Practice, Result, Task, build_network
     from flcav.perception.tasks import TASKS, task_named
@@ -27,10 +37,12 @@ PLACES = {
     "Evaluation": "flcav.perception.networks",
     "Inference": "flcav.perception.networks",
     "TrainedNetwork": "flcav.perception.networks",
+    "compare_networks": "flcav.perception.networks",
     "evaluate": "flcav.perception.networks",
     "infer": "flcav.perception.networks",
     "register_errors": "flcav.perception.networks",
     "train": "flcav.perception.networks",
+    "NetworkComparison": "flcav.perception.outcomes",
     "StudyRecipe": "flcav.perception.study",
     "Evaluated": "flcav.perception.task",
     "Finding": "flcav.perception.task",

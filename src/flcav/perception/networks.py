@@ -26,6 +26,7 @@ from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.objects.predict import look_around
 from flcav.perception.objects.task import ObjectsTask
 from flcav.perception.objects.truth import narrow_range
+from flcav.perception.outcomes import NetworkComparison, as_measurable, compare_outcomes
 from flcav.perception.task import ConfigT, Finding, KnownLidar, NetworkT, SampleT, Scores, Task
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.tracking.evaluate import evaluate_tracks, group_sequences
@@ -158,6 +159,37 @@ def evaluate(
         followed = evaluate_tracks(tested, dataset, chosen.frames, **narrow, progress=progress)
         found = replace(found, tracks=followed)
     return Evaluation(learned.name, found.score, chosen, found.as_json(), tuple(found.lines()))
+
+
+def compare_networks(
+    task: Named,
+    data: Data,
+    first: Weights,
+    second: Weights,
+    *,
+    agents: str | None = None,
+    device: str = "auto",
+    threads: int = 1,
+    progress: Report = print_progress,
+) -> NetworkComparison:
+    """Compare two networks on the same recorded frames, paired over scenes: the second minus the first.
+
+    Raises `InputError` where task, data, weights, device or agents are unusable, where the networks use different
+    frames, or these hold nothing to find.
+
+    >>> from flcav.perception import compare_networks
+    >>> same = compare_networks("weather", "data", None, None)  # the network of the package, with itself
+    >>> same.difference.mean, same.verdict
+    (0.0, 'undecided')
+    """
+    use_threads(threads)
+    learned, dataset = resolve_task(task), open_data(data)
+    tested = [resolve_network(learned, each, device) for each in (first, second)]
+    chosen = [choose_frames(learned, each.config, dataset, agents).frames for each in tested]
+    if chosen[0] != chosen[1]:
+        raise InputError(f"{dataset.folder}: the networks use different frames of it, so that none are paired")
+    before, after = (as_measurable(learned).outcomes(each, dataset, chosen[0], progress) for each in tested)
+    return compare_outcomes(learned, before, after, len(chosen[0]))
 
 
 def _evaluate_benchmark(task: ObjectsTask, folder: Path, network: Weights, device: str, progress: Report) -> Evaluation:

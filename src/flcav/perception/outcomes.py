@@ -19,10 +19,13 @@ from torch import nn
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.files import atomic_path
-from flcav.intervals import REDRAWS, SharedScenes, bootstrap_over_scenes, share_scenes
+from flcav.intervals import REDRAWS, Estimate, SharedScenes, bootstrap_over_scenes, share_scenes
 from flcav.perception.task import Task
 from flcav.progress import Report, ignore_progress
+from flcav.records import Record
 from flcav.seeds import stream
+from flcav.verdicts import verdict
+from flcav.wording import plural
 
 SCENE = "scene"
 Times = NDArray[np.int64]  # (n, N) how often each of N units is drawn in each of n bootstrap samples
@@ -186,6 +189,51 @@ def difference(
         return of(after, times) - of(before, times)
 
     return mean, *_known(bootstrap_over_scenes(change, before.scene, own.redraws, rng=rng))
+
+
+@dataclass(frozen=True)
+class NetworkComparison(Record):
+    """Paired comparison of two networks on the same frames: the second minus the first."""
+
+    task: str
+    measure: str
+    frames: int
+    scenes: int
+    first: float  # the first network's measure
+    second: float
+    difference: Estimate  # with its interval over scenes (95 %, bootstrap); none of a single scene
+    verdict: str  # of the claim that the second network is better on such frames
+
+    def lines(self) -> list[str]:
+        """Return the comparison in words."""
+        change = self.difference
+        interval = "no interval: one scene" if change.low is None else f"{change.low:+.3f} to {change.high:+.3f}"
+        over = f"{plural(self.frames, 'frame')} of {plural(self.scenes, 'scene')}"
+        both = f"{self.measure} of {self.task}: {self.first:.3f} -> {self.second:.3f}, {change.mean:+.3f}"
+        return [
+            f"{both} ({interval}) over {over}: {self.verdict}",
+            "of these two networks; other trainings of the same settings differ besides",
+        ]
+
+
+def compare_outcomes(task: Task, first: Outcomes, second: Outcomes, frames: int) -> NetworkComparison:
+    """Return the comparison of two networks by their outcomes.
+
+    Raises `InputError` where they look for different things, or nothing was to be found.
+    """
+    own = as_measurable(task)
+    wanted = [(sorted(each.arrays), own.numbers(each).get("targets")) for each in (first, second)]
+    if wanted[0] != wanted[1]:
+        raise InputError(
+            f"the networks look for different things, by their classes or ranges ({wanted[0][1]} and {wanted[1][1]} "
+            "targets in these frames), so that there is no paired difference"
+        )
+    before, after = compute_measure(task, first), compute_measure(task, second)
+    if np.isnan([before, after]).any():
+        raise InputError(f"the {plural(frames, 'frame')} hold nothing to find for '{task.name}'")
+    change, scenes = Estimate(*difference(task, first, second)), len(np.unique(first.scene))
+    decided = verdict(change.low, change.high)
+    return NetworkComparison(task.name, own.measure_name, frames, scenes, before, after, change, decided)
 
 
 def share_test_scenes(
