@@ -7,6 +7,7 @@ from pathlib import Path
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting, name_repeat
+from flcav.pipeline.collecting.arm_costs import list_arm_costs
 from flcav.pipeline.collecting.caveats import list_caveats, list_cut, list_diverged, list_unreached
 from flcav.pipeline.collecting.differences import list_differences
 from flcav.pipeline.collecting.findings import findings
@@ -42,7 +43,7 @@ def collect_results(graph: Graph, work: Path) -> Run:
     arms = {name: _arm(graph, work, arm) for name, arm in settings.items()}
     differences = list_differences(graph, work)
     rests = {task: LABEL_SOURCES[kind].caveat for task, kind in main.labels.items()}
-    return Run(
+    run = Run(
         recipe=recipe,
         arms=arms,
         pretrained=tuple(Pretrained.load(work / names.pretrain(MAIN, task)) for task in recipe.tasks),
@@ -61,6 +62,7 @@ def collect_results(graph: Graph, work: Path) -> Run:
             *compare_rigs(graph),
         ),
     )
+    return replace(run, costs=list_arm_costs(run) or None)
 
 
 def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:

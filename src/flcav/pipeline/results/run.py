@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from flcav.intervals import MeanOverSeeds
+from flcav.intervals import Estimate, MeanOverSeeds
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
 from flcav.pipeline.results.placement import Placed
@@ -13,7 +13,7 @@ from flcav.pipeline.results.saved import Saved
 from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.results.tests import Difference, Finding, HomeCost, RegionalTest, Test, Tested
 from flcav.pipeline.results.training import Pretrained, StageResult, Watched
-from flcav.records import LEFT_OUT
+from flcav.records import LEFT_OUT, Record
 from flcav.verdicts import Judged
 
 
@@ -68,6 +68,26 @@ class ArmResult:
 
 
 @dataclass(frozen=True)
+class ArmCost(Record):
+    """Costs and gain of a task in an arm, in the mean over the regions that federate in it."""
+
+    arm: str
+    task: str
+    regions: tuple[str, ...]
+    measure: str
+    stage: str  # the last one that was tested
+    wireless_mb: float  # uplink of stages II and III
+    wireline_mb: float
+    edge_rounds: int  # of a region, the most
+    cloud_rounds: int
+    epsilon: float | None  # of a vehicle, all tasks and trainings together; None: no noise
+    before: float  # the measure after pretraining
+    after: Estimate  # and after the last stage, with its interval
+    gain: float  # how much it rose
+    gain_per_mb: float | None  # for a megabyte of uplink on both links; None: nothing was sent
+
+
+@dataclass(frozen=True)
 class Run(Saved):
     """Results of a finished run."""
 
@@ -82,6 +102,7 @@ class Run(Saved):
     caveats: tuple[str, ...]  # of the kinds of labels, and of rigs unlike those of the training
     provenance: Provenance
     elapsed_s: float = 0.0  # wall time of all starts together
+    costs: Annotated[tuple[ArmCost, ...] | None, LEFT_OUT] = None  # of each arm and task
     home: Annotated[tuple[HomeCost, ...] | None, LEFT_OUT] = None  # of further measures than the tasks' own
 
     def test(self, *, stage: str, region: str, task: str, arm: str = "main") -> Tested:

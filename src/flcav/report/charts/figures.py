@@ -61,6 +61,17 @@ def megabytes(ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> F
 
 
 @style.styled
+def gains(costs: Mapping[str, Sequence[Row]]) -> Figure:
+    """Return a measure against the uplink of arms, a panel per task; for the rows see `runs.draw_gains`."""
+    figure = style.canvas(1.4 * WIDTH, 0.75 * WIDTH * len(costs))
+    for axes, (task, rows) in zip(figure.subplots(len(costs), squeeze=False)[:, 0], costs.items(), strict=True):
+        runs.draw_gains(axes, rows)
+        axes.set_title(task, fontweight="bold")
+    figure.axes[-1].set_xlabel("uplink of stages II and III [MB]")
+    return figure
+
+
+@style.styled
 def arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> Figure:
     """Return a forest plot of AP50 by arm, a panel per town."""
     figure = style.canvas(6.4, 0.9 + 0.32 * sum(map(len, towns.values())))

@@ -134,6 +134,41 @@ def draw_megabytes(axes: Axes, ledger_by_stage: Sequence[Row], budgets: Mapping[
     axes.set(xlabel="uplink megabytes (1 MB = 10⁶ bytes)", ylim=(len(budgets) - 0.6, -0.65))
 
 
+def draw_gains(axes: Axes, rows: Sequence[Row]) -> None:
+    """Draw the measure of each arm against its uplink, with a line from pretraining.
+
+    `rows` have arm, measure, mb, before, score, low, high; low and high may be None.
+    """
+    colours, most = (style.BLUE, *style.OTHER_COLOURS, style.VERMILLION), max(row["mb"] for row in rows)
+    at: dict[str, float] = {}  # by arm; bars at the same megabytes stand side by side
+    for number, row in enumerate(rows):
+        colour, before = (
+            colours[number % len(colours)],
+            [each for each in at.values() if abs(each - row["mb"]) < most / 50],
+        )
+        at[row["arm"]] = x = row["mb"] + len(before) * most / 60
+        axes.plot([0, x], [row["before"], row["score"]], color=colour, linewidth=1.2, linestyle=(0, (3, 2)))
+        axes.plot(0, row["before"], "o", color=colour, markerfacecolor="white", markersize=6, clip_on=False)
+        _draw_interval(axes, x, row, colour)
+    low, top = axes.get_ylim()
+    for x in sorted({round(each / most, 1) for each in at.values()}):
+        own = [(row, number) for number, row in enumerate(rows) if round(at[row["arm"]] / most, 1) == x]
+        places = style.keep_apart([row["score"] for row, _ in own], LINE * (top - low), top)
+        right = max(at[row["arm"]] for row, _ in own)
+        for (row, number), place in zip(own, places, strict=True):
+            axes.annotate(
+                row["arm"],
+                (right, place),
+                (9, 0),
+                textcoords="offset points",
+                color=colours[number % len(colours)],
+                va="center",
+                fontweight="bold",
+            )
+    axes.set(ylabel=rows[0]["measure"], xlim=(0, 1.08 * most), ylim=(low, top))
+    axes.grid(axis="y")
+
+
 def draw_arms(axes: Axes, town: str, rows: Mapping[str, MeanOverSeeds]) -> None:
     """Draw the forest plot of a town: mean and interval of each arm, with the numbers."""
     colour = _colour(town, [town])

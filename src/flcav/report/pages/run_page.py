@@ -16,6 +16,7 @@ from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.arms import Names, resolve_settings
+from flcav.pipeline.collecting.arm_costs import list_arm_costs
 from flcav.pipeline.collecting.caveats import PLACED_BARE
 from flcav.pipeline.collecting.findings import WORDS
 from flcav.pipeline.collecting.home import list_home_costs
@@ -24,9 +25,9 @@ from flcav.pipeline.federations.records import list_rounds
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.testing import LOOK
 from flcav.pipeline.labels.sources import choose_labels
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.placement import Placed
-from flcav.pipeline.results.run import LinkUse, Run
+from flcav.pipeline.results.run import ArmCost, LinkUse, Run
 from flcav.pipeline.results.saved import ERRORS
 from flcav.pipeline.results.spending import TOGETHER
 from flcav.pipeline.results.tests import SweepComparison, SweepDetections
@@ -117,6 +118,7 @@ def page(run: Run) -> dict[str, Any]:
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
+        "costs": [{**vars(each), "where": "central" if each.stage == CENTRAL else ""} for each in _list_costs(run)],
         "home": list_home_costs(run),
         "statistics": [(stage.task, each) for stage in main.stages for each in stage.statistics or ()],
         "caveats": [caveat for caveat in run.caveats if caveat != PLACED_BARE],
@@ -124,6 +126,26 @@ def page(run: Run) -> dict[str, Any]:
         "elapsed_s": run.elapsed_s,
         "provenance": run.provenance,
     }
+
+
+def _list_gains(costs: Sequence[ArmCost], task: str) -> list[Row]:
+    return [
+        {
+            "arm": each.arm,
+            "measure": each.measure,
+            "mb": each.wireless_mb + each.wireline_mb,
+            "before": each.before,
+            "score": each.after.mean,
+            "low": each.after.low,
+            "high": each.after.high,
+        }
+        for each in costs
+        if each.task == task
+    ]
+
+
+def _list_costs(run: Run) -> Sequence[ArmCost]:
+    return run.costs or list_arm_costs(run)
 
 
 def draw(run: Run, work: Path) -> dict[str, bytes]:
@@ -137,6 +159,8 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
         drawn[f"rounds_{_file_name(task)}"] = figures.by_round(*chart)
     drawn |= _timelines(run, work)
     drawn["megabytes"] = figures.megabytes(_sent(run), {link: use.budget_mb for link, use in main.links.items()})
+    if costs := [each for each in _list_costs(run) if each.gain_per_mb is not None]:
+        drawn["gain"] = figures.gains({task: _list_gains(costs, task) for task in {each.task: None for each in costs}})
     sweep = _sweep(work, _names(run), run) if (work / LOOK).is_dir() else None
     if sweep is not None:
         drawn["before_after"] = figures.before_after(sweep)
@@ -194,7 +218,7 @@ def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
         np.array([error.kind for error in errors], dtype=np.str_),
         {number: at for number, at in maps.poles_of(town).items() if int(number) in {p.pole for p in placed.poles}},
         {str(pole): placed.range_m for pole in placed.chosen},
-        {maps.DENSEST: (str(placed.densest),)},
+        conventional={maps.DENSEST: (str(placed.densest),)},
     )
 
 
