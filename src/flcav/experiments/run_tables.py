@@ -156,7 +156,7 @@ def _rounds(run: Run) -> str:
             lost = Counter(each.failed[name] for each in joined if name in each.failed)
             rows.append(
                 [
-                    *(task, name, f"{run.recipe.regions[region].speed.get(vehicle, 1.0):g}"),
+                    *(task, name, f"{run.recipe.speeds(region).get(vehicle, 1.0):g}"),
                     len(own) if plan.joins is None else len(plan.joins[name]),
                     sum(name in each.clients for each in joined),
                     ", ".join(f"{times} {reason}" for reason, times in lost.items()),

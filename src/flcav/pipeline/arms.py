@@ -234,7 +234,7 @@ def _check_bare_labels(setting: Setting) -> None:
 
 def _plans_joiners(recipe: RunRecipe, setting: Setting) -> bool:
     """Return whether a plan says which vehicles join a round, as it does where it times each of them."""
-    speeds = any(recipe.regions[region].speed for region in recipe.with_role("federate"))
+    speeds = any(recipe.speeds(region) for region in recipe.with_role("federate"))
     timed = recipe.federation.network is not None or speeds
     return recipe.horizon_s is not None and timed and setting.central is None and _learns(recipe, setting.plan)
 

@@ -15,6 +15,7 @@ from flcav.federation.rules import Rules
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors
 from flcav.network.clock.rounds import NetworkSettings
+from flcav.pipeline.stragglers import Stragglers, draw_stragglers
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
 from flcav.world.scenarios.scenario import Scenario
@@ -266,6 +267,7 @@ class RunRecipe(Config):
     headroom: float = Field(default=0.02, ge=0, lt=0.5)  # fraction left unspent: samples differ in size
     limits: Limits = Limits()  # bounds of the plan's quantities
     horizon_s: Positive | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]
+    stragglers: Stragglers | None = None  # vehicles that train slower, in every region that is simulated
     placement: Placement = Placement()  # placement of roadside sensors
     federation: Federation = Federation()  # settings of aggregation
     distillation: Distillation | None = None  # of labels "road-average"; None: the defaults
@@ -303,6 +305,13 @@ class RunRecipe(Config):
             known = [f"cav{number}" for number in range(self.vehicles(name))]
             if odd := [each for each in self.regions[name].speed if each not in known]:
                 raise ValueError(f"regions.{name}.speed: '{odd[0]}' is none of its vehicles: {', '.join(known)}")
+        timed = [
+            self.horizon_s,
+            self.federation.network,
+            *(arm.federation.get("network") for arm in self.arms.values()),
+        ]
+        if self.stragglers is not None and not any(timed):
+            raise ValueError("stragglers: time counts with 'horizon_s' or 'federation.network' alone; give one of them")
         if MAIN in self.arms:
             raise ValueError(f"arms: '{MAIN}' is the run itself; choose another name")
         for name, arm in self.arms.items():
@@ -346,6 +355,14 @@ class RunRecipe(Config):
     def training_of(self, task: str) -> Training:
         """Return a task's training schedule: its own, else the run's, else that of the preset `size`."""
         return self.tasks[task].training or self.training or SIZES[self.size][1]
+
+    def speeds(self, region: str) -> Mapping[str, float]:
+        """Return the speeds of a region's vehicles, its own and those of stragglers; others have 1."""
+        own, drawn = self.regions[region], dict[str, float]()
+        if self.stragglers is not None and own.role == "federate" and own.data is None:
+            names = [f"cav{number}" for number in range(self.vehicles(region))]
+            drawn = draw_stragglers(self.stragglers, names, self.seed, region)
+        return {**drawn, **own.speed}
 
     def vehicles(self, region: str) -> int:
         """Return the number of vehicles of a federating region's edge server."""

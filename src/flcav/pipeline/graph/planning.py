@@ -117,7 +117,7 @@ def _count_held(outline: Outline) -> dict[str, dict[str, int]]:
 
 def _list_speeds(outline: Outline, held: dict[str, dict[str, int]], timed: bool) -> dict[str, float]:
     """Return the speed of every vehicle, "region/vehicle"; empty where no region gives any, and no message is timed."""
-    regions = outline.recipe.regions
-    if not timed and not any(regions[region].speed for region in held):
+    speeds = {region: outline.recipe.speeds(region) for region in held}
+    if not timed and not any(speeds.values()):
         return {}
-    return {f"{region}/{cav}": regions[region].speed.get(cav, 1.0) for region, own in held.items() for cav in own}
+    return {f"{region}/{cav}": speeds[region].get(cav, 1.0) for region, own in held.items() for cav in own}

@@ -78,7 +78,7 @@ def list_further_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
 def _federate(outline: Outline, arm: Setting, task: str, stage: str, replan: RoundPlans | None) -> dict[str, Any]:
     """Return the fields of `FederationSettings` of a stage of a task."""
     recipe, timed = outline.recipe, arm.federation.network is not None
-    given = {name: recipe.regions[name].speed for name in outline.federating}
+    given = {name: recipe.speeds(name) for name in outline.federating}
     speeds = {f"{region}/{vehicle}": speed for region in given for vehicle, speed in given[region].items()}
     return {
         "learning": outline.learning(arm, task),
