@@ -17,6 +17,7 @@ from flcav.dataset.formats.exporter import (
     Exported,
     ExportOptions,
     count_unlabelled,
+    count_unwritten,
     missing_data_error,
     split_scenes,
 )
@@ -52,6 +53,7 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
                 for annotation in _annotations(frame, camera, labels, options.min_pixels):
                     counts[labels] += 1
                     table["annotations"].append({"id": counts[labels], "image_id": image["id"], **annotation})
+        exported.left_out.update(count_unwritten("COCO", frame, frame.images))
         progress(i + 1, len(dataset), "")
     if not counts["images"]:
         raise missing_data_error(dataset, "COCO", "camera images")

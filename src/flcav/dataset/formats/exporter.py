@@ -91,6 +91,13 @@ def select_objects(
     return kept, left_out
 
 
+def count_unwritten(name: str, frame: Frame, written: Collection[str]) -> Counter[LeftOut]:
+    """Return the measurements of a frame by sensors other than those `written` in the format `name`."""
+    sensors = (*frame.lidar, *frame.images, *frame.infrared, *frame.radar, *frame.gnss, *frame.imu)
+    why = f"{name} has no place for them"
+    return Counter(LeftOut("measurements", why, sensor) for sensor in sensors if sensor not in written)
+
+
 def lacks_points(min_points: int) -> str:
     """Return the reason for which objects with fewer than `min_points` LiDAR points are left out."""
     return f"fewer than {plural(min_points, 'LiDAR point')} in the box (--min-points)"

@@ -14,6 +14,7 @@ from flcav.dataset.formats.exporter import (
     ExportOptions,
     LeftOut,
     count_unlabelled,
+    count_unwritten,
     find_visible,
     missing_data_error,
     split_with_validation,
@@ -50,6 +51,7 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
             exported.counts.update({"images": 1, options.labels: len(found)})
             exported.left_out.update(count_unlabelled(frame, camera, options.labels, options.min_pixels))
             exported.left_out[others] += len(find_visible(frame, camera, others.what))
+        exported.left_out.update(count_unwritten("YOLO", frame, frame.images))
         progress(i + 1, len(dataset), "")
     if not exported.counts["images"]:
         raise missing_data_error(dataset, "YOLO", "camera images")

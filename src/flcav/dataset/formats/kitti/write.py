@@ -18,6 +18,7 @@ from flcav.dataset.formats.exporter import (
     LeftOut,
     check_rectified,
     count_points_in_boxes,
+    count_unwritten,
     lacks_points,
     missing_data_error,
     read_frame,
@@ -99,7 +100,7 @@ def _write_frame(
     )
     _write(folder / "velodyne" / f"{number}.bin", frame.lidar[lidar].astype("<f4").tobytes())
     _write(folder / "image_2" / f"{number}.png", encode_png(frame.images[camera].rgb))
-    return len(objects), len(regions), left_out
+    return len(objects), len(regions), left_out + count_unwritten("KITTI", frame, {lidar, camera})
 
 
 def format_label_lines(

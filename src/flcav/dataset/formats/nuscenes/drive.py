@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import LeftOut, check_rectified, count_points_in_boxes, select_objects
+from flcav.dataset.formats.exporter import (
+    LeftOut,
+    check_rectified,
+    count_points_in_boxes,
+    count_unwritten,
+    select_objects,
+)
 from flcav.dataset.formats.mounts import assign_channels, optical_yaw, quaternion
 from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, encode_lidar, encode_radar
 from flcav.dataset.formats.nuscenes.tables import (
@@ -75,15 +81,16 @@ class Drive:
             self._add_data(
                 frame, name, channel, "pcd.bin", encode_lidar(points, self.elevations.get(name, NO_CHANNELS))
             )
-        for name, channel in assign_channels(
-            {name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS
-        ).items():
+        cameras = assign_channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
+        radars = assign_channels({name: yaw_of(mounts[name]) for name in frame.radar}, RADARS)
+        for name, channel in cameras.items():
             check_rectified(frame, name, "nuScenes")
             self._add_data(frame, name, channel, "png", encode_png(frame.images[name].rgb))
-        for name, channel in assign_channels({name: yaw_of(mounts[name]) for name in frame.radar}, RADARS).items():
+        for name, channel in radars.items():
             radar_from_world = frame.world_from_sensor(name)[:3, :3].T
             self._add_data(frame, name, channel, "pcd", encode_radar(frame.radar[name], radar_from_world @ velocity))
         self._add_annotations(frame)
+        self.left_out.update(count_unwritten("nuScenes", frame, {*frame.lidar, *cameras, *radars}))
 
     def _add_data(self, frame: Frame, name: str, channel: str, suffix: str, data: bytes) -> None:
         true = frame.calibration

@@ -19,6 +19,7 @@ from flcav.dataset.formats.exporter import (
     LeftOut,
     check_rectified,
     count_points_in_boxes,
+    count_unwritten,
     lacks_points,
     missing_data_error,
     read_frame,
@@ -89,7 +90,8 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
             speed = float(np.linalg.norm(speeds[frame.agent, frame.index]))
             vehicles, left_out = _vehicles(frame, numbers, options.min_points)
             exported.left_out.update(left_out)
-            _write_frame(frame, folder / str(numbers[frame.agent]), vehicles, speed)
+            written = _write_frame(frame, folder / str(numbers[frame.agent]), vehicles, speed)
+            exported.left_out.update(count_unwritten("OPV2V", frame, written))
             counts.update(frames=1, objects=len(vehicles))
         protocol = {"recipe": dataset.manifest.recipe, "numbers": numbers}
         (folder / "data_protocol.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False), encoding="utf-8")
@@ -150,7 +152,8 @@ def from_carla(values: Sequence[float]) -> Array:
     return MIRROR @ matrix @ MIRROR
 
 
-def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed_m_s: float) -> None:
+def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed_m_s: float) -> set[str]:
+    """Write the files of a frame; return the sensors whose measurements they hold."""
     lidar, points = next(iter(frame.lidar.items()))
     folder.mkdir(parents=True, exist_ok=True)
     time = f"{frame.index:06d}"
@@ -178,6 +181,7 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed
         "vehicles": vehicles,
     }
     (folder / f"{time}.yaml").write_text(yaml.dump(about, Dumper=FAST_DUMPER), encoding="utf-8")
+    return {lidar, *cameras}
 
 
 def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> tuple[dict[int, Vehicle], Counter[LeftOut]]:
