@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.formats.export import FORMATS, export
 from flcav.dataset.formats.exporter import ExportOptions
+from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, points_in_boxes, wrap_angle
@@ -486,9 +488,9 @@ def test_a_share_to_validate_is_refused_of_a_dataset_recorded_for_it(name: str, 
         export(Dataset.open(tmp_path / "dataset"), name, tmp_path / "out", ExportOptions(validation=0.2))
 
 
-def _summary(name: str, dataset: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
+def _summary(name: str, dataset: Path, out: Path, capsys: pytest.CaptureFixture[str], *asked: str) -> list[str]:
     with pytest.raises(SystemExit) as end:
-        run(["export", name, str(dataset), "--out", str(out)])
+        run(["export", name, str(dataset), "--out", str(out), *asked])
     assert not end.value.code
     return capsys.readouterr().out.splitlines()
 
@@ -496,19 +498,112 @@ def _summary(name: str, dataset: Path, out: Path, capsys: pytest.CaptureFixture[
 def test_opv2v_holds_the_spins_that_every_agent_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """OpenCOOD takes the spins of the first agent and looks for them at all others."""
     record(PaintedSource(2, spins=3, cut=1), tmp_path / "dataset")
-    written, left_out = _summary("opv2v", tmp_path / "dataset", tmp_path / "out", capsys)
-    assert "exported 2 scenarios, 8 frames, " in written
+    written, classes, points, sensors, left_out = _summary("opv2v", tmp_path / "dataset", tmp_path / "out", capsys)
+    assert "exported 2 scenarios, 8 frames, 32 objects, " in written
+    assert classes == "left out 24 objects: OPV2V has no class for them (motorcycle, bicycle, pedestrian)"
+    assert points == "left out 16 objects: fewer than 1 LiDAR point in the box (--min-points)"
+    assert sensors == "left out 16 measurements: OPV2V has no place for them (thermal, radar, gnss, imu)"
     spins = "spin 2 of painted-0-000, spin 2 of painted-0-001"
-    assert left_out == f"2 frames left out, OPV2V needs each spin of every agent: {spins}"
+    assert left_out == f"left out 2 frames, 18 objects: OPV2V needs each spin of every agent ({spins})"
     seen = READERS["opv2v"](tmp_path / "out")
     assert sorted({key[14:18] for key in seen}) == ["0000", "0001"]
     assert len(seen) == 8
 
 
 def test_kitti_says_which_frames_it_leaves_out(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    written, left_out = _summary("kitti", dataset.folder, tmp_path / "out", capsys)
-    assert f"exported {2 * SCENES} frames, " in written
-    assert left_out == f"{2 * SCENES} frames left out, no level camera that looks ahead: pole3"
+    written, outside, points, sensors, left_out = _summary("kitti", dataset.folder, tmp_path / "out", capsys)
+    assert f"exported {2 * SCENES} frames, 30 objects, 6 DontCare regions, " in written
+    assert outside == "left out 18 objects: outside the image"
+    assert points == "left out 6 objects: fewer than 1 LiDAR point in the box (--min-points)"
+    assert sensors == "left out 30 measurements: KITTI has no place for them (back, thermal, radar, gnss, imu)"
+    assert left_out == f"left out {2 * SCENES} frames, 54 objects: no level camera that looks ahead (pole3)"
+
+
+@pytest.mark.parametrize("labels", [None, "actors"])
+def test_yolo_says_that_it_labels_signs_or_actors(
+    labels: str | None, dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    asked = ["--labels", labels] if labels else []
+    written, *left_out = _summary("yolo", dataset.folder, tmp_path / "out", capsys, *asked)
+    if labels is None:
+        assert "exported 12 images, 48 signs, " in written
+        assert left_out == [
+            "left out 12 signs: there is no class for them (signal off)",
+            "left out 42 actors: YOLO has one list of classes, by default signs and lights; "
+            "--labels actors writes vehicles and pedestrians",
+            "left out 36 measurements: YOLO has no place for them (lidar, thermal, radar, gnss, imu)",
+        ]
+    else:
+        assert "exported 12 images, 42 actors, " in written
+        assert left_out == [
+            "left out 60 signs: --labels actors writes vehicles and pedestrians alone; signs are the default",
+            "left out 36 measurements: YOLO has no place for them (lidar, thermal, radar, gnss, imu)",
+        ]
+
+
+def _count_objects(name: str, out: Path) -> int:
+    """Return the number of labelled objects in the files of an export."""
+    if name == "yolo":
+        return sum(len(path.read_text().splitlines()) for path in (out / "labels").rglob("*.txt"))
+    if name == "coco":
+        return sum(len(json.loads(path.read_text())["annotations"]) for path in (out / "annotations").iterdir())
+    return sum(len(frame.boxes) for frame in READERS[name](out).values())
+
+
+@pytest.mark.parametrize("options", [{}, {"min_points": 20, "min_pixels": 6, "labels": "actors"}])
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_object_is_written_or_left_out_for_a_reason(name: str, options: dict[str, object], tmp_path: Path):
+    record(PaintedSource(2, spins=3, cut=1), tmp_path / "dataset")
+    dataset = Dataset.open(tmp_path / "dataset")
+    frames = [dataset.frame(i) for i in range(len(dataset))]
+    if name in ("yolo", "coco"):
+        images = [(frame.annotations, camera) for frame in frames for camera in frame.images]
+        source = sum((truth.views[camera].pixels > 0).sum() + len(truth.signs[camera]) for truth, camera in images)
+    else:
+        source = sum(len(frame.annotations) for frame in frames)
+    taken = {option: value for option, value in options.items() if option in FORMATS[name].options}
+    exported = export(dataset, name, tmp_path / "out", ExportOptions.model_validate(taken))
+    left_out = Counter[str]()
+    for each, number in exported.left_out.items():
+        assert each.why
+        left_out[each.what] += number
+    kinds = ("objects", "signs", "actors")
+    written = _count_objects(name, tmp_path / "out")
+    assert written == sum(exported.counts[kind] for kind in kinds) > 0
+    assert written + sum(left_out[kind] for kind in kinds) == source
+    if "frames" in exported.counts:
+        assert exported.counts["frames"] + left_out["frames"] == len(dataset)
+
+
+@pytest.mark.parametrize(("name", "lacks"), [("kitti", False), ("nuscenes", True), ("opv2v", True), ("mcap", False)])
+def test_a_class_that_a_format_lacks_is_named(name: str, lacks: bool, exported: dict[str, Path], tmp_path: Path):
+    """Trams are of KITTI's classes; an import keeps their name."""
+    shutil.copytree(exported["kitti"], tmp_path / "kitti")
+    trams = 0
+    for path in (tmp_path / "kitti" / "training" / "label_2").iterdir():
+        text = path.read_text()
+        trams += text.count("Van")
+        path.write_text(text.replace("Van", "Tram"))
+    import_dataset("kitti", tmp_path / "kitti", tmp_path / "dataset")
+    dataset = Dataset.open(tmp_path / "dataset")
+    written = export(dataset, name, tmp_path / "out")
+    left_out = {each.which: number for each, number in written.left_out.items() if "no class" in each.why}
+    assert left_out.get("Tram", 0) == trams * lacks
+    objects = sum(number for each, number in written.left_out.items() if each.what == "objects")
+    assert written.counts["objects"] + objects == sum(len(dataset.frame(i).annotations) for i in range(len(dataset)))
+    assert trams > 0
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "mcap"])  # which holds all: see above
+def test_every_measurement_is_a_file_or_left_out(name: str, dataset: Dataset, tmp_path: Path):
+    left_out = export(dataset, name, tmp_path / "out").left_out
+    frames = [dataset.frame(i) for i in range(len(dataset))]
+    kept = [frame for frame in frames if frame.images or name != "kitti"]
+    kinds = ("lidar", "images", "infrared", "radar", "gnss", "imu")
+    files = [path for path in (tmp_path / "out").rglob("*") if path.suffix in (".png", ".bin", ".pcd")]
+    written = sum(path.parent.name != "maps" for path in files)
+    others = sum(number for each, number in left_out.items() if each.what == "measurements")
+    assert written + others == sum(len(getattr(frame, kind)) for frame in kept for kind in kinds)
 
 
 VALUES = {"labels": "actors", "validation": 0.5, "min_pixels": 6, "min_points": 50, "calibration": "assumed"}

@@ -1,11 +1,16 @@
 """`flcav export`: convert a dataset to another format."""
 
-from collections import Counter, defaultdict
+from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from flcav.cli.options import Format, join_choices
+from flcav.wording import plural
+
+if TYPE_CHECKING:
+    from flcav.dataset.formats.exporter import LeftOut
 
 
 def register(app: typer.Typer) -> None:
@@ -53,17 +58,25 @@ def export(
     with progress.show_progress(f"export {out}") as report:
         exported = write(dataset, format, out, options, progress=report)
     size_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
-    written = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in exported.counts.items())
-    typer.echo(f"{out}: exported {written}, {size_mb:.1f} MB")
-    for line in _left_out(exported.left_out):
+    typer.echo(f"{out}: exported {_format_counts(exported.counts)}, {size_mb:.1f} MB")
+    for line in _format_left_out(exported.left_out):
         typer.echo(line)
 
 
-def _left_out(left_out: Counter[tuple[str, str]]) -> list[str]:
-    """Return a line for each reason for which frames were left out."""
-    frames: dict[str, list[str]] = defaultdict(list)
-    count: Counter[str] = Counter()
-    for (why, which), number in left_out.items():
-        frames[why].append(which)
-        count[why] += number
-    return [f"{count[why]} frames left out, {why}: {', '.join(which)}" for why, which in frames.items()]
+def _format_counts(counts: Counter[str]) -> str:
+    return ", ".join(plural(number, what.removesuffix("s").replace("_", " ")) for what, number in counts.items())
+
+
+def _format_left_out(left_out: "Counter[LeftOut]") -> list[str]:
+    """Return a line for each reason, with what was left out for it."""
+    lines = []
+    for why in dict.fromkeys(each.why for each in left_out):
+        counts, which = Counter[str](), dict[str, None]()
+        for each, number in left_out.items():
+            if each.why == why and number:
+                counts[each.what] += number
+                which[each.which] = None
+        if counts:
+            named = ", ".join(filter(None, which))
+            lines.append(f"left out {_format_counts(counts)}: {why}" + f" ({named})" * bool(named))
+    return lines

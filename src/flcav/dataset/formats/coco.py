@@ -13,7 +13,14 @@ import numpy as np
 from faster_coco_eval.core import mask as coco_mask
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import Exported, ExportOptions, missing_data_error, split_scenes
+from flcav.dataset.formats.exporter import (
+    Exported,
+    ExportOptions,
+    count_unlabelled,
+    count_unwritten,
+    missing_data_error,
+    split_scenes,
+)
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
@@ -28,7 +35,8 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
         raise missing_data_error(dataset, "COCO", "the visible pixels of objects")
     split_of = split_scenes(dataset, options)
     tables = {(labels, split): _empty(labels) for labels in CLASSES for split in split_of.values()}
-    counts: Counter[str] = Counter(images=0, signs=0, actors=0)
+    exported = Exported(Counter(images=0, signs=0, actors=0))
+    counts = exported.counts
     for i, key in enumerate(dataset.keys):
         frame = dataset.frame(i)
         split = split_of[key.scene]
@@ -41,9 +49,11 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
             for labels in CLASSES:
                 table = tables[labels, split]
                 table["images"].append(image)
+                exported.left_out.update(count_unlabelled(frame, camera, labels, options.min_pixels))
                 for annotation in _annotations(frame, camera, labels, options.min_pixels):
                     counts[labels] += 1
                     table["annotations"].append({"id": counts[labels], "image_id": image["id"], **annotation})
+        exported.left_out.update(count_unwritten("COCO", frame, frame.images))
         progress(i + 1, len(dataset), "")
     if not counts["images"]:
         raise missing_data_error(dataset, "COCO", "camera images")
@@ -51,7 +61,7 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
         path = out / "annotations" / f"{labels}_{split}.json"
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(table, allow_nan=False), encoding="utf-8")
-    return Exported(counts)
+    return exported
 
 
 class Table(TypedDict):

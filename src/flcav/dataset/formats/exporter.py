@@ -2,20 +2,22 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from flcav.config import Config, InputError
+from flcav.dataset.rectangles import select_rectangles
 from flcav.dataset.store import Dataset
 from flcav.geometry import points_in_boxes, transform_points
 from flcav.progress import Report
 from flcav.sensors.frame import Frame
+from flcav.wording import plural
 
 SPLITS = ("train", "val", "test")
 
@@ -30,12 +32,28 @@ class ExportOptions(Config):
     calibration: Literal["true", "assumed"] = "true"  # which of the two calibrations of a frame is written
 
 
+class LeftOut(NamedTuple):
+    """A kind of data that an export did not write, and the reason."""
+
+    what: str  # kind, in the plural as in `Exported.counts`
+    why: str
+    which: str = ""  # agent, spin, camera or class that the reason is about; "" where it is about none
+
+
 @dataclass(frozen=True)
 class Exported:
-    """The result of an export: counts of what was written, and of the frames left out."""
+    """The result of an export: counts of what was written and of what was left out.
+
+    Objects are annotated actors of frames; of formats with 2D labels, signs and actors that show in an image. Each of
+    the dataset's is counted once, as written or, by the first reason that applies, as left out.
+    """
 
     counts: Counter[str]  # kind, e.g. "frames", "objects" -> number written
-    left_out: Counter[tuple[str, str]] = field(default_factory=Counter)  # (reason, agent or spin) -> number of frames
+    left_out: Counter[LeftOut] = field(default_factory=Counter)
+
+    def leave_out(self, frame: Frame, why: str, which: str) -> None:
+        """Count a frame and its objects as left out."""
+        self.left_out.update({LeftOut("frames", why, which): 1, LeftOut("objects", why, which): len(frame.annotations)})
 
 
 # Writes a dataset in one format into an empty folder; raises `InputError` where the dataset lacks what that needs.
@@ -56,6 +74,53 @@ def count_points_in_boxes(frame: Frame, sensor: str, points: NDArray[np.floating
     """
     world = transform_points(frame.world_from_sensor(sensor), points[:, :3].astype(np.float64))
     return points_in_boxes(world, frame.annotations.boxes).sum(axis=1)
+
+
+def select_objects(
+    name: str, label: NDArray[np.str_], known: Collection[str], reasons: Mapping[str, NDArray[np.bool_]]
+) -> tuple[NDArray[np.bool_], Counter[LeftOut]]:
+    """Return (M,) which objects of the (M,) classes `label` an export to the format `name` labels, and the others.
+
+    Left out are objects of no class in `known`, then those that the `reasons` apply to: reason -> (M,).
+    """
+    kept = np.isin(label, [*known])
+    left_out = Counter(LeftOut("objects", f"{name} has no class for them", each) for each in label[~kept].tolist())
+    for why, applies in reasons.items():
+        left_out[LeftOut("objects", why)] += int((kept & applies).sum())
+        kept = kept & ~applies
+    return kept, left_out
+
+
+def count_unwritten(name: str, frame: Frame, written: Collection[str]) -> Counter[LeftOut]:
+    """Return the measurements of a frame by sensors other than those `written` in the format `name`."""
+    sensors = (*frame.lidar, *frame.images, *frame.infrared, *frame.radar, *frame.gnss, *frame.imu)
+    why = f"{name} has no place for them"
+    return Counter(LeftOut("measurements", why, sensor) for sensor in sensors if sensor not in written)
+
+
+def lacks_points(min_points: int) -> str:
+    """Return the reason for which objects with fewer than `min_points` LiDAR points are left out."""
+    return f"fewer than {plural(min_points, 'LiDAR point')} in the box (--min-points)"
+
+
+def find_visible(frame: Frame, camera: str, labels: str) -> dict[int, str]:
+    """Return row -> class of the signs or actors (`labels`) that show in an image, those without a 2D label too."""
+    truth = frame.annotations
+    if labels == "actors":
+        return {int(row): str(truth.boxes.label[row]) for row in np.flatnonzero(truth.views[camera].pixels)}
+    signs = truth.signs[camera]
+    return {int(row): f"{signs.kind[row]} {signs.state[row]}".strip() for row in np.flatnonzero(signs.pixels)}
+
+
+def count_unlabelled(frame: Frame, camera: str, labels: str, min_pixels: int) -> Counter[LeftOut]:
+    """Return the signs or actors (`labels`) that show in an image and that `select_rectangles` leaves out."""
+    visible = find_visible(frame, camera, labels)
+    known = select_rectangles(frame, camera, labels, min_pixels=1)
+    unknown = visible.keys() - set(known.row.tolist())
+    left_out = Counter(LeftOut(labels, "there is no class for them", visible[row]) for row in sorted(unknown))
+    few = f"fewer than {plural(min_pixels, 'visible pixel')} (--min-pixels)"
+    left_out[LeftOut(labels, few)] += int((known.pixels < min_pixels).sum())
+    return left_out
 
 
 def missing_data_error(dataset: Dataset, name: str, needed: str, who: str = "the dataset") -> InputError:

@@ -9,11 +9,28 @@ from pathlib import Path
 
 import yaml
 
-from flcav.dataset.formats.exporter import Exported, ExportOptions, missing_data_error, split_with_validation
+from flcav.dataset.formats.exporter import (
+    Exported,
+    ExportOptions,
+    LeftOut,
+    count_unlabelled,
+    count_unwritten,
+    find_visible,
+    missing_data_error,
+    split_with_validation,
+)
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.rectangles import CLASSES, Rectangles, select_rectangles
 from flcav.dataset.store import Dataset
 from flcav.progress import Report
+
+OTHERS = {  # what is labelled -> what is not, and how to have it
+    "signs": LeftOut(
+        "actors",
+        "YOLO has one list of classes, by default signs and lights; --labels actors writes vehicles and pedestrians",
+    ),
+    "actors": LeftOut("signs", "--labels actors writes vehicles and pedestrians alone; signs are the default"),
+}
 
 
 def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
@@ -21,7 +38,7 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     if dataset.manifest.imported:
         raise missing_data_error(dataset, "YOLO", "the visible pixels of objects")
     split_of = split_with_validation(dataset, options, "YOLO")
-    counts: Counter[str] = Counter(images=0, objects=0)
+    exported, others = Exported(Counter({"images": 0, options.labels: 0})), OTHERS[options.labels]
     for i, key in enumerate(dataset.keys):
         frame = dataset.frame(i)
         split = split_of[key.scene]
@@ -31,16 +48,19 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
             name = f"{frame.key}_{camera}"
             _write(out / "images" / split / f"{name}.png", encode_png(picture.rgb))
             _write(out / "labels" / split / f"{name}.txt", format_label_file(found, width, height).encode())
-            counts.update(images=1, objects=len(found))
+            exported.counts.update({"images": 1, options.labels: len(found)})
+            exported.left_out.update(count_unlabelled(frame, camera, options.labels, options.min_pixels))
+            exported.left_out[others] += len(find_visible(frame, camera, others.what))
+        exported.left_out.update(count_unwritten("YOLO", frame, frame.images))
         progress(i + 1, len(dataset), "")
-    if not counts["images"]:
+    if not exported.counts["images"]:
         raise missing_data_error(dataset, "YOLO", "camera images")
     folders = {split: f"images/{split}" for split in ("train", "val", *split_of.values())}
     for folder in folders.values():  # Ultralytics requires the first two, even for a test
         (out / folder).mkdir(exist_ok=True)
     names = dict(enumerate(CLASSES[options.labels]))
     (out / "data.yaml").write_text(yaml.safe_dump({**folders, "names": names}, sort_keys=False), encoding="utf-8")
-    return Exported(counts)
+    return exported
 
 
 def format_label_file(found: Rectangles, width: int, height: int) -> str:

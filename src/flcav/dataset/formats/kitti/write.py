@@ -15,10 +15,14 @@ from flcav.dataset.formats.exporter import (
     SPLITS,
     Exported,
     ExportOptions,
+    LeftOut,
     check_rectified,
     count_points_in_boxes,
+    count_unwritten,
+    lacks_points,
     missing_data_error,
     read_frame,
+    select_objects,
     split_scenes,
 )
 from flcav.dataset.formats.kitti.files import CLASSES as KITTI_CLASSES
@@ -58,13 +62,14 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
         frame = read_frame(dataset, i, options)
         camera = find_front_camera({name: frame.calibration.agent_from_sensor[name] for name in frame.images})
         if camera is None or not frame.lidar:
-            exported.left_out["no level camera that looks ahead" if frame.lidar else "no LiDAR", frame.agent] += 1
+            exported.leave_out(frame, "no level camera that looks ahead" if frame.lidar else "no LiDAR", frame.agent)
         else:
             split, number = split_of[key.scene], f"{counts['frames']:06d}"
             folder = out / ("testing" if split == "test" else "training")
-            objects, regions = _write_frame(frame, camera, folder, number, options.min_points)
+            objects, regions, left_out = _write_frame(frame, camera, folder, number, options.min_points)
             numbers[split].append(number)
             counts.update(frames=1, objects=objects, DontCare_regions=regions)
+            exported.left_out.update(left_out)
             rows.append((number, split, frame.key, frame.agent, f"{frame.time_s:.3f}", camera))
         progress(i + 1, len(dataset), "")
     if not rows:
@@ -77,11 +82,13 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
     return exported
 
 
-def _write_frame(frame: Frame, camera: str, folder: Path, number: str, min_points: int) -> tuple[int, int]:
+def _write_frame(
+    frame: Frame, camera: str, folder: Path, number: str, min_points: int
+) -> tuple[int, int, Counter[LeftOut]]:
     lidar = next(iter(frame.lidar))
     mounts = frame.calibration.agent_from_sensor
     check_rectified(frame, camera, "KITTI")
-    objects, regions = format_label_lines(frame, camera, lidar, min_points)
+    objects, regions, left_out = format_label_lines(frame, camera, lidar, min_points)
     _write_lines(folder / "label_2" / f"{number}.txt", objects + regions or [NOTHING])
     _write_lines(
         folder / "calib" / f"{number}.txt",
@@ -93,12 +100,15 @@ def _write_frame(frame: Frame, camera: str, folder: Path, number: str, min_point
     )
     _write(folder / "velodyne" / f"{number}.bin", frame.lidar[lidar].astype("<f4").tobytes())
     _write(folder / "image_2" / f"{number}.png", encode_png(frame.images[camera].rgb))
-    return len(objects), len(regions)
+    return len(objects), len(regions), left_out + count_unwritten("KITTI", frame, {lidar, camera})
 
 
-def format_label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -> tuple[list[str], list[str]]:
+def format_label_lines(
+    frame: Frame, camera: str, lidar: str, min_points: int
+) -> tuple[list[str], list[str], Counter[LeftOut]]:
     """Return the lines of a label file: of labelled actors, and of DontCare regions around other visible actors.
 
+    Actors that are not labelled are counted by reason.
     Labelled are actors in the image and ahead of the camera with at least `min_points` LiDAR points in their box, and
     at least one point or visible pixel.
     """
@@ -116,8 +126,12 @@ def format_label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -
     alpha = wrap_angle(rotation - np.arctan2(bottom[:, 0], bottom[:, 2]))
     level = occlusion_levels(views.occlusion, views.pixels)
     points, shows = count_points_in_boxes(frame, lidar, frame.lidar[lidar]), views.pixels > 0
-    known = np.isin(boxes.label, [*CLASSES, *KITTI_CLASSES])
-    labelled = known & within & (bottom[:, 2] > 0) & (points >= min_points) & (shows | (points > 0))
+    reasons = {
+        "outside the image": ~within | (bottom[:, 2] <= 0),
+        lacks_points(min_points): points < min_points,
+        "neither a LiDAR point nor a visible pixel": ~shows & (points == 0),
+    }
+    labelled, left_out = select_objects("KITTI", boxes.label, [*CLASSES, *KITTI_CLASSES], reasons)
     lines = []
     for i in np.flatnonzero(labelled):
         length, breadth, tall = boxes.size[i]
@@ -127,7 +141,7 @@ def format_label_lines(frame: Frame, camera: str, lidar: str, min_points: int) -
             + " ".join(f"{number:.4f}" for number in numbers)
         )
     regions = [dont_care(np.clip(views.visible_box[i], 0, edge)) for i in np.flatnonzero(shows & ~labelled)]
-    return lines, regions
+    return lines, regions, left_out
 
 
 def dont_care(rectangle: NDArray[np.float64]) -> str:

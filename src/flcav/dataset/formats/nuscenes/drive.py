@@ -1,6 +1,6 @@
 """One agent's frames of a scene as a nuScenes scene: its files and table rows."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import check_rectified, count_points_in_boxes
+from flcav.dataset.formats.exporter import (
+    LeftOut,
+    check_rectified,
+    count_points_in_boxes,
+    count_unwritten,
+    select_objects,
+)
 from flcav.dataset.formats.mounts import assign_channels, optical_yaw, quaternion
 from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, encode_lidar, encode_radar
 from flcav.dataset.formats.nuscenes.tables import (
@@ -50,6 +56,7 @@ class Drive:
     data: dict[str, list[Row]] = field(default_factory=lambda: defaultdict(list))  # by channel
     annotations: dict[str, list[Row]] = field(default_factory=lambda: defaultdict(list))  # by track
     category: dict[str, str] = field(default_factory=dict)  # of each track
+    left_out: Counter[LeftOut] = field(default_factory=Counter)
 
     @property
     def name(self) -> str:
@@ -74,15 +81,16 @@ class Drive:
             self._add_data(
                 frame, name, channel, "pcd.bin", encode_lidar(points, self.elevations.get(name, NO_CHANNELS))
             )
-        for name, channel in assign_channels(
-            {name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS
-        ).items():
+        cameras = assign_channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
+        radars = assign_channels({name: yaw_of(mounts[name]) for name in frame.radar}, RADARS)
+        for name, channel in cameras.items():
             check_rectified(frame, name, "nuScenes")
             self._add_data(frame, name, channel, "png", encode_png(frame.images[name].rgb))
-        for name, channel in assign_channels({name: yaw_of(mounts[name]) for name in frame.radar}, RADARS).items():
+        for name, channel in radars.items():
             radar_from_world = frame.world_from_sensor(name)[:3, :3].T
             self._add_data(frame, name, channel, "pcd", encode_radar(frame.radar[name], radar_from_world @ velocity))
         self._add_annotations(frame)
+        self.left_out.update(count_unwritten("nuScenes", frame, {*frame.lidar, *cameras, *radars}))
 
     def _add_data(self, frame: Frame, name: str, channel: str, suffix: str, data: bytes) -> None:
         true = frame.calibration
@@ -132,9 +140,10 @@ class Drive:
         for name, echoes in frame.radar.items():
             radar += count_points_in_boxes(frame, name, echoes[:, :1] * compute_echo_directions(echoes))
         center = transform_points(self.global_from_world, boxes.center)
-        for i, (track, category) in enumerate(zip(truth.track.tolist(), boxes.label.tolist())):
-            if category not in CATEGORIES:  # of an imported dataset
-                continue
+        labelled, left_out = select_objects("nuScenes", boxes.label, CATEGORIES, {})  # imported datasets have others
+        self.left_out.update(left_out)
+        for i in np.flatnonzero(labelled).tolist():
+            track, category = str(truth.track[i]), str(boxes.label[i])
             length, width, height = boxes.size[i].tolist()
             speed = float(np.linalg.norm(truth.velocity[i]))
             self.category[track] = category

@@ -36,7 +36,8 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
     global_from_world = _write_map(dataset, out / MAP)
     location = Path(str(dataset.manifest.recipe.get("town", "unknown"))).name
     splits: dict[str, list[str]] = defaultdict(list)
-    counts: Counter[str] = Counter(scenes=0, samples=0, objects=0)
+    exported = Exported(Counter(scenes=0, samples=0, objects=0))
+    counts = exported.counts
     for scene, split in split_of.items():
         velocities = agent_velocities(dataset, scene)
         for agent in dict.fromkeys(dataset.keys[i].agent for i in dataset.select(scenes=[scene])):
@@ -50,10 +51,12 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
                 if not frame.lidar:
                     raise missing_data_error(dataset, "nuScenes", "a LiDAR on every agent", agent)
                 drive.add(frame, velocities[agent, frame.index])
-                counts.update(samples=1, objects=len(frame.annotations))
+                counts["samples"] += 1
                 progress(counts["samples"], len(dataset), "")
             for table, rows in drive.rows().items():
                 tables[table] += rows
+            exported.left_out.update(drive.left_out)
+    counts["objects"] = len(tables["sample_annotation"])
     tables["sensor"] = list({row["token"]: row for row in tables["sensor"]}.values())
     tables["map"] = [
         {
@@ -68,7 +71,7 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(rows, indent=0, allow_nan=False), encoding="utf-8")
     (out / "sweeps").mkdir()
-    return Exported(counts)
+    return exported
 
 
 def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:

@@ -16,10 +16,14 @@ from numpy.typing import NDArray
 from flcav.dataset.formats.exporter import (
     Exported,
     ExportOptions,
+    LeftOut,
     check_rectified,
     count_points_in_boxes,
+    count_unwritten,
+    lacks_points,
     missing_data_error,
     read_frame,
+    select_objects,
     split_with_validation,
 )
 from flcav.dataset.formats.mounts import agent_velocities, assign_channels, optical_yaw
@@ -75,17 +79,19 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
         for i in selected:
             done += 1
             progress(done, len(dataset), "")
-            if (spin := dataset.keys[i].index) not in shared:
-                exported.left_out["OPV2V needs each spin of every agent", f"spin {spin} of {scene}"] += 1
-                continue
             frame = read_frame(dataset, i, options)
+            if frame.index not in shared:
+                exported.leave_out(frame, "OPV2V needs each spin of every agent", f"spin {frame.index} of {scene}")
+                continue
             if not frame.lidar:
                 raise missing_data_error(dataset, "OPV2V", "a LiDAR on every agent", frame.agent)
             for track in frame.annotations.track.tolist():
                 numbers.setdefault(track, FIRST_TRACK + len(numbers))
             speed = float(np.linalg.norm(speeds[frame.agent, frame.index]))
-            vehicles = _vehicles(frame, numbers, options.min_points)
-            _write_frame(frame, folder / str(numbers[frame.agent]), vehicles, speed)
+            vehicles, left_out = _vehicles(frame, numbers, options.min_points)
+            exported.left_out.update(left_out)
+            written = _write_frame(frame, folder / str(numbers[frame.agent]), vehicles, speed)
+            exported.left_out.update(count_unwritten("OPV2V", frame, written))
             counts.update(frames=1, objects=len(vehicles))
         protocol = {"recipe": dataset.manifest.recipe, "numbers": numbers}
         (folder / "data_protocol.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False), encoding="utf-8")
@@ -146,7 +152,8 @@ def from_carla(values: Sequence[float]) -> Array:
     return MIRROR @ matrix @ MIRROR
 
 
-def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed_m_s: float) -> None:
+def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed_m_s: float) -> set[str]:
+    """Write the files of a frame; return the sensors whose measurements they hold."""
     lidar, points = next(iter(frame.lidar.items()))
     folder.mkdir(parents=True, exist_ok=True)
     time = f"{frame.index:06d}"
@@ -174,14 +181,19 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed
         "vehicles": vehicles,
     }
     (folder / f"{time}.yaml").write_text(yaml.dump(about, Dumper=FAST_DUMPER), encoding="utf-8")
+    return {lidar, *cameras}
 
 
-def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[int, Vehicle]:
-    """Return number -> OPV2V's box of each vehicle with at least `min_points` points of the first LiDAR in its box."""
+def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> tuple[dict[int, Vehicle], Counter[LeftOut]]:
+    """Return number -> OPV2V's box of each vehicle with at least `min_points` points of the first LiDAR in its box.
+
+    Other actors are counted by reason.
+    """
     truth, boxes = frame.annotations, frame.annotations.boxes
-    enough = count_points_in_boxes(frame, *next(iter(frame.lidar.items()))) >= min_points
+    few = count_points_in_boxes(frame, *next(iter(frame.lidar.items()))) < min_points
+    labelled, left_out = select_objects("OPV2V", boxes.label, VEHICLES, {lacks_points(min_points): few})
     vehicles: dict[int, Vehicle] = {}
-    for i in np.flatnonzero(np.isin(boxes.label, VEHICLES) & enough):
+    for i in np.flatnonzero(labelled):
         tall = boxes.size[i, 2]
         placed = boxes.pose(int(i))
         placed[2, 3] -= tall / 2  # below the centre, upright too where the box leans: OpenCOOD adds the two unturned
@@ -193,7 +205,7 @@ def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> dict[in
             "location": [x, y, z],
             "speed": float(np.linalg.norm(truth.velocity[i]) * KMH),
         }
-    return vehicles
+    return vehicles, left_out
 
 
 def encode_pcd(points: NDArray[np.float32]) -> bytes:
