@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flcav.optimization.placement.solve import place
+from flcav import place
 
 
 def main() -> None:

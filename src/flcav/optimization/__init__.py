@@ -9,7 +9,8 @@ if TYPE_CHECKING:
     from flcav.optimization.curves.fitting import Fit, fit
     from flcav.optimization.curves.history import History, article_histories
     from flcav.optimization.graph import load_problem
-    from flcav.optimization.placement.solve import Placement, place
+    from flcav.optimization.placement.place import place
+    from flcav.optimization.placement.solve import Placement
     from flcav.optimization.problem import AllocationTask, Budgets, Limits, Problem
 
 PLACES = {
@@ -21,7 +22,7 @@ PLACES = {
     "Fit": "flcav.optimization.curves.fitting",
     "fit": "flcav.optimization.curves.fitting",
     "Placement": "flcav.optimization.placement.solve",
-    "place": "flcav.optimization.placement.solve",
+    "place": "flcav.optimization.placement.place",
     "Budgets": "flcav.optimization.problem",
     "Limits": "flcav.optimization.problem",
     "Problem": "flcav.optimization.problem",

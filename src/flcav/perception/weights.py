@@ -56,11 +56,12 @@ def save_network(
     write_bytes(path, _in_order(save(tensors, metadata)))
 
 
-def load_network(task: Task[ConfigT, NetworkT, SampleT], path: Path) -> NetworkT:
+def load_network(task: Task[ConfigT, NetworkT, SampleT], path: Path | str) -> NetworkT:
     """Return the network that `save_network` wrote, in evaluation mode on the CPU.
 
     Raises `InputError` for any other file, and for weights that are not finite.
     """
+    path = Path(path)
     config, tensors = _read(task, path)
     try:
         with torch.random.fork_rng(devices=[]):
@@ -71,9 +72,9 @@ def load_network(task: Task[ConfigT, NetworkT, SampleT], path: Path) -> NetworkT
     return network.eval()
 
 
-def read_card(path: Path) -> Card:
+def read_card(path: Path | str) -> Card:
     """Return the card in a file of weights; raises `InputError` if there is none, `DamagedFile` if it is damaged."""
-    metadata, _ = _opened(path)
+    metadata, _ = _opened(Path(path))
     if CARD_KEY not in metadata:
         raise InputError(f"{path}: weights without a card")
     try:

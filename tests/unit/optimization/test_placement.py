@@ -10,7 +10,9 @@ from flcav.config import InputError
 from flcav.optimization.placement import cheapest, solve
 from flcav.optimization.placement.baselines import place_at_random, place_by_score
 from flcav.optimization.placement.cheapest import cover_share
-from flcav.optimization.placement.solve import Candidates, coverage, find_candidates, place, place_budget, place_count
+from flcav.optimization.placement.place import find_seen, place
+from flcav.optimization.placement.solve import Candidates, coverage, find_candidates, place_budget, place_count
+from flcav.world.map.town import load_town
 
 
 def drawn(seed: int):
@@ -179,3 +181,23 @@ def test_conventional_placement_takes_the_best_scores_that_fit():
     by_cost = place_by_score(candidates, score.ravel(), cost[1, 2] + cost[4, 1])
     assert (by_cost.chosen, by_cost.sensors) == ((1, 4), (2, 1))
     assert by_cost.covered == (within[1, 2] | within[4, 1]).sum()
+
+
+def test_place_takes_kinds_of_sensors_budgets_shares_and_towns():
+    town, rng = load_town("grid"), np.random.default_rng(3)
+    poles = town.poles.position
+    errors = poles[rng.integers(len(poles), size=40)] + np.c_[rng.normal(0, 25, (40, 2)), np.full(40, -4.0)]
+    costs, ranges = rng.uniform(1, 3, len(poles)), [20.0, 60.0]
+    priced = find_candidates(errors, poles, ranges, sensor_cost=[2, 5], pole_cost=costs)
+    found = place(errors, poles, ranges, budget=20, sensor_cost=[2, 5], pole_cost=costs)
+    assert found == place_budget(priced, 20)
+    assert found.cost <= 20
+    assert place(errors, poles, ranges, cover=0.5, sensor_cost=[2, 5], pole_cost=costs) == cover_share(priced, 0.5)[0]
+    assert place(errors, poles, 60.0, 2) == place_count(find_candidates(errors, poles, [60.0]), 2)
+    seen = place(errors, poles, 60.0, 2, town=town)
+    visible = find_seen(errors, poles, 60.0, town, ())
+    assert seen == place_count(find_candidates(errors, poles, [60.0], visible=visible), 2)
+    assert seen.covered < place(errors, poles, 60.0, 2).covered
+    for wrong in ({}, {"count": 1, "budget": 5.0}):
+        with pytest.raises(InputError, match="one of count, budget and cover is wanted"):
+            place(errors, poles, 60.0, **wrong)

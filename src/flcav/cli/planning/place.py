@@ -73,6 +73,7 @@ def place(
     from flcav.optimization.placement import solve
     from flcav.optimization.placement.baselines import place_at_random
     from flcav.optimization.placement.cheapest import cover_share
+    from flcav.optimization.placement.place import find_seen
 
     for file in (errors, poles, sensors):
         if file is not None and not file.exists():
@@ -92,7 +93,9 @@ def place(
         place_inputs.check_inside(here, given, errors, poles)
     if budget is not None and not given.priced:
         raise InputError(f"--budget: nothing has a cost; give {poles} a column 'cost', or give --sensors")
-    seen = place_inputs.find_seen(given, here if line_of_sight else None, traces)
+    seen = None
+    if line_of_sight and here is not None:
+        seen = find_seen(given.errors, given.poles, float(given.ranges_m.max()), here, traces)
     candidates = place_inputs.build_candidates(given, seen)
     if count is not None or not given.priced:
         candidates = candidates.at_unit_cost()

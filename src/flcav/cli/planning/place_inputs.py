@@ -15,7 +15,6 @@ from flcav.dataset.store import Dataset
 from flcav.optimization.placement.instance import find_covered
 from flcav.optimization.placement.solve import Candidates, Placement, find_candidates
 from flcav.perception.errors import CLASS
-from flcav.world.line_of_sight import find_visible
 from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
 
@@ -121,16 +120,6 @@ def check_inside(town: Town, given: Given, errors: Path, poles: Path) -> None:
         if len(rows):
             x, y = places[rows[0], :2]
             raise InputError(f"{file}: row {rows[0] + 1} lies at {x:g}, {y:g}, {where} {town.name}")
-
-
-def find_seen(given: Given, town: Town | None, traces: Sequence[Trace]) -> csr_array | None:
-    """Return (P, E) 1.0 where a pole sees an error in the `town`, past the traffic; None without a town: all do."""
-    if town is None:
-        return None
-    visible = find_covered(given.errors, given.poles, [given.ranges_m.max()])
-    pole, error = np.repeat(np.arange(len(given.ids)), np.diff(visible.indptr)), visible.indices.astype(np.int64)
-    seen = find_visible(town, traces, given.poles, given.errors, (pole, error))
-    return csr_array((seen.astype(np.float64), visible.indices, visible.indptr), shape=visible.shape)
 
 
 def build_candidates(given: Given, visible: csr_array | None) -> Candidates:

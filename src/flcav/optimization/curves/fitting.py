@@ -8,6 +8,7 @@ which turns from squares to absolute values at three standard deviations (estima
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Generic, Literal
 
 import numpy as np
@@ -25,7 +26,7 @@ from flcav.optimization.curves.forms import (
     effective_forms,
     federated_forms,
 )
-from flcav.optimization.curves.history import History
+from flcav.optimization.curves.history import History, load_history
 from flcav.optimization.curves.levels import level_seeds
 
 Array = NDArray[np.float64]
@@ -129,7 +130,7 @@ class FitState(Generic[CurveT]):
 
 
 def fit(
-    history: History,
+    history: History | Path | str,
     *,
     model: Literal["additive", "effective", "federated", "best"] = "additive",
     group_samples: float | Sequence[float] = 0.0,
@@ -137,7 +138,9 @@ def fit(
     alpha: float = 0.1,
     beta: float | None = None,
 ) -> CurveFit:
-    """Return the learning curve fitted to the history of one task: the error by samples, edge rounds and cloud rounds.
+    """Return the learning curve fitted to the history of one task, or to that in a CSV file.
+
+    It is the error by samples, edge rounds and cloud rounds.
 
     `model` is `Additive`, `Effective` or `Federated`; the other settings belong to the last two, see `fit_effective`
     and `fit_federated`. The best one is the additive or, where there are several regions and cloud rounds vary, the
@@ -152,7 +155,7 @@ def fit(
     >>> found.points, float(found.curve.error(2500, 0, 0)) < float(found.curve.error(50, 0, 0))
     (5, True)
     """
-    history = level_seeds(history).history
+    history = level_seeds(history if isinstance(history, History) else load_history(history)).history
     samples, edge_rounds, cloud_rounds = history.resources.T
     columns = (samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
     if model == "additive":

@@ -15,6 +15,7 @@ seed stay.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pyarrow.csv
@@ -58,6 +59,21 @@ class History:
         """Return the points that are true in `chosen` (n,)."""
         runs, seeds = (tuple(name for name, taken in zip(names, chosen) if taken) for names in (self.runs, self.seeds))
         return History(self.resources[chosen], self.accuracy[chosen], self.weight[chosen], runs, seeds)
+
+
+def load_history(path: Path | str) -> History:
+    """Return the history of one task in a CSV file; raises `InputError` where it holds none, or several."""
+    try:
+        table = pyarrow.csv.read_csv(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a table ({error})") from None
+    found = parse_histories(table.to_pydict(), str(path), Path(path).stem)
+    if len(found) != 1:
+        told = ", ".join(found) or "none"
+        raise InputError(f"{path}: a history of one task is wanted, and it has those of {told}")
+    return next(iter(found.values()))
 
 
 def article_histories() -> dict[str, History]:

@@ -67,29 +67,6 @@ def coverage(errors: ArrayLike, poles: ArrayLike, range_m: float) -> NDArray[np.
     return np.stack([((places - site) ** 2).sum(axis=1) <= range_m**2 for site in sites])
 
 
-def place(
-    errors: ArrayLike,
-    poles: ArrayLike,
-    range_m: float,
-    count: int,
-    *,
-    weight: ArrayLike | None = None,
-    method: Method = "exact",
-) -> Placement:
-    """Return the `count` of the poles (P, 3) that cover most of the weight (E,) of the errors (E, 3).
-
-    Positions are in the world frame [m]. Without `weight` each error weighs 1. Among equal choices earlier poles are
-    preferred. Raises `InputError` where positions, weights, range, count or method are invalid.
-
-    >>> from flcav import place
-    >>> placed = place([[0, 0, 1], [5, 0, 1], [90, 0, 1]], poles=[[0, 9, 3], [90, 9, 3]], range_m=40, count=1)
-    >>> placed.chosen, placed.covered, placed.optimal
-    ((0,), 2, True)
-    """
-    candidates = find_candidates(errors, poles, [range_m], weight=weight)
-    return place_count(candidates, count, method=method)
-
-
 @dataclass(frozen=True)
 class Candidates:
     """Every sensor on every pole: candidate k is the sensor `order[k % S]` on the pole k // S."""

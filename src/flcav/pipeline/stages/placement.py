@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.optimization.placement.solve import coverage, place
+from flcav.optimization.placement.place import place
+from flcav.optimization.placement.solve import coverage
 from flcav.perception.errors import PerceptionError
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import Placement

@@ -1,0 +1,76 @@
+"""Placement of roadside sensors by VRCSP: as many as there are, within a budget, or to cover a share of the errors."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+
+from flcav.config import InputError
+from flcav.optimization.placement.cheapest import cover_share
+from flcav.optimization.placement.instance import find_covered
+from flcav.optimization.placement.solve import Method, Placement, find_candidates, place_budget, place_count
+from flcav.world.line_of_sight import find_visible
+from flcav.world.map.town import Town
+from flcav.world.trace import Trace
+
+
+def place(
+    errors: ArrayLike,
+    poles: ArrayLike,
+    range_m: float | Sequence[float],
+    count: int | None = None,
+    *,
+    budget: float | None = None,
+    cover: float | None = None,
+    sensor_cost: ArrayLike | None = None,
+    pole_cost: ArrayLike | None = None,
+    town: Town | None = None,
+    traces: Sequence[Trace] = (),
+    weight: ArrayLike | None = None,
+    method: Method = "exact",
+) -> Placement:
+    """Return the sensors on poles (P, 3), at most one each, that cover most of the weight (E,) of the errors (E, 3).
+
+    Positions are in the world frame [m]; without `weight` each error weighs 1. Sensors are of one range, or of several
+    kinds, each with its `range_m` and `sensor_cost` (S,); a pole may have a cost (P,) of its own. One of these is
+    given: `count`, the number of sensors; `budget`, the most that they cost; `cover`, the share of the weight that they
+    cover for the least cost. With a `town` an error is covered where the pole sees it past buildings and the traffic
+    of `traces`. Among equal choices of a number earlier poles are preferred. Raises `InputError` where positions,
+    weights, ranges, costs, limits or method are invalid, or not one limit is given.
+
+    >>> from flcav import place
+    >>> placed = place([[0, 0, 1], [5, 0, 1], [90, 0, 1]], poles=[[0, 9, 3], [90, 9, 3]], range_m=40, count=1)
+    >>> placed.chosen, placed.covered, placed.optimal
+    ((0,), 2, True)
+    >>> kinds = place([[0, 0, 1], [90, 0, 1]], [[0, 9, 3]], range_m=[40, 120], sensor_cost=[1, 5], budget=5)
+    >>> kinds.sensors, kinds.covered, kinds.cost  # the kind on each chosen pole
+    ((1,), 2, 5.0)
+    """
+    limits = {"count": count, "budget": budget, "cover": cover}
+    given = [name for name, value in limits.items() if value is not None]
+    if len(given) != 1:
+        raise InputError(f"one of count, budget and cover is wanted, not {' and '.join(given) or 'none'}")
+    ranges = np.atleast_1d(np.asarray(range_m, dtype=np.float64))
+    asked = partial(find_candidates, errors, poles, ranges, weight=weight, pole_cost=pole_cost, sensor_cost=sensor_cost)
+    candidates = asked()
+    if town is not None:
+        places, sites = np.asarray(errors, dtype=np.float64), np.asarray(poles, dtype=np.float64)
+        candidates = asked(visible=find_seen(places, sites, float(ranges.max()), town, traces))
+    if count is not None:
+        return place_count(candidates, count, method=method)
+    if budget is not None:
+        return place_budget(candidates, budget, method=method)
+    assert cover is not None
+    return cover_share(candidates, cover, method=method)[0]
+
+
+def find_seen(
+    errors: NDArray[np.float64], poles: NDArray[np.float64], range_m: float, town: Town, traces: Sequence[Trace]
+) -> csr_array:
+    """Return (P, E) 1.0 where a pole sees an error within `range_m` in the town, past the traffic."""
+    visible = find_covered(errors, poles, [range_m])
+    pole, error = np.repeat(np.arange(len(poles)), np.diff(visible.indptr)), visible.indices.astype(np.int64)
+    seen = find_visible(town, traces, poles, errors, (pole, error))
+    return csr_array((seen.astype(np.float64), visible.indices, visible.indptr), shape=visible.shape)
