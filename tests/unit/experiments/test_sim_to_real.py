@@ -22,7 +22,8 @@ def frame(objects: Boxes) -> KittiFrame:
     count = len(objects)
     labelled = Objects(objects, np.zeros(count), np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros((count, 4)))
     calibration = Calibration(LIDAR_TO_CAMERA, PROJECTION)
-    return KittiFrame("000001", np.ones((5, 4), np.float32), calibration, labelled, np.zeros((375, 1242, 3), np.uint8))
+    image = np.zeros((375, 1242, 3), np.uint8)
+    return KittiFrame("000001", np.ones((5, 4), np.float32), calibration, labelled, image, (375, 1242))
 
 
 def test_numbers_of_a_cloud_are_counts():
