@@ -1,5 +1,6 @@
 """Rounds on a network: who takes part, who is lost, by name and in bytes, and how long a round takes."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,6 +27,7 @@ from flcav.pipeline.federations.network import DrivenRounds, Fleet, drive_rounds
 from flcav.pipeline.federations.prediction import link_drive, measure_uplinks, predict_air_s
 from flcav.pipeline.recipe import CLOUD
 from flcav.pipeline.stages.placement import Sites
+from flcav.pipeline.stragglers import Stragglers, draw_stragglers
 
 GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing
 MB = 1_000_000
@@ -54,6 +56,20 @@ def test_a_round_takes_download_training_and_upload_of_all_that_share_the_band()
     assert driven.seconds == pytest.approx([13.0])
     assert [client.end_s for client in driven.records[0].clients] == pytest.approx([10.0, 13.0])
     assert driven.rules == Rules()
+
+
+def test_a_straggler_prolongs_a_round_and_misses_its_deadline() -> None:
+    scenes = [made_links(TIMES, dict.fromkeys(("cav0", "cav1", "cav2"), GOOD))]
+    drawn = draw_stragglers(Stragglers(share=0.3, slower=12), ["cav0", "cav1", "cav2"], 1, "grid")
+    slowed = {f"grid/{vehicle}": speed for vehicle, speed in drawn.items()}
+    late = NetworkSettings(rounds=RoundRules(deadline_s=20))
+    plain, driven, missed = (
+        drive_rounds(replace(FLEET, speeds=speeds), scenes, settings, Rules(), range(1, 2), 0)
+        for speeds, settings in (({}, NetworkSettings()), (slowed, NetworkSettings()), (slowed, late))
+    )
+    assert len(slowed) == 1
+    assert driven.seconds[0] > plain.seconds[0]
+    assert missed.outages.keys() == {(1, name) for name in slowed}
 
 
 def test_rounds_are_driven_in_the_scenes_in_turn_one_after_another() -> None:
