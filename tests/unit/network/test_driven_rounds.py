@@ -161,7 +161,7 @@ def test_a_round_that_loses_everybody_leaves_the_weights() -> None:
     schedule = Schedule(1, 1, 0.1, 0.1, 3)
     end = federate({"grid": server}, START, schedule, Account(book, CLOUD, "t", "wireline"))
     assert np.array_equal(end.weights["w"], START["w"])
-    assert (state.records[0].clients, state.records[0].loss, len(state.records[0].failed)) == ((), 0.0, 3)
+    assert (state.records[0].clients, state.records[0].loss, len(state.records[0].failed)) == ((), None, 3)
 
 
 LATE, GONE = Outage("past the deadline", 7), Outage("not in the town")
@@ -199,8 +199,8 @@ def test_a_masked_round_that_the_network_leaves_too_few_for_has_no_update_and_th
     assert {name: failed[name] for name in lost} == {name: outage.reason for name, outage in lost.items()}
     assert {*failed} == {*lost, *joins}
     assert all(others in failed[name] and "2 are needed" in failed[name] for name in joins if name not in lost)
-    assert (state.records[1].samples, state.records[1].loss) == (0, 0.0)
-    assert after[1] == (after[0][0], 0.0)
+    assert (state.records[1].samples, state.records[1].loss) == (0, None)
+    assert after[1] == (after[0][0], None)
     assert after[2][0] != after[1][0]
 
 
@@ -230,7 +230,7 @@ def test_a_first_round_that_the_network_predicts_for_one_vehicle_has_no_update_a
     )
     assert [record.clients for record in state.records] == [(), NAMES]
     assert state.records[0].failed == {NAMES[0]: why}
-    assert after[0] == (0.0, 0.0)
+    assert after[0] == (0.0, None)
     assert after[1][0] > 0
     assert [client.trained for client in clients.values()] == [1, 1, 1]
 
@@ -321,7 +321,7 @@ def test_a_round_with_fewer_than_the_strategy_needs_has_no_update_and_the_next_g
     assert {name: failed[name] for name in FIVE[left:]} == dict.fromkeys(FIVE[left:], GONE.reason)
     assert {*failed} == {*FIVE}
     assert all(told in failed[name] for name in FIVE[:left])
-    assert after[1] == (after[0][0], 0.0)
+    assert after[1] == (after[0][0], None)
     assert after[2][0] != after[1][0]
 
 
