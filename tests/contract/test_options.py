@@ -43,7 +43,7 @@ RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads",
 TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "run": dict.fromkeys(("--dry", "--jobs", "--seeds", "--engine", "--stale"), ALWAYS),
     "demo": dict.fromkeys(("--seed", "--recipe", "--jobs", "--engine", "--stale"), ALWAYS),
-    "compare": dict.fromkeys(("--data", "--task"), ALWAYS),
+    "compare": dict.fromkeys(("--data", "--task", "--agents"), ALWAYS),
     "federate": dict.fromkeys(("--arm", "--jobs", "--runtime", "--stale"), ALWAYS),
     "towns list": {},
     "towns show": {"--poles": ALWAYS},

@@ -425,7 +425,8 @@ def test_the_report_needs_no_other_file(finished: Path, result: Run) -> None:
     assert all(finding.sentence in read for finding in result.findings)
     names = {path.stem for path in (finished / "pictures").iterdir()}
     timelines = {"timeline_grid_equal", "timeline_ring_equal"}
-    assert names == {"map_grid", "map_ring", "rounds_objects", "megabytes", "before_after", "overview"} | timelines
+    drawn = {"map_grid", "map_ring", "rounds_objects", "megabytes", "gain", "before_after", "overview"}
+    assert names == drawn | timelines
     for path in (finished / "pictures").iterdir():
         with Image.open(path) as picture:
             assert min(picture.size) > 300

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
+from flcav.cli.options import AGENTS, ENGINE, JOBS, STALE, Engine, Stale
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.config import InputError
 from flcav.machine.threads import use_threads
@@ -150,14 +150,16 @@ def compare(
     second: Path = typer.Argument(help="Folder of another, with the same test frames; or a file of weights."),
     data: Path | None = typer.Option(None, "--data", help="Dataset that two networks are compared on."),
     task: str | None = typer.Option(None, "--task", help="Task of the networks, if not that of the first one's card."),
+    agents: str | None = AGENTS,
     as_json: bool = AS_JSON,
 ) -> None:
     """Compare two runs, or two networks on a dataset: differences, second minus first, on the same frames."""
     if data is not None:
-        _compare_networks(first, second, data, task, as_json)
+        _compare_networks(first, second, data, task, agents, as_json)
         return
-    if task is not None:
-        raise InputError("--task: only two networks have one, and without --data two runs are compared")
+    for option, value in (("--task", task), ("--agents", agents)):
+        if value is not None:
+            raise InputError(f"{option}: only two networks have one, and without --data two runs are compared")
     from flcav.pipeline.seeds.comparing import compare as compare_runs
 
     rows = compare_runs(first, second)
@@ -174,13 +176,18 @@ def compare(
         )
 
 
-def _compare_networks(first: Path, second: Path, data: Path, task: str | None, as_json: bool) -> None:
+def _compare_networks(
+    first: Path, second: Path, data: Path, task: str | None, agents: str | None, as_json: bool
+) -> None:
     from flcav.perception.networks import compare_networks
     from flcav.perception.weights import read_card
     from flcav.progress import show_progress
 
+    if odd := next((path for path in (first, second) if path.is_dir()), None):
+        raise InputError(f"{odd}: a folder; with --data two files of weights are compared")
     with show_progress(f"compare on {data}") as report:
-        found = compare_networks(task or read_card(first).task, data, first, second, progress=report)
+        asked = task or read_card(first).task
+        found = compare_networks(asked, data, first, second, agents=agents, progress=report)
     if as_json:
         print_json(found.as_json())
         return

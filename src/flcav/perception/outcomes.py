@@ -207,7 +207,7 @@ class NetworkComparison(Record):
     def lines(self) -> list[str]:
         """Return the comparison in words."""
         change = self.difference
-        interval = "no interval: one scene" if change.low is None else f"{change.low:+.3f} to {change.high:+.3f}"
+        interval = "no interval" if change.low is None else f"{change.low:+.3f} to {change.high:+.3f}"
         over = f"{plural(self.frames, 'frame')} of {plural(self.scenes, 'scene')}"
         both = f"{self.measure} of {self.task}: {self.first:.3f} -> {self.second:.3f}, {change.mean:+.3f}"
         return [
@@ -224,9 +224,10 @@ def compare_outcomes(task: Task, first: Outcomes, second: Outcomes, frames: int)
     own = as_measurable(task)
     wanted = [(sorted(each.arrays), own.numbers(each).get("targets")) for each in (first, second)]
     if wanted[0] != wanted[1]:
+        targets = " and ".join(f"{count or 0:.0f}" for _, count in wanted)
         raise InputError(
-            f"the networks look for different things, by their classes or ranges ({wanted[0][1]} and {wanted[1][1]} "
-            "targets in these frames), so that there is no paired difference"
+            f"the networks look for different things, by their classes or ranges ({targets} targets in these frames), "
+            "so that there is no paired difference"
         )
     before, after = compute_measure(task, first), compute_measure(task, second)
     if np.isnan([before, after]).any():

@@ -55,7 +55,7 @@ def test_one_scene_has_no_interval():
     )
     found = compare_outcomes(WEATHER, one, other, 3)
     assert (found.difference.low, found.verdict) == (None, "undecided")
-    assert "no interval: one scene" in found.lines()[0]
+    assert "(no interval)" in found.lines()[0]
 
 
 def test_the_command_compares_two_files_of_weights(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -79,5 +79,11 @@ def test_the_command_compares_two_files_of_weights(tmp_path: Path, capsys: pytes
     assert found["difference"]["mean"] == pytest.approx(found["second"] - found["first"])
     code, _, wrong = call(*weights, "--data", data)
     assert (code, "weights without a card" in wrong) == (2, True)
+    code, _, wrong = call(data, weights[1], "--data", data)
+    assert (code, "a folder; with --data two files of weights" in wrong) == (2, True)
+    code, said, _ = call(*weights, "--data", data, "--task", "weather", "--agents", "vehicles")
+    assert (code, "over 4 frames of 2 scenes" in said) == (0, True)
+    code, _, wrong = call(*weights, "--agents", "all")
+    assert (code, "--agents: only two networks have one" in wrong) == (2, True)
     code, _, wrong = call(*weights, "--task", "weather")
     assert (code, "--task: only two networks have one" in wrong) == (2, True)
