@@ -92,7 +92,8 @@ def _bound_convex(powers: Powers, price: float, low: int, high: int) -> Array:
         first, last = (np.full(np.shape(powers[0][3]) if powers else (), float(edge)) for edge in (low, high))
         while np.any(first < last):
             x = np.floor((first + last) / 2)
-            first, last = np.where(at(x)[1] > price, x + 1, first), np.where(at(x)[1] > price, last, x)
+            beyond = (first < last) & (at(x)[1] > price)  # where it is found, it stays
+            first, last = np.where(beyond, x + 1, first), np.where(beyond, last, x)
         bounds = []
         for x, edge, side in ((first, high, 1), (np.maximum(first - 1, low), low, -1)):
             value, fall = at(x)
