@@ -34,9 +34,8 @@ import os, sys, time
 from pathlib import Path
 from flcav.machine.locks import only_writer
 with only_writer(Path(sys.argv[1])):
-    child = os.fork() if "fork" in sys.argv else 1
-    if child:
-        print(child, flush=True)
+    if "fork" not in sys.argv or not os.fork():
+        print(os.getpid(), flush=True)  # of a fork: it has run what a fork begins with
     time.sleep(60)
 """
 
