@@ -148,16 +148,16 @@ class Ledger:
         """Return `used_bytes` in MB (10^6 bytes)."""
         return self.used_bytes(link, stage=stage, task=task, direction=direction) / BYTES_PER_MB
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Write the ledger atomically to a Parquet file: a row per entry, the budget in the schema's metadata."""
         columns = {field.name: [getattr(entry, field.name) for entry in self._entries] for field in fields(LedgerEntry)}
         schema = _SCHEMA.with_metadata({"budget": json.dumps(asdict(self.budget))})
-        write_parquet(pa.table(columns, schema=schema), path)
+        write_parquet(pa.table(columns, schema=schema), Path(path))
 
     @classmethod
-    def load(cls, path: Path) -> "Ledger":
+    def load(cls, path: Path | str) -> "Ledger":
         """Return the ledger that `save` wrote to `path`; raises `InputError` where the file is missing or not one."""
-        table = read_parquet(path)
+        table = read_parquet(Path(path))
         try:
             budget = Budget(**json.loads((table.schema.metadata or {})[b"budget"]))
             return cls(budget, (LedgerEntry(**row) for row in table.to_pylist()))

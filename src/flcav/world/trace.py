@@ -83,7 +83,7 @@ class Trace:
             middle = (rotations(self.yaw[index], *self.tilt[index].T) @ middle[..., None])[..., 0]
         return self.position[index] + middle
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Write the trace as one Parquet file: a row per instant and present actor, the rest in the file's metadata."""
         instant, actor = np.nonzero(self.present)
         motion = (self.position, self.yaw[..., None], self.velocity, self.acceleration, self.yaw_rate[..., None])
@@ -106,13 +106,13 @@ class Trace:
         if self.events:
             rest["events"] = [event._asdict() for event in self.events]
         table = pa.table(columns).replace_schema_metadata({METADATA: json.dumps(rest)})
-        with atomic_path(path) as temporary:
+        with atomic_path(Path(path)) as temporary:
             pq.write_table(table, temporary)
 
     @classmethod
-    def load(cls, path: Path) -> "Trace":
+    def load(cls, path: Path | str) -> "Trace":
         """Return the trace that `save` wrote; raises `InputError` where `path` is missing or no trace."""
-        table = read_parquet(path)
+        table = read_parquet(Path(path))
         metadata = table.schema.metadata or {}
         if METADATA not in metadata:
             raise InputError(f"{path}: not a trace (Parquet without the metadata {METADATA.decode()!r})")

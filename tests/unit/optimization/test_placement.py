@@ -201,3 +201,27 @@ def test_place_takes_kinds_of_sensors_budgets_shares_and_towns():
     for wrong in ({}, {"count": 1, "budget": 5.0}):
         with pytest.raises(InputError, match="one of count, budget and cover is wanted"):
             place(errors, poles, 60.0, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"range_m": [], "count": 1}, "one kind at least"),
+        ({"range_m": [40, 120], "sensor_cost": [1], "budget": 5}, "sensors: 2 costs are wanted, and there are 1"),
+        ({"range_m": 40, "pole_cost": [1, 2], "budget": 5}, "poles: 1 costs are wanted, and there are 2"),
+        ({"range_m": 40, "budget": 5}, "nothing has a cost"),
+        ({"range_m": 40, "count": 1, "traces": [None]}, "traffic is in the way where the town"),
+        ({"range_m": 40, "count": 1, "town": "atlantis"}, "unknown town 'atlantis'"),
+        ({"range_m": 40, "count": 1, "town": "grid"}, "number 0 stands outside grid"),
+    ],
+)
+def test_place_refuses_in_a_sentence_what_goes_together_with_nothing(given, said):
+    with pytest.raises(InputError, match=said):
+        place([[9e3, 9e3, 1]], [[9e3, 9e3, 3]], **given)
+
+
+def test_place_takes_the_name_of_a_town():
+    poles = load_town("grid").poles.position
+    assert place(poles - [0, 0, 4], poles, 40.0, 2, town="grid") == place(
+        poles - [0, 0, 4], poles, 40.0, 2, town=load_town("grid")
+    )

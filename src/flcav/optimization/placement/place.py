@@ -12,7 +12,7 @@ from flcav.optimization.placement.cheapest import cover_share
 from flcav.optimization.placement.instance import find_covered
 from flcav.optimization.placement.solve import Method, Placement, find_candidates, place_budget, place_count
 from flcav.world.line_of_sight import find_visible
-from flcav.world.map.town import Town
+from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
 
 
@@ -26,7 +26,7 @@ def place(
     cover: float | None = None,
     sensor_cost: ArrayLike | None = None,
     pole_cost: ArrayLike | None = None,
-    town: Town | None = None,
+    town: Town | str | None = None,
     traces: Sequence[Trace] = (),
     weight: ArrayLike | None = None,
     method: Method = "exact",
@@ -36,7 +36,7 @@ def place(
     Positions are in the world frame [m]; without `weight` each error weighs 1. Sensors are of one range, or of several
     kinds, each with its `range_m` and `sensor_cost` (S,); a pole may have a cost (P,) of its own. One of these is
     given: `count`, the number of sensors; `budget`, the most that they cost; `cover`, the share of the weight that they
-    cover for the least cost. With a `town` an error is covered where the pole sees it past buildings and the traffic
+    cover for the least cost. With a `town`, or its name, a pole has to see an error past buildings and the traffic
     of `traces`. Among equal choices of a number earlier poles are preferred. Raises `InputError` where positions,
     weights, ranges, costs, limits or method are invalid, or not one limit is given.
 
@@ -52,12 +52,20 @@ def place(
     given = [name for name, value in limits.items() if value is not None]
     if len(given) != 1:
         raise InputError(f"one of count, budget and cover is wanted, not {' and '.join(given) or 'none'}")
+    if budget is not None and sensor_cost is None and pole_cost is None:
+        raise InputError("budget: nothing has a cost; give sensor_cost or pole_cost")
+    if traces and town is None:
+        raise InputError("traces: traffic is in the way where the town is given alone")
     ranges = np.atleast_1d(np.asarray(range_m, dtype=np.float64))
     asked = partial(find_candidates, errors, poles, ranges, weight=weight, pole_cost=pole_cost, sensor_cost=sensor_cost)
     candidates = asked()
     if town is not None:
+        stands = load_town(town) if isinstance(town, str) else town
         places, sites = np.asarray(errors, dtype=np.float64), np.asarray(poles, dtype=np.float64)
-        candidates = asked(visible=find_seen(places, sites, float(ranges.max()), town, traces))
+        low, high = np.array(stands.bounds).reshape(2, 2)
+        if (out := np.flatnonzero(((sites[:, :2] < low) | (sites[:, :2] > high)).any(axis=1))).size:
+            raise InputError(f"poles: number {out[0]} stands outside {stands.name}")
+        candidates = asked(visible=find_seen(places, sites, float(ranges.max()), stands, traces))
     if count is not None:
         return place_count(candidates, count, method=method)
     if budget is not None:

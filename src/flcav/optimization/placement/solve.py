@@ -120,12 +120,16 @@ def find_candidates(
     if not weights.any():
         raise InputError("errors: every weight is 0")
     ranges = np.asarray(ranges_m, dtype=np.float64)
+    if ranges.ndim != 1 or not len(ranges):
+        raise InputError("range: one number for each kind of sensor is wanted, and one kind at least")
     for range_m in ranges.tolist():
         if not 0 < range_m <= FARTHEST_M:
             raise InputError(f"range = {range_m}: must be a positive number of metres, at most {FARTHEST_M:g}")
     of_pole = np.zeros(len(sites)) if pole_cost is None else np.asarray(pole_cost, dtype=np.float64)
     of_sensor = np.zeros(len(ranges)) if sensor_cost is None else np.asarray(sensor_cost, dtype=np.float64)
-    for name, costs in (("poles", of_pole), ("sensors", of_sensor)):
+    for name, costs, wanted in (("poles", of_pole, len(sites)), ("sensors", of_sensor, len(ranges))):
+        if costs.shape != (wanted,):
+            raise InputError(f"{name}: {wanted} costs are wanted, and there are {costs.size}")
         if not np.all((costs == 0) | (costs >= 1e-9) & (costs <= 1e9)):
             raise InputError(f"{name}: every cost must be 0, or a number from 1e-09 to 1e+09")
     order = np.lexsort((of_sensor, ranges))

@@ -101,7 +101,7 @@ def check_town_name(name: str) -> None:
         )
 
 
-def load_town(name: str | Path, beside: Path | None = None) -> Town:
+def load_town(name: str | Path, beside: Path | str | None = None) -> Town:
     """Return a town of `PACKAGED`, or that of a folder with `town.net.xml`, `town.yaml` and maybe its heights.
 
     A `Path` is that folder; any other name is a folder in `beside`, where given, or else in the working directory. The
@@ -115,6 +115,7 @@ def load_town(name: str | Path, beside: Path | None = None) -> Town:
     Traceback (most recent call last):
     flcav.config.InputError: unknown town 'atlantis'; known towns: ...
     """
+    beside = None if beside is None else Path(beside)
     if isinstance(name, str) and name in HILLY:
         return _raise_hills(name, _folder(HILLY[name], beside))
     folder = name if isinstance(name, Path) else _folder(name, beside)
