@@ -12,9 +12,10 @@ from flcav.network.ledger import Ledger
 from flcav.pipeline.federations.alone import RESULTS, TRAIN_TIMES, Federations
 from flcav.pipeline.federations.network import TOO_SLOW
 from flcav.pipeline.federations.timing import TrainTimes
-from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe, Training, load_run_recipe
+from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe, load_run_recipe
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.running import SPREAD, run
+from flcav.pipeline.sizes import Training
 from flcav.report.pages.run_page import draw
 
 pytestmark = pytest.mark.slow

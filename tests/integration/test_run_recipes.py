@@ -30,9 +30,6 @@ from flcav.pipeline.recipe import (
     Federation,
     Role,
     RunRecipe,
-    Split,
-    Splits,
-    Training,
     load_run_recipe,
 )
 from flcav.pipeline.results import tests as results
@@ -43,6 +40,7 @@ from flcav.pipeline.results.tests import Difference
 from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.running import RESULTS, run, run_several
 from flcav.pipeline.seeds.learning_history import ORIGIN, HistoryOrigin
+from flcav.pipeline.sizes import Split, Splits, Training
 from flcav.pipeline.steps import Step, ignore_steps, run_side_by_side
 from flcav.report.pages.run_page import page, write_report
 from flcav.verdicts import UNDECIDED

@@ -53,11 +53,16 @@ class Privacy(Config):
         return self
 
     @property
-    def deviation(self) -> float:
-        """Return the standard deviation of the noise; raises ValueError where it is not known yet."""
+    def multiplier(self) -> float:
+        """Return `noise`; raises ValueError where it is not known yet."""
         if self.noise is None:
             raise ValueError("noise that no rounds have been planned for")
-        return self.noise * self.clip
+        return self.noise
+
+    @property
+    def deviation(self) -> float:
+        """Return the standard deviation of the noise; raises ValueError where it is not known yet."""
+        return self.multiplier * self.clip
 
     @property
     def local(self) -> bool:
@@ -165,7 +170,7 @@ def compose_epsilon(
         relation = NeighboringRelation.REPLACE_ONE
     times = Counter[tuple[int, float]]()  # by number of clients, and noise
     for (clients, rounds), found in zip(trainings, noises, strict=False):
-        noise = privacy.deviation / privacy.clip if found is None else found
+        noise = privacy.multiplier if found is None else found
         taken = rounds if privacy.amplified(selection) else most_participations(selection, clients, rounds)
         times[clients, noise / 2 if replaced else noise] += taken
     accountant = rdp.RdpAccountant(neighboring_relation=relation)

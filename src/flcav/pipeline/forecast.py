@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from flcav.perception.outcomes import score_network
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import Setting, check_federations
-from flcav.pipeline.federations.spent import Training, compose_trainings, plan_private_rounds
+from flcav.pipeline.federations.spent import Training, compose_trainings, find_budget_noise, plan_private_rounds
 from flcav.pipeline.frames import Frames, deal_frames, make_recording_recipe, record_frames
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.planning.allocation import PlanRequest, make_plan
@@ -32,7 +33,7 @@ from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.stages.clients import make_clients
 from flcav.pipeline.work.planning import FirstPlanSettings, frame_plan
 from flcav.progress import Report, ignore_progress
-from flcav.records import Record
+from flcav.records import LEFT_OUT, Record
 from flcav.wording import plural
 
 STEPS = 3  # that are timed
@@ -47,11 +48,12 @@ class PlannedRounds(Record):
     samples: int
     edge_rounds: int
     cloud_rounds: int
+    noise: Annotated[float | None, LEFT_OUT] = None  # that a privacy budget alone gives; None: it is given, or none is
 
 
 @dataclass(frozen=True)
 class ArmForecast(Record):
-    """What an arm is to send and to spend."""
+    """Forecast of an arm: rounds, uplink and privacy."""
 
     tasks: Mapping[str, PlannedRounds]
     uplink_mb: Mapping[Link, float]
@@ -112,7 +114,6 @@ def forecast_run(
         progress(done, len(recipe.tasks), task)
     plans = {name: _plan_arm(graph, arm, measured) for name, arm in graph.settings.items()}
     arms = {name: _forecast_arm(graph, arm, plans, measured) for name, arm in graph.settings.items() if not arm.repeat}
-    scenes = recipe.sized_splits.test.scenes
     scenes = recipe.sized_splits.test.scenes
     minutes = sum(_list_seconds(graph, plans, measured)) / 60
     return Forecast(minutes, arms, scenes, TOLD * SCENE_SD / float(np.sqrt(scenes)))
@@ -176,7 +177,8 @@ def _plan_arm(graph: Graph, arm: Setting, measured: Mapping[str, _Measured]) -> 
         further = own.cloud_rounds * (k := arm.federation.edge_rounds_per_cloud_round)
         vehicles = [graph.vehicles[region] for region in arm.regions]
         private = plan_private_rounds(arm.federation, vehicles, own.edge_rounds, _follow(arm) * further, k)
-        planned[name] = PlannedRounds(own.samples, private.edge, private.further // k)
+        found = find_budget_noise(arm.federation, private.rules)
+        planned[name] = PlannedRounds(own.samples, private.edge, private.further // k, found)
     return planned
 
 
@@ -204,23 +206,13 @@ def _forecast_arm(
         sent = price(StagePlan(own.samples, edge, cloud, groups, k), _size_messages(settings, task, measured[task]))
         uplink_mb += (sent.wireless_mb, sent.wireline_mb)
     trainings = [
-        Training(region, graph.vehicles[region], own.edge_rounds + own.cloud_rounds * k, _find_noise(graph, arm, own))
+        Training(region, graph.vehicles[region], own.edge_rounds + own.cloud_rounds * k, own.noise)
         for repeat in range(1 + graph.recipe.retrainings)
         for own in plans[arm.name].values()
         for region in arm.regions
     ]
     spent = None if arm.central else compose_trainings(arm.federation, trainings)
     return ArmForecast(plans[arm.name], dict(zip(("wireless", "wireline"), uplink_mb.tolist())), spent)
-
-
-def _find_noise(graph: Graph, arm: Setting, own: PlannedRounds) -> float | None:
-    """Return the noise that a budget alone gives an arm's task; None where it is given, or none is."""
-    privacy, k = arm.federation.privacy, arm.federation.edge_rounds_per_cloud_round
-    if privacy is None or privacy.noise is not None:
-        return None
-    vehicles = [graph.vehicles[region] for region in arm.regions]
-    private = plan_private_rounds(arm.federation, vehicles, own.edge_rounds, own.cloud_rounds * k, k).rules.privacy
-    return None if private is None else private.noise
 
 
 def _list_seconds(

@@ -27,9 +27,10 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies
 from flcav.pipeline.federations.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
-from flcav.pipeline.recipe import Federation, Training
+from flcav.pipeline.recipe import Federation
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import StatisticsScore
+from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages import statistics
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud

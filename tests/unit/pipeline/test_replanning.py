@@ -28,10 +28,11 @@ from flcav.pipeline.planning.rounds import Follower, Planner, restrict_problem
 from flcav.pipeline.planning.stages import continue_joins, count_carried_out, remake_plan
 from flcav.pipeline.planning.terms import Terms
 from flcav.pipeline.planning.updates import follow_plan
-from flcav.pipeline.recipe import Federation, Training
+from flcav.pipeline.recipe import Federation
 from flcav.pipeline.results.plans import Plan, RoundPlan, TaskPlan
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import StageResult
+from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages import edge as stage_two
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
 from flcav.pipeline.stages.learning import Learning

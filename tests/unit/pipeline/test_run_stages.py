@@ -31,8 +31,8 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.checkpoint import find_checkpoint
 from flcav.pipeline.federations.records import ROUNDS, SCHEMA
 from flcav.pipeline.federations.rounds import FederationCheckpoints, round_path
-from flcav.pipeline.recipe import Training
 from flcav.pipeline.results.saved import WEIGHTS
+from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages import centralised
 from flcav.pipeline.stages.centralised import pretrain, train_centrally
 from flcav.pipeline.stages.learning import Learning

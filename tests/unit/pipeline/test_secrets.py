@@ -29,8 +29,8 @@ from flcav.pipeline.federations.secrets import (
     remove_secrets,
     write_secrets,
 )
-from flcav.pipeline.recipe import Training
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
+from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge

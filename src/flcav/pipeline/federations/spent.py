@@ -52,6 +52,13 @@ def plan_private_rounds(
     return PrivateRounds(rules.model_copy(update={"privacy": private}), edge, further)
 
 
+def find_budget_noise(asked: Rules, private: Rules) -> float | None:
+    """Return the noise that `private` rules have and the `asked` ones lack; None where these have it, or want none."""
+    if asked.privacy is None or asked.privacy.noise is not None or private.privacy is None:
+        return None
+    return private.privacy.noise
+
+
 def take_noise(rules: RulesT, noise: float | None) -> RulesT:
     """Return rules with the noise that was found for them (None: they have it)."""
     if rules.privacy is None or noise is None:

@@ -13,9 +13,10 @@ from pathlib import Path
 
 from flcav.config import InputError, parse_config
 from flcav.pipeline.provenance import Provenance
-from flcav.pipeline.recipe import RunRecipe, Split
+from flcav.pipeline.recipe import RunRecipe
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import Saved
+from flcav.pipeline.sizes import Split
 
 AMPLE_MB = 1e6
 UNUSED = Split(scenes=2, spins=1, cavs=1)  # test frames

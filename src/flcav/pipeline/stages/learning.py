@@ -7,8 +7,8 @@ from typing import Any
 from flcav.federation.stages import Schedule
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.weights import load_network
-from flcav.pipeline.recipe import Training
 from flcav.pipeline.results.saved import WEIGHTS
+from flcav.pipeline.sizes import Training
 from flcav.seeds import derive_seed
 
 

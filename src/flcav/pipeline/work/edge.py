@@ -12,7 +12,7 @@ from flcav.pipeline.arms import find_strategies
 from flcav.pipeline.federations.network import DrivenRounds
 from flcav.pipeline.federations.outputs import send_region_network, share_frames
 from flcav.pipeline.federations.records import read_rounds
-from flcav.pipeline.federations.spent import PrivateRounds, plan_private_rounds, take_noise
+from flcav.pipeline.federations.spent import PrivateRounds, find_budget_noise, plan_private_rounds, take_noise
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.planning.course import Course, Replanning
@@ -140,13 +140,9 @@ def _plan_private(settings: EdgeSettings, plan: Plan) -> PrivateRounds[Federatio
 
 def _find_noise(work: Work, settings: EdgeSettings, plan: Plan) -> float | None:
     """Return the noise that the privacy budget gives for the planned rounds; None where it is given, or none is."""
-    privacy, before = settings.federation.privacy, settings.inputs.edge
-    if privacy is None or privacy.noise is not None:
-        return None
-    if before is not None:
-        return StageResult.load(work.inputs[before]).noise
-    private = _plan_private(settings, plan).rules.privacy
-    return None if private is None else private.noise
+    if settings.inputs.edge is not None:
+        return StageResult.load(work.inputs[settings.inputs.edge]).noise
+    return find_budget_noise(settings.federation, _plan_private(settings, plan).rules)
 
 
 def _open_federation(

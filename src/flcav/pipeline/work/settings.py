@@ -6,7 +6,8 @@ from flcav.config import Config
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors
 from flcav.perception.tasks import task_named
-from flcav.pipeline.recipe import Budgets, Federation, Training
+from flcav.pipeline.recipe import Budgets, Federation
+from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages.learning import Learning
 from flcav.pipeline.steps import Step
 

@@ -25,7 +25,7 @@ from flcav.pipeline.federations.records import list_rounds
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.testing import LOOK
 from flcav.pipeline.labels.sources import choose_labels
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.run import ArmCost, LinkUse, Run
 from flcav.pipeline.results.saved import ERRORS
@@ -118,7 +118,7 @@ def page(run: Run) -> dict[str, Any]:
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
-        "costs": [{**vars(each), "where": "central" if each.stage == CENTRAL else ""} for each in _list_costs(run)],
+        "costs": _list_costs(run),
         "home": list_home_costs(run),
         "statistics": [(stage.task, each) for stage in main.stages for each in stage.statistics or ()],
         "caveats": [caveat for caveat in run.caveats if caveat != PLACED_BARE],
