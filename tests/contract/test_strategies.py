@@ -154,7 +154,7 @@ def test_without_state_it_keeps_nothing_between_rounds(strategy):
 def test_it_resumes_from_weights_and_state_to_the_same_bits(strategy):
     state, kept = FederationState(), []
 
-    def keep(number: int, weights: Weights, loss: float) -> None:
+    def keep(number: int, weights: Weights, loss: float | None) -> None:
         arrays = {name: array.copy() for name, array in state.to_arrays().items()}
         kept.append((weights, arrays, [record.as_json() for record in state.records]))
 

@@ -60,7 +60,7 @@ def test_the_weights_on_ray_are_those_of_the_embedded_runtime(strategy: Strategy
     account, state = Account(Ledger(Budget(1.0, 1.0)), "edge", "walk", "wireless"), FederationState()
     kept: dict[int, tuple[Weights, dict, list]] = {}
 
-    def keep(number: int, weights: Weights, loss: float) -> None:
+    def keep(number: int, weights: Weights, loss: float | None) -> None:
         kept[number] = weights, {name: dict(kinds) for name, kinds in state.clients.items()}, [*state.records]
         kept[number][1].update({"": dict(state.server)})
 

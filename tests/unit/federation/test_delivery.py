@@ -66,7 +66,7 @@ def run(
     """Return the weights, the state, and the state's arrays after each round."""
     state, after = FederationState(), []
 
-    def keep(number: int, weights: Weights, loss: float) -> None:
+    def keep(number: int, weights: Weights, loss: float | None) -> None:
         after.append({name: np.array(array) for name, array in state.to_arrays().items()})
 
     account = Account(ledger(wireless_mb), "edge", "walk", "wireless", outages)

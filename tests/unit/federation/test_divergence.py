@@ -76,7 +76,7 @@ def test_a_cloud_round_records_how_far_regions_were_apart(tmp_path: Path, monkey
     def stopping(checkpoints: FederationCheckpoints, rounds: int) -> Any:
         keep = make(checkpoints, rounds)
 
-        def keep_once(round_: int, weights: Any, loss: float) -> None:
+        def keep_once(round_: int, weights: Any, loss: float | None) -> None:
             nonlocal stopped
             keep(round_, weights, loss)
             stopped += 1

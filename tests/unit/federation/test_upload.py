@@ -80,7 +80,7 @@ def test_a_compressed_federation_is_deterministic_and_resumes_to_the_same_bits(k
     upload, kept = Upload(**KINDS[kind]), []
     state = FederationState()
 
-    def keep(round_: int, weights: Weights, loss: float) -> None:
+    def keep(round_: int, weights: Weights, loss: float | None) -> None:
         kept.append((weights, save({name: array.copy() for name, array in state.to_arrays().items()})))
 
     once = run(upload, on_round=keep, state=state)[0]

@@ -106,7 +106,7 @@ def test_clients_of_another_process_a_restart_and_masks_end_with_the_same_networ
     kept: list[Any] = []
     state = FederationState()
 
-    def keep(number: int, weights: Weights, loss: float) -> None:
+    def keep(number: int, weights: Weights, loss: float | None) -> None:
         kept.append((weights, {name: array.copy() for name, array in state.to_arrays().items()}, [*state.records]))
 
     whole, book = run(state=state, on_round=keep)
