@@ -14,10 +14,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from docutils import nodes
-from fields import written_fields
 from pydantic import BaseModel
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
+
+from flcav.fields import HEADING, written_fields
 
 WHOLE = "flcav"  # the package whose names are not said again of the others
 
@@ -54,7 +55,8 @@ def autodoc_of(package: str, name: str) -> str:
 
 def describe(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
     """Rewrite a docstring as reStructuredText, a class's fields below it."""
-    paragraphs = "\n".join(lines).strip().split("\n\n")
+    said, _, _ = "\n".join(lines).partition(f"\n\n{HEADING}\n")  # they are listed below
+    paragraphs = said.strip().split("\n\n")
     text = "\n\n".join(as_rst(each) for each in paragraphs)
     if what == "class" and has_fields(value):
         text += "\n\n" + "\n".join(field_list(value))

@@ -7,11 +7,11 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
-from fields import written_fields
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from pydantic.fields import FieldInfo
 
 from flcav.config import Config
+from flcav.fields import written_fields
 from flcav.markdown import format_table
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.camera.camera import Camera

@@ -2,8 +2,11 @@
 
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import is_dataclass
 from importlib import import_module
 from typing import Any
+
+from flcav.fields import document_fields
 
 
 def lazy_names(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -16,6 +19,8 @@ def lazy_names(package: str, places: Mapping[str, str]) -> tuple[Callable[[str],
         if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         found = getattr(import_module(places[name]), name)
+        if isinstance(found, type) and (is_dataclass(found) or hasattr(found, "model_fields")):
+            document_fields(found)
         setattr(sys.modules[package], name, found)  # so that it is looked up once
         return found
 

@@ -1,12 +1,16 @@
-"""Conversion of frozen dataclasses to JSON values and back, by pydantic."""
+"""Conversion of frozen dataclasses to JSON values and back, by pydantic, and to rows of a table."""
 
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
-from typing import Annotated, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
 
 from pydantic import Field, TypeAdapter, ValidationError
 
 from flcav.config import InputError
 from flcav.files import Json
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 Class = Annotated[str, Field(alias="class")]  # a field named "class" in JSON, a reserved word in Python
 LEFT_OUT = Field(exclude_if=lambda value: value is None)  # for `Annotated`: not in the JSON where it is None
@@ -43,6 +47,26 @@ def from_json(kind: type[RecordT], values: Json, origin: str) -> RecordT:
             f"{origin}: not a result of this version of flcav (field '{where}': {first['msg']}); run it anew, in "
             "another folder"
         ) from None
+
+
+def to_rows(records: Iterable["DataclassInstance"]) -> list[dict[str, Json]]:
+    """Return a row of a table for each record; `pandas.DataFrame` and `polars.DataFrame` take the list.
+
+    Fields of a record within a record are columns of their own, named as in "estimate.mean".
+
+    >>> from flcav.intervals import Estimate
+    >>> to_rows([Estimate(0.5, 0.4, 0.6)])
+    [{'mean': 0.5, 'low': 0.4, 'high': 0.6}]
+    """
+    return [dict(_flatten(to_json(record, type(record)))) for record in records]
+
+
+def _flatten(values: Mapping[str, Json], above: str = "") -> Iterator[tuple[str, Json]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{above}{name}.")
+        else:
+            yield above + name, value
 
 
 @cache

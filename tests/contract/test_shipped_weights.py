@@ -51,7 +51,7 @@ def test_they_load_and_their_card_says_how_they_came_about(task):
 
 @pytest.mark.parametrize("task", NOT_SENT.values(), ids=NOT_SENT)
 def test_where_there_are_none_one_sentence_says_so(task, tmp_path, capsys):
-    with pytest.raises(InputError, match=f"no weights for '{task.name}' come with the package"):
+    with pytest.raises(InputError, match=f"no weights of '{task.family}' come with the package"):
         find_shipped(task)
     with pytest.raises(SystemExit, match="2"):
         run(["infer", task.name, str(tmp_path)])

@@ -11,6 +11,13 @@ import pytest
 from PIL import Image
 
 from flcav.cli.main import run as flcav
+from flcav.dataset.recording.recorder import record
+from flcav.perception.networks import evaluate
+from flcav.perception.objects.model import Second
+from flcav.perception.tasks import task_named
+from flcav.perception.weights import load_network
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -80,6 +87,31 @@ def test_bring_your_own_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert len(list((tmp_path / "pictures").iterdir())) == 18
     assert re.search(r"^other scenes, score: 0\.\d+", said, re.MULTILINE)
     assert (tmp_path / "study" / "counting.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_the_network_in_the_docs_is_trained_and_evaluated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    page = (EXAMPLES.parent / "docs" / "tasks.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"^```python\n(from torch .*?)^```$", page, re.M | re.S)
+    (tmp_path / "flat.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    record(EmbeddedSource(Recipe(town="suburb", frames=2)), tmp_path / "data")
+    for command in ("train flat:TASK --data data --epochs 1 --out out", "infer flat:TASK data"):
+        learned = [] if command.startswith("train") else ["--weights", "out/weights.safetensors"]
+        with pytest.raises(SystemExit, match="0"):
+            flcav([*command.split(), *learned])
+    with pytest.raises(SystemExit, match="2"):
+        flcav(["evaluate", "flat:TASK", "--data", "data"])
+    assert "no weights of 'flat' come with the package" in capsys.readouterr().err
+    task = task_named("flat:TASK")
+    network = load_network(task, "out/weights.safetensors")
+    assert sum(each.numel() for each in network.parameters()) != sum(
+        each.numel() for each in Second(network.config).parameters()
+    )
+    assert evaluate(task, "data", "out/weights.safetensors").score >= 0
 
 
 @pytest.mark.slow

@@ -101,3 +101,12 @@ def test_no_boxes_of_several_parts_keep_their_scores():
     assert concatenate([none, none]).score is not None
     assert concatenate([Boxes.empty(), Boxes.empty()]).score is None
     assert len(concatenate([])) == 0
+
+
+def test_columns_of_boxes_are_those_of_their_array():
+    rows = np.arange(14.0).reshape(2, 7)
+    boxes = Boxes.from_array(rows, ["Car", "Van"], [0.5, 0.25])
+    columns = boxes.columns()
+    assert [*columns] == ["label", "x", "y", "z", "length", "width", "height", "yaw", "score"]
+    np.testing.assert_array_equal(np.column_stack([columns[name] for name in [*columns][1:8]]), rows)
+    assert "score" not in Boxes.from_array(rows, "Car").columns()

@@ -1,5 +1,8 @@
 """The Python pages: every public name is on one of them, and a docstring becomes markup that says what it said."""
 
+import dataclasses
+import importlib
+import pydoc
 import re
 from pathlib import Path
 
@@ -42,3 +45,14 @@ def test_a_docstring_is_shown_as_it_was_written(text: str, shown: str):
 
 def test_examples_are_left_alone():
     assert as_rst(">>> a_ * 2\n4") == ">>> a_ * 2\n4"
+
+
+@pytest.mark.parametrize("name", sorted(name for name in flcav.__all__ if isinstance(getattr(flcav, name), type)))
+def test_help_shows_the_fields_of_records_and_models(name: str):
+    owner = getattr(flcav, name)
+    getattr(importlib.import_module(flcav.PLACES[name]), name)  # a second face gives the same class
+    fields = [field.name for field in dataclasses.fields(owner)] if dataclasses.is_dataclass(owner) else []
+    fields += getattr(owner, "model_fields", ())
+    shown = pydoc.plain(pydoc.render_doc(owner))
+    for field in fields:
+        assert len(re.findall(rf"^ \|      {field}: ", shown, re.M)) == 1, field

@@ -92,6 +92,12 @@ class Boxes:
         """Return (N, 7) rows x, y, z, length, width, height [m], yaw [rad]."""
         return np.concatenate((self.center, self.size, self.yaw[:, None]), axis=1)
 
+    def columns(self) -> dict[str, NDArray]:
+        """Return each quantity as a column (N,), with the scores if known, for `pandas.DataFrame`."""
+        names = ("x", "y", "z", "length", "width", "height", "yaw")
+        found: dict[str, NDArray] = {"label": self.label, **dict(zip(names, self.array().T))}
+        return found if self.score is None else found | {"score": self.score}
+
     def transform(self, target_from_source: Array) -> "Boxes":
         """Return the boxes in the target frame of a rigid (4, 4) transform.
 

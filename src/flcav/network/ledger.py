@@ -1,7 +1,7 @@
 """Communication ledger: the bytes of every message on every link, under uplink budgets that it enforces."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args
@@ -91,6 +91,9 @@ class Ledger:
         self._up = dict.fromkeys(LINKS, 0)
         for entry in entries:
             self.enter(entry)
+
+    def __iter__(self) -> Iterator[LedgerEntry]:
+        return iter(self._entries)
 
     @property
     def entries(self) -> tuple[LedgerEntry, ...]:

@@ -33,7 +33,7 @@ def find_shipped(task: Task, name: str = SHIPPED) -> Path:
     module = sys.modules.get(type(task).__module__)
     path = Path(getattr(module, "__file__", None) or "").parent / name
     if not path.is_file():
-        raise InputError(f"--weights is missing: no weights for '{task.name}' come with the package, train some first")
+        raise InputError(f"--weights is missing: no weights of '{task.family}' come with the package, train some first")
     return path
 
 

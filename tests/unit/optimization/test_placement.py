@@ -212,12 +212,17 @@ def test_place_takes_kinds_of_sensors_budgets_shares_and_towns():
         ({"range_m": 40, "budget": 5}, "nothing has a cost"),
         ({"range_m": 40, "count": 1, "traces": [None]}, "traffic is in the way where the town"),
         ({"range_m": 40, "count": 1, "town": "atlantis"}, "unknown town 'atlantis'"),
-        ({"range_m": 40, "count": 1, "town": "grid"}, "number 0 stands outside grid"),
+        ({"range_m": 40, "count": 1, "town": "grid"}, "poles: row 1 lies at 9000, 9000, outside grid"),
     ],
 )
 def test_place_refuses_in_a_sentence_what_goes_together_with_nothing(given, said):
     with pytest.raises(InputError, match=said):
-        place([[9e3, 9e3, 1]], [[9e3, 9e3, 3]], **given)
+        place([[1e3, 1e3, 1]], [[9e3, 9e3, 3]], **given)
+
+
+def test_place_refuses_errors_that_lie_on_no_map_of_the_town():
+    with pytest.raises(InputError, match="errors: row 2 lies at 1e\\+06, 0, far from grid"):
+        place([[0, 0, 1], [1e6, 0, 1]], load_town("grid").poles.position, 40, 1, town="grid")
 
 
 def test_place_takes_the_name_of_a_town():

@@ -22,36 +22,18 @@ def birdseye(
     range_m: float = typer.Option(
         50.0, "--range", min=5.0, max=500.0, callback=check_finite, help="How far from the agent to show [m]."
     ),
+    tracks: bool = typer.Option(False, "--tracks", help="Also the path of every annotated actor over the scene."),
 ) -> None:
-    """Draw a frame of a dataset from above: its points by height, its boxes, its agent."""
-    import numpy as np
-
-    from flcav.dataset.ground import Ground
+    """Draw a frame of a dataset from above: points by height, radar echoes, boxes, the agent."""
     from flcav.dataset.store import Dataset
     from flcav.files import write_bytes
-    from flcav.geometry import inverse, transform_points
-    from flcav.perception.agents import POLE, kind_of
     from flcav.report import style
-    from flcav.report.pictures.birdseye import View, birdseye
-    from flcav.world.shapes import SHAPES
+    from flcav.report.pictures.birdseye import birdseye, view_frame
 
-    sedan = next(shape for shape in SHAPES["car"] if shape.name == "sedan")
     dataset = Dataset.open(folder)
-    number = 0 if frame is None else dataset.number(frame)
-    seen = dataset.frame(number)
-    clouds = [transform_points(seen.agent_from_sensor[name], cloud[:, :3]) for name, cloud in seen.lidar.items()]
-    points, ground = np.concatenate(clouds).astype(np.float64), Ground(dataset)
-    if ground.relief is None:
-        points[:, 2] += ground.height_of(number)
-    else:
-        points[:, 2] = ground.relief.above(transform_points(seen.world_from_agent, points))
-    view = View(
-        points=points,
-        truth=seen.annotations.boxes.transform(inverse(seen.world_from_agent)),
-        returns=seen.annotations.returns,
-        title=f"{seen.key} · {seen.time_s:.1f} s",
-        range_m=range_m,
-        agent_size=None if kind_of(seen.agent) == POLE else (sedan.length, sedan.width),
-    )
+    seen = dataset.frame(0 if frame is None else dataset.number(frame))
+    view = view_frame(dataset, seen, range_m=range_m, tracks=tracks)
     write_bytes(out, style.png(birdseye(view)))
-    typer.echo(f"{out}: {seen.key}, {plural(len(points), 'point')}, {plural(len(seen.annotations), 'annotated actor')}")
+    typer.echo(
+        f"{out}: {seen.key}, {plural(len(view.points), 'point')}, {plural(len(seen.annotations), 'annotated actor')}"
+    )

@@ -73,7 +73,7 @@ def place(
     from flcav.optimization.placement import solve
     from flcav.optimization.placement.baselines import place_at_random
     from flcav.optimization.placement.cheapest import cover_share
-    from flcav.optimization.placement.place import find_seen
+    from flcav.optimization.placement.place import check_inside, find_seen
 
     for file in (errors, poles, sensors):
         if file is not None and not file.exists():
@@ -90,7 +90,7 @@ def place(
             raise InputError(f"{option}: needs --town, or --data whose town is known")
     given = place_inputs.read_given(errors, poles, sensors, range_m, class_weight)
     if here is not None:
-        place_inputs.check_inside(here, given, errors, poles)
+        check_inside(here, given.errors, given.poles, (errors, poles))
     if budget is not None and not given.priced:
         raise InputError(f"--budget: nothing has a cost; give {poles} a column 'cost', or give --sensors")
     seen = None

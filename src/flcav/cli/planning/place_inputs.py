@@ -26,7 +26,6 @@ ERRORS = (*AXES, *FACTORS, CLASS, "kind", "returns", "occlusion", "scene", "trac
 POLES = ("id", *AXES, "cost", "yaw_deg", "kind")
 SENSORS = ("name", "range_m", "cost")
 NAMES = ("id", "name")  # columns that are kept as they are written
-FAR = 10  # times the size of a town: errors beyond are on no map of it
 
 
 @dataclass(frozen=True)
@@ -105,21 +104,6 @@ def read_world(data: Path | None, town: str | None) -> tuple[Town | None, list[T
     if own is not None and own.name != here.name:
         raise InputError(f"--town {town}: the traffic of {data} is that of {own.name}")
     return here, traces
-
-
-def check_inside(town: Town, given: Given, errors: Path, poles: Path) -> None:
-    """Raise `InputError` for a pole outside the town, or an error that no map of it can show."""
-    low, high = np.array(town.bounds).reshape(2, 2)
-    reach_m = FAR * float((high - low).max())
-    far = np.flatnonzero((np.abs(given.errors[:, :2] - (low + high) / 2) > reach_m).any(axis=1))
-    out = np.flatnonzero(((given.poles[:, :2] < low) | (given.poles[:, :2] > high)).any(axis=1))
-    for file, rows, places, where in (
-        (errors, far, given.errors, "far from"),
-        (poles, out, given.poles, "outside"),
-    ):
-        if len(rows):
-            x, y = places[rows[0], :2]
-            raise InputError(f"{file}: row {rows[0] + 1} lies at {x:g}, {y:g}, {where} {town.name}")
 
 
 def build_candidates(given: Given, visible: csr_array | None) -> Candidates:

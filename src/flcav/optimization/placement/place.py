@@ -15,6 +15,8 @@ from flcav.world.line_of_sight import find_visible
 from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
 
+FAR = 10  # times the size of a town: errors beyond are on no map of it
+
 
 def place(
     errors: ArrayLike,
@@ -62,9 +64,7 @@ def place(
     if town is not None:
         stands = load_town(town) if isinstance(town, str) else town
         places, sites = np.asarray(errors, dtype=np.float64), np.asarray(poles, dtype=np.float64)
-        low, high = np.array(stands.bounds).reshape(2, 2)
-        if (out := np.flatnonzero(((sites[:, :2] < low) | (sites[:, :2] > high)).any(axis=1))).size:
-            raise InputError(f"poles: number {out[0]} stands outside {stands.name}")
+        check_inside(stands, places, sites)
         candidates = asked(visible=find_seen(places, sites, float(ranges.max()), stands, traces))
     if count is not None:
         return place_count(candidates, count, method=method)
@@ -72,6 +72,26 @@ def place(
         return place_budget(candidates, budget, method=method)
     assert cover is not None
     return cover_share(candidates, cover, method=method)[0]
+
+
+def check_inside(
+    town: Town,
+    errors: NDArray[np.float64],
+    poles: NDArray[np.float64],
+    names: tuple[object, object] = ("errors", "poles"),
+) -> None:
+    """Raise `InputError` for a pole (P, 3) outside the town, or an error (E, 3) so far away that no map of it shows it.
+
+    `names` are those of the two tables in the sentence.
+    """
+    low, high = np.array(town.bounds).reshape(2, 2)
+    reach_m = FAR * float((high - low).max())
+    far = np.flatnonzero((np.abs(errors[:, :2] - (low + high) / 2) > reach_m).any(axis=1))
+    out = np.flatnonzero(((poles[:, :2] < low) | (poles[:, :2] > high)).any(axis=1))
+    for name, rows, places, where in zip(names, (far, out), (errors, poles), ("far from", "outside"), strict=True):
+        if len(rows):
+            x, y = places[rows[0], :2]
+            raise InputError(f"{name}: row {rows[0] + 1} lies at {x:g}, {y:g}, {where} {town.name}")
 
 
 def find_seen(

@@ -1,5 +1,6 @@
-"""Bird's-eye view of a frame: points coloured by height, boxes, and the agent; ahead of the agent is up."""
+"""Bird's-eye view of a frame: points coloured by height, radar echoes, boxes, tracks, and the agent; ahead is up."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +13,20 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from flcav.geometry import Boxes
+from flcav.dataset.ground import Ground
+from flcav.dataset.store import Dataset
+from flcav.geometry import Boxes, inverse, transform_points
+from flcav.perception.agents import POLE, kind_of
 from flcav.report import style
 from flcav.report.pictures.clouds import GROUND_M, draw_boxes, on_page
+from flcav.sensors.frame import Frame
+from flcav.sensors.radar.radar import compute_echo_directions
+from flcav.world.shapes import SHAPES
 
 HEIGHTS_M = Normalize(0.0, 4.0, clip=True)
+SEDAN = next(shape for shape in SHAPES["car"] if shape.name == "sedan")
+MOVED_M = 1.0  # actors that move less are not drawn with a path
+STANDING_M_S = 0.5  # range rates up to this count as none
 HEIGHT_COLOURS = ListedColormap(colormaps["turbo"](np.linspace(0.08, 0.92, 64)))
 
 
@@ -31,6 +41,51 @@ class View:
     range_m: float = 50.0  # half the side of the square shown
     predictions: Boxes | None = None
     agent_size: tuple[float, float] | None = None  # length, width of a vehicle [m]; None is a pole
+    echoes: NDArray | None = None  # (E, 3) x, y and measured range rate [m/s, positive: receding] of radar echoes
+    tracks: Sequence[NDArray] = ()  # (T, 2) x, y of an actor over the scene, for each actor that moved
+
+
+def view_frame(dataset: Dataset, frame: Frame, *, range_m: float, tracks: bool = False) -> View:
+    """Return the view of a frame of `dataset`, `range_m` [m] to each side; with `tracks` its actors' paths as well."""
+    agent_from_world = inverse(frame.world_from_agent)
+    clouds = [transform_points(frame.agent_from_sensor[name], cloud[:, :3]) for name, cloud in frame.lidar.items()]
+    points, ground = np.concatenate([np.zeros((0, 3)), *clouds]), Ground(dataset)
+    if ground.relief is None:
+        points[:, 2] += ground.height_of(dataset.number(frame.key))
+    else:
+        points[:, 2] = ground.relief.above(transform_points(frame.world_from_agent, points))
+    return View(
+        points=points,
+        truth=frame.annotations.boxes.transform(agent_from_world),
+        returns=frame.annotations.returns,
+        title=f"{frame.key} · {frame.time_s:.1f} s",
+        range_m=range_m,
+        agent_size=None if kind_of(frame.agent) == POLE else (SEDAN.length, SEDAN.width),
+        echoes=_locate_echoes(frame),
+        tracks=_collect_paths(dataset, frame, agent_from_world) if tracks else (),
+    )
+
+
+def _locate_echoes(frame: Frame) -> NDArray | None:
+    """Return x, y [m, agent frame] and range rate [m/s] of all radar echoes (E, 3); None without radar."""
+    found = []
+    for name, echoes in frame.radar.items():
+        positions = echoes[:, :1] * compute_echo_directions(echoes)
+        found.append(np.column_stack((transform_points(frame.agent_from_sensor[name], positions)[:, :2], echoes[:, 3])))
+    return np.concatenate(found) if found else None
+
+
+def _collect_paths(dataset: Dataset, frame: Frame, agent_from_world: NDArray) -> list[NDArray]:
+    """Return the path (T, 2) [m, agent frame now] of each actor that the agent's frames of the scene show moving."""
+    path: dict[str, list[NDArray]] = {}
+    for number, key in enumerate(dataset.keys):
+        if (key.scene, key.agent) == (frame.scene, frame.agent):
+            truth = dataset.frame(number).annotations
+            for track, center in zip(truth.track.tolist(), truth.boxes.center):
+                path.setdefault(track, []).append(center)
+    paths = (np.array(centers) for centers in path.values())
+    moving = (centers for centers in paths if np.ptp(centers, axis=0).max() > MOVED_M)
+    return [transform_points(agent_from_world, centers)[:, :2] for centers in moving]
 
 
 @style.styled
@@ -45,7 +100,7 @@ def birdseye(view: View) -> Figure:
     )
     bar.set_label("height of a return above ground [m]; ground in grey")
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    figure.legend(handles=_legend(view), loc="outside lower center", ncols=4, frameon=False, handlelength=1.6)
+    figure.legend(handles=_legend(view), loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
     return figure
 
 
@@ -55,6 +110,10 @@ def draw_view(axes: Axes, view: View) -> None:
     style.hide_axes(axes)
     _draw_rings(axes, view.range_m)
     _draw_points(axes, view.points)
+    for track in view.tracks:
+        axes.plot(*on_page(track).T, color=style.GREEN, linewidth=1.2, zorder=2)
+    for colour, chosen in _by_range_rate(view.echoes):
+        axes.scatter(*on_page(chosen).T, s=9, marker="D", color=colour, edgecolor="white", linewidths=0.4, zorder=4.5)
     seen = view.returns > 0
     draw_boxes(axes, view.truth[~seen], style.MUTED, width=0.8, dashed=True)
     draw_boxes(axes, view.truth[seen], style.INK, width=0.8)
@@ -91,6 +150,16 @@ def _draw_points(axes: Axes, points: NDArray) -> None:
     axes.scatter(*on_page(raised[:, :2]).T, s=2.2, c=colours, linewidths=0, zorder=4)
 
 
+def _by_range_rate(echoes: NDArray | None) -> list[tuple[str, NDArray]]:
+    """Return the positions of approaching, receding and other radar echoes, with the colour of each kind."""
+    if echoes is None:
+        return []
+    rate = echoes[:, 2]
+    kinds = {style.BLUE: rate < -STANDING_M_S, style.VERMILLION: rate > STANDING_M_S}
+    kinds[style.MUTED] = ~(kinds[style.BLUE] | kinds[style.VERMILLION])
+    return [(colour, echoes[chosen, :2]) for colour, chosen in kinds.items() if chosen.any()]
+
+
 def _draw_agent(axes: Axes, size: tuple[float, float] | None) -> None:
     if size is None:
         axes.plot(0, 0, "o", markersize=7, color=style.INK, markeredgecolor="white", zorder=5)
@@ -107,6 +176,11 @@ def _legend(view: View) -> list[Line2D]:
     ]
     if view.predictions is not None:
         entries.append(Line2D([], [], color=style.PURPLE, linewidth=1.6, label="predicted"))
+    if view.tracks:
+        entries.append(Line2D([], [], color=style.GREEN, linewidth=1.2, label="path over the scene"))
+    names = {style.BLUE: "radar, approaching", style.VERMILLION: "radar, receding", style.MUTED: "radar, no range rate"}
+    for colour, _ in _by_range_rate(view.echoes):
+        entries.append(Line2D([], [], linestyle="none", marker="D", markersize=4, color=colour, label=names[colour]))
     marker, agent = ("^", "vehicle with the sensor") if view.agent_size else ("o", "pole with the sensor")
     entries.append(Line2D([], [], linestyle="none", marker=marker, color=style.INK, label=agent))
     return entries
