@@ -9,7 +9,7 @@ from flcav.cli.main import run as command
 from flcav.experiments.run_tables import tables
 from flcav.network.clock.records import ClientTiming, load_rounds
 from flcav.network.ledger import Ledger
-from flcav.pipeline.federations.alone import RESULTS, TRAIN_TIMES, Federations
+from flcav.pipeline.federations.alone import TRAIN_TIMES, Federations, name_results
 from flcav.pipeline.federations.network import TOO_SLOW
 from flcav.pipeline.federations.timing import TrainTimes
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe, load_run_recipe
@@ -105,7 +105,7 @@ def test_stage_two_alone_has_the_stragglers_of_the_run(
         with pytest.raises(SystemExit) as ended:
             command(["federate", str(folder / "radio.yaml"), "--out", str(folder), "--arm", arm, "--jobs", "1"])
         assert not ended.value.code
-        alone = {each.result.region: each.result for each in Federations.load(folder, RESULTS).federations}
+        alone = {each.result.region: each.result for each in Federations.load(folder, name_results("main")).federations}
         stages = {stage.region: stage for stage in result.arms[arm].stages if stage.stage == EDGE}
         assert [*alone] == [*stages] == ["grid", "ring"]
         for region, stage in stages.items():

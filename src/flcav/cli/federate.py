@@ -37,14 +37,14 @@ def federate(
 ) -> None:
     """Run stage II of a recipe alone, edge FL in every region; print each round with its scores on validation frames.
 
-    Speeds of vehicles, times and the network are the recipe's, as in a run. Writes federation.json, and the weights of
+    Speeds of vehicles, times and the network are the recipe's, as in a run. Writes federation.json (of another arm federation-ARM.json), and the weights of
     each federation as safetensors. At the end it prints each task's train_s, the CPU time that a vehicle trained in a
     round, in the median; times.json has each vehicle's.
     """
     use_threads(1)
     from flcav.cli.steps import live_steps
     from flcav.files import check_writable
-    from flcav.pipeline.federations.alone import RESULTS, TRAIN_TIMES, federate_regions, measure_times
+    from flcav.pipeline.federations.alone import TRAIN_TIMES, federate_regions, measure_times, name_results
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.results.spending import TOGETHER
     from flcav.sources.recipe import find_recipe
@@ -67,7 +67,7 @@ def federate(
     if results.privacy is not None:
         typer.echo(f"{TOGETHER}: {results.privacy.describe()}")
     typer.echo(f"{out / TRAIN_TIMES}: times and speeds of each vehicle")
-    typer.echo(f"{out / RESULTS}: all rounds")
+    typer.echo(f"{out / name_results(arm)}: all rounds")
 
 
 def _describe(result: "StageResult") -> str:

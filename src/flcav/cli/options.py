@@ -95,12 +95,12 @@ def join_choices(choices: Iterable[str]) -> str:
 
 
 ANY_TASK = f"{join_choices(TASKS)}, or one of your own as module:NAME"
-ENGINE = typer.Option(Engine.processes, "--engine", help="Who works: processes here, or a cluster by Ray.")
+ENGINE = typer.Option(Engine.processes, "--engine", help="Backend: processes on this machine, or a Ray cluster.")
 STALE = typer.Option(
     Stale.refuse,
     "--stale",
-    help="What becomes of steps in the folder that other code did, or that are built on such: refuse the folder, redo "
-    "them, or keep them.",
+    help="Steps in the folder that were done by other code or, after an edit of the recipe, by other settings, and those "
+    "built on them: refuse the folder, redo these steps alone, or keep those of other code.",
 )
 
 

@@ -37,7 +37,10 @@ def read_table(field: str, name: str, noun: str, folder: str, beside: Path) -> s
 
 
 def append_records(path: Path, records: Sequence["DataclassInstance"]) -> None:
-    """Append the records that the table at `path` lacks, a column per field; numbers are rounded to 5 decimals."""
+    """Append records to the table at `path`, a column per field; numbers are rounded to 5 decimals.
+
+    Earlier rows of the same `run`, a field of the records, are replaced.
+    """
     if not records:
         return
     held: list[dict[str, str]] = []
@@ -48,7 +51,7 @@ def append_records(path: Path, records: Sequence["DataclassInstance"]) -> None:
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(told[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows([*held, *(row for row in told if row not in held)])
+        writer.writerows([*(row for row in held if row.get("run") not in {new["run"] for new in told}), *told])
 
 
 def _cell(value: object) -> str:

@@ -30,6 +30,10 @@ def count(work: Work, start: int) -> int:
     return start
 
 
+def take(work: Work, **given: object) -> int:
+    return len(given)
+
+
 def add(work: Work, names: list[str]) -> int:
     work.report(1, 2, "halfway")
     return sum(work.result(name) for name in names)
@@ -155,6 +159,38 @@ def test_a_folder_of_another_configuration_is_refused(tmp_path):
         run_steps([Step("a", count, {"start": 5})], tmp_path, jobs=1, notify=quiet)
 
 
+def edited(budget_mb: float, weight: float = 1.0) -> list[Step]:
+    """Return steps of which two are given settings, and one what the first gives."""
+    first = Step("first", take, {"start": 1, "settings": {"budgets_mb": {"wireless": budget_mb}}})
+    return [first, Step("second", take, {"weight": weight}), Step("third", take, {"need": "first"}, needs=("first",))]
+
+
+def test_after_an_edit_the_steps_it_concerns_are_named_with_their_fields_and_done_anew(tmp_path: Path):
+    def start(budget_mb: float, weight: float = 1.0, stale: str = "refuse") -> list[str]:
+        done: list[str] = []
+        run_steps(
+            edited(budget_mb, weight),
+            tmp_path,
+            jobs=1,
+            notify=lambda name, now, total, note: done.append(name) if note == DONE_NOW else None,
+            stale=stale,
+        )
+        return done
+
+    assert start(60.0) == ["first", "second", "third"]
+    for stale in ("refuse", "keep"):
+        with pytest.raises(InputError) as refusal:
+            start(80.0, stale=stale)
+        assert str(refusal.value) == (
+            f"{tmp_path}: did first by another configuration (budgets_mb.wireless: 80.0, was 60.0); third on top of that; "
+            "choose another folder, or --stale redo to do that again and keep 1 other step"
+        )
+    assert start(60.0) == []
+    assert start(80.0, stale="redo") == ["first", "third"]
+    assert start(80.0, 2.0, stale="redo") == ["second"]
+    assert start(80.0, 2.0) == []
+
+
 def test_a_step_that_was_begun_is_not_gone_on_with_as_another(tmp_path):
     def begun(setting: Setting | Other) -> list[Step]:
         return [Step("a", refuse, {"setting": setting})]
@@ -240,7 +276,7 @@ def test_what_other_code_did_is_refused_and_named(own, tmp_path):
     assert str(refusal.value).endswith(REFUSED)
     assert kept(out) == before
     with pytest.raises(InputError, match="another configuration"):
-        told([Step("apart", own.apart, {"more": 1})], out, stale="redo")
+        told([Step("apart", own.apart, {"more": 1})], out, stale="keep")
     with pytest.raises(InputError, match="stale 'perhaps': choose one of refuse, redo, keep"):
         told(chain(own), out, stale="perhaps")
 

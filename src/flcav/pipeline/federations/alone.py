@@ -32,7 +32,7 @@ from flcav.pipeline.work.settings import make_step
 from flcav.progress import DAMAGED
 from flcav.records import LEFT_OUT
 
-WORK, RESULTS, TRAIN_TIMES = "work", "federation.json", "times.json"
+WORK, TRAIN_TIMES = "work", "times.json"
 FEDERATE = "federate"  # in the names of the steps
 
 
@@ -67,7 +67,7 @@ def federate_regions(
     notify: Notify = print_steps,
     stale: Stale = "refuse",
 ) -> Federations:
-    """Run or finish stage II of a recipe's arm in the folder `out`; return its results, federation.json there.
+    """Run or finish stage II of a recipe's arm in the folder `out`; return its results, see `name_results`.
 
     In every federating region and for every task vehicles train in `jobs` processes of one thread each, or actors where
     the `runtime`, one of `RUNTIMES`, is "ray". The weights do not depend on that, on Ray up to rounding. Others
@@ -99,8 +99,13 @@ def federate_regions(
     trainings = [Training(own.region or "", own.clients, own.rounds, own.noise) for own in trained]
     spent = compose_trainings(graph.settings[arm].federation, trainings)
     results = Federations(recipe, arm, found, provenance(recipe.seed), spent)
-    results.save(out, RESULTS)
+    results.save(out, name_results(arm))
     return results
+
+
+def name_results(arm: str) -> str:
+    """Return the name of an arm's file of results; each arm has its own."""
+    return "federation.json" if arm == MAIN else f"federation-{arm}.json"
 
 
 def measure_times(results: Federations, out: Path) -> TrainTimes:

@@ -33,6 +33,7 @@ from flcav.pipeline.steps.step import (
     Record,
     Step,
     find_damage,
+    make_edited_error,
     make_stale_error,
     read_record,
     read_value,
@@ -76,9 +77,9 @@ def run_steps(
     `jobs` workers of one thread each: processes, which end with this one however it ends, or actors on the machines of
     a Ray cluster, see `flcav.pipeline.steps.cluster`. Of the processes, those that no step waits for are lent to steps
     that can make use of several, until these end. Steps begun or finished by other code are refused, done again
-    ("redo") or kept ("keep", their records unchanged). Raises `InputError` where `folder` holds steps of other
-    arguments or, where that is refused, of other code, and where another process runs steps in it; `OSError` where a
-    worker was killed.
+    ("redo") or kept ("keep", their records unchanged); those of other arguments, and what needs them, are done again by
+    "redo" and else refused. Raises `InputError` for what is refused, and where another process runs steps in the folder;
+    `OSError` where a worker was killed.
     """
     with only_writer(folder):
         plan = _plan_steps(steps, folder, notify, stale, Sources())
@@ -209,28 +210,34 @@ def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
 def _settle_records(
     steps: Sequence[Step], folder: Path, stale: str, sources: Sources
 ) -> tuple[dict[str, Record], set[str]]:
-    """Return the record by which each step is, or is to be, done, and the stale steps; "redo" removes these."""
+    """Return the record by which each step is, or is to be, done, and the stale steps.
+
+    "redo" removes these, and those of other arguments.
+    """
     if stale not in STALE:
         raise InputError(f"stale '{stale}': choose one of {', '.join(STALE)}")
     records: dict[str, Record] = {}
     outdated: dict[str, tuple[Record, Record]] = {}
+    edited: dict[str, tuple[Record, Record]] = {}
     for step in steps:
         asked = step.fingerprint({name: records[name].fingerprint for name in step.needs})
         code = sources.hashes(find_definitions((step.run, step.arguments)))
-        record = Record.of(asked, code, [records[name] for name in step.needs])
+        record = Record.of(asked, code, [records[name] for name in step.needs], step.asked)
         held = read_record(folder / step.name)
         if held is not None and held.fingerprint != asked:
-            raise InputError(f"{folder}: holds the steps of another configuration; choose another folder")
-        if held is not None and held.lineage != record.lineage:
+            edited[step.name] = held, record
+        elif held is not None and held.lineage != record.lineage:
             outdated[step.name] = held, record
             record = held if stale == "keep" else record
         records[step.name] = record
+    if edited and stale != "redo":
+        raise make_edited_error(folder, edited, steps)
     if outdated and stale == "refuse":
         raise make_stale_error(folder, outdated)
     for step in steps:
         for what in ("old", "copy"):
             reserve_sibling(folder / step.name, what)
-        if stale == "redo" and step.name in outdated:
+        if stale == "redo" and step.name in outdated | edited:
             remove(folder / step.name)
     return records, set(outdated)
 

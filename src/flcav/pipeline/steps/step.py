@@ -8,20 +8,21 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flcav.config import Config, InputError, read_json
+from flcav.config import Config, InputError, read_json, shorten
 from flcav.files import flush_tree, write_json
 from flcav.progress import Report, print_progress
+from flcav.wording import plural
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
 DONE_NOW, DONE_BEFORE, KEPT = FINISHED = ("done", "done before", "kept, of other code")  # notes of finished steps
 DONE, STARTED = "done.json", "started.json"
 Stale = str  # one of STALE
-STALE = ("refuse", "redo", "keep")  # what to do with steps begun or done by other code
+STALE = ("refuse", "redo", "keep")  # what to do with steps of other code; "redo": of other arguments, too
 NAMED = 3  # most steps, or modules, that a message lists
 
 
@@ -63,6 +64,11 @@ class Step:
         """Return the step with so many workers."""
         return self if workers == 1 else replace(self, means={**self.means, "processes": workers})
 
+    @property
+    def asked(self) -> dict[str, Any]:
+        """Return the arguments as JSON values, by dotted name, to say in which of them two steps differ."""
+        return dict(_flatten(json.loads(json.dumps(self.arguments, default=_fields))))
+
     def fingerprint(self, inputs: Mapping[str, str]) -> str:
         """Return a hash of what is asked: function, arguments, and the fingerprints of the needed steps (`inputs`).
 
@@ -74,13 +80,25 @@ class Step:
 
 def _named(value: Any) -> list[Any]:
     """Return the identity of a record among a step's arguments as JSON: its class and its fields."""
+    return [type(value).__module__, type(value).__qualname__, _fields(value)]
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    """Return the fields of a record among a step's arguments."""
     if isinstance(value, Config):
-        own: Any = value.model_dump(mode="json")
-    elif is_dataclass(value):
-        own = {each.name: getattr(value, each.name) for each in fields(value)}
-    else:
-        raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a record of them")
-    return [type(value).__module__, type(value).__qualname__, own]
+        return value.model_dump(mode="json")
+    if is_dataclass(value):
+        return {each.name: getattr(value, each.name) for each in fields(value)}
+    raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a record of them")
+
+
+def _flatten(values: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values within nested JSON objects by dotted names, "settings" and "recipe" at the beginning left out."""
+    if not isinstance(values, dict) or not values:
+        yield name, values
+        return
+    for key, value in values.items():
+        yield from _flatten(value, key if name in ("", "settings", "recipe") else f"{name}.{key}")
 
 
 @dataclass(frozen=True)
@@ -90,11 +108,14 @@ class Record:
     fingerprint: str  # see `Step.fingerprint`
     code: Mapping[str, str]  # hash of the code it reaches, by module: see `steps.source_hash`
     lineage: str  # of its code and of the lineages of the steps it needs; "" where the code is not known
+    asked: Mapping[str, Any] | None = field(default=None, compare=False)  # see `Step.asked`; None: not recorded
 
     @classmethod
-    def of(cls, fingerprint: str, code: Mapping[str, str], needs: Iterable["Record"]) -> "Record":
+    def of(
+        cls, fingerprint: str, code: Mapping[str, str], needs: Iterable["Record"], asked: Mapping[str, Any] | None = None
+    ) -> "Record":
         """Return the record of a step done by `code`, where the steps it needs have the records `needs`."""
-        return cls(fingerprint, code, digest([sorted(code.items()), *(need.lineage for need in needs)]))
+        return cls(fingerprint, code, digest([sorted(code.items()), *(need.lineage for need in needs)]), asked)
 
 
 def digest(value: Any, **how: Any) -> str:
@@ -115,7 +136,8 @@ def read_record(folder: Path) -> Record | None:
             values: Any = read_json(path)
             if not isinstance(values, dict) or not isinstance(values.get("fingerprint"), str):
                 raise InputError(f"{path}: not the record of a step; choose another folder")
-            return Record(values["fingerprint"], values.get("code") or {}, values.get("lineage") or "")
+            known = (values["fingerprint"], values.get("code") or {}, values.get("lineage") or "")
+            return Record(*known, values.get("asked"))
     return None
 
 
@@ -184,6 +206,41 @@ def make_stale_error(folder: Path, outdated: Mapping[str, tuple[Record, Record]]
         f"{folder}: did {', '.join(filter(None, told))}; choose another folder, or --stale redo to do that again, or "
         "--stale keep to take it as it is"
     )
+
+
+def make_edited_error(folder: Path, edited: Mapping[str, tuple[Record, Record]], steps: Sequence[Step]) -> InputError:
+    """Return the error for a folder some of whose `steps` are of other arguments: records (held, wanted) by step."""
+    changes: dict[str, list[str]] = {}  # steps by how their arguments differ
+    after = []
+    for step in steps:
+        if step.name in edited:
+            differences = describe_differences(*edited[step.name])
+            if not differences and any(name in edited for name in step.needs):
+                after.append(step.name)
+            else:
+                changes.setdefault(_some(differences), []).append(step.name)
+    told = [
+        f"{_some(names)} by another configuration{f' ({fields})' if fields else ''}"
+        for fields, names in changes.items()
+    ]
+    told += [f"{_some(after)} on top of that"] if after else []
+    return InputError(
+        f"{folder}: did {'; '.join(told)}; choose another folder, or --stale redo to do that again and keep "
+        f"{plural(len(steps) - len(edited), 'other step')}"
+    )
+
+
+def describe_differences(held: Record, wanted: Record) -> list[str]:
+    """Return the arguments of a step that are not as they were, in words; none where they were not recorded."""
+    if held.asked is None or wanted.asked is None:
+        return []
+    names = [*dict.fromkeys((*wanted.asked, *held.asked))]
+    pairs = {name: (wanted.asked.get(name), held.asked.get(name)) for name in names}
+    return [f"{name}: {_said(new)}, was {_said(old)}" for name, (new, old) in pairs.items() if new != old]
+
+
+def _said(value: Any) -> str:
+    return shorten(json.dumps(value, ensure_ascii=False))
 
 
 def _some(names: Sequence[str]) -> str:
