@@ -105,7 +105,7 @@ def test_stage_two_alone_has_the_stragglers_of_the_run(
         with pytest.raises(SystemExit) as ended:
             command(["federate", str(folder / "radio.yaml"), "--out", str(folder), "--arm", arm, "--jobs", "1"])
         assert not ended.value.code
-        alone = {each.result.region: each.result for each in Federations.load(folder, name_results("main")).federations}
+        alone = {each.result.region: each.result for each in Federations.load(folder, name_results(arm)).federations}
         stages = {stage.region: stage for stage in result.arms[arm].stages if stage.stage == EDGE}
         assert [*alone] == [*stages] == ["grid", "ring"]
         for region, stage in stages.items():

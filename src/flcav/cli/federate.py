@@ -37,9 +37,9 @@ def federate(
 ) -> None:
     """Run stage II of a recipe alone, edge FL in every region; print each round with its scores on validation frames.
 
-    Speeds of vehicles, times and the network are the recipe's, as in a run. Writes federation.json (of another arm federation-ARM.json), and the weights of
-    each federation as safetensors. At the end it prints each task's train_s, the CPU time that a vehicle trained in a
-    round, in the median; times.json has each vehicle's.
+    Speeds of vehicles, times and the network are the recipe's, as in a run. Writes federation.json, or
+    federation-ARM.json for another arm, and the weights of each federation as safetensors. At the end it prints each
+    task's train_s, the CPU time that a vehicle trained in a round, in the median; times.json has each vehicle's.
     """
     use_threads(1)
     from flcav.cli.steps import live_steps

@@ -30,7 +30,7 @@ def count(work: Work, start: int) -> int:
     return start
 
 
-def take(work: Work, **given: object) -> int:
+def count_arguments(work: Work, **given: object) -> int:
     return len(given)
 
 
@@ -161,8 +161,12 @@ def test_a_folder_of_another_configuration_is_refused(tmp_path):
 
 def edited(budget_mb: float, weight: float = 1.0) -> list[Step]:
     """Return steps of which two are given settings, and one what the first gives."""
-    first = Step("first", take, {"start": 1, "settings": {"budgets_mb": {"wireless": budget_mb}}})
-    return [first, Step("second", take, {"weight": weight}), Step("third", take, {"need": "first"}, needs=("first",))]
+    first = Step("first", count_arguments, {"start": 1, "settings": {"budgets_mb": {"wireless": budget_mb}}})
+    return [
+        first,
+        Step("second", count_arguments, {"weight": weight}),
+        Step("third", count_arguments, {"need": "first"}, needs=("first",)),
+    ]
 
 
 def test_after_an_edit_the_steps_it_concerns_are_named_with_their_fields_and_done_anew(tmp_path: Path):

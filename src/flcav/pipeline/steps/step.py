@@ -112,7 +112,11 @@ class Record:
 
     @classmethod
     def of(
-        cls, fingerprint: str, code: Mapping[str, str], needs: Iterable["Record"], asked: Mapping[str, Any] | None = None
+        cls,
+        fingerprint: str,
+        code: Mapping[str, str],
+        needs: Iterable["Record"],
+        asked: Mapping[str, Any] | None = None,
     ) -> "Record":
         """Return the record of a step done by `code`, where the steps it needs have the records `needs`."""
         return cls(fingerprint, code, digest([sorted(code.items()), *(need.lineage for need in needs)]), asked)
