@@ -7,12 +7,13 @@ aliases stand for are bounded before anything is built of them, and names lead n
 import json
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path, PureWindowsPath
-from typing import Any, ClassVar, TypeVar, get_args
+from types import NoneType
+from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
 from flcav.files import Json
@@ -54,6 +55,16 @@ class Config(BaseModel):
     document: ClassVar[str | None] = None  # key of DOCUMENTS: the kind of file that holds this configuration
     magnitudes: ClassVar[tuple[float, float]] = (0.0, 1e15)  # limits of |x| of every float x other than 0
 
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_booleans(cls, values: Any) -> Any:
+        """Refuse YAML's `yes` and `no` for numbers, which Python takes for 1 and 0."""
+        for name, value in values.items() if isinstance(values, dict) else ():
+            field = cls.model_fields.get(name)
+            if field is not None and _holds_boolean(value) and _leaf_types(field.annotation) <= {int, float}:
+                raise ValueError(f"'{name}' is true or false (yes, no, on, off), and a number is wanted")
+        return values
+
     @field_validator("*", mode="after")
     @classmethod
     def _check_magnitude(cls, value: Any) -> Any:
@@ -62,6 +73,23 @@ class Config(BaseModel):
             if number and not least <= abs(number) <= most:
                 raise ValueError(f"a number's size, sign apart, must be from {least:g} to {most:g}, or 0")
         return value
+
+
+def _holds_boolean(value: object) -> bool:
+    if isinstance(value, list | tuple):
+        return any(map(_holds_boolean, value))
+    return isinstance(value, bool) or (isinstance(value, dict) and any(isinstance(v, bool) for v in value.values()))
+
+
+def _leaf_types(annotation: Any) -> set[Any]:
+    """Return the types that an annotation is made of; None and the keys of mappings are left out."""
+    origin = get_origin(annotation)
+    if origin in (Literal, Callable):
+        return {annotation}
+    keys = int(isinstance(origin, type) and issubclass(origin, Mapping))
+    parts = [part for part in get_args(annotation)[keys:] if isinstance(part, type) or get_args(part)]
+    leaves = (_leaf_types(part) for part in parts if part is not NoneType)
+    return set().union(*leaves) if parts else {annotation}
 
 
 def _list_floats(value: object) -> Iterator[float]:
@@ -103,6 +131,8 @@ def parse_config(model: type[ConfigT], values: object, origin: str) -> ConfigT:
 
     Raises `InputError` that names `origin`, the field, its value and the violated rule.
     """
+    if values is None:
+        raise InputError(f"{origin}: is empty")
     if not isinstance(values, dict):
         found = "text" if isinstance(values, str) else type(values).__name__
         raise InputError(f"{origin}: expected a mapping of fields, found {found}")
@@ -138,6 +168,8 @@ def read_yaml(path: Path, loader: type[Loader] = Loader) -> object:
 def _check_exists(path: Path) -> None:
     if not path.exists():  # nor does a link to itself lead anywhere
         raise InputError(f"{path}: no such file")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, and a file is wanted")
 
 
 def _check_yaml(text: str) -> None:
@@ -274,6 +306,8 @@ def describe_error(error: ValidationError, model: type[BaseModel]) -> str:
         message = describe_number(str(first["input"]), field)
     elif first["type"] in ("less_than", "less_than_equal") and 1 in first.get("ctx", {}).values():
         message += hint_share(float(first["input"]))
+    if not first["loc"]:
+        return f"{message}{more}"
     return f"field '{field}' = {shorten(first['input'])}: {message}{more}"
 
 

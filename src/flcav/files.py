@@ -1,6 +1,7 @@
 """Atomic and durable file writing, JSON files and SHA-256 checksums."""
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -25,6 +26,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     and on return it has its name on the disk, too. Creates missing parent folders. An `OSError` without a file name,
     such as one raised by a write, is raised on with `path` as its file name.
     """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

@@ -37,11 +37,11 @@ def describe_number(text: str, field: str) -> str:
     if found is None:
         return "must be a number"
     amount, unit = float(found[1]), found[2].lower()
-    if unit == "%":
-        return f"must be a number, without the unit: {amount / 100:g}"
     own = next((part.rsplit("_", 1)[1] for part in reversed(field.split(".")) if _unit_of(part)), None)
+    if own is None and unit == "%":
+        return f"must be a number, without the unit: {amount / 100:g}"
     if own is None:
-        return f"must be a number, without a unit: {amount:g}"
+        return "must be a number, without a unit"
     if unit not in UNITS[own]:
         return f"must be a number of {NAMES[own]}, without a unit"
     return f"must be a number of {NAMES[own]}, without the unit: {amount * UNITS[own][unit]:.10g}"

@@ -50,7 +50,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "towns import": {},
     "record": {"--frames": ALWAYS, "--seed": ALWAYS, "--jobs": ALWAYS, "--engine": ALWAYS},
     "validate": {},
-    "birdseye": {"--frame": ALWAYS, "--range": ALWAYS},
+    "birdseye": {"--frame": ALWAYS, "--range": ALWAYS, "--tracks": ALWAYS},
     "camera": {"--frame": ALWAYS, "--camera": ALWAYS, "--boxes": ALWAYS},
     "view": {"--scene": ALWAYS, "--save": ALWAYS},
     "export": {  # which format takes which is said beside the formats

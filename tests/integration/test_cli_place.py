@@ -73,7 +73,7 @@ def test_a_certificate_is_verified_and_one_that_does_not_hold_is_exit_1(files, b
     monkeypatch.setattr(solve, "bound_by", claimed)
     assert asked(files, "--verify") == (by < 1)
     told = capsys.readouterr().out
-    assert "recomputed: 5 at the cost 1; its dual alone proves 5, a gap of" in told
+    assert "recomputed: 5 with 1 of the sensors; its dual alone proves 5, a gap of" in told
     assert ("does not hold: the dual's bound" in told) == (by < 1)
     assert asked(files, "--verify", "--json") == (by < 1)
     assert bool(json.loads(capsys.readouterr().out)["verification"]["faults"]) == (by < 1)

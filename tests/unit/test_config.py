@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field
 
-from flcav.config import Config, InputError, parse_config, read_json
+from flcav.config import Config, InputError, parse_config, read_config, read_json
 
 
 class Circle(Config):
@@ -87,3 +87,26 @@ def test_what_is_no_mapping_is_refused() -> None:
 def test_numbers_of_mappings_have_a_size_that_can_be_computed_with():
     with pytest.raises(InputError, match=r"field 'paint' = .*: a number's size, sign apart, must be from 0 to 1e"):
         parse_config(Picture, {"shapes": [{"kind": "circle", "radius_m": 1}], "paint": {"a": {"b": 1.7e308}}}, "test")
+
+
+def test_yes_and_no_are_no_numbers():
+    class Numbers(Config):
+        amount: float
+        counts: tuple[int, ...] = ()
+        by_name: Mapping[str, float] | None = None
+        least: int | None = None
+        shown: bool = False
+        rounds: int | Literal["all"] | bool = 1
+
+    assert Numbers(amount=1, shown=True, rounds=True).shown
+    for field, value in (("amount", True), ("counts", [1, False]), ("by_name", {"a": True}), ("least", True)):
+        with pytest.raises(InputError, match=f"'{field}' is true or false .yes, no, on, off., and a number is wanted"):
+            parse_config(Numbers, {"amount": 1.0, field: value}, "numbers.yaml")
+
+
+def test_an_empty_file_and_a_folder_are_called_so(tmp_path: Path):
+    (tmp_path / "empty.yaml").write_text("")
+    with pytest.raises(InputError, match=r"empty\.yaml: is empty"):
+        read_config(Config, tmp_path / "empty.yaml")
+    with pytest.raises(InputError, match="is a folder, and a file is wanted"):
+        read_config(Config, tmp_path)

@@ -24,7 +24,7 @@ def test_the_closest_known_name_is_suggested_if_it_is_close() -> None:
         ("1 Gbit/s", "uplink_mbps.car0", "of Mbit/s, without the unit: 1000"),
         ("2 GB", "horizon_s", "of s, without a unit"),
         ("55%", "accuracy", ", without the unit: 0.55"),
-        ("10 MB", "resource", ", without a unit: 10"),
+        ("10 MB", "resource", ", without a unit"),
         ("many", "budgets_mb.wireless", ""),
     ],
 )

@@ -24,6 +24,7 @@ from flcav.config import InputError
 from flcav.wording import describe_number, suggest
 
 INTERRUPTED = 130
+WRONG_PATHS = (errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ELOOP)  # a named file is missing, or is none
 LONGEST = 1000  # characters of a message
 
 atexit.register(gc.freeze)  # searching all modules for garbage would take a second before the process ends
@@ -97,8 +98,7 @@ def run(arguments: list[str] | None = None) -> None:
         code = 2
     except OSError as error:
         _say(f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror or error))
-        missing = isinstance(error, FileNotFoundError | IsADirectoryError) or error.errno == errno.ELOOP
-        code = 2 if missing else 1  # a named file is missing
+        code = 2 if error.errno in WRONG_PATHS else 1
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -113,7 +113,8 @@ def _describe(error: click.ClickException) -> str:
     if isinstance(kind, click.Choice):
         return told.removesuffix(".") + suggest(given[1], map(str, kind.choices))
     if isinstance(kind, click.types.FloatParamType):
-        return told.replace("is not a valid float.", describe_number(given[1], error.param.name or ""))
+        said = describe_number(given[1], error.param.name or "")
+        return re.sub(r"is not a valid float( range)?\.", lambda _: said, told)
     return told
 
 

@@ -99,8 +99,8 @@ ENGINE = typer.Option(Engine.processes, "--engine", help="Backend: processes on 
 STALE = typer.Option(
     Stale.refuse,
     "--stale",
-    help="Steps in the folder that were done by other code or, after an edit of the recipe, by other settings, and those "
-    "built on them: refuse the folder, redo these steps alone, or keep those of other code.",
+    help="Steps in the folder that were done by other code or, after an edit of the recipe, by other settings, and "
+    "those built on them: refuse the folder, redo these steps alone, or keep those of other code.",
 )
 
 

@@ -36,7 +36,8 @@ def _read_csv(path: Path, names: Sequence[str]) -> pa.Table:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a table ({error})") from None
+        said = str(error) if str(error).isprintable() else "its bytes are no text"
+        raise InputError(f"{path}: not a table ({said})") from None
     for name in {*names}.intersection(table.column_names):
         text = table[name]
         try:

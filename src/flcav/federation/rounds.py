@@ -16,6 +16,7 @@ from flwr.serverapp import Grid
 from flwr.serverapp.strategy import Strategy as FlowerStrategy
 from numpy.typing import NDArray
 
+from flcav.config import InputError
 from flcav.federation.acceptance import Expected, ReplyRefused, extra_forms, read_masked, read_norm, read_update
 from flcav.federation.attendance import Attendance, ClientFailed
 from flcav.federation.encoding import unflatten
@@ -50,6 +51,7 @@ from flcav.federation.trainable import LocalUpdate, Weights, forms_of, learned_n
 
 OnRound = Callable[[int, Weights, float | None], None]  # aggregated round, its weights, mean training loss
 AnswerT = TypeVar("AnswerT")
+WHOLE = (1, 1.0)  # samples and loss of the one update that a strategy is given where the server averages them itself
 ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere; Flower's own limit for updates
 Away = Callable[[int], Mapping[str, str]]  # of a round, by client why it is not there when the round begins
 
@@ -338,7 +340,7 @@ class Rounds(FlowerStrategy):
         """Return the weights after round `number`, and change the strategy's state."""
         privacy, start, updates, each = self._rules.privacy, self._expected.start, received.updates, received.combinable
         if self._rules.secure is not None:
-            each = [LocalUpdate(self._average_securely(updates, self._rules.secure), 1, 0.0)]
+            each = [LocalUpdate(self._average_securely(updates, self._rules.secure), *WHOLE)]
         elif privacy is not None and not privacy.local:
             sent = self._rules.upload.exchanged(start)
             names = [name for name in learned_names(start) if name in sent]
@@ -348,20 +350,23 @@ class Rounds(FlowerStrategy):
             work = self._work(number)
             key = None if privacy.seeded else self._key("noise", work)
             mean = average_privately(start, each, names, privacy, expected, work.seed, key)
-            each = [LocalUpdate(mean, 1, 0.0)]
+            each = [LocalUpdate(mean, *WHOLE)]
         elif self._rules.selection.weighs and updates:
             weights = {name: self._shares[name] / self._drawn[name] for name in updates}
-            each = [LocalUpdate(average_inversely(start, updates, weights), 1, 0.0)]
+            each = [LocalUpdate(average_inversely(start, updates, weights), *WHOLE)]
         if not each:
             return start
-        if isinstance(self._strategy, Stateful):
-            weights, after = self._strategy.step(start, each, self._state.server, len(self._names))
-            self._state.server = {name: np.asarray(array) for name, array in after.items()}
-        else:
-            weights = self._strategy.combine(start, each)
+        name = type(self._strategy).__name__
+        try:
+            if isinstance(self._strategy, Stateful):
+                weights, after = self._strategy.step(start, each, self._state.server, len(self._names))
+                self._state.server = {name: np.asarray(array) for name, array in after.items()}
+            else:
+                weights = self._strategy.combine(start, each)
+        except ValueError as error:
+            raise InputError(f"strategy {name}, round {number}: {error}") from error
         if forms_of(weights) != forms_of(start):
-            name = type(self._strategy).__name__
-            raise ValueError(f"{name} returned arrays of other names, shapes or types than the round started from")
+            raise InputError(f"{name} returned arrays of other names, shapes or types than the round started from")
         return weights
 
     def configure_evaluate(

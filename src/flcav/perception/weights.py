@@ -59,8 +59,10 @@ def save_network(
 def load_network(task: Task[ConfigT, NetworkT, SampleT], path: Path | str) -> NetworkT:
     """Return the network that `save_network` wrote, in evaluation mode on the CPU.
 
-    Raises `InputError` for any other file, and for weights that are not finite.
+    Raises `InputError` for any other file, for weights that are not finite, and for the name of a task.
     """
+    if isinstance(task, str):
+        raise InputError(f"load_network: a task is wanted, flcav.task_named({task!r}), not its name")
     path = Path(path)
     config, tensors = _read(task, path)
     try:
@@ -135,7 +137,7 @@ def _adapter(task: Task) -> TypeAdapter[Any]:
 
 def _opened(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
     if not path.is_file():
-        raise InputError(f"{path}: no such file")
+        raise InputError(f"{path}: {'is a folder, and a file is wanted' if path.is_dir() else 'no such file'}")
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping

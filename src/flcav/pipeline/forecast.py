@@ -133,6 +133,7 @@ def _measure(graph: Graph, task: str) -> _Measured:
         (client,) = make_clients(learning, learning.config, {task: samples}).values()
         weights = to_arrays(network)
         client.train(weights, steps=1, learning_rate=1e-4, seed=0)  # compiles
+        score_network(learning.task, network, split.data, split.vehicles[:1])
         began = time.perf_counter()
         client.train(weights, steps=STEPS, learning_rate=1e-4, seed=0)
         trained, frames = time.perf_counter(), split.vehicles
@@ -152,6 +153,9 @@ def _record_scene(graph: Graph, task: str, folder: Path) -> tuple[Frames, int, f
         split = Frames.open(folder)
         return split, len(split.vehicles) * len(pools), 0.0
     asked = make_recording_recipe(recipe, region, "pool", task, name)
+    first = asked.model_copy(update={"scenes": 1, "spins_per_scene": 1, "cavs": 1, "window_s": 0.0, "frames": None})
+    with tempfile.TemporaryDirectory() as unused:  # compiles what the recording calls
+        record_frames(first, graph.beside, Path(unused) / "first", ignore_progress)
     began = time.perf_counter()
     record_frames(asked.model_copy(update={"scenes": 1}), graph.beside, folder, ignore_progress).save(folder)
     split = Frames.open(folder)

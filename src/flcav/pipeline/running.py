@@ -10,7 +10,7 @@ from flcav.pipeline.collecting.collect import collect_results
 from flcav.pipeline.collecting.history import make_history_points
 from flcav.pipeline.federations.records import save_rounds
 from flcav.pipeline.graph.graph import Graph
-from flcav.pipeline.recipe import RunRecipe
+from flcav.pipeline.recipe import RunRecipe, load_run_recipe
 from flcav.pipeline.results.run import Run, Summary
 from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.seeds.spread import list_spreads
@@ -22,7 +22,7 @@ WORK, RESULTS, SUMMARY, HISTORY, SPREAD = "work", "results.json", "summary.json"
 
 
 def run(
-    recipe: RunRecipe,
+    recipe: RunRecipe | Path | str,
     out: Path | str,
     *,
     beside: Path | str | None = None,
@@ -31,7 +31,7 @@ def run(
     stale: Stale = "refuse",
     engine: str = "processes",
 ) -> Run:
-    """Run or finish a recipe in the folder `out`; write its results there, and return them.
+    """Run or finish a recipe, or that in a YAML file, in the folder `out`; write its results there, and return them.
 
     The files are results.json, history.csv, ledgers, rounds.parquet, and TensorBoard's event files.
 
@@ -55,9 +55,9 @@ def run(
     >>> test.measure, test.frames, result.arms["main"].links["wireless"].used_mb < 9
     ('accuracy', 2, True)
     """
-    out = Path(out)
+    out, recipe = Path(out), recipe if isinstance(recipe, RunRecipe) else load_run_recipe(recipe)
     if (out / RESULTS).exists():
-        Run.load(out, RESULTS)  # raises for results of another version
+        Run.load(out)  # raises for results of another version
     graph, clock = Graph(recipe, Path(beside or ".")), stopwatch(out / WORK)
     check_federations(recipe, graph.settings.values())
     tell_rigs([graph], notify)

@@ -55,7 +55,7 @@ def test_costs_are_those_of_ledgers_and_tests(run: Run):
 
 def test_the_report_has_a_table_of_arms_and_one_of_many_undecided_claims(run: Run):
     shown = html.render(page(run), {"gain": b""})
-    assert "What each arm costs and gains" in shown
+    assert "Cost and gain of each arm" in shown
     assert f"<td>{list_arm_costs(run)[0].gain:+.3f}</td>" in shown
     undecided = [each for each in run.findings if each.verdict == "undecided"]
     assert len(undecided) > 3

@@ -186,8 +186,8 @@ def test_after_an_edit_the_steps_it_concerns_are_named_with_their_fields_and_don
         with pytest.raises(InputError) as refusal:
             start(80.0, stale=stale)
         assert str(refusal.value) == (
-            f"{tmp_path}: did first by another configuration (budgets_mb.wireless: 80.0, was 60.0); third on top of that; "
-            "choose another folder, or --stale redo to do that again and keep 1 other step"
+            f"{tmp_path}: did first by another configuration (budgets_mb.wireless: 80.0, was 60.0); third on top of "
+            "that; choose another folder, or --stale redo to do that again and keep 1 other step"
         )
     assert start(60.0) == []
     assert start(80.0, stale="redo") == ["first", "third"]

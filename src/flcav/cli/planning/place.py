@@ -134,7 +134,8 @@ def place(
         )
     else:
         _show(given, np.diff(candidates.covers.indptr).tolist(), result, conventional, least)
-        typer.echo("\n".join([] if verified is None else verified.lines()), nl=verified is not None)
+        told = [] if verified is None else verified.lines(counted=count is not None or not given.priced)
+        typer.echo("\n".join(told), nl=verified is not None)
     if verified is not None and verified.faults:
         raise typer.Exit(1)
 

@@ -44,7 +44,7 @@ def import_dataset(
     if name not in READABLE:
         raise InputError(f"format '{name}': cannot be imported; known formats: {', '.join(READABLE)}")
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
+        raise InputError(f"{folder}: {'is a file, and a folder is wanted' if folder.exists() else 'no such folder'}")
     shown = [each for each in READABLE if _shows(folder, each)]
     if shown and name not in shown:
         raise InputError(f"{folder}: is no folder of '{name}' but of '{shown[0]}'")

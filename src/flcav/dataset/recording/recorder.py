@@ -48,7 +48,7 @@ from flcav.files import Json, flush_all, sha256, write_bytes, write_json
 from flcav.machine.locks import LOCK, only_writer
 from flcav.progress import DAMAGED, Report, print_progress
 from flcav.sources.embedded import EmbeddedSource
-from flcav.sources.recipe import Recipe
+from flcav.sources.recipe import Recipe, load_recipe
 from flcav.sources.source import Source, TownSource
 
 Header = Mapping[str, Mapping[str, Json]]  # "recipe" -> description of the source, "versions" -> of packages
@@ -57,14 +57,14 @@ ENGINES = {"processes": start_processes, "ray": start_ray_engine}
 
 
 def record(
-    source: Source | Recipe,
+    source: Source | Recipe | Path | str,
     out: Path | str,
     *,
     jobs: int = 1,
     engine: str = "processes",
     progress: Report = print_progress,
 ) -> bool:
-    """Record a source, or the built-in simulator with a recipe, into the folder `out`.
+    """Record a source, or the built-in simulator with a recipe or that in a YAML file, into the folder `out`.
 
     `jobs` workers of the `engine`, one of ENGINES, do the work. Returns True if anything was recorded, False if `out`
     already held this very dataset. An interrupted recording of the same source is resumed. A dataset is mended, see
@@ -82,6 +82,8 @@ def record(
         raise InputError(f"jobs = {jobs}: must be at least 1")
     if engine not in ENGINES:
         raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
+    if isinstance(source, Path | str):
+        source = load_recipe(source)
     if isinstance(source, Recipe):
         source = EmbeddedSource(source)
     out = Path(out)

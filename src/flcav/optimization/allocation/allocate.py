@@ -7,12 +7,14 @@ the first two have a proven lower bound. Source: Wang et al., IEEE Network 37(3)
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.network.plan import Price
 from flcav.optimization.curves.curves import Curve, Shared
+from flcav.optimization.graph import load_problem
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.area import area, maximise_area
 from flcav.optimization.solvers.branches import solve_branches
@@ -92,21 +94,23 @@ class _Best:
     dual: Dual | None
 
 
-def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = ()) -> Allocation:
+def allocate(problem: Problem | Path | str, *, gap: float = 1e-4, clocks: Sequence[Clock] = ()) -> Allocation:
     """Return the best plan within both budgets, with its certificate: MLGRA of Wang et al., IEEE Network 37(3), 2023.
 
-    It is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS` tasks. Robust plans minimise the upper
-    bands of the learning curves. `marginal_error_per_gb` is the derivative of the continuous optimum by each budget,
-    times 1000 MB: a shadow price at these budgets, not a forecast of what 1000 MB more bring, for which see
-    `budget_sweep.compute_savings`. Of limits of time only the problem's `shared_clock` and `clocks` are kept; for those
-    of vehicles with names see `fleet.allocate_fleet`. Raises `Infeasible`, naming the budget, the cost of the least
-    plan within the limits and the excess, and `InputError` where the solver cannot handle the problem's numbers.
+    The problem is given, or its file. The plan is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS`
+    tasks. Robust plans minimise the upper bands of the learning curves. `marginal_error_per_gb` is the derivative of
+    the continuous optimum by each budget, times 1000 MB: a shadow price at these budgets, not a forecast of what
+    1000 MB more bring, for which see `budget_sweep.compute_savings`. Of limits of time only the problem's
+    `shared_clock` and `clocks` are kept; for those of vehicles with names see `fleet.allocate_fleet`. Raises
+    `Infeasible`, naming the budget, the cost of the least plan within the limits and the excess, and `InputError` where
+    the solver cannot handle the problem's numbers.
 
     >>> from flcav import allocate, load_problem
     >>> plan = allocate(load_problem("recipes/allocation/objects.yaml"))
     >>> plan.status, plan.tasks[0].name, plan.used_mb.wireless_mb <= 4000
     ('optimal', 'objects', True)
     """
+    problem = problem if isinstance(problem, Problem) else load_problem(problem)
     asked = resolve_problem(problem)
     sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
     method = _METHODS[problem.objective]

@@ -68,7 +68,8 @@ def load_history(path: Path | str) -> History:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a table ({error})") from None
+        said = str(error) if str(error).isprintable() else "its bytes are no text"
+        raise InputError(f"{path}: not a table ({said})") from None
     found = parse_histories(table.to_pydict(), str(path), Path(path).stem)
     if len(found) != 1:
         told = ", ".join(found) or "none"

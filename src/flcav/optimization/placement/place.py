@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.optimization.placement.cheapest import cover_share
 from flcav.optimization.placement.instance import find_covered
 from flcav.optimization.placement.solve import Method, Placement, find_candidates, place_budget, place_count
@@ -58,7 +58,13 @@ def place(
         raise InputError("budget: nothing has a cost; give sensor_cost or pole_cost")
     if traces and town is None:
         raise InputError("traces: traffic is in the way where the town is given alone")
-    ranges = np.atleast_1d(np.asarray(range_m, dtype=np.float64))
+    if count is not None and not isinstance(count, int | np.integer):
+        raise InputError(f"count = {shorten(count)}: must be a whole number")
+    try:
+        ranges = np.atleast_1d(np.asarray(range_m, dtype=np.float64))
+        sensor_cost = None if sensor_cost is None else np.atleast_1d(np.asarray(sensor_cost, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"range_m, sensor_cost: numbers are wanted, or lists of them ({error})") from None
     asked = partial(find_candidates, errors, poles, ranges, weight=weight, pole_cost=pole_cost, sensor_cost=sensor_cost)
     candidates = asked()
     if town is not None:

@@ -18,14 +18,15 @@ class Verification:
     faults: tuple[str, ...]  # what is stated and does not hold; none: the certificate holds
     trusted: tuple[str, ...]  # on what the certificate rests beside the dual
 
-    def lines(self) -> list[str]:
-        """Return the verification in words."""
+    def lines(self, *, counted: bool = False) -> list[str]:
+        """Return the verification in words; `counted`: the cost is a number of sensors."""
         proof = "there is no bound for this objective: nothing is proven"
         if self.bound is not None:
             proof = f"its dual alone proves {self.bound:.9g}, a gap of {100 * (self.gap or 0.0):.3g} %"
         cost = " and ".join(f"{each:.9g}" for each in self.cost)
+        spent = f"with {cost} of the sensors" if counted else f"at the cost {cost}"
         return [
-            f"recomputed: {self.objective:.9g} at the cost {cost}; {proof}",
+            f"recomputed: {self.objective:.9g} {spent}; {proof}",
             *(f"trusted: {each}" for each in self.trusted),
             *(f"does not hold: {each}" for each in self.faults),
         ]

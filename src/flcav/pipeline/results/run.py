@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from flcav.intervals import Estimate, MeanOverSeeds
 from flcav.pipeline.provenance import Provenance
@@ -89,8 +89,9 @@ class ArmCost(Record):
 
 @dataclass(frozen=True)
 class Run(Saved):
-    """Results of a finished run."""
+    """Results of a finished run; `Run.load(folder)` reads them back."""
 
+    file: ClassVar[str] = "results.json"
     recipe: RunRecipe
     arms: Mapping[str, ArmResult]
     pretrained: tuple[Pretrained, ...]  # of the run itself
@@ -127,6 +128,7 @@ class Mean:
 class Summary(Saved):
     """Means over several seeds of a recipe; verdicts are corrected together, on primary claims apart from others."""
 
+    file: ClassVar[str] = "summary.json"
     seeds: tuple[int, ...]
     measures: tuple[Mean, ...]
     differences: tuple[Mean, ...]

@@ -1,7 +1,7 @@
 """Results as JSON in the folders of their steps, and the names of the files beside them."""
 
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 from flcav.config import read_json
 from flcav.files import write_json
@@ -14,11 +14,14 @@ WEIGHTS, LEDGER, ERRORS, OUTCOMES = "weights.safetensors", "ledger.parquet", "er
 class Saved(Record):
     """A record that is saved as JSON in a folder."""
 
-    def save(self, folder: Path, name: str = RESULT) -> None:
+    file: ClassVar[str] = RESULT  # its name there, unless another is given
+
+    def save(self, folder: Path | str, name: str | None = None) -> None:
         """Write the record to `folder`, atomically; tasks and regions stay in their order."""
-        write_json(folder / name, self.as_json(), sort=False)
+        write_json(Path(folder) / (name or self.file), self.as_json(), sort=False)
 
     @classmethod
-    def load(cls, folder: Path, name: str = RESULT) -> Self:
+    def load(cls, folder: Path | str, name: str | None = None) -> Self:
         """Return what `save` wrote; raises `InputError` where it is not there, or of another version."""
-        return cls.from_json(read_json(folder / name), str(folder / name))
+        path = Path(folder) / (name or cls.file)
+        return cls.from_json(read_json(path), str(path))

@@ -78,8 +78,8 @@ def run_steps(
     a Ray cluster, see `flcav.pipeline.steps.cluster`. Of the processes, those that no step waits for are lent to steps
     that can make use of several, until these end. Steps begun or finished by other code are refused, done again
     ("redo") or kept ("keep", their records unchanged); those of other arguments, and what needs them, are done again by
-    "redo" and else refused. Raises `InputError` for what is refused, and where another process runs steps in the folder;
-    `OSError` where a worker was killed.
+    "redo" and else refused. Raises `InputError` for what is refused, and where another process runs steps in the
+    folder; `OSError` where a worker was killed.
     """
     with only_writer(folder):
         plan = _plan_steps(steps, folder, notify, stale, Sources())

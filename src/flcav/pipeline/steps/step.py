@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flcav.config import Config, InputError, read_json, shorten
+from flcav.config import SHOWN, Config, InputError, read_json, shorten
 from flcav.files import flush_tree, write_json
 from flcav.progress import Report, print_progress
 from flcav.wording import plural
@@ -93,7 +93,7 @@ def _fields(value: Any) -> dict[str, Any]:
 
 
 def _flatten(values: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values within nested JSON objects by dotted names, "settings" and "recipe" at the beginning left out."""
+    """Yield the values within nested JSON objects by dotted names, without a leading "settings" or "recipe"."""
     if not isinstance(values, dict) or not values:
         yield name, values
         return
@@ -244,7 +244,8 @@ def describe_differences(held: Record, wanted: Record) -> list[str]:
 
 
 def _said(value: Any) -> str:
-    return shorten(json.dumps(value, ensure_ascii=False))
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= SHOWN else shorten(text)
 
 
 def _some(names: Sequence[str]) -> str:

@@ -1,0 +1,6 @@
+"""`python -m flcav`: the command line."""
+
+from flcav.cli.main import run
+
+if __name__ == "__main__":
+    run()
