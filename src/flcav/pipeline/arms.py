@@ -137,8 +137,14 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
     """Raise `InputError` where an arm's strategies and rules do not go together, or not with so many vehicles.
 
     Raises it also where a pose graph is asked for without GTSAM. The vehicles of regions of recorded data are not known
-    before their frames are dealt.
+    before their frames are dealt; and for a horizon that no plan is made by.
     """
+    settings = [*settings]
+    if recipe.horizon_s is not None and not any(_learns(recipe, setting.plan) for setting in settings):
+        raise InputError(
+            "horizon_s: every task has a fixed plan, so that nothing is planned by time; give a task a 'history' in "
+            "place of its 'plan', or leave horizon_s out and have rounds timed by 'federation.network'"
+        )
     for setting in settings:
         try:
             _check_federation(recipe, setting)

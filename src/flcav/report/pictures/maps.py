@@ -146,7 +146,7 @@ def _plot_errors(axes: Axes, scene: ErrorMap) -> None:
         for kind, (label, look) in looks.items():
             if (own := (scene.kind == kind) & chosen).any():
                 name = f"{label}{state} ({own.sum()})"
-                axes.plot(*scene.errors[own, :2].T, linestyle="none", label=name, **{**look, **colour})
+                axes.plot(*scene.errors[own, :2].T, linestyle="none", label=name, zorder=5.5, **{**look, **colour})
 
 
 def _plot_poles(axes: Axes, scene: ErrorMap) -> None:
@@ -167,9 +167,10 @@ def _plot_poles(axes: Axes, scene: ErrorMap) -> None:
         axes.plot(x, y, shape, markersize=size, **look)
         if not small:
             axes.text(x, y, number, ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
-        if label not in known:
-            axes.plot([], [], "o", markersize=7, label=label, **look)
-            known.add(label)
+        for name, sign in ((label, "o"), *((("of a conventional rule", "s"),) if shape == "s" else ())):
+            if name not in known:
+                axes.plot([], [], sign, markersize=7, label=name, **look)
+                known.add(name)
 
 
 def draw_density(axes: Axes, scene: ErrorMap) -> None:
