@@ -24,14 +24,14 @@ from pathlib import Path
 
 from flcav.files import sha256
 from flcav.machine.threads import use_threads
-from flcav.pipeline.federations.alone import WORK, list_needed
+from flcav.pipeline.alone import WORK, list_needed
+from flcav.pipeline.engine import Step, ignore_steps, run_steps
+from flcav.pipeline.engine.engines import perform
+from flcav.pipeline.engine.step import Record, read_record
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, load_run_recipe
 from flcav.pipeline.results.saved import LEDGER, RESULT, WEIGHTS
-from flcav.pipeline.steps import Step, ignore_steps, run_steps
-from flcav.pipeline.steps.engines import perform
-from flcav.pipeline.steps.step import Record, read_record
 from flcav.progress import ignore_progress
 from flcav.seeds import stream
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from flcav import pipeline
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.running import RESULTS
-from flcav.pipeline.seeds.spread import SpreadRow, list_spreads
+from flcav.pipeline.spread import SpreadRow, list_spreads
 from flcav.pipeline.tables import append_records
 
 PACKAGE = Path(pipeline.__path__[0])

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flcav.network.ledger import LedgerEntry
+from flcav.pipeline.engine import Work
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.steps import Work
 from flcav.progress import ignore_progress
 
 

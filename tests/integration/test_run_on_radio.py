@@ -9,7 +9,7 @@ from flcav.cli.main import run as command
 from flcav.experiments.run_tables import tables
 from flcav.network.clock.records import ClientTiming, load_rounds
 from flcav.network.ledger import Ledger
-from flcav.pipeline.federations.alone import TRAIN_TIMES, Federations, name_results
+from flcav.pipeline.alone import TRAIN_TIMES, Federations, name_results
 from flcav.pipeline.federations.network import TOO_SLOW
 from flcav.pipeline.federations.timing import TrainTimes
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe, load_run_recipe

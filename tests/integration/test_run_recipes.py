@@ -15,6 +15,8 @@ from flcav.federation.privacy import Privacy
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.pipeline.analysis.learning_history import ORIGIN, HistoryOrigin
+from flcav.pipeline.engine import Step, ignore_steps, run_side_by_side
 from flcav.pipeline.forecast import forecast_run
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.graph import Graph
@@ -39,9 +41,7 @@ from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.tests import Difference
 from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.running import RESULTS, run, run_several
-from flcav.pipeline.seeds.learning_history import ORIGIN, HistoryOrigin
 from flcav.pipeline.sizes import Split, Splits, Training
-from flcav.pipeline.steps import Step, ignore_steps, run_side_by_side
 from flcav.report.pages.run_page import page, write_report
 from flcav.verdicts import UNDECIDED
 from flcav.world.opendrive.importing import import_town

@@ -39,7 +39,8 @@ from flcav.network.clock.records import load_rounds
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import find_configuration
-from flcav.pipeline.federations.alone import federate_regions
+from flcav.pipeline.alone import federate_regions
+from flcav.pipeline.comparing import compare
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe, load_run_recipe
@@ -49,7 +50,6 @@ from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import FederatedRound, Pretrained, StageResult, Watched
 from flcav.pipeline.running import RESULTS, SUMMARY, run, run_seeds
-from flcav.pipeline.seeds.comparing import compare
 from flcav.report.pages.run_page import write_report
 from flcav.verdicts import ESTIMATE, UNDECIDED, verdict
 from flcav.world.map.town import load_town

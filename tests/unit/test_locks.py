@@ -21,10 +21,10 @@ from flcav.dataset.recording.recorder import record
 from flcav.machine import locks
 from flcav.machine.locks import only_writer
 from flcav.perception.training.run import train_prepared
+from flcav.pipeline.engine import Step, ignore_steps, run_side_by_side, run_steps
+from flcav.pipeline.engine.engines import perform
+from flcav.pipeline.engine.step import Record
 from flcav.pipeline.provenance import provenance
-from flcav.pipeline.steps import Step, ignore_steps, run_side_by_side, run_steps
-from flcav.pipeline.steps.engines import perform
-from flcav.pipeline.steps.step import Record
 from flcav.progress import ignore_progress
 from flcav.sources.recipe import Recipe
 from flcav.world.opendrive.importing import import_town

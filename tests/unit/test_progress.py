@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from flcav import progress
-from flcav.pipeline.steps import print_steps
+from flcav.pipeline.engine import print_steps
 from flcav.progress import DAMAGED, print_progress
 
 

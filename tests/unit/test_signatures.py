@@ -22,10 +22,10 @@ ALLOWED: Mapping[str, str] = {
     "flcav.config:read_yaml": UNCHECKED,
     "flcav.config:shorten": UNCHECKED,
     "flcav.lazy:lazy_names": OWN,
-    "flcav.pipeline.steps.run:run_steps": STEPS,
-    "flcav.pipeline.steps.step:Step.arguments": STEPS,
-    "flcav.pipeline.steps.step:Step.run": STEPS,
-    "flcav.pipeline.steps.step:Work.result": STEPS,
+    "flcav.pipeline.engine.run:run_steps": STEPS,
+    "flcav.pipeline.engine.step:Step.arguments": STEPS,
+    "flcav.pipeline.engine.step:Step.run": STEPS,
+    "flcav.pipeline.engine.step:Work.result": STEPS,
 }
 
 

@@ -11,8 +11,8 @@ from flcav.machine.threads import use_threads
 from flcav.wording import plural
 
 if TYPE_CHECKING:
+    from flcav.pipeline.engine import Notify
     from flcav.pipeline.results.training import StageResult
-    from flcav.pipeline.steps import Notify
 
 
 def register(app: typer.Typer) -> None:
@@ -44,7 +44,7 @@ def federate(
     use_threads(1)
     from flcav.cli.steps import live_steps
     from flcav.files import check_writable
-    from flcav.pipeline.federations.alone import TRAIN_TIMES, federate_regions, measure_times, name_results
+    from flcav.pipeline.alone import TRAIN_TIMES, federate_regions, measure_times, name_results
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.results.spending import TOGETHER
     from flcav.sources.recipe import find_recipe
@@ -85,7 +85,7 @@ def _describe(result: "StageResult") -> str:
 
 def _telling(notify: "Notify") -> "Notify":
     """Return a `Notify` that also prints the rounds as they end."""
-    from flcav.pipeline.federations.alone import tells_of_round
+    from flcav.pipeline.alone import tells_of_round
 
     def tell(step: str, done: int, total: int, note: str) -> None:
         of_round = tells_of_round(step, note)

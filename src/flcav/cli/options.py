@@ -60,7 +60,7 @@ class ImportFormat(StrEnum):
 
 
 class Engine(StrEnum):
-    """Execution engine, see `flcav.dataset.recording.recorder` and `flcav.pipeline.steps`."""
+    """Execution engine, see `flcav.dataset.recording.recorder` and `flcav.pipeline.engine`."""
 
     processes = "processes"
     ray = "ray"
@@ -74,7 +74,7 @@ class Runtime(StrEnum):
 
 
 class Stale(StrEnum):
-    """Treatment of steps that were done by other code, see `flcav.pipeline.steps`."""
+    """Treatment of steps that were done by other code, see `flcav.pipeline.engine`."""
 
     refuse = "refuse"
     redo = "redo"

@@ -127,7 +127,7 @@ def _run(
 
 
 def _tell(results: "list[Run]", summary: "Summary | None") -> None:
-    from flcav.pipeline.collecting.caveats import PLACED_BARE
+    from flcav.pipeline.analysis.caveats import PLACED_BARE
     from flcav.pipeline.results.spending import TOGETHER
 
     if summary is None:
@@ -160,7 +160,7 @@ def compare(
     for option, value in (("--task", task), ("--agents", agents)):
         if value is not None:
             raise InputError(f"{option}: only two networks have one, and without --data two runs are compared")
-    from flcav.pipeline.seeds.comparing import compare as compare_runs
+    from flcav.pipeline.comparing import compare as compare_runs
 
     rows = compare_runs(first, second)
     if as_json:

@@ -7,8 +7,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from flcav.federation.state import FAILED
+from flcav.pipeline.engine import FINISHED, Notify
 from flcav.pipeline.rigs import RIG
-from flcav.pipeline.steps import FINISHED, Notify
 from flcav.progress import DAMAGED
 from flcav.wording import plural
 

@@ -9,16 +9,16 @@ from flcav.experiments.cloud_rounds import cloud_tables
 from flcav.federation.state import FAILED
 from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
+from flcav.pipeline.analysis.findings import findings, name_stage
+from flcav.pipeline.analysis.home import list_home_costs
 from flcav.pipeline.arms import resolve_settings
-from flcav.pipeline.collecting.findings import findings, name_stage
-from flcav.pipeline.collecting.home import list_home_costs
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.plans import RoundPlan
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Finding
 from flcav.pipeline.results.training import StageResult
-from flcav.pipeline.seeds.spread import read_spreads, widen_anew
+from flcav.pipeline.spread import read_spreads, widen_anew
 
 
 def tables(run: Run) -> dict[str, str]:

@@ -5,19 +5,19 @@ from typing import TYPE_CHECKING
 from flcav.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from flcav.pipeline.comparing import Compared, compare
     from flcav.pipeline.forecast import Forecast, forecast_run
     from flcav.pipeline.recipe import RunRecipe, load_run_recipe
     from flcav.pipeline.results.run import Run, Summary
     from flcav.pipeline.running import run, run_seeds
-    from flcav.pipeline.seeds.comparing import Compared, compare
 
 PLACES = {
-    "Compared": "flcav.pipeline.seeds.comparing",
+    "Compared": "flcav.pipeline.comparing",
     "Forecast": "flcav.pipeline.forecast",
     "Run": "flcav.pipeline.results.run",
     "RunRecipe": "flcav.pipeline.recipe",
     "Summary": "flcav.pipeline.results.run",
-    "compare": "flcav.pipeline.seeds.comparing",
+    "compare": "flcav.pipeline.comparing",
     "forecast_run": "flcav.pipeline.forecast",
     "load_run_recipe": "flcav.pipeline.recipe",
     "run": "flcav.pipeline.running",

@@ -31,7 +31,7 @@ from flcav.pipeline.planning.updates import model_mb
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, SPLITS_OF, RunRecipe
 from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.stages.clients import make_clients
-from flcav.pipeline.work.planning import FirstPlanSettings, frame_plan
+from flcav.pipeline.steps.planning import FirstPlanSettings, frame_plan
 from flcav.progress import Report, ignore_progress
 from flcav.records import LEFT_OUT, Record
 from flcav.wording import plural

@@ -10,10 +10,10 @@ from flcav.perception.agents import choose_frames
 from flcav.perception.card import join_lidars, read_lidar
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
+from flcav.pipeline.engine import Notify
 from flcav.pipeline.frames import make_recording_recipe
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.recipe import SPLITS_OF
-from flcav.pipeline.steps import Notify
 
 RIG = "rig"  # reported in the place of a step
 

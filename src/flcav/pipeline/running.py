@@ -5,17 +5,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from flcav.config import InputError
+from flcav.pipeline.analysis.collect import collect_results
+from flcav.pipeline.analysis.history import make_history_points
+from flcav.pipeline.analysis.summary import summarise
 from flcav.pipeline.arms import check_federations
-from flcav.pipeline.collecting.collect import collect_results
-from flcav.pipeline.collecting.history import make_history_points
+from flcav.pipeline.engine import Notify, Stale, print_steps, run_side_by_side, run_steps, stopwatch
 from flcav.pipeline.federations.records import save_rounds
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import RunRecipe, load_run_recipe
 from flcav.pipeline.results.run import Run, Summary
 from flcav.pipeline.rigs import tell_rigs
-from flcav.pipeline.seeds.spread import list_spreads
-from flcav.pipeline.seeds.summary import summarise
-from flcav.pipeline.steps import Notify, Stale, print_steps, run_side_by_side, run_steps, stopwatch
+from flcav.pipeline.spread import list_spreads
 from flcav.pipeline.tables import append_records
 
 WORK, RESULTS, SUMMARY, HISTORY, SPREAD = "work", "results.json", "summary.json", "history.csv", "spread.csv"

@@ -1,7 +1,9 @@
 """What the pages tell to type exists: commands, their options, the recipe and the strategy of the tutorials."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import commands_page
 import numpy as np
@@ -10,7 +12,15 @@ import typer
 
 from flcav import load_run_recipe
 from flcav.cli.main import app
-from flcav.federation import LocalUpdate
+from flcav.config import InputError
+from flcav.federation import LocalUpdate, Update
+from flcav.federation.privacy import Privacy
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.stages import Schedule, federate
+from flcav.federation.strategies import Strategy
+from flcav.federation.trainable import Weights
+from flcav.network.ledger import Budget, Ledger
 
 ROOT = Path(__file__).parents[3]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -48,8 +58,44 @@ def test_the_recipe_of_the_tutorial_is_one(tmp_path: Path, monkeypatch: pytest.M
 
 def test_the_strategy_that_is_shown_is_one():
     page = (ROOT / "docs" / "how-to.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"^```python\n(# mine.py.*?|[^`]*class .*?)^```$", page, re.M | re.S)
+    (code,) = re.findall(r"^```python\n(from collections[^`]*class .*?)^```$", page, re.M | re.S)
     names: dict = {"__name__": "mine"}
     exec(compile(code, "how-to.md", "exec"), names)
     updates = [LocalUpdate({"w": np.full(2, float(i))}, samples=1, loss=float(i)) for i in (1, 2)]
     assert names["LossWeighted"]().combine({}, updates)["w"] == pytest.approx([9 / 5] * 2)
+
+
+class Fixed:
+    """A client whose update is a fixed number."""
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+
+    def train(self, weights: Weights, **how: Any) -> LocalUpdate:
+        return LocalUpdate({"w": np.full(4, self.value)}, 1, self.value)
+
+
+class Unable:
+    """A strategy that cannot combine what it is given."""
+
+    def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
+        raise ValueError("no mean of these")
+
+
+@pytest.mark.parametrize("privacy", [None, Privacy(clip=1.0, noise=1.0, seeded=True)])
+def test_the_strategy_that_is_shown_runs_under_central_noise_and_one_that_fails_is_a_sentence(privacy: Privacy | None):
+    page = (ROOT / "docs" / "how-to.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"^```python\n(from collections[^`]*class .*?)^```$", page, re.M | re.S)
+    names: dict = {"__name__": "mine"}
+    exec(compile(code, "how-to.md", "exec"), names)
+    start, schedule = {"w": np.zeros(4)}, Schedule(1, 1, 0.1, 0.1, seed=1)
+    clients = {f"cav{i}": Fixed(float(i)) for i in range(1, 4)}
+
+    def run(strategy: Strategy) -> Weights:
+        account = Account(Ledger(Budget(1.0, 1.0)), "edge", "walk", "wireless")
+        rules = Rules(privacy=privacy)
+        return federate(clients, start, schedule, account, strategy=strategy, rules=rules).weights
+
+    assert run(names["LossWeighted"]())["w"].any()
+    with pytest.raises(InputError, match="strategy Unable, round 1: no mean of these"):
+        run(Unable())

@@ -21,7 +21,7 @@ import yaml
 from flcav.config import read_json
 from flcav.files import Json
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.seeds.spread import read_spreads, widen_anew
+from flcav.pipeline.spread import read_spreads, widen_anew
 
 ROOT = Path(__file__).parents[3]
 TIES: Mapping[str, Any] = yaml.safe_load((ROOT / "reproductions" / "figures.yaml").read_text(encoding="utf-8"))

@@ -15,11 +15,11 @@ from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.checkpoint import LAST, Checkpoint
 from flcav.pipeline.federations.rounds import FederationCheckpoints
+from flcav.pipeline.learning import Learning
 from flcav.pipeline.recipe import CLOUD
 from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
-from flcav.pipeline.stages.learning import Learning
 from flcav.progress import ignore_progress
 
 

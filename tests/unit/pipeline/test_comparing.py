@@ -10,13 +10,13 @@ from test_run_recipe import parsed
 
 from flcav.intervals import Estimate, Spread
 from flcav.perception.outcomes import Outcomes
+from flcav.pipeline.comparing import compare
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import EDGE, MAIN
 from flcav.pipeline.results import tests
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.running import RESULTS, WORK
-from flcav.pipeline.seeds.comparing import compare
 from flcav.verdicts import HELD, UNDECIDED
 
 SCENES, PICTURES = 10, 20

@@ -26,6 +26,7 @@ from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies
 from flcav.pipeline.federations.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
+from flcav.pipeline.learning import Learning, load_stage_network
 from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
 from flcav.pipeline.recipe import Federation
 from flcav.pipeline.results.saved import WEIGHTS
@@ -35,7 +36,6 @@ from flcav.pipeline.stages import statistics
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
-from flcav.pipeline.stages.learning import Learning, load_stage_network
 from flcav.pipeline.stages.statistics import keep_statistics, score_statistics
 from flcav.progress import ignore_progress
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from flcav.intervals import Estimate, SharedScenes, Spread, mean_over_seeds
+from flcav.pipeline.analysis.findings import findings
+from flcav.pipeline.analysis.history import gap_closed, gaps_closed
 from flcav.pipeline.arms import resolve_settings
-from flcav.pipeline.collecting.findings import findings
-from flcav.pipeline.collecting.history import gap_closed, gaps_closed
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results import tests as results
 from flcav.pipeline.results.placement import Placed

@@ -15,15 +15,15 @@ from flcav.config import InputError
 from flcav.intervals import Estimate, Spread
 from flcav.perception.outcomes import Outcomes, compute_interval, compute_measure, difference
 from flcav.perception.tasks import task_named
-from flcav.pipeline.collecting.differences import list_differences
-from flcav.pipeline.collecting.history import gaps_closed
-from flcav.pipeline.collecting.tests import collect_test
+from flcav.pipeline.analysis.differences import list_differences
+from flcav.pipeline.analysis.history import gaps_closed
+from flcav.pipeline.analysis.tests import collect_test
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results import tests as results
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.training import StageResult, Watched
-from flcav.pipeline.work import testing
-from flcav.pipeline.work.testing import RoundsSettings, rounds_step
+from flcav.pipeline.steps import testing
+from flcav.pipeline.steps.testing import RoundsSettings, rounds_step
 from flcav.seeds import stream
 
 WEATHER = task_named("weather")

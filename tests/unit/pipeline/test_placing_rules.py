@@ -11,14 +11,14 @@ from flcav.config import InputError, parse_config
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
 from flcav.perception.errors import PerceptionError
+from flcav.pipeline.analysis.caveats import list_unreached
 from flcav.pipeline.arms import resolve_settings
-from flcav.pipeline.collecting.caveats import list_unreached
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.poles import Sites, find_passed, place_sensors
 from flcav.pipeline.recipe import EDGE, MAIN, Placement, RunRecipe
 from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.training import StageResult
-from flcav.pipeline.stages.placement import Sites, find_passed, place_sensors
 
 SITES = Sites(np.array([2, 5, 7, 9]), np.array([[0, 0, 6], [100, 0, 6], [200, 0, 6], [300, 0, 6]], dtype=np.float64))
 

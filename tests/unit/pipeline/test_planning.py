@@ -38,7 +38,7 @@ from flcav.pipeline.planning.stages import remake_plan
 from flcav.pipeline.planning.updates import model_mb
 from flcav.pipeline.recipe import FixedPlan, Limits, load_run_recipe
 from flcav.pipeline.results.plans import TaskPlan
-from flcav.pipeline.seeds.spread import read_spreads
+from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.tables import append_records
 
 RECIPES = Path(__file__).parents[3] / "recipes/runs"

@@ -10,8 +10,8 @@ from flcav.config import InputError
 from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
+from flcav.pipeline.analysis.collect import list_trainings
 from flcav.pipeline.arms import name_repeat
-from flcav.pipeline.collecting.collect import list_trainings
 from flcav.pipeline.federations.spent import Training, compose_trainings, plan_private_rounds
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, RunRecipe

@@ -23,6 +23,7 @@ from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.network import DrivenRounds
+from flcav.pipeline.learning import Learning
 from flcav.pipeline.planning.course import Course, Replanning
 from flcav.pipeline.planning.rounds import Follower, Planner, restrict_problem
 from flcav.pipeline.planning.stages import continue_joins, count_carried_out, remake_plan
@@ -35,7 +36,6 @@ from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages import edge as stage_two
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
-from flcav.pipeline.stages.learning import Learning
 from flcav.progress import Report, ignore_progress
 
 PREDICTED = {"pretrain": 0.4, "edge": 0.6, "cloud": 0.7}

@@ -10,8 +10,8 @@ from flcav.config import InputError
 from flcav.fusion.distillation import Distillation
 from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
+from flcav.pipeline.analysis.caveats import PLACED_BARE, list_caveats
 from flcav.pipeline.arms import resolve_settings
-from flcav.pipeline.collecting.caveats import PLACED_BARE, list_caveats
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels import pseudo_labels
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold, select_frames_near

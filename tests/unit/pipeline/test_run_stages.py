@@ -31,13 +31,13 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.checkpoint import find_checkpoint
 from flcav.pipeline.federations.records import ROUNDS, SCHEMA
 from flcav.pipeline.federations.rounds import FederationCheckpoints, round_path
+from flcav.pipeline.learning import Learning
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages import centralised
 from flcav.pipeline.stages.centralised import pretrain, train_centrally
-from flcav.pipeline.stages.learning import Learning
 from flcav.pipeline.stages.uploads import choose_planned_uploads, choose_uploads
-from flcav.pipeline.work.budgets import region_budget, share_budget
+from flcav.pipeline.steps.budgets import region_budget, share_budget
 from flcav.progress import Report, ignore_progress
 from flcav.seeds import derive_seed
 

@@ -29,12 +29,12 @@ from flcav.pipeline.federations.secrets import (
     remove_secrets,
     write_secrets,
 )
+from flcav.pipeline.learning import Learning
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
-from flcav.pipeline.stages.learning import Learning
 from flcav.progress import ignore_progress
 
 ROUNDS, VEHICLES = 6, 3

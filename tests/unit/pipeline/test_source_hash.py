@@ -12,9 +12,9 @@ import pytest
 
 from flcav.experiments.splits import record_split
 from flcav.experiments.studies import STUDIES, study_named
+from flcav.pipeline.engine.source_hash import PACKAGES, Sources, find_definitions
 from flcav.pipeline.recipe import Federation
-from flcav.pipeline.steps.source_hash import PACKAGES, Sources, find_definitions
-from flcav.pipeline.work import cloud, edge, pretraining, recording, testing
+from flcav.pipeline.steps import cloud, edge, pretraining, recording, testing
 
 TOY = {
     "__init__.py": """
@@ -173,7 +173,7 @@ def test_no_step_reaches_the_drawing_of_results_or_the_command_line(run):
     assert len(reached) > 50
     assert count_lines(PACKAGES["flcav"], reached) < 0.51 * count_lines(PACKAGES["flcav"], [])
     assert not [name for name in reached if name.startswith(("flcav.report", "flcav.cli"))]
-    assert not [name for name in reached if name.startswith("flcav.pipeline.steps.run")]
+    assert not [name for name in reached if name.startswith("flcav.pipeline.engine.run")]
 
 
 def test_an_edit_of_flcav_makes_stale_what_it_should(tmp_path):
@@ -206,7 +206,7 @@ def test_everything_that_a_step_loads_of_flcav_and_runs_is_among_what_it_reaches
         import sys
         from pathlib import Path
         from flcav.experiments.splits import record_split
-        from flcav.pipeline.steps import Work
+        from flcav.pipeline.engine import Work
         ran = set()
         def trace(frame, event, argument):
             name = frame.f_globals.get("__name__", "")

@@ -11,7 +11,7 @@ from flcav.config import InputError
 from flcav.experiments.run_tables import tables
 from flcav.intervals import Spread
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.seeds.spread import SpreadRow, difference_key, list_figures, list_spreads, read_spreads, widen_anew
+from flcav.pipeline.spread import SpreadRow, difference_key, list_figures, list_spreads, read_spreads, widen_anew
 from flcav.pipeline.tables import append_records
 
 ROOT = Path(__file__).parents[3]

@@ -17,11 +17,11 @@ import pytest
 
 import flcav
 from flcav.config import Config, InputError
+from flcav.pipeline.engine import Step, Work, run_side_by_side, run_steps
+from flcav.pipeline.engine.cluster import packed, replace_folder, stamps
+from flcav.pipeline.engine.engines import find_seed
+from flcav.pipeline.engine.step import DONE_NOW
 from flcav.pipeline.provenance import checkout
-from flcav.pipeline.steps import Step, Work, run_side_by_side, run_steps
-from flcav.pipeline.steps.cluster import packed, replace_folder, stamps
-from flcav.pipeline.steps.engines import find_seed
-from flcav.pipeline.steps.step import DONE_NOW
 
 
 def count(work: Work, start: int) -> int:

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from flcav.perception.outcomes import Outcomes
+from flcav.pipeline.analysis.summary import mean_of_tests
 from flcav.pipeline.results.saved import OUTCOMES
-from flcav.pipeline.seeds.summary import mean_of_tests
 
 SCENES, PICTURES = 10, 20
 

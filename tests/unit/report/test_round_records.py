@@ -13,7 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.state import RoundRecord
 from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
-from flcav.pipeline.collecting.caveats import PLACED_BARE
+from flcav.pipeline.analysis.caveats import PLACED_BARE
 from flcav.pipeline.federations.checkpoint import Checkpoint
 from flcav.pipeline.federations.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN

@@ -12,8 +12,8 @@ from typing import Annotated
 
 from flcav.files import Json
 from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds
-from flcav.pipeline.collecting.findings import name_stage
-from flcav.pipeline.collecting.history import gap_closed
+from flcav.pipeline.analysis.findings import name_stage
+from flcav.pipeline.analysis.history import gap_closed
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.placement import Pole

@@ -11,7 +11,7 @@ from typing import Annotated
 
 from flcav.files import Json
 from flcav.intervals import MeanOverSeeds, mean_over_seeds
-from flcav.pipeline.collecting.history import gap_closed
+from flcav.pipeline.analysis.history import gap_closed
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import Run

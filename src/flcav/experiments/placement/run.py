@@ -49,13 +49,13 @@ from flcav.pipeline.arms import Names, resolve_settings
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.pseudo_labels import select_frames_near
 from flcav.pipeline.labels.sources import choose_labels
+from flcav.pipeline.poles import find_sites, read_traces
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import ERRORS, OUTCOMES, WEIGHTS
 from flcav.pipeline.results.training import Pretrained
-from flcav.pipeline.stages.placement import find_sites, read_traces
 from flcav.report import style
 from flcav.report.charts.placement import draw_gains
 

@@ -24,8 +24,8 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import LOWEST_SCORE, ObjectFound, boxes_to_rows, detect, rows_to_boxes
 from flcav.perception.objects.truth import CARS, select_class
 from flcav.perception.ops.rotated import Kind
+from flcav.pipeline.engine import Notify, Step, run_steps
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.steps import Notify, Step, run_steps
 from flcav.records import LEFT_OUT, Class, Record
 from flcav.report import style
 from flcav.report.charts.clouds import CloudSeries, cloud_statistics

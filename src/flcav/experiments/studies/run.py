@@ -26,8 +26,8 @@ from flcav.perception.study import RecipeFields, StudyRecipe, test_seed
 from flcav.perception.task import Evaluated, Task
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network
+from flcav.pipeline.engine import Notify, Step, Work, run_steps
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.steps import Notify, Step, Work, run_steps
 from flcav.records import LEFT_OUT, from_json, to_json
 from flcav.verdicts import Claim
 

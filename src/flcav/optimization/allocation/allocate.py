@@ -7,14 +7,13 @@ the first two have a proven lower bound. Source: Wang et al., IEEE Network 37(3)
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.config import InputError
 from flcav.network.plan import Price
 from flcav.optimization.curves.curves import Curve, Shared
-from flcav.optimization.graph import load_problem
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.area import area, maximise_area
 from flcav.optimization.solvers.branches import solve_branches
@@ -94,10 +93,10 @@ class _Best:
     dual: Dual | None
 
 
-def allocate(problem: Problem | Path | str, *, gap: float = 1e-4, clocks: Sequence[Clock] = ()) -> Allocation:
+def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = ()) -> Allocation:
     """Return the best plan within both budgets, with its certificate: MLGRA of Wang et al., IEEE Network 37(3), 2023.
 
-    The problem is given, or its file. The plan is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS`
+    The plan is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS`
     tasks. Robust plans minimise the upper bands of the learning curves. `marginal_error_per_gb` is the derivative of
     the continuous optimum by each budget, times 1000 MB: a shadow price at these budgets, not a forecast of what
     1000 MB more bring, for which see `budget_sweep.compute_savings`. Of limits of time only the problem's
@@ -110,7 +109,8 @@ def allocate(problem: Problem | Path | str, *, gap: float = 1e-4, clocks: Sequen
     >>> plan.status, plan.tasks[0].name, plan.used_mb.wireless_mb <= 4000
     ('optimal', 'objects', True)
     """
-    problem = problem if isinstance(problem, Problem) else load_problem(problem)
+    if not isinstance(problem, Problem):
+        raise InputError("allocate: a problem is wanted; flcav.load_problem(path) reads one")
     asked = resolve_problem(problem)
     sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
     method = _METHODS[problem.objective]

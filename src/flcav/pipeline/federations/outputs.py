@@ -13,12 +13,12 @@ from flcav.perception.client import as_shared
 from flcav.perception.distillation import SharedSamples
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
+from flcav.pipeline.engine import Work
 from flcav.pipeline.federations.messages import send_to_vehicles
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.learning import Learning
 from flcav.pipeline.recipe import EDGE
 from flcav.pipeline.results.training import Pretrained
-from flcav.pipeline.stages.learning import Learning
-from flcav.pipeline.steps import Work
 from flcav.seeds import stream
 
 

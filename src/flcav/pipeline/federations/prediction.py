@@ -13,7 +13,7 @@ from flcav.network.clock.work import ClientWork
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.recorded import link_scene
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.stages.placement import find_sites, read_traces
+from flcav.pipeline.poles import find_sites, read_traces
 from flcav.world.map.census import measure_traffic_density
 
 

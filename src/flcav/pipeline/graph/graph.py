@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from flcav.pipeline.arms import Setting
+from flcav.pipeline.engine import Step
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.graph.placement import list_placements
 from flcav.pipeline.graph.planning import make_plan, make_replan
@@ -11,7 +12,6 @@ from flcav.pipeline.graph.recording import list_recordings, make_recording
 from flcav.pipeline.graph.testing import list_tests, list_validations
 from flcav.pipeline.graph.training import list_edge_stages, list_further_stages, list_pretraining
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.steps import Step
 
 
 class Graph(Outline):

@@ -12,8 +12,8 @@ from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import count_training_frames
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Region, RunRecipe, SplitName, find_path
-from flcav.pipeline.seeds.spread import read_spreads
-from flcav.pipeline.work.settings import LearningSettings, RegionInputs
+from flcav.pipeline.spread import read_spreads
+from flcav.pipeline.steps.settings import LearningSettings, RegionInputs
 from flcav.seeds import derive_seed
 
 

@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 
 from flcav.pipeline.arms import Setting
+from flcav.pipeline.engine import Step
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.graph.recording import make_recording
 from flcav.pipeline.recipe import EDGE
-from flcav.pipeline.steps import Step
-from flcav.pipeline.work.placing import ErrorsSettings, PlaceSettings, errors_step, place_step
-from flcav.pipeline.work.settings import make_step
+from flcav.pipeline.steps.placing import ErrorsSettings, PlaceSettings, errors_step, place_step
+from flcav.pipeline.steps.settings import make_step
 
 
 def list_placements(outline: Outline, arm: Setting, region: str) -> Iterator[Step]:

@@ -1,13 +1,13 @@
 """Steps that plan a run, and plan the rest of it anew after a stage."""
 
 from flcav.pipeline.arms import Setting
+from flcav.pipeline.engine import Step
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.graph.testing import list_validations
 from flcav.pipeline.planning.histories import read_history
 from flcav.pipeline.planning.updates import update_forms
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
-from flcav.pipeline.steps import Step
-from flcav.pipeline.work.planning import (
+from flcav.pipeline.steps.planning import (
     AirSettings,
     FirstPlanSettings,
     LabelSettings,
@@ -16,8 +16,8 @@ from flcav.pipeline.work.planning import (
     plan_step,
     replan_step,
 )
-from flcav.pipeline.work.settings import make_step
-from flcav.pipeline.work.uploads import UploadSettings
+from flcav.pipeline.steps.settings import make_step
+from flcav.pipeline.steps.uploads import UploadSettings
 
 
 def make_plan(outline: Outline, arm: Setting) -> Step:

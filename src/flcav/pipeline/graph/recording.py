@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 
+from flcav.pipeline.engine import Step
 from flcav.pipeline.frames import hash_manifest, hash_town, make_recording_recipe
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.recipe import EDGE, SPLITS_OF, SplitName
-from flcav.pipeline.steps import Step
-from flcav.pipeline.work.recording import DealSettings, RecordSettings, deal_step, record_step
-from flcav.pipeline.work.settings import make_step
+from flcav.pipeline.steps.recording import DealSettings, RecordSettings, deal_step, record_step
+from flcav.pipeline.steps.settings import make_step
 
 
 def list_recordings(outline: Outline) -> Iterator[Step]:

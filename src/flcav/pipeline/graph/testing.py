@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 
 from flcav.pipeline.arms import Setting
+from flcav.pipeline.engine import Step
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN
-from flcav.pipeline.steps import Step
-from flcav.pipeline.work.settings import make_step
-from flcav.pipeline.work.testing import (
+from flcav.pipeline.steps.settings import make_step
+from flcav.pipeline.steps.testing import (
     LookSettings,
     RoundsSettings,
     TestSettings,

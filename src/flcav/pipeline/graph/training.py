@@ -5,15 +5,15 @@ from typing import Any
 
 from flcav.fusion.navigation import NavigationErrors
 from flcav.pipeline.arms import Setting
+from flcav.pipeline.engine import Step
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE
-from flcav.pipeline.steps import Step
-from flcav.pipeline.work.central import CentralSettings, central_step
-from flcav.pipeline.work.cloud import CloudSettings, cloud_step
-from flcav.pipeline.work.edge import EdgeSettings, edge_step
-from flcav.pipeline.work.pretraining import PretrainSettings, pretrain_step
-from flcav.pipeline.work.settings import RoundPlans, make_step
+from flcav.pipeline.steps.central import CentralSettings, central_step
+from flcav.pipeline.steps.cloud import CloudSettings, cloud_step
+from flcav.pipeline.steps.edge import EdgeSettings, edge_step
+from flcav.pipeline.steps.pretraining import PretrainSettings, pretrain_step
+from flcav.pipeline.steps.settings import RoundPlans, make_step
 
 
 def list_pretraining(outline: Outline, arm: Setting) -> Iterator[Step]:

@@ -12,10 +12,10 @@ from flcav.perception.training import Checkpointing, Validation, train, train_st
 from flcav.perception.weights import save_network
 from flcav.pipeline.federations.checkpoint import LAST
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.learning import Learning
 from flcav.pipeline.recipe import PRETRAIN
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import Validated
-from flcav.pipeline.stages.learning import Learning
 from flcav.progress import Report
 from flcav.seeds import derive_seed
 

@@ -10,7 +10,7 @@ from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Weights
 from flcav.perception.client import TaskClient
 from flcav.perception.distillation import OutputClient, SharedSamples
-from flcav.pipeline.stages.learning import Learning
+from flcav.pipeline.learning import Learning
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ from flcav.perception.outcomes import score_network
 from flcav.perception.weights import from_arrays, save_network, to_arrays
 from flcav.pipeline.federations.rounds import FederationCheckpoints, load_round_network
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.learning import Learning, load_stage_network, regional_weights
 from flcav.pipeline.planning.course import Driven, Replanning
 from flcav.pipeline.recipe import CLOUD, EDGE
 from flcav.pipeline.stages.clients import Strategies, describe_federation, give_outputs
-from flcav.pipeline.stages.learning import Learning, load_stage_network, regional_weights
 from flcav.pipeline.stages.statistics import keep_statistics
 from flcav.progress import Report
 

@@ -23,10 +23,10 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.federations.rounds import FederationCheckpoints, load_round_network
 from flcav.pipeline.federations.timing import time_clients
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.learning import Learning
 from flcav.pipeline.planning.course import Driven, Replanning
 from flcav.pipeline.recipe import EDGE
 from flcav.pipeline.stages.clients import describe_federation, give_outputs
-from flcav.pipeline.stages.learning import Learning
 from flcav.progress import Report
 
 OnStart = Callable[[int, Weights], None]  # called before a round with its number and weights; changes the clients

@@ -1,18 +1,5 @@
-"""Resumable workflows of named steps: finished steps are kept, independent ones run in parallel."""
+"""The step functions of a run: each loads the results of earlier steps, calls its stage's function, saves the result.
 
-from flcav.pipeline.steps.run import run_side_by_side, run_steps, stopwatch
-from flcav.pipeline.steps.step import FINISHED, STALE, Notify, Stale, Step, Work, ignore_steps, print_steps
-
-__all__ = [
-    "FINISHED",
-    "STALE",
-    "Notify",
-    "Stale",
-    "Step",
-    "Work",
-    "ignore_steps",
-    "print_steps",
-    "run_side_by_side",
-    "run_steps",
-    "stopwatch",
-]
+A step's settings are one frozen record, of which its fingerprint is made. Other steps are given by name; `Work.inputs`
+has their folders.
+"""

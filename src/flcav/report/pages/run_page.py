@@ -15,11 +15,11 @@ from flcav.geometry import Boxes
 from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
+from flcav.pipeline.analysis.arm_costs import list_arm_costs
+from flcav.pipeline.analysis.caveats import PLACED_BARE
+from flcav.pipeline.analysis.findings import WORDS
+from flcav.pipeline.analysis.home import list_home_costs
 from flcav.pipeline.arms import Names, resolve_settings
-from flcav.pipeline.collecting.arm_costs import list_arm_costs
-from flcav.pipeline.collecting.caveats import PLACED_BARE
-from flcav.pipeline.collecting.findings import WORDS
-from flcav.pipeline.collecting.home import list_home_costs
 from flcav.pipeline.federations.network import CLOCK
 from flcav.pipeline.federations.records import list_rounds
 from flcav.pipeline.frames import Frames

@@ -6,14 +6,14 @@ from pathlib import Path
 from flcav.intervals import Estimate, measure_spread, widen
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
+from flcav.pipeline.analysis.findings import name_stage
+from flcav.pipeline.analysis.tests import mean_over_trainings, number_retrainings, test_folder
 from flcav.pipeline.arms import name_repeat
-from flcav.pipeline.collecting.findings import name_stage
-from flcav.pipeline.collecting.tests import mean_over_trainings, number_retrainings, test_folder
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import Difference, Tested
-from flcav.pipeline.seeds.spread import difference_key
+from flcav.pipeline.spread import difference_key
 
 
 def list_differences(graph: Graph, work: Path) -> list[Difference]:

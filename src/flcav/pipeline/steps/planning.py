@@ -19,6 +19,7 @@ from flcav.perception.objects.config import SecondConfig
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import PlanRule
+from flcav.pipeline.engine import Work
 from flcav.pipeline.federations.prediction import link_drive, predict_air_s
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.planning.allocation import PlanRequest, PlanSettings, make_plan
@@ -31,10 +32,9 @@ from flcav.pipeline.recipe import Budgets, FixedPlan, Limits
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import PROBLEM
 from flcav.pipeline.results.training import StageResult, Watched, average_last
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.budgets import read_entries
-from flcav.pipeline.work.settings import StepSettings
-from flcav.pipeline.work.uploads import UploadSettings, plan_uploads
+from flcav.pipeline.steps.budgets import read_entries
+from flcav.pipeline.steps.settings import StepSettings
+from flcav.pipeline.steps.uploads import UploadSettings, plan_uploads
 
 
 class LabelSettings(Config):

@@ -10,8 +10,8 @@ from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import FrameTruth, asked_of
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.learning import load_stage_network
 from flcav.pipeline.results.tests import SweepComparison, SweepDetections
-from flcav.pipeline.stages.learning import load_stage_network
 
 SHOWN_SCORE = 0.3  # lowest score of a detection that is shown
 

@@ -5,18 +5,18 @@ from collections.abc import Mapping
 from flcav.config import InputError
 from flcav.perception.errors import THRESHOLD, RegistersErrors, load_errors, save_errors
 from flcav.perception.tasks import task_named
+from flcav.pipeline.engine import Work
 from flcav.pipeline.federations.messages import release_network, report_errors
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.learning import load_stage_network
+from flcav.pipeline.poles import find_passed, find_sites, place_sensors, read_traces
 from flcav.pipeline.recipe import Budgets, Placement
 from flcav.pipeline.results.placement import ErrorRegistry
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import ERRORS, LEDGER
 from flcav.pipeline.results.training import Pretrained
-from flcav.pipeline.stages.learning import load_stage_network
-from flcav.pipeline.stages.placement import find_passed, find_sites, place_sensors, read_traces
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.budgets import open_region_book, share_plan_budget
-from flcav.pipeline.work.settings import StepSettings
+from flcav.pipeline.steps.budgets import open_region_book, share_plan_budget
+from flcav.pipeline.steps.settings import StepSettings
 
 
 class ErrorsSettings(StepSettings):

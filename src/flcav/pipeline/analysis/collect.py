@@ -6,14 +6,14 @@ from pathlib import Path
 
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.tasks import task_named
+from flcav.pipeline.analysis.arm_costs import list_arm_costs
+from flcav.pipeline.analysis.caveats import list_caveats, list_cut, list_diverged, list_unreached
+from flcav.pipeline.analysis.differences import list_differences
+from flcav.pipeline.analysis.findings import findings
+from flcav.pipeline.analysis.history import gaps_closed
+from flcav.pipeline.analysis.home import collect_home_costs
+from flcav.pipeline.analysis.tests import collect_regional_tests, collect_test, number_retrainings
 from flcav.pipeline.arms import Setting, name_repeat
-from flcav.pipeline.collecting.arm_costs import list_arm_costs
-from flcav.pipeline.collecting.caveats import list_caveats, list_cut, list_diverged, list_unreached
-from flcav.pipeline.collecting.differences import list_differences
-from flcav.pipeline.collecting.findings import findings
-from flcav.pipeline.collecting.history import gaps_closed
-from flcav.pipeline.collecting.home import collect_home_costs
-from flcav.pipeline.collecting.tests import collect_regional_tests, collect_test, number_retrainings
 from flcav.pipeline.federations.spent import Training, compose_trainings
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.labels.sources import LABEL_SOURCES

@@ -4,19 +4,19 @@ from collections.abc import Mapping
 from typing import Any
 
 from flcav.network.ledger import Ledger
+from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold
+from flcav.pipeline.learning import load_stage_network
 from flcav.pipeline.recipe import Budgets
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.stages.centralised import pretrain
-from flcav.pipeline.stages.learning import load_stage_network
 from flcav.pipeline.stages.uploads import choose_planned_uploads, choose_uploads, upload_samples
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.budgets import share_plan_budget
-from flcav.pipeline.work.settings import LearningSettings, StepSettings
-from flcav.pipeline.work.uploads import list_frames
+from flcav.pipeline.steps.budgets import share_plan_budget
+from flcav.pipeline.steps.settings import LearningSettings, StepSettings
+from flcav.pipeline.steps.uploads import list_frames
 
 
 class PretrainSettings(StepSettings):

@@ -9,17 +9,17 @@ import numpy as np
 from flcav.fusion.distillation import Distillation
 from flcav.network.ledger import Ledger
 from flcav.perception.objects.distillation.loss import DistillationTerms, DistilledObjects
+from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.pseudo_labels import annotated_samples, pseudo_label_samples, select_frames_near
 from flcav.pipeline.labels.quality import measure_labels, read_history
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.learning import Learning, load_stage_network
+from flcav.pipeline.poles import find_sites
 from flcav.pipeline.results.placement import Placed
 from flcav.pipeline.results.training import LabelQuality, Pretrained
-from flcav.pipeline.stages.learning import Learning, load_stage_network
-from flcav.pipeline.stages.placement import find_sites
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.settings import FederationSettings, RegionInputs
+from flcav.pipeline.steps.settings import FederationSettings, RegionInputs
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from flcav.config import InputError
+from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import deal_frames, hash_manifest, hash_town, record_frames
 from flcav.pipeline.recipe import Role, SplitName
 from flcav.pipeline.results.placement import Placed
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.settings import StepSettings
+from flcav.pipeline.steps.settings import StepSettings
 from flcav.sources.recipe import Recipe
 
 

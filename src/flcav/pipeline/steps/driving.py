@@ -8,12 +8,12 @@ from flcav.federation.strategies import exchanges_more
 from flcav.network.clock.records import save_rounds
 from flcav.network.radio.links import RadioLinks
 from flcav.perception.weights import to_arrays
+from flcav.pipeline.engine import Work
 from flcav.pipeline.federations.network import CLOCK, DrivenRounds, Fleet, drive_rounds, link_scenes
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.learning import Learning
 from flcav.pipeline.results.placement import Placed
-from flcav.pipeline.stages.learning import Learning
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.settings import FederationSettings, RegionInputs
+from flcav.pipeline.steps.settings import FederationSettings, RegionInputs
 
 
 def open_network(

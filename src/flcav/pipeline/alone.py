@@ -13,6 +13,7 @@ from typing import Annotated
 from flcav.config import InputError
 from flcav.files import atomic_path
 from flcav.pipeline.arms import check_federations
+from flcav.pipeline.engine import Notify, Stale, Step, print_steps, run_steps
 from flcav.pipeline.federations.checkpoint import LAST, Checkpoint
 from flcav.pipeline.federations.rounds import LOSS
 from flcav.pipeline.federations.spent import Training, compose_trainings
@@ -26,9 +27,8 @@ from flcav.pipeline.results.saved import WEIGHTS, Saved
 from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.results.training import Round, StageResult, Watched
 from flcav.pipeline.rigs import tell_rigs
-from flcav.pipeline.steps import Notify, Stale, Step, print_steps, run_steps
-from flcav.pipeline.work.edge import EdgeSettings, edge_step
-from flcav.pipeline.work.settings import make_step
+from flcav.pipeline.steps.edge import EdgeSettings, edge_step
+from flcav.pipeline.steps.settings import make_step
 from flcav.progress import DAMAGED
 from flcav.records import LEFT_OUT
 

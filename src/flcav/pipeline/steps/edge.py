@@ -9,12 +9,14 @@ from flcav.network.ledger import Ledger
 from flcav.perception.distillation import SharedSamples
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import find_strategies
+from flcav.pipeline.engine import Work
 from flcav.pipeline.federations.network import DrivenRounds
 from flcav.pipeline.federations.outputs import send_region_network, share_frames
 from flcav.pipeline.federations.records import read_rounds
 from flcav.pipeline.federations.spent import PrivateRounds, find_budget_noise, plan_private_rounds, take_noise
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
+from flcav.pipeline.learning import load_stage_network
 from flcav.pipeline.planning.course import Course, Replanning
 from flcav.pipeline.planning.updates import follow_plan
 from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
@@ -22,13 +24,11 @@ from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.stages.clients import make_clients
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
-from flcav.pipeline.stages.learning import load_stage_network
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.budgets import open_region_book, read_entries, share_plan_budget
-from flcav.pipeline.work.driving import open_network
-from flcav.pipeline.work.labelling import LabelledSamples, label_samples, learn_by_distillation, score_labels
-from flcav.pipeline.work.replanning import Rest
-from flcav.pipeline.work.settings import FederationSettings, RegionInputs
+from flcav.pipeline.steps.budgets import open_region_book, read_entries, share_plan_budget
+from flcav.pipeline.steps.driving import open_network
+from flcav.pipeline.steps.labelling import LabelledSamples, label_samples, learn_by_distillation, score_labels
+from flcav.pipeline.steps.replanning import Rest
+from flcav.pipeline.steps.settings import FederationSettings, RegionInputs
 
 
 class EdgeSettings(FederationSettings):

@@ -1,16 +1,16 @@
 """The step of centralised training in place of stage II, on ground truth."""
 
 from flcav.perception.weights import save_network
+from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.learning import load_stage_network
 from flcav.pipeline.recipe import CENTRAL, Role
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import Pretrained, StageResult
 from flcav.pipeline.stages.centralised import train_centrally
-from flcav.pipeline.stages.learning import load_stage_network
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.labelling import select_group
-from flcav.pipeline.work.settings import LearningSettings, RegionInputs, StepSettings
+from flcav.pipeline.steps.labelling import select_group
+from flcav.pipeline.steps.settings import LearningSettings, RegionInputs, StepSettings
 
 
 class CentralSettings(StepSettings):

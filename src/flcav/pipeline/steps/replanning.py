@@ -7,6 +7,7 @@ from flcav.config import read_config
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Budget, Ledger
 from flcav.network.plan import Price
 from flcav.optimization.problem import Problem
+from flcav.pipeline.engine import Work
 from flcav.pipeline.planning.course import Course
 from flcav.pipeline.planning.rounds import Follower, Planner, restrict_problem
 from flcav.pipeline.planning.terms import Terms
@@ -14,9 +15,8 @@ from flcav.pipeline.recipe import CLOUD, EDGE
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.saved import PROBLEM
 from flcav.pipeline.results.training import StageResult
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.budgets import read_entries, share_plan_budget
-from flcav.pipeline.work.settings import FederationSettings, RoundPlans
+from flcav.pipeline.steps.budgets import read_entries, share_plan_budget
+from flcav.pipeline.steps.settings import FederationSettings, RoundPlans
 
 
 @dataclass(frozen=True)

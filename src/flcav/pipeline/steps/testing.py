@@ -6,16 +6,16 @@ from flcav.config import InputError
 from flcav.intervals import Estimate
 from flcav.perception.outcomes import as_measurable, compute_interval, compute_measure, score_network
 from flcav.perception.tasks import task_named
+from flcav.pipeline.engine import Work
 from flcav.pipeline.federations.rounds import load_round_network
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.learning import load_stage_network
 from flcav.pipeline.recipe import PRETRAIN
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import Tested
 from flcav.pipeline.results.training import Round, StageResult, Watched
-from flcav.pipeline.stages.learning import load_stage_network
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.before_after import detect_before_after
-from flcav.pipeline.work.settings import StepSettings
+from flcav.pipeline.steps.before_after import detect_before_after
+from flcav.pipeline.steps.settings import StepSettings
 
 
 class TestSettings(StepSettings):

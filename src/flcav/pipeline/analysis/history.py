@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from flcav.pipeline.collecting.findings import name_stage
+from flcav.pipeline.analysis.findings import name_stage
 from flcav.pipeline.planning.histories import HistoryPoint
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import Run

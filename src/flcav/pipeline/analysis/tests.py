@@ -12,7 +12,7 @@ from flcav.pipeline.arms import Setting, name_repeat
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import RegionalTest, Test, Tested
-from flcav.pipeline.seeds.spread import test_key
+from flcav.pipeline.spread import test_key
 
 
 def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, task: str) -> Test:

@@ -5,10 +5,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.pipeline.engine import Work
 from flcav.pipeline.recipe import Budgets
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import LEDGER
-from flcav.pipeline.steps import Work
 
 
 def share_budget(budget: Budget, planned: Mapping[str, tuple[float, float]], task: str) -> Budget:

@@ -16,8 +16,8 @@ from flcav.config import Config
 from flcav.machine.locks import only_writer
 from flcav.machine.processes import exit_with_parent, start_server
 from flcav.machine.threads import use_threads
+from flcav.pipeline.engine.step import Record, Step, Work, read_value, write_done, write_started
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.steps.step import Record, Step, Work, read_value, write_done, write_started
 from flcav.progress import Report
 
 KILLED = "a step's process was killed from outside, most often for want of memory"

@@ -16,8 +16,8 @@ from flcav.perception.outcomes import (
     share_test_scenes,
 )
 from flcav.perception.tasks import task_named
+from flcav.pipeline.analysis.tests import number_retrainings, test_folder
 from flcav.pipeline.arms import name_repeat
-from flcav.pipeline.collecting.tests import number_retrainings, test_folder
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import MAIN, PRETRAIN
 from flcav.pipeline.results.run import Run

@@ -9,8 +9,8 @@ import numpy as np
 
 from flcav.config import InputError
 from flcav.intervals import Estimate, MeanOverSeeds, OneTraining, combine_spreads, of_one_training, widen
-from flcav.pipeline.collecting.differences import compare_tests
-from flcav.pipeline.collecting.tests import mean_of_tests, mean_over_trainings
+from flcav.pipeline.analysis.differences import compare_tests
+from flcav.pipeline.analysis.tests import mean_of_tests, mean_over_trainings
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Test
 from flcav.pipeline.running import RESULTS, WORK, seed_folders

@@ -6,10 +6,10 @@ from dataclasses import replace
 from flcav.config import Config
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.allocation.uploads import Asked, share_by_held, share_by_links
+from flcav.pipeline.engine import Work
 from flcav.pipeline.federations.prediction import measure_uplinks
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.results.plans import Plan
-from flcav.pipeline.steps import Work
 
 
 class UploadSettings(Config):

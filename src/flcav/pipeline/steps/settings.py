@@ -6,10 +6,10 @@ from flcav.config import Config
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors
 from flcav.perception.tasks import task_named
+from flcav.pipeline.engine import Step
+from flcav.pipeline.learning import Learning
 from flcav.pipeline.recipe import Budgets, Federation
 from flcav.pipeline.sizes import Training
-from flcav.pipeline.stages.learning import Learning
-from flcav.pipeline.steps import Step
 
 
 class StepSettings(Config):
@@ -22,7 +22,7 @@ class StepSettings(Config):
 
 
 class LearningSettings(Config):
-    """Settings of a task's training, from which `flcav.pipeline.stages.learning.Learning` is made."""
+    """Settings of a task's training, from which `flcav.pipeline.learning.Learning` is made."""
 
     task: str
     network: str | None  # name of the configuration; None: the task's first

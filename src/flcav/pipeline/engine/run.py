@@ -21,9 +21,9 @@ from typing import Any
 from flcav.config import InputError, read_json
 from flcav.files import write_json
 from flcav.machine.locks import only_writer
-from flcav.pipeline.steps.engines import Engine, Processes
-from flcav.pipeline.steps.source_hash import Sources, find_definitions
-from flcav.pipeline.steps.step import (
+from flcav.pipeline.engine.engines import Engine, Processes
+from flcav.pipeline.engine.source_hash import Sources, find_definitions
+from flcav.pipeline.engine.step import (
     DONE,
     DONE_BEFORE,
     DONE_NOW,
@@ -51,7 +51,7 @@ def _processes(jobs: int) -> Iterator[Engine]:
 
 @contextlib.contextmanager
 def _ray(jobs: int) -> Iterator[Engine]:
-    from flcav.pipeline.steps.cluster import ray_cluster
+    from flcav.pipeline.engine.cluster import ray_cluster
 
     with ray_cluster(jobs) as engine:
         yield engine
@@ -75,7 +75,7 @@ def run_steps(
     """Run `steps`, given in topological order, in `folder`, and return their values by name.
 
     `jobs` workers of one thread each: processes, which end with this one however it ends, or actors on the machines of
-    a Ray cluster, see `flcav.pipeline.steps.cluster`. Of the processes, those that no step waits for are lent to steps
+    a Ray cluster, see `flcav.pipeline.engine.cluster`. Of the processes, those that no step waits for are lent to steps
     that can make use of several, until these end. Steps begun or finished by other code are refused, done again
     ("redo") or kept ("keep", their records unchanged); those of other arguments, and what needs them, are done again by
     "redo" and else refused. Raises `InputError` for what is refused, and where another process runs steps in the

@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.pipeline.analysis.claims import ask, judge_asked
+from flcav.pipeline.analysis.findings import name_stage
+from flcav.pipeline.analysis.tests import mean_of_tests
 from flcav.pipeline.arms import resolve_settings
-from flcav.pipeline.collecting.claims import ask, judge_asked
-from flcav.pipeline.collecting.findings import name_stage
-from flcav.pipeline.collecting.tests import mean_of_tests
 from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.recipe import MAIN
 from flcav.pipeline.results.run import Mean, Run, Summary

@@ -10,12 +10,14 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.network.ledger import Ledger
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import find_strategies
+from flcav.pipeline.engine import Work
 from flcav.pipeline.federations.network import DrivenCloud, join_regions
 from flcav.pipeline.federations.outputs import send_region_network, share_frames
 from flcav.pipeline.federations.records import read_rounds
 from flcav.pipeline.federations.spent import take_noise
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
+from flcav.pipeline.learning import Learning, load_stage_network
 from flcav.pipeline.planning.course import Replanning, mean_by_frames
 from flcav.pipeline.planning.updates import follow_plan
 from flcav.pipeline.recipe import CLOUD
@@ -23,14 +25,12 @@ from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult, StatisticsScore
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
-from flcav.pipeline.stages.learning import Learning, load_stage_network
 from flcav.pipeline.stages.statistics import score_statistics
-from flcav.pipeline.steps import Work
-from flcav.pipeline.work.budgets import read_entries, share_plan_budget
-from flcav.pipeline.work.driving import open_network
-from flcav.pipeline.work.labelling import label_samples, learn_by_distillation
-from flcav.pipeline.work.replanning import Rest
-from flcav.pipeline.work.settings import FederationSettings, RegionInputs
+from flcav.pipeline.steps.budgets import read_entries, share_plan_budget
+from flcav.pipeline.steps.driving import open_network
+from flcav.pipeline.steps.labelling import label_samples, learn_by_distillation
+from flcav.pipeline.steps.replanning import Rest
+from flcav.pipeline.steps.settings import FederationSettings, RegionInputs
 
 
 class CloudSettings(FederationSettings):
