@@ -73,8 +73,8 @@ def test_heading_ticks_leave_through_the_front():
 def test_echoes_are_coloured_by_their_range_rate():
     echoes = np.array([[10.0, 0.0, -4.0], [20.0, 0.0, 4.0], [30.0, 0.0, 0.1]])
     axes = birdseye(view(points=np.zeros((0, 3)), echoes=echoes)).axes[0]
-    drawn = [each for each in axes.collections if len(each.get_facecolor()) and len(each.get_offsets()) == 1]
-    found = {tuple(np.asarray(each.get_offsets())[0]): to_hex(each.get_facecolor()[0]) for each in drawn}
+    drawn = [(np.asarray(each.get_offsets()), np.asarray(each.get_facecolor())) for each in axes.collections]
+    found = {tuple(at[0]): to_hex(colours[0].tolist()) for at, colours in drawn if len(at) == 1 and len(colours)}
     expected = {(0.0, 10.0): style.BLUE, (0.0, 20.0): style.VERMILLION, (0.0, 30.0): style.MUTED}
     assert expected.items() <= found.items()
 
@@ -88,8 +88,8 @@ def test_echoes_and_paths_of_a_recording_lie_on_the_actors(tmp_path: Path):
     assert seen.echoes is not None
     assert len(seen.echoes) == len(frame.radar["radar"])
     assert (seen.echoes[:, 0] > 0).all()  # the radar looks ahead
-    polygons = shapely.polygons(seen.truth.corners()[:, :4, :2])
-    distance = shapely.distance(shapely.points(seen.echoes[:, :2])[:, None], polygons[None])
+    polygons = np.asarray(shapely.polygons(seen.truth.corners()[:, :4, :2]))
+    distance = shapely.distance(np.asarray(shapely.points(seen.echoes[:, :2]))[:, None], polygons[None])
     of_actors = frame.annotations.points["radar"]
     assert (np.sort(distance.min(axis=0))[: np.count_nonzero(of_actors)] < 1.5).all()
     now = seen.truth.center[:, :2]
