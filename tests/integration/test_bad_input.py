@@ -427,3 +427,13 @@ def test_fields_and_numbers_that_users_guess_are_told_as_they_are_written(right,
 def test_accuracies_in_per_cent_are_told_as_shares(accuracy, told, tmp_path, refused):
     (tmp_path / "history.csv").write_text(f"task,stage,resource,accuracy\na,pretrain,10,{accuracy}\n")
     assert told in refused("fit", tmp_path / "history.csv")
+
+
+def test_a_picture_takes_the_place_of_no_other_kind_of_file(
+    data: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("town: suburb")
+    for command in (("birdseye", data, "--out"), ("camera", data, "--out"), ("towns", "show", "suburb", "--out")):
+        assert refused(*command, recipe) == f"--out {recipe}: a PNG picture is written; name it {tmp_path}/recipe.png"
+    assert recipe.read_text() == "town: suburb"

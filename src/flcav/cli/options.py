@@ -4,6 +4,7 @@ import inspect
 import math
 from collections.abc import Iterable
 from enum import StrEnum
+from pathlib import Path
 
 import click
 import typer
@@ -116,6 +117,13 @@ def check_all_finite(parameter: click.Parameter, values: list[float]) -> list[fl
     for value in values:
         check_finite(parameter, value)
     return values
+
+
+def check_png(parameter: click.Parameter, value: Path | None) -> Path | None:
+    """Callback of a picture's option: return the path; raises `InputError` for one of another kind of file."""
+    if value is not None and value.suffix.lower() not in ("", ".png"):
+        raise InputError(f"{parameter.opts[0]} {value}: a PNG picture is written; name it {value.with_suffix('.png')}")
+    return value
 
 
 def refuse_unused(what: str, *names: str) -> None:

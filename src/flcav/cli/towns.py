@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from flcav.cli.options import check_png
 from flcav.cli.terminal import print_json
 from flcav.wording import plural
 
@@ -41,7 +42,7 @@ def list_towns(as_json: bool = typer.Option(False, "--json", help="Print one JSO
 @towns.command()
 def show(
     town: str = typer.Argument(help="A town's name, or its folder."),
-    out: Path | None = typer.Option(None, "--out", help="PNG file: the map."),
+    out: Path | None = typer.Option(None, "--out", callback=check_png, help="PNG file: the map."),
     poles: Path | None = typer.Option(None, "--poles", help="Table (.csv or .parquet) of its candidate poles."),
 ) -> None:
     """Show a town.

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.options import check_finite
+from flcav.cli.options import check_finite, check_png
 from flcav.wording import plural
 
 
@@ -15,7 +15,7 @@ def register(app: typer.Typer) -> None:
 
 def birdseye(
     folder: Path = typer.Argument(metavar="DIR", help="A dataset."),
-    out: Path = typer.Option(..., "--out", help="The PNG file to write."),
+    out: Path = typer.Option(..., "--out", callback=check_png, help="The PNG file to write."),
     frame: str | None = typer.Option(
         None, "--frame", help="Key of the frame, as the point clouds are named; else the first."
     ),

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.options import check_png
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -12,7 +14,7 @@ def register(app: typer.Typer) -> None:
 
 def camera(
     folder: Path = typer.Argument(metavar="DIR", help="A dataset."),
-    out: Path = typer.Option(..., "--out", help="The PNG file to write."),
+    out: Path = typer.Option(..., "--out", callback=check_png, help="The PNG file to write."),
     frame: str | None = typer.Option(
         None, "--frame", help="Key of the frame, as the pictures are named; else the first that has any."
     ),

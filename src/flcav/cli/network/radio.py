@@ -4,6 +4,7 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.options import check_png
 from flcav.cli.terminal import print_json
 
 POLES = typer.Option(
@@ -29,7 +30,9 @@ def radio(
     scene: str | None = SCENE,
     network: Path | None = NETWORK,
     seed: int = SEED,
-    map_: Path | None = typer.Option(None, "--map", help="PNG file: rate by place, line of sight, drives."),
+    map_: Path | None = typer.Option(
+        None, "--map", callback=check_png, help="PNG file: rate by place, line of sight, drives."
+    ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object, with the rates over time."),
 ) -> None:
     """Compute the radio rates of a recording's connected vehicles at roadside units.

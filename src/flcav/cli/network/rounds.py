@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.network.radio import NETWORK, POLES, SCENE, SEED
-from flcav.cli.options import check_all_finite, check_finite
+from flcav.cli.options import check_all_finite, check_finite, check_png
 from flcav.cli.terminal import print_json
 from flcav.wording import plural
 
@@ -52,7 +52,7 @@ def rounds(
     network: Path | None = NETWORK,
     seed: int = SEED,
     out: Path | None = typer.Option(None, "--out", help="Parquet file: a row per vehicle and round."),
-    timeline: Path | None = typer.Option(None, "--timeline", help="PNG file: who did what when."),
+    timeline: Path | None = typer.Option(None, "--timeline", callback=check_png, help="PNG file: who did what when."),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
 ) -> None:
     """Simulate the clock of federated rounds among a recording's connected vehicles.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device, check_finite, refuse_unused
+from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device, check_finite, check_png, refuse_unused
 from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
@@ -37,7 +37,9 @@ def errors(
         callback=check_finite,
         help="objects, signs: lowest score of a detection; 0.3 if not given.",
     ),
-    map_: Path | None = typer.Option(None, "--map", help="PNG file: the errors in the dataset's town."),
+    map_: Path | None = typer.Option(
+        None, "--map", callback=check_png, help="PNG file: the errors in the dataset's town."
+    ),
     agents: str | None = AGENTS,
     around: bool = AROUND,
     threads: int = THREADS,

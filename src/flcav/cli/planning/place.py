@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import Method, check_finite
+from flcav.cli.options import Method, check_finite, check_png
 from flcav.cli.terminal import print_json
 from flcav.wording import plural
 
@@ -55,7 +55,9 @@ def place(
         metavar="CLASS=FACTOR",
         help="Factor on the weight of a class; may be given several times.",
     ),
-    map_: Path | None = typer.Option(None, "--map", help="PNG file of errors, poles and what they cover, in the town."),
+    map_: Path | None = typer.Option(
+        None, "--map", callback=check_png, help="PNG file of errors, poles and what they cover, in the town."
+    ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
     verify: bool = typer.Option(
         False, "--verify", help="Recompute coverage, cost and bound with no code of the solver; exit 1 if one is wrong."
