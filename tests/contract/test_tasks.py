@@ -321,7 +321,7 @@ def test_where_no_picture_can_be_drawn_nothing_is_inferred(task, data, tmp_path,
     weights, taken = tmp_path / "weights.safetensors", tmp_path / "file"
     save_network(task, build_network(task, small(task), 1), weights)
     taken.touch()
-    assert called("infer", task.name, data.folder, "--weights", weights, "--pictures", taken) == 1
+    assert called("infer", task.name, data.folder, "--weights", weights, "--pictures", taken) == 2
     assert capsys.readouterr() == ("", f"flcav: {taken}: Not a directory\n")
 
 
@@ -330,7 +330,7 @@ def test_where_nothing_can_be_written_no_training_starts(task, data, tmp_path, c
     monkeypatch.setattr(type(task), "samples", None)  # not even called
     (tmp_path / "file").touch()
     for out in (tmp_path / "file" / "out", tmp_path / "file"):
-        assert called("train", task.name, "--data", data.folder, "--out", out) == 1
+        assert called("train", task.name, "--data", data.folder, "--out", out) == 2
         told = capsys.readouterr()
         assert told.err == f"flcav: {out}: Not a directory\n"
 

@@ -363,7 +363,7 @@ def test_the_network_takes_time_and_loses_vehicles_by_name(finished: Path, resul
         assert record.seconds is not None
         assert 0 < record.seconds <= 3
     assert {path.stem for path in finished.glob("pictures/timeline*")} == {"timeline_grid_equal", "timeline_ring_equal"}
-    assert (finished / "report.html").read_text().count("(equal), on the clock") == 2
+    assert (finished / "report.html").read_text().count("(equal), over time") == 2
     slowest = max(rounds_of(result, "equal", CLOUD, region)[0].seconds or 0.0 for region in ("grid", "ring"))
     assert cloud[0].seconds == pytest.approx(slowest + 2 * (0.01 + 8 * 1337440 / 1e9), rel=1e-3)
     assert all(record.seconds is None for record in rounds_of(result, MAIN, EDGE, "grid"))
@@ -499,7 +499,7 @@ def test_stage_two_alone_goes_on_with_a_run_and_ends_with_its_weights(
     printed = capsys.readouterr().out.splitlines()
     name = "grid-federate-objects-no_pole"
     assert [line.partition(": loss")[0] for line in printed[:2]] == [f"{name}, round {n} of 2" for n in (1, 2)]
-    found = json.loads((tmp_path / "federation.json").read_text())["federations"][0]
+    found = json.loads((tmp_path / "federation-no_pole.json").read_text())["federations"][0]
     assert [each["region"] for each in found["watched"]] == ["suburb", "grid", "ring"]
     at = {each["region"]: f"{each['region']} {each['rounds'][1]['score']:.3f}" for each in found["watched"]}
     assert printed[1].endswith(", ".join(at.values()))

@@ -24,7 +24,7 @@ from flcav.config import InputError
 from flcav.wording import describe_number, suggest
 
 INTERRUPTED = 130
-WRONG_PATHS = (errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ELOOP)  # a named file is missing, or is none
+NO_FOLDER = (errno.ENOTDIR, errno.ELOOP)  # a path leads over a file, or a link to itself
 LONGEST = 1000  # characters of a message
 
 atexit.register(gc.freeze)  # searching all modules for garbage would take a second before the process ends
@@ -98,7 +98,8 @@ def run(arguments: list[str] | None = None) -> None:
         code = 2
     except OSError as error:
         _say(f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror or error))
-        code = 2 if error.errno in WRONG_PATHS else 1
+        wrong = isinstance(error, FileNotFoundError | IsADirectoryError) or error.errno in NO_FOLDER
+        code = 2 if wrong else 1
     sys.exit(code if isinstance(code, int) else 0)
 
 

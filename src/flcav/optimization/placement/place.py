@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,7 +85,7 @@ def check_inside(
     town: Town,
     errors: NDArray[np.float64],
     poles: NDArray[np.float64],
-    names: tuple[object, object] = ("errors", "poles"),
+    names: tuple[Path | str, Path | str] = ("errors", "poles"),
 ) -> None:
     """Raise `InputError` for a pole (P, 3) outside the town, or an error (E, 3) so far away that no map of it shows it.
 

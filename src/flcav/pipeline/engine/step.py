@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import SHOWN, Config, InputError, read_json, shorten
-from flcav.files import flush_tree, write_json
+from flcav.files import Json, flush_tree, write_json
 from flcav.progress import Report, print_progress
 from flcav.wording import plural
 
@@ -65,7 +65,7 @@ class Step:
         return self if workers == 1 else replace(self, means={**self.means, "processes": workers})
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def asked(self) -> dict[str, Json]:
         """Return the arguments as JSON values, by dotted name, to say in which of them two steps differ."""
         return dict(_flatten(json.loads(json.dumps(self.arguments, default=_fields))))
 
@@ -108,7 +108,7 @@ class Record:
     fingerprint: str  # see `Step.fingerprint`
     code: Mapping[str, str]  # hash of the code it reaches, by module: see `steps.source_hash`
     lineage: str  # of its code and of the lineages of the steps it needs; "" where the code is not known
-    asked: Mapping[str, Any] | None = field(default=None, compare=False)  # see `Step.asked`; None: not recorded
+    asked: Mapping[str, Json] | None = field(default=None, compare=False)  # see `Step.asked`; None: not recorded
 
     @classmethod
     def of(
@@ -116,7 +116,7 @@ class Record:
         fingerprint: str,
         code: Mapping[str, str],
         needs: Iterable["Record"],
-        asked: Mapping[str, Any] | None = None,
+        asked: Mapping[str, Json] | None = None,
     ) -> "Record":
         """Return the record of a step done by `code`, where the steps it needs have the records `needs`."""
         return cls(fingerprint, code, digest([sorted(code.items()), *(need.lineage for need in needs)]), asked)
