@@ -156,7 +156,7 @@ def read_config(model: type[ConfigT], path: Path) -> ConfigT:
 
 def read_yaml(path: Path, loader: type[Loader] = Loader) -> object:
     """Return the value in the YAML (or JSON) file at `path`; raises `InputError` if it is missing or not YAML."""
-    _check_exists(path)
+    check_is_file(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
         _check_yaml(text)
@@ -165,7 +165,8 @@ def read_yaml(path: Path, loader: type[Loader] = Loader) -> object:
         raise InputError(f"{path}: not a YAML file ({error})") from None
 
 
-def _check_exists(path: Path) -> None:
+def check_is_file(path: Path) -> None:
+    """Raise `InputError` where there is no file at `path`, or a folder."""
     if not path.exists():  # nor does a link to itself lead anywhere
         raise InputError(f"{path}: no such file")
     if path.is_dir():
@@ -202,7 +203,7 @@ def _check_yaml(text: str) -> None:
 
 def read_json(path: Path) -> Json:
     """Return the value in the JSON file at `path`; raises `InputError` if it is missing or not JSON."""
-    _check_exists(path)
+    check_is_file(path)
     try:
         value = json.loads(path.read_text(encoding="utf-8-sig"))
         _check_depth(value)
@@ -248,7 +249,7 @@ def read_xml(path: Path, kind: str) -> ElementTree.Element:
 
     Raises `InputError` if it is missing or not XML, so no `kind`.
     """
-    _check_exists(path)
+    check_is_file(path)
     parser = ElementTree.XMLParser(target=_Shallow())
     try:
         text = path.read_bytes()

@@ -1,5 +1,6 @@
-"""Tables for users, written as CSV or Parquet by the suffix of the file's name."""
+"""Tables of users: CSV read, and tables written as CSV or Parquet by the suffix of the file's name."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -16,6 +17,21 @@ def check_ending(path: Path) -> None:
     """Raise `InputError` where the suffix of `path` is none of ENDINGS."""
     if path.suffix not in ENDINGS:
         raise InputError(f"{path}: tables are written as {' or '.join(ENDINGS)}; end the name with one of them")
+
+
+def read_csv(path: Path | str, texts: Sequence[str] = ()) -> pa.Table:
+    """Return the table in the CSV file at `path`, the columns `texts` as text.
+
+    Raises `InputError` where it is missing or no table.
+    """
+    written = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()))
+    try:
+        return pyarrow.csv.read_csv(path, convert_options=written)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        said = str(error) if str(error).isprintable() else "its bytes are no text"
+        raise InputError(f"{path}: not a table ({said})") from None
 
 
 def write_table(table: pa.Table, path: Path) -> None:

@@ -58,13 +58,14 @@ def to_rows(records: Iterable["DataclassInstance"]) -> list[dict[str, Json]]:
     >>> to_rows([Estimate(0.5, 0.4, 0.6)])
     [{'mean': 0.5, 'low': 0.4, 'high': 0.6}]
     """
-    return [dict(_flatten(to_json(record, type(record)))) for record in records]
+    return [dict(flatten(to_json(record, type(record)))) for record in records]
 
 
-def _flatten(values: Mapping[str, Json], above: str = "") -> Iterator[tuple[str, Json]]:
+def flatten(values: Mapping[str, Json], above: str = "") -> Iterator[tuple[str, Json]]:
+    """Yield the values within nested JSON objects by dotted names, as in "estimate.mean"; empty objects are values."""
     for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f"{above}{name}.")
+        if isinstance(value, Mapping) and value:
+            yield from flatten(value, f"{above}{name}.")
         else:
             yield above + name, value
 

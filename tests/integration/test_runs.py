@@ -46,10 +46,10 @@ from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe, load_run_recipe
 from flcav.pipeline.results.placement import ErrorRegistry, Placed
 from flcav.pipeline.results.plans import Plan
-from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.run import Run, Summary
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import FederatedRound, Pretrained, StageResult, Watched
-from flcav.pipeline.running import RESULTS, SUMMARY, run, run_seeds
+from flcav.pipeline.running import RESULTS, run, run_seeds
 from flcav.report.pages.run_page import write_report
 from flcav.verdicts import ESTIMATE, UNDECIDED, verdict
 from flcav.world.map.town import load_town
@@ -615,7 +615,7 @@ def test_a_stopped_run_leaves_no_process_behind(number: signal.Signals, tmp_path
 
 
 def test_the_summary_of_seeds_is_beside_them(studied: tuple[Path, Any, Any]) -> None:
-    summary = json.loads((studied[0] / SUMMARY).read_text())
+    summary = json.loads((studied[0] / Summary.file).read_text())
     assert summary["seeds"] == [1]
     assert {row["name"] for row in summary["gap_closed"]} >= {"grid, objects: edge FL"}
     judged = {row["name"] for row in summary["differences"] if "judged" in row}

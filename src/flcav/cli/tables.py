@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv
 
 from flcav.config import InputError, shorten
+from flcav.exchange import read_csv
 from flcav.parquet import read_parquet
 
 
@@ -29,15 +29,8 @@ def read_table(path: Path, columns: Sequence[str], names: Sequence[str] = ()) ->
 def _read_csv(path: Path, names: Sequence[str]) -> pa.Table:
     if path.suffix.lower() in (".yaml", ".yml", ".json"):
         raise InputError(f"{path}: a table is wanted, .csv or .parquet, and no {path.suffix[1:].upper()} file")
-    written = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(names, pa.string()))
-    try:
-        table = pyarrow.csv.read_csv(path, convert_options=written)
-        table = table.rename_columns([column.strip() for column in table.column_names])
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        said = str(error) if str(error).isprintable() else "its bytes are no text"
-        raise InputError(f"{path}: not a table ({said})") from None
+    table = read_csv(path, names)
+    table = table.rename_columns([column.strip() for column in table.column_names])
     for name in {*names}.intersection(table.column_names):
         text = table[name]
         try:

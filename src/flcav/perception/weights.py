@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
-from flcav.config import DamagedFile, InputError
+from flcav.config import DamagedFile, InputError, check_is_file
 from flcav.files import write_bytes
 from flcav.perception.card import CARD_KEY, Card
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
@@ -136,8 +136,7 @@ def _adapter(task: Task) -> TypeAdapter[Any]:
 
 
 def _opened(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
-    if not path.is_file():
-        raise InputError(f"{path}: {'is a folder, and a file is wanted' if path.is_dir() else 'no such file'}")
+    check_is_file(path)
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping

@@ -13,7 +13,7 @@ from flcav.pipeline.analysis.differences import compare_tests
 from flcav.pipeline.analysis.tests import mean_of_tests, mean_over_trainings
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Test
-from flcav.pipeline.running import RESULTS, WORK, seed_folders
+from flcav.pipeline.running import WORK, seed_folders
 from flcav.verdicts import UNDECIDED, Claim, Judged, judge, judge_known
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task
@@ -67,7 +67,7 @@ class _Pair:
 
 
 def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, _Pair]:
-    runs = [Run.load(folder, RESULTS) for folder in (first, second)]
+    runs = [Run.load(folder) for folder in (first, second)]
     tests: list[Mapping[Key, Test]] = [{_key(test): test for test in run.tested} for run in runs]
     found = {}
     for key in (key for key in tests[0] if key in tests[1]):

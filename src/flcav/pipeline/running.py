@@ -18,7 +18,8 @@ from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.spread import list_spreads
 from flcav.pipeline.tables import append_records
 
-WORK, RESULTS, SUMMARY, HISTORY, SPREAD = "work", "results.json", "summary.json", "history.csv", "spread.csv"
+WORK, HISTORY, SPREAD = "work", "history.csv", "spread.csv"
+RESULTS = Run.file
 
 
 def run(
@@ -91,7 +92,7 @@ def run_seeds(
     }
     runs = run_several(recipes, out, beside=beside, jobs=jobs, notify=notify, stale=stale, engine=engine)
     summary = summarise(runs, [Path(out) / name / WORK for name in recipes])
-    summary.save(Path(out), SUMMARY)
+    summary.save(out)
     return runs, summary
 
 
@@ -127,14 +128,14 @@ def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float, name
     if graph.recipe.retrainings:
         append_records(history.with_name(SPREAD), list_spreads(result, name))
     save_rounds(result, out)
-    result.save(out, RESULTS)
+    result.save(out)
     return result
 
 
 def seed_folders(folder: Path) -> dict[int, Path]:
     """Return the folders of a run, or of each of its seeds, by seed; raises `InputError` where there is no run."""
     own = [folder] if (folder / RESULTS).is_file() else sorted(folder.glob("seed*"))
-    found = {Run.load(each, RESULTS).recipe.seed: each for each in own if (each / RESULTS).is_file()}
+    found = {Run.load(each).recipe.seed: each for each in own if (each / RESULTS).is_file()}
     if not found:
         raise InputError(f"{folder}: no finished run, it has no {RESULTS}")
     return found

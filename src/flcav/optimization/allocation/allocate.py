@@ -96,13 +96,12 @@ class _Best:
 def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = ()) -> Allocation:
     """Return the best plan within both budgets, with its certificate: MLGRA of Wang et al., IEEE Network 37(3), 2023.
 
-    The plan is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS`
-    tasks. Robust plans minimise the upper bands of the learning curves. `marginal_error_per_gb` is the derivative of
-    the continuous optimum by each budget, times 1000 MB: a shadow price at these budgets, not a forecast of what
-    1000 MB more bring, for which see `budget_sweep.compute_savings`. Of limits of time only the problem's
-    `shared_clock` and `clocks` are kept; for those of vehicles with names see `fleet.allocate_fleet`. Raises
-    `Infeasible`, naming the budget, the cost of the least plan within the limits and the excess, and `InputError` where
-    the solver cannot handle the problem's numbers.
+    It is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS` tasks. Robust plans minimise the upper
+    bands of the learning curves. `marginal_error_per_gb` is the derivative of the continuous optimum by each budget,
+    times 1000 MB: a shadow price at these budgets, not a forecast of what 1000 MB more bring, for which see
+    `budget_sweep.compute_savings`. Of limits of time only the problem's `shared_clock` and `clocks` are kept; for those
+    of vehicles with names see `fleet.allocate_fleet`. Raises `Infeasible`, naming the budget, the cost of the least
+    plan within the limits and the excess, and `InputError` where the solver cannot handle the problem's numbers.
 
     >>> from flcav import allocate, load_problem
     >>> plan = allocate(load_problem("recipes/allocation/objects.yaml"))

@@ -22,6 +22,7 @@ import pyarrow.csv
 from numpy.typing import ArrayLike, NDArray
 
 from flcav.config import InputError, shorten
+from flcav.exchange import read_csv
 from flcav.optimization.curves.curves import STAGES
 from flcav.wording import describe_number, hint_share
 
@@ -63,13 +64,7 @@ class History:
 
 def load_history(path: Path | str) -> History:
     """Return the history of one task in a CSV file; raises `InputError` where it holds none, or several."""
-    try:
-        table = pyarrow.csv.read_csv(path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
-        said = str(error) if str(error).isprintable() else "its bytes are no text"
-        raise InputError(f"{path}: not a table ({said})") from None
+    table = read_csv(path)
     found = parse_histories(table.to_pydict(), str(path), Path(path).stem)
     if len(found) != 1:
         told = ", ".join(found) or "none"

@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 from flcav.config import SHOWN, Config, InputError, read_json, shorten
 from flcav.files import Json, flush_tree, write_json
 from flcav.progress import Report, print_progress
+from flcav.records import flatten
 from flcav.wording import plural
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
@@ -67,7 +68,8 @@ class Step:
     @property
     def asked(self) -> dict[str, Json]:
         """Return the arguments as JSON values, by dotted name, to say in which of them two steps differ."""
-        return dict(_flatten(json.loads(json.dumps(self.arguments, default=_fields))))
+        values = json.loads(json.dumps(self.arguments, default=_fields))
+        return {name.removeprefix("settings.").removeprefix("recipe."): value for name, value in flatten(values)}
 
     def fingerprint(self, inputs: Mapping[str, str]) -> str:
         """Return a hash of what is asked: function, arguments, and the fingerprints of the needed steps (`inputs`).
@@ -92,21 +94,12 @@ def _fields(value: Any) -> dict[str, Any]:
     raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a record of them")
 
 
-def _flatten(values: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values within nested JSON objects by dotted names, without a leading "settings" or "recipe"."""
-    if not isinstance(values, dict) or not values:
-        yield name, values
-        return
-    for key, value in values.items():
-        yield from _flatten(value, key if name in ("", "settings", "recipe") else f"{name}.{key}")
-
-
 @dataclass(frozen=True)
 class Record:
     """The record of a step's execution: hashes of what was asked and of the code that did it."""
 
     fingerprint: str  # see `Step.fingerprint`
-    code: Mapping[str, str]  # hash of the code it reaches, by module: see `steps.source_hash`
+    code: Mapping[str, str]  # hash of the code it reaches, by module: see `engine.source_hash`
     lineage: str  # of its code and of the lineages of the steps it needs; "" where the code is not known
     asked: Mapping[str, Json] | None = field(default=None, compare=False)  # see `Step.asked`; None: not recorded
 
