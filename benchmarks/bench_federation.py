@@ -33,9 +33,9 @@ from flcav.perception.weather.model import SIDE
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
-from flcav.seeds import derive_seed
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.statistics.streams import derive_seed
 
 STEPS, REPEATS = 20, 5
 SCHEDULE = Schedule(rounds=1, steps=STEPS, learning_rate=1e-3, final_learning_rate=1e-3, seed=0)

@@ -26,9 +26,9 @@ from flcav.perception.objects.predict import predict
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network
 from flcav.perception.training import AdamW, step
-from flcav.seeds import stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.statistics.streams import stream
 
 T = TypeVar("T")
 

@@ -19,9 +19,9 @@ from flcav.perception.signs.samples import Sample, sample_from_frame
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import build_network
 from flcav.perception.training import AdamW, step
-from flcav.seeds import stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.statistics.streams import stream
 
 RECIPE = Path(__file__).parents[1] / "recipes/signs.yaml"
 FRAMES, REPEATS = 16, 7

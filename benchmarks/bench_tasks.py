@@ -20,10 +20,10 @@ from flcav.dataset.store import Dataset
 from flcav.perception.task import Task, build_network
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.training import AdamW, step
-from flcav.seeds import stream
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.statistics.streams import stream
 
 REPEATS = 5
 RING = {"front": 0, "front_left": 60, "front_right": -60, "back_left": 120, "back_right": -120, "back": 180}

@@ -8,13 +8,13 @@ import numpy as np
 from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.files import write_bytes
 from flcav.geometry import inverse, transform_points
 from flcav.report import style
 from flcav.report.pictures.birdseye import View, birdseye
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.storage.files import write_bytes
 
 RECIPE = {"town": "grid", "seed": 7, "cavs": 2, "poles": [8], "warmup_s": 40.0, "spins_per_scene": 2, "every_s": 2.0}
 

@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from flcav.geometry import left_vectors
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 from flcav.world.map.relief import Relief
 from flcav.world.map.roads import Edge, RoadNet, read_net
 from flcav.world.map.town import HILLS, TOWNS

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict
 
 import flcav
 from flcav.cli.main import app
-from flcav.markdown import format_table
+from flcav.storage.markdown import format_table
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "commands.md"

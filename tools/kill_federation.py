@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from flcav.files import sha256
+from flcav.interface.progress import ignore_progress
 from flcav.machine.threads import use_threads
 from flcav.pipeline.alone import WORK, list_needed
 from flcav.pipeline.engine import Step, ignore_steps, run_steps
@@ -32,8 +32,8 @@ from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, load_run_recipe
 from flcav.pipeline.results.saved import LEDGER, RESULT, WEIGHTS
-from flcav.progress import ignore_progress
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
+from flcav.storage.files import sha256
 
 FILES = (LEDGER, RESULT)  # beside the weights
 FORK = multiprocessing.get_context("fork")

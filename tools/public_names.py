@@ -18,7 +18,7 @@ from pydantic import BaseModel
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from flcav.fields import HEADING, written_fields
+from flcav.interface.fields import HEADING, written_fields
 
 WHOLE = "flcav"  # the package whose names are not said again of the others
 

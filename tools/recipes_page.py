@@ -11,8 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from pydantic.fields import FieldInfo
 
 from flcav.config import Config
-from flcav.fields import written_fields
-from flcav.markdown import format_table
+from flcav.interface.fields import written_fields
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.camera.camera import Camera
 from flcav.sensors.camera.infrared import Infrared
@@ -34,6 +33,7 @@ from flcav.sensors.rig import (
     Rig,
 )
 from flcav.sources.recipe import Recipe
+from flcav.storage.markdown import format_table
 from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.weather import WEATHER_CLASSES, WEATHERS, Keyframe, Weather, WeatherSchedule

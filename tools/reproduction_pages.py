@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from flcav.config import InputError, read_json
+from flcav.config import InputError, Json, read_json
 from flcav.experiments import run_tables
 from flcav.experiments.arms import tables as arms_tables
 from flcav.experiments.arms.run import ArmsResult
@@ -43,10 +43,10 @@ from flcav.experiments.studies import signs as signs_tables
 from flcav.experiments.studies import trajectory as trajectory_tables
 from flcav.experiments.studies import weather as weather_tables
 from flcav.experiments.studies.run import EvaluationT, Study, StudyResult, results_of_json
-from flcav.files import Json, write_bytes
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.running import RESULTS
-from flcav.records import from_json
+from flcav.storage.files import write_bytes
+from flcav.storage.records import from_json
 
 Tables = Mapping[str, str]
 T = TypeVar("T")

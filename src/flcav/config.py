@@ -7,7 +7,7 @@ aliases stand for are bounded before anything is built of them, and names lead n
 import json
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PureWindowsPath
 from types import NoneType
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin
@@ -15,10 +15,11 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args, get_origin
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
+from typing_extensions import TypeAliasType  # typing has it from Python 3.12 on; pydantic needs it for recursive types
 
-from flcav.files import Json
-from flcav.wording import describe_number, hint_share, suggest
+from flcav.interface.wording import describe_number, hint_share, suggest
 
+Json = TypeAliasType("Json", "bool | int | float | str | Sequence[Json] | Mapping[str, Json] | None")
 Place = tuple[int | str, ...]  # path to a nested field: names of fields, indices and keys, as pydantic's `loc`
 
 DEEPEST = 100  # most levels of nesting in a document

@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from flcav.config import InputError
-from flcav.wording import suggest
+from flcav.interface.wording import suggest
 
 Wanted = TypeVar("Wanted")
 

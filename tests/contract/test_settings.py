@@ -15,11 +15,11 @@ from task_drives import Drives
 
 from flcav.cli.main import run
 from flcav.dataset.recording.recorder import record
-from flcav.files import sha256
 from flcav.machine.threads import use_threads
 from flcav.perception.device import CPU, processor_of
 from flcav.perception.weather.task import WeatherTask
 from flcav.perception.weights import read_card
+from flcav.storage.files import sha256
 
 STEPS = 60  # one an epoch; a checkpoint is written after 50
 

@@ -20,10 +20,10 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import FILES_SCHEMA, write_table
 from flcav.dataset.validation import validate
-from flcav.files import sha256, write_json
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.storage.files import sha256, write_json
 
 RIG = {
     "lidars": {"lidar": {"mount": {"z": 1.85}, "settings": {"channels": 16, "azimuth_steps": 360}}},

@@ -18,9 +18,9 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import FILES_SCHEMA, write_table
 from flcav.dataset.validation import check_order, find_leaks, validate
-from flcav.files import sha256, write_json
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.storage.files import sha256, write_json
 
 RIG = {"lidars": {"lidar": {"mount": {"z": 1.85}, "settings": {"channels": 20, "azimuth_steps": 450}}}}
 

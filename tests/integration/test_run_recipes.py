@@ -43,7 +43,7 @@ from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.running import RESULTS, run, run_several
 from flcav.pipeline.sizes import Split, Splits, Training
 from flcav.report.pages.run_page import page, write_report
-from flcav.verdicts import UNDECIDED
+from flcav.statistics.verdicts import UNDECIDED
 from flcav.world.opendrive.importing import import_town
 
 pytestmark = pytest.mark.slow

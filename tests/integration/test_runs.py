@@ -51,7 +51,7 @@ from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import FederatedRound, Pretrained, StageResult, Watched
 from flcav.pipeline.running import RESULTS, run, run_seeds
 from flcav.report.pages.run_page import write_report
-from flcav.verdicts import ESTIMATE, UNDECIDED, verdict
+from flcav.statistics.verdicts import ESTIMATE, UNDECIDED, verdict
 from flcav.world.map.town import load_town
 
 pytestmark = pytest.mark.slow

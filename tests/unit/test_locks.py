@@ -18,6 +18,7 @@ from flcav.config import InputError
 from flcav.dataset.formats.export import export
 from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.recording.recorder import record
+from flcav.interface.progress import ignore_progress
 from flcav.machine import locks
 from flcav.machine.locks import only_writer
 from flcav.perception.training.run import train_prepared
@@ -25,7 +26,6 @@ from flcav.pipeline.engine import Step, ignore_steps, run_side_by_side, run_step
 from flcav.pipeline.engine.engines import perform
 from flcav.pipeline.engine.step import Record
 from flcav.pipeline.provenance import provenance
-from flcav.progress import ignore_progress
 from flcav.sources.recipe import Recipe
 from flcav.world.opendrive.importing import import_town
 

@@ -7,8 +7,8 @@ import typer
 
 from flcav.cli.options import STALE, Runtime, Stale
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
+from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
-from flcav.wording import plural
 
 if TYPE_CHECKING:
     from flcav.pipeline.engine import Notify
@@ -43,11 +43,11 @@ def federate(
     """
     use_threads(1)
     from flcav.cli.steps import live_steps
-    from flcav.files import check_writable
     from flcav.pipeline.alone import TRAIN_TIMES, federate_regions, measure_times, name_results
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.results.spending import TOGETHER
     from flcav.sources.recipe import find_recipe
+    from flcav.storage.files import check_writable
 
     check_writable(out)
     found = find_recipe(recipe)

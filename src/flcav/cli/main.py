@@ -21,7 +21,7 @@ from flcav.cli.perception import errors, evaluate, infer, train
 from flcav.cli.planning import allocate, fit, history, place
 from flcav.cli.terminal import Interrupted
 from flcav.config import InputError
-from flcav.wording import describe_number, suggest
+from flcav.interface.wording import describe_number, suggest
 
 INTERRUPTED = 130
 NO_FOLDER = (errno.ENOTDIR, errno.ELOOP)  # a path leads over a file, or a link to itself

@@ -12,11 +12,11 @@ import typer
 from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale, join_choices, refuse_unused
 from flcav.cli.terminal import only_writer_of, when_interrupted
 from flcav.experiments.studies import STUDIES
+from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
-from flcav.wording import plural
 
 if TYPE_CHECKING:
-    from flcav.files import Json
+    from flcav.config import Json
     from flcav.pipeline.recipe import RunRecipe
     from flcav.pipeline.results.run import Run
 
@@ -148,9 +148,9 @@ def reproduce(
 
 @when_interrupted()
 def _fig1b(out: Path) -> None:
-    from flcav import progress
     from flcav.experiments.fig1b.run import fig1b
-    from flcav.files import write_bytes
+    from flcav.interface import progress
+    from flcav.storage.files import write_bytes
 
     with progress.show_progress("record") as report:
         picture = fig1b(out, report)
@@ -160,7 +160,7 @@ def _fig1b(out: Path) -> None:
 
 def _fig3a(out: Path) -> None:
     from flcav.experiments.fig3a.run import draw_fig3a, fig3a
-    from flcav.files import write_bytes, write_json
+    from flcav.storage.files import write_bytes, write_json
 
     results = fig3a()
     write_json(out / "result.json", results.as_json())
@@ -171,7 +171,7 @@ def _fig3a(out: Path) -> None:
 
 @when_interrupted()
 def _record_and_draw(target: Target, out: Path) -> None:
-    from flcav import progress
+    from flcav.interface import progress
 
     with progress.show_progress(target.value) as report:
         if target == Target.fig3b:
@@ -190,7 +190,7 @@ def _record_and_draw(target: Target, out: Path) -> None:
 
 @when_interrupted()
 def _attack(target: Target, out: Path, seeds: int) -> None:
-    from flcav import progress
+    from flcav.interface import progress
 
     with progress.show_progress(target.value) as report:
         if target == Target.federation_faults:
@@ -203,7 +203,7 @@ def _attack(target: Target, out: Path, seeds: int) -> None:
 
 def _write_figures(out: Path, numbers: "Json", pictures: Mapping[str, bytes], sentences: Sequence[str]) -> None:
     """Write numbers and pictures, and say what was found."""
-    from flcav.files import write_bytes, write_json
+    from flcav.storage.files import write_bytes, write_json
 
     write_json(out / "result.json", numbers)
     for name, picture in pictures.items():
@@ -214,7 +214,7 @@ def _write_figures(out: Path, numbers: "Json", pictures: Mapping[str, bytes], se
 
 def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.experiments.arms.run import compare_arms, draw_arms, judge_differences
-    from flcav.files import write_bytes, write_json
+    from flcav.storage.files import write_bytes, write_json
 
     results = compare_arms(*_run_seeds(Target.demo_arms, "arms", out, seeds, scale, jobs, engine, stale))
     write_json(out / "result.json", results.as_json())
@@ -233,8 +233,8 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
 def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.fig6a.run import BUDGETS, budget_recipes, compare_plans, draw_allocation, plans_differ
-    from flcav.files import write_bytes, write_json
     from flcav.pipeline.running import run_several
+    from flcav.storage.files import write_bytes, write_json
 
     recipe = _load_sized("allocation", scale)
     with live_steps(Target.fig6a_allocation.value) as notify:
@@ -342,9 +342,9 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int,
     from flcav.cli.steps import live_steps
     from flcav.config import InputError
     from flcav.experiments.sim_to_real.run import draw_clouds, draw_frame, run_sim_to_real
-    from flcav.files import write_bytes, write_json
     from flcav.perception.networks import resolve_network
     from flcav.perception.objects.task import OBJECTS
+    from flcav.storage.files import write_bytes, write_json
 
     if kitti is None:
         raise InputError("--kitti is missing: sim-to-real needs a folder of real frames in KITTI's layout")
@@ -366,7 +366,7 @@ def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: E
     from flcav.cli.steps import live_steps
     from flcav.experiments.studies import study_named
     from flcav.experiments.studies.run import results_as_json, run_study
-    from flcav.files import write_bytes, write_json
+    from flcav.storage.files import write_bytes, write_json
 
     study = study_named(target.removeprefix(TASK))
     with live_steps(target) as notify:

@@ -9,8 +9,8 @@ import typer
 from flcav.cli.options import AGENTS, ENGINE, JOBS, STALE, Engine, Stale
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.config import InputError
+from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
-from flcav.wording import plural
 
 if TYPE_CHECKING:
     from flcav.pipeline.results.run import Run, Summary
@@ -51,9 +51,9 @@ def run(
 
 def _forecast(path: Path, as_json: bool) -> None:
     use_threads(1)
+    from flcav.interface.progress import show_progress
     from flcav.pipeline.forecast import forecast_run
     from flcav.pipeline.recipe import load_run_recipe
-    from flcav.progress import show_progress
     from flcav.sources.recipe import find_recipe
 
     found = find_recipe(path)
@@ -95,12 +95,12 @@ def _run(
 ) -> None:
     use_threads(1)
     from flcav.cli.steps import live_steps
-    from flcav.files import check_writable
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import run as run_one
     from flcav.pipeline.running import run_seeds
     from flcav.report.pages.run_page import write_report
     from flcav.sources.recipe import find_recipe
+    from flcav.storage.files import check_writable
 
     check_writable(out)
     found = find_recipe(path)
@@ -179,9 +179,9 @@ def compare(
 def _compare_networks(
     first: Path, second: Path, data: Path, task: str | None, agents: str | None, as_json: bool
 ) -> None:
+    from flcav.interface.progress import show_progress
     from flcav.perception.networks import compare_networks
     from flcav.perception.weights import read_card
-    from flcav.progress import show_progress
 
     if odd := next((path for path in (first, second) if path.is_dir()), None):
         raise InputError(f"{odd}: a folder; with --data two files of weights are compared")

@@ -7,10 +7,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from flcav.federation.state import FAILED
+from flcav.interface.progress import DAMAGED
+from flcav.interface.wording import plural
 from flcav.pipeline.engine import FINISHED, Notify
 from flcav.pipeline.rigs import RIG
-from flcav.progress import DAMAGED
-from flcav.wording import plural
 
 EPSILON = "epsilon"  # in the notes of rounds with differential privacy
 

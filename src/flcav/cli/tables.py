@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 
 from flcav.config import InputError, shorten
-from flcav.exchange import read_csv
-from flcav.parquet import read_parquet
+from flcav.storage.exchange import read_csv
+from flcav.storage.parquet import read_parquet
 
 
 def read_table(path: Path, columns: Sequence[str], names: Sequence[str] = ()) -> pa.Table:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from flcav.files import Json
+from flcav.config import Json
 from flcav.machine.locks import only_writer
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import typer
 
 from flcav.cli.options import check_png
 from flcav.cli.terminal import print_json
-from flcav.wording import plural
+from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -50,9 +50,9 @@ def show(
     As a map: roads, lanes, markings, buildings, trees, signs, lights, and the numbered candidate poles. As a table: the
     poles' id, x, y, z [m, world], yaw_deg and kind, which `flcav place` reads; recipes take the same ids.
     """
-    from flcav.exchange import write_table
-    from flcav.files import write_bytes
     from flcav.report.pictures.town_map import town_map
+    from flcav.storage.exchange import write_table
+    from flcav.storage.files import write_bytes
     from flcav.world.map.census import summarise_town
     from flcav.world.map.town import load_town
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from flcav.lazy import lazy_names
+from flcav.interface.lazy import lazy_names
 
 if TYPE_CHECKING:
     from flcav.dataset.recording.recorder import record

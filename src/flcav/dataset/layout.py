@@ -7,8 +7,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from flcav.config import InputError, describe_error, read_json
-from flcav.files import Json
+from flcav.config import InputError, Json, describe_error, read_json
 
 FORMAT = 3  # of datasets with tilted boxes, in the table `tilts`
 LEVEL_FORMAT = 2  # of all others

@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from flcav.config import Json
 from flcav.dataset.tables import (
     ACCELERATION_COLUMNS,
     AMODAL_COLUMNS,
@@ -20,7 +21,6 @@ from flcav.dataset.tables import (
     VISIBLE_COLUMNS,
     WEATHER_COLUMNS,
 )
-from flcav.files import Json
 from flcav.sensors.frame import Frame, SignViews, Views
 
 Column = Sequence[Json] | NDArray

@@ -18,11 +18,11 @@ from flcav.dataset.checks.scenes import BlockedViews, check_motion
 from flcav.dataset.layout import MANIFEST, FrameKey, Manifest, read_manifest, trace_path
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import list_files
-from flcav.files import sha256
-from flcav.progress import Report, print_progress
+from flcav.interface.progress import Report, print_progress
+from flcav.interface.wording import plural
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Frame
-from flcav.wording import plural
+from flcav.storage.files import sha256
 from flcav.world.trace import Trace
 
 

@@ -6,11 +6,11 @@ import numpy as np
 from scipy.stats import permutation_test, rankdata
 
 from flcav.federation.divergence import RoundDivergence
-from flcav.markdown import format_table
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.training import FederatedRound, StageResult
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
+from flcav.storage.markdown import format_table
 
 PARTS = ("whole", "learned", "statistics")  # of `Divergence`
 CORRELATION = "rank correlation with the mean gain"

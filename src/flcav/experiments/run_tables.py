@@ -7,7 +7,6 @@ import numpy as np
 
 from flcav.experiments.cloud_rounds import cloud_tables
 from flcav.federation.state import FAILED
-from flcav.markdown import format_bullets, format_table
 from flcav.network.ledger import LINKS
 from flcav.pipeline.analysis.findings import findings, name_stage
 from flcav.pipeline.analysis.home import list_home_costs
@@ -19,6 +18,7 @@ from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Finding
 from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.spread import read_spreads, widen_anew
+from flcav.storage.markdown import format_bullets, format_table
 
 
 def tables(run: Run) -> dict[str, str]:

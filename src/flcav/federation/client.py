@@ -53,7 +53,7 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.trainable import Correction, LocalUpdate, Trainable, Update, Weights, count_samples, learned_names
 from flcav.federation.upload import Arrays, subtract
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 PARTITION = "partition-id"  # key of Flower's simulation in a node's config: place of the client among all
 OWN, RESIDUAL = "own", "residual"  # records of a node's state: what strategy and compression keep between rounds

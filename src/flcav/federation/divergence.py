@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flcav.federation.trainable import Weights, learned_names, statistics_names
-from flcav.records import Record
+from flcav.storage.records import Record
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from flcav.federation.privacy import add_noise, clip_change
 from flcav.federation.rules import Rules
 from flcav.federation.trainable import Forms, LocalUpdate, Update, Weights, forms_of, learned_names
 from flcav.federation.upload import VALUES, Arrays, add, compress, compressed_forms, decompress, subtract
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 
 def is_changed(rules: Rules) -> bool:

@@ -23,7 +23,7 @@ from flcav.federation.noise import Normals, secret_noise
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import add, subtract
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 Arrays = dict[str, NDArray[np.number]]  # by name
 ROUNDING = 1e-12  # relative: more than the sum of squares of a clipped change is off in float64

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flcav.config import Config, InputError
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 Rule = Literal["all", "uniform", "poisson", "round-robin", "importance", "deadline", "planned"]
 

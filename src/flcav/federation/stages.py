@@ -32,7 +32,7 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust, needs_known_number
 from flcav.federation.trainable import Counts, Distiller, LocalUpdate, Trainable, Weights
 from flcav.federation.upload import name_like
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 if TYPE_CHECKING:
     from flcav.federation.runtimes.simulation import RaySimulation

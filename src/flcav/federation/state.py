@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flcav.federation.divergence import RoundDivergence
 from flcav.federation.noise import Secret, draw_secret
-from flcav.records import LEFT_OUT, Record
+from flcav.storage.records import LEFT_OUT, Record
 
 Arrays = dict[str, NDArray[np.number]]  # by name
 ClientStates = dict[str, dict[str, Arrays]]  # by client and kind

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.extras import format_install_command
 from flcav.fusion.average import YAW, RoadAverage, average_boxes, variance_of
 from flcav.fusion.clocks import set_clocks
 from flcav.fusion.sightings import Navigation, Sighting, tell
 from flcav.geometry import pose, transform_points, wrap_angle, yaw_of
+from flcav.interface.extras import format_install_command
 
 Array = NDArray[np.float64]
 

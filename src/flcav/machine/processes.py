@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from flcav.config import InputError
-from flcav.extras import format_install_command
+from flcav.interface.extras import format_install_command
 from flcav.machine.threads import VARIABLES, threads_of_children
 
 _STARTING = threading.Lock()  # of the fork server: only one thread at a time changes the environment

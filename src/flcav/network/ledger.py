@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import pyarrow as pa
 
 from flcav.config import InputError
-from flcav.parquet import read_parquet, write_parquet
+from flcav.storage.parquet import read_parquet, write_parquet
 
 Link = Literal["wireless", "wireline"]
 Direction = Literal["up", "down"]

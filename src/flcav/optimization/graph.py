@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 from flcav.config import InputError, parse_config, read_yaml
 from flcav.optimization.curves.curves import NonNegative, OwnCurve, Positive
 from flcav.optimization.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
-from flcav.records import LEFT_OUT
+from flcav.storage.records import LEFT_OUT
 
 KINDS = ("task", "network", "modality", "vehicle")  # of nodes; each layer joins two neighbours of this list
 

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from flcav.config import Config
 from flcav.network.plan import MessageSizes
 from flcav.optimization.curves.curves import STAGES, Additive, Curve, NonNegative, OwnCurve, Positive, Shared
-from flcav.records import LEFT_OUT
+from flcav.storage.records import LEFT_OUT
 
 MOST = 10**9  # largest count
 WORST = 1e6  # largest error that a curve may predict within the limits; that of a fitted curve is about 1

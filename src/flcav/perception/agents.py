@@ -4,10 +4,9 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from flcav.config import InputError
+from flcav.config import InputError, Json
 from flcav.dataset.ground import POLE
 from flcav.dataset.store import Dataset
-from flcav.files import Json
 from flcav.perception.task import ConfigT, KnownLidar, KnowsRig, NetworkT, RigBound, SampleT, Task
 
 

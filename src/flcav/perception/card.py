@@ -6,18 +6,18 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
-from flcav.config import Config
+from flcav.config import Config, Json
 from flcav.dataset.ground import POLE
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
-from flcav.files import Json, sha256, write_bytes
-from flcav.markdown import format_bullets, format_table
+from flcav.interface.wording import plural
 from flcav.perception.agents import FrameSelection, kind_of
 from flcav.perception.task import KnownLidar
-from flcav.records import LEFT_OUT, Record
 from flcav.sensors.rig import RIGS
 from flcav.sources.randomisation import DRAWN_BEAMS
-from flcav.wording import plural
+from flcav.storage.files import sha256, write_bytes
+from flcav.storage.markdown import format_bullets, format_table
+from flcav.storage.records import LEFT_OUT, Record
 
 CARD_KEY = "flcav.card"  # key of the card in the metadata of a safetensors file
 LICENCE = "Apache-2.0"

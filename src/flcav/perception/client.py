@@ -10,9 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from flcav.config import InputError
+from flcav.config import InputError, Json
 from flcav.dataset.store import Dataset
-from flcav.files import Json
 from flcav.machine.threads import use_threads
 from flcav.network.messages import from_names, pack
 from flcav.perception.images import pack_pictures

@@ -17,7 +17,7 @@ from flcav.perception.client import TaskClient
 from flcav.perception.task import ConfigT, NetworkT, Practice, SampleT, Task
 from flcav.perception.training import train_steps
 from flcav.perception.weights import from_arrays, to_arrays
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 PROBABILITIES = "probabilities"  # name of the one array that is sent
 SAME = 1e-6  # difference up to which probabilities teach nothing

@@ -15,9 +15,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
-from flcav.exchange import write_table
+from flcav.interface.progress import Report, ignore_progress
 from flcav.network.messages import from_names, pack, to_names, unpack
-from flcav.progress import Report, ignore_progress
+from flcav.storage.exchange import write_table
 
 if TYPE_CHECKING:
     from torch import nn

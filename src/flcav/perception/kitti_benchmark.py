@@ -17,6 +17,8 @@ from flcav.dataset.formats.kitti.read import BEAMS, HEIGHT_M, RANGE_M
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import EDGES
 from flcav.geometry import Boxes, pose, transform_points
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.metrics.kitti import (
     COUNTS,
@@ -34,10 +36,8 @@ from flcav.perception.objects.samples import describe_rig
 from flcav.perception.objects.truth import level_mount
 from flcav.perception.ops.rotated import iou
 from flcav.perception.task import Evaluated, KnownLidar
-from flcav.progress import Report, ignore_progress
-from flcav.records import Class
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front
-from flcav.wording import plural
+from flcav.storage.records import Class
 
 Array = NDArray[np.float64]
 BenchmarkKind = Literal["image", "bev", "3d"]  # rectangles in the image, footprints, boxes

@@ -12,10 +12,10 @@ from typing import Any, cast
 
 from torch import nn
 
-from flcav.config import DamagedFile, InputError
+from flcav.config import DamagedFile, InputError, Json
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
-from flcav.files import Json
+from flcav.interface.progress import Report, print_progress
 from flcav.machine.threads import use_threads
 from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card, join_lidars, read_lidar
@@ -32,7 +32,6 @@ from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.tracking.evaluate import evaluate_tracks, group_sequences
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import find_shipped, load_network, read_card
-from flcav.progress import Report, print_progress
 
 Named = str | Task
 Data = Dataset | Path | str

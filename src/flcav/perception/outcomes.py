@@ -1,7 +1,7 @@
 """Outcomes of a test, from which the task's measure and its bootstrap over scenes follow without the network.
 
 The bootstrap gives 95 % percentile intervals of the measure and of paired differences between two networks, see
-`flcav.intervals`. The `outcomes.py` of each task defines what is kept per unit (a frame, an image or a road user) and
+`flcav.statistics`. The `outcomes.py` of each task defines what is kept per unit (a frame, an image or a road user) and
 how the measure is computed from it.
 """
 
@@ -18,14 +18,16 @@ from torch import nn
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.files import atomic_path
-from flcav.intervals import REDRAWS, Estimate, SharedScenes, bootstrap_over_scenes, share_scenes
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
 from flcav.perception.task import Task
-from flcav.progress import Report, ignore_progress
-from flcav.records import Record
-from flcav.seeds import stream
-from flcav.verdicts import verdict
-from flcav.wording import plural
+from flcav.statistics.bootstrap import REDRAWS, bootstrap_over_scenes, share_scenes
+from flcav.statistics.estimates import Estimate
+from flcav.statistics.seeds import SharedScenes
+from flcav.statistics.streams import stream
+from flcav.statistics.verdicts import verdict
+from flcav.storage.files import atomic_path
+from flcav.storage.records import Record
 
 SCENE = "scene"
 Times = NDArray[np.int64]  # (n, N) how often each of N units is drawn in each of n bootstrap samples
@@ -244,7 +246,7 @@ def share_test_scenes(
     seed: int = 0,
     measure: Measure | None = None,
 ) -> SharedScenes:
-    """Return the spread of a mean over seeds by the test scenes that several seeds share, see `flcav.intervals`.
+    """Return the spread of a mean over seeds by the test scenes that several seeds share, see `flcav.statistics`.
 
     Each seed has one or several tests of the same frames. `number` computes the seed's number from their measures, such
     as the difference of two. `measure`: by default the task's own.

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
-from flcav.config import InputError, read_yaml
-from flcav.files import Json
+from flcav.config import InputError, Json, read_yaml
 from flcav.sources.recipe import recipe_path
 
 RecipeFields = Mapping[str, Json]  # fields of a recording's `Recipe`, as in YAML

@@ -18,11 +18,11 @@ from typing_extensions import TypeVar  # of typing from Python 3.13 on: with def
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import suggest
 from flcav.perception.marks import Mark
-from flcav.progress import Report, ignore_progress
-from flcav.records import Record
-from flcav.seeds import derive_seed
-from flcav.wording import suggest
+from flcav.statistics.streams import derive_seed
+from flcav.storage.records import Record
 
 if TYPE_CHECKING:
     from flcav.perception.images import CameraView

@@ -15,9 +15,9 @@ from safetensors.torch import save
 from torch import nn
 
 from flcav.config import DamagedFile, InputError, check_is_file
-from flcav.files import write_bytes
 from flcav.perception.card import CARD_KEY, Card
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
+from flcav.storage.files import write_bytes
 
 PREFIX = "flcav."
 LARGEST = 1e9  # largest absolute value of a weight; larger ones overflow in a few layers

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated
 
 from flcav.config import InputError
-from flcav.files import atomic_path
+from flcav.interface.progress import DAMAGED
 from flcav.pipeline.arms import check_federations
 from flcav.pipeline.engine import Notify, Stale, Step, print_steps, run_steps
 from flcav.pipeline.federations.checkpoint import LAST, Checkpoint
@@ -29,8 +29,8 @@ from flcav.pipeline.results.training import Round, StageResult, Watched
 from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.steps.edge import EdgeSettings, edge_step
 from flcav.pipeline.steps.settings import make_step
-from flcav.progress import DAMAGED
-from flcav.records import LEFT_OUT
+from flcav.storage.files import atomic_path
+from flcav.storage.records import LEFT_OUT
 
 WORK, TRAIN_TIMES = "work", "times.json"
 FEDERATE = "federate"  # in the names of the steps

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import InputError
-from flcav.intervals import Estimate, MeanOverSeeds, OneTraining, combine_spreads, of_one_training, widen
 from flcav.pipeline.analysis.differences import compare_tests
 from flcav.pipeline.analysis.tests import mean_of_tests, mean_over_trainings
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Test
 from flcav.pipeline.running import WORK, seed_folders
-from flcav.verdicts import UNDECIDED, Claim, Judged, judge, judge_known
+from flcav.statistics.estimates import Estimate, combine_spreads, widen
+from flcav.statistics.seeds import MeanOverSeeds, OneTraining, of_one_training
+from flcav.statistics.verdicts import UNDECIDED, Claim, Judged, judge, judge_known
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task
 

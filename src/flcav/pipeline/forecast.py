@@ -14,6 +14,8 @@ from typing import Annotated
 
 import numpy as np
 
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
 from flcav.network.ledger import Link
 from flcav.network.plan import MessageSizes, StagePlan, price
 from flcav.perception.client import as_shared
@@ -32,9 +34,7 @@ from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAI
 from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.stages.clients import make_clients
 from flcav.pipeline.steps.planning import FirstPlanSettings, frame_plan
-from flcav.progress import Report, ignore_progress
-from flcav.records import LEFT_OUT, Record
-from flcav.wording import plural
+from flcav.storage.records import LEFT_OUT, Record
 
 STEPS = 3  # that are timed
 SCENE_SD = 0.1  # of a paired difference of AP50 or accuracy in one test scene: .08 to .14 in reproductions/runs

@@ -12,16 +12,16 @@ from flcav.config import InputError, parse_config, shorten
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.files import sha256
+from flcav.interface.progress import Report
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.client import as_shared
 from flcav.perception.tasks import task_named
 from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName, find_path
 from flcav.pipeline.results.saved import Saved
-from flcav.progress import Report
-from flcav.seeds import derive_seed, stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.statistics.streams import derive_seed, stream
+from flcav.storage.files import sha256
 from flcav.world.map.town import PACKAGED
 
 DATA = "data"

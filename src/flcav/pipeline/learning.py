@@ -9,7 +9,7 @@ from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.weights import load_network
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.sizes import Training
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 
 @dataclass(frozen=True)

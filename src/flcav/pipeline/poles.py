@@ -14,7 +14,7 @@ from flcav.perception.errors import PerceptionError
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import Placement
 from flcav.pipeline.results.placement import Placed, Pole
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 from flcav.world.map.census import measure_traffic_density
 from flcav.world.trace import Trace
 

@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
+from flcav.config import Json
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
-from flcav.files import Json
 from flcav.perception.agents import choose_frames
 from flcav.perception.card import join_lidars, read_lidar
 from flcav.perception.task import find_configuration

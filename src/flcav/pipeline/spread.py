@@ -13,10 +13,10 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from flcav.config import InputError
-from flcav.intervals import Spread, measure_spread, pool_spreads, widen, widen_share
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Difference, Test
 from flcav.pipeline.tables import read_table
+from flcav.statistics.estimates import Spread, measure_spread, pool_spreads, widen, widen_share
 
 Key = tuple[str, str, str, str, str, str]  # task, region, arm, stage, and of a difference the arm and stage before
 Spreads = Mapping[Key, Spread]

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pydantic import Field
 
 from flcav.config import Config
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 
 class Stragglers(Config):

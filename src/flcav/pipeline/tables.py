@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flcav.config import InputError, shorten
-from flcav.files import atomic_path
 from flcav.pipeline.recipe import find_path
+from flcav.storage.files import atomic_path
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

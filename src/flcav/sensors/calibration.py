@@ -12,10 +12,10 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from flcav.config import Config
-from flcav.seeds import stream
 from flcav.sensors.frame import Array, Calibration
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
 from flcav.sensors.rig import Mounted, Rig
+from flcav.statistics.streams import stream
 
 
 class CalibrationError(Config):

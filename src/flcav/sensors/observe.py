@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.geometry import pose
-from flcav.seeds import stream
 from flcav.sensors.calibration import CalibrationError, build_calibration, perturb_calibration
 from flcav.sensors.camera.camera import photograph
 from flcav.sensors.camera.infrared import render_thermal
@@ -19,6 +18,7 @@ from flcav.sensors.lidar.lidar import Lidar, point_times_s, scan
 from flcav.sensors.navigation import measure_inertia, measure_position
 from flcav.sensors.radar.radar import sweep_radar
 from flcav.sensors.rig import CAMERA_RANGE_M, Rig
+from flcav.statistics.streams import stream
 from flcav.world.scene import Scene
 from flcav.world.weather import WEATHERS, Weather
 

@@ -5,14 +5,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from flcav.config import InputError, shorten
-from flcav.files import Json
-from flcav.seeds import derive_seed, stream
+from flcav.config import InputError, Json, shorten
 from flcav.sensors.frame import LONGEST_NAME, Frame, format_key
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
 from flcav.sources.randomisation import randomise_rig, randomise_sizes, randomise_town, town_files
 from flcav.sources.recipe import Recipe
+from flcav.statistics.streams import derive_seed, stream
 from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, check_town_name, load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from flcav.config import Config, InputError, read_config, shorten
+from flcav.interface.wording import suggest
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
-from flcav.wording import suggest
 from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
 from flcav.world.weather import WEATHERS, WeatherSchedule

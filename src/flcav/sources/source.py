@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
-from flcav.files import Json
+from flcav.config import Json
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 

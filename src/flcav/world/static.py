@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from flcav.geometry import left_vectors
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 from flcav.world.map.relief import Relief
 from flcav.world.map.signals import Signals
 from flcav.world.map.town import KERB_M, Town

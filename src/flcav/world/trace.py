@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.files import atomic_path
 from flcav.geometry import rotations
-from flcav.parquet import read_parquet
+from flcav.storage.files import atomic_path
+from flcav.storage.parquet import read_parquet
 from flcav.world.shapes import SHAPES
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from flcav.config import Config
-from flcav.wording import suggest
+from flcav.interface.wording import suggest
 
 NO_FOG_M = 20_000.0  # from this visibility on, the air is clear
 NIGHT_DEG = -6.0  # sun elevation at the end of civil twilight: below it, street lamps and headlamps are on

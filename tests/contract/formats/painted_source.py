@@ -14,8 +14,8 @@ from PIL import Image, ImageDraw
 from shapely.geometry import MultiPoint
 
 from flcav.geometry import Boxes, pose
-from flcav.seeds import stream
 from flcav.sensors.frame import Annotations, Calibration, CameraImage, Frame, SignViews, Views
+from flcav.statistics.streams import stream
 from flcav.world.weather import Weather
 
 WIDTH, HEIGHT, FOCAL = 320, 160, 200.0

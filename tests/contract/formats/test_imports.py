@@ -26,6 +26,7 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import find_leaks, validate
 from flcav.geometry import inverse, wrap_angle
+from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger
 from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import group_frames
@@ -33,7 +34,6 @@ from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import EDGE, SPLITS_OF, RunRecipe
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import LEDGER
-from flcav.progress import ignore_progress
 from flcav.sensors.frame import Frame
 
 SCENES = 2

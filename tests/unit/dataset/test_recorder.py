@@ -15,12 +15,12 @@ import pytest
 import toy_source
 from toy_source import ToySource
 
-from flcav import files
 from flcav.config import InputError
 from flcav.dataset import layout
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
+from flcav.storage import files
 
 
 def digests(folder: Path) -> dict[str, str]:

@@ -10,7 +10,7 @@ from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import validate
-from flcav.files import sha256
+from flcav.storage.files import sha256
 from flcav.world.map.town import load_town
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from flcav.geometry import Boxes, pose
-from flcav.seeds import stream
 from flcav.sensors.frame import Annotations, Calibration, Frame
+from flcav.statistics.streams import stream
 
 MOUNT = pose(0.1, 0.0, 1.8, yaw=0.01)
 

@@ -17,7 +17,7 @@ from flcav.experiments.attacks.tables import fault_tables
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.reading import read_round
 from flcav.federation.stages import Schedule
-from flcav.intervals import OWN_SCENES
+from flcav.statistics.seeds import OWN_SCENES
 
 START = draw_head(1)
 CENTRES = np.random.default_rng(0).normal(0, 3, (CLASSES, 120)).clip(0)

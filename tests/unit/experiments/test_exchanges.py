@@ -39,7 +39,7 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, resolve_settings
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Federation, load_run_recipe
 from flcav.sources.recipe import recipe_path
-from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
+from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED
 
 RECIPE = load_run_recipe(recipe_path("runs/exchange"))
 

@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 import yaml
 
-from flcav.config import read_json
-from flcav.files import Json
+from flcav.config import Json, read_json
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.spread import read_spreads, widen_anew
 

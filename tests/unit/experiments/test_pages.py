@@ -6,8 +6,8 @@ from reproduction_pages import TABLES, fill, fill_folder, tables_of
 
 from flcav.config import InputError, read_json
 from flcav.experiments.arms.run import ARMS, ArmsResult, order_arms
-from flcav.markdown import format_table
 from flcav.pipeline.running import RESULTS
+from flcav.storage.markdown import format_table
 
 REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"
 RUNS = sorted((REPRODUCTIONS / "runs").glob("*"))

@@ -6,11 +6,11 @@ from flcav.config import parse_config
 from flcav.dataset.rectangles import SIGNS
 from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
 from flcav.experiments.studies.signs import STUDY, tables
-from flcav.intervals import mean_over_seeds
 from flcav.perception.card import Card
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.statistics.seeds import mean_over_seeds
 
 MISSING = frozenset({"stop", "speed_90"})  # in the held-out town
 

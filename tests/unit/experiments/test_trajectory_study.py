@@ -8,10 +8,10 @@ import pytest
 from flcav.experiments.studies import study_named
 from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
 from flcav.experiments.studies.trajectory import CAMERAS, STUDY, tables
-from flcav.intervals import mean_over_seeds
 from flcav.perception.card import Card
 from flcav.perception.trajectory.config import FUTURE, PAST
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
+from flcav.statistics.seeds import mean_over_seeds
 
 
 @pytest.mark.parametrize("study", [STUDY, CAMERAS])

@@ -10,6 +10,7 @@ from line_task import LineTask, Slope
 from flcav.federation.divergence import measure_divergence
 from flcav.federation.rules import Rules
 from flcav.federation.strategies import FEDAVG
+from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
@@ -20,7 +21,6 @@ from flcav.pipeline.recipe import CLOUD
 from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
-from flcav.progress import ignore_progress
 
 
 def test_divergence_is_the_mean_relative_distance_from_the_mean() -> None:

@@ -28,7 +28,7 @@ from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.federation.trainable import LocalUpdate
 from flcav.federation.upload import Upload
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 RATE, STEPS = 0.02, 5
 SCHEDULE = Schedule(rounds=4, steps=STEPS, learning_rate=RATE, final_learning_rate=RATE, seed=3)

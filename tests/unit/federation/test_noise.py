@@ -22,7 +22,7 @@ from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import Upload
-from flcav.seeds import derive_seed, stream
+from flcav.statistics.streams import derive_seed, stream
 
 START = {"w": np.zeros((60, 50), np.float32), "b": np.ones(30, np.float32)}
 SCHEDULE = Schedule(rounds=3, steps=1, learning_rate=0.1, final_learning_rate=0.1, seed=3)

@@ -23,7 +23,7 @@ from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, count_samples
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 SCHEDULE = Schedule(rounds=6, steps=5, learning_rate=0.05, final_learning_rate=0.02, seed=3)
 NAMES = [f"grid/cav{i}" for i in range(6)]

@@ -10,7 +10,7 @@ from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.strategies.fedavg import FedAvg, average
 from flcav.network.ledger import BudgetExceeded
 from flcav.network.plan import MessageSizes, StagePlan, price
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 SCHEDULE = Schedule(rounds=4, steps=20, learning_rate=0.05, final_learning_rate=0.01, seed=3)
 

@@ -12,6 +12,7 @@ from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, transform_points
+from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.weights import to_arrays
@@ -19,7 +20,6 @@ from flcav.pipeline.frames import Frames, list_window
 from flcav.pipeline.labels import pseudo_labels, road_average, sightings
 from flcav.pipeline.labels.pseudo_labels import pseudo_label_samples
 from flcav.pipeline.labels.road_average import RoadAverageLabels
-from flcav.progress import ignore_progress
 from flcav.sensors.frame import Annotations, Calibration, Frame
 
 CONFIG = second_tiny().config

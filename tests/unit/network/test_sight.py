@@ -15,7 +15,7 @@ from flcav.network.radio.coverage import cover_town, share_in_state
 from flcav.network.radio.links import link_vehicles, unit_positions
 from flcav.network.radio.propagation import State
 from flcav.network.radio.sight import find_sight, raise_walls, vehicle_boxes
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 from flcav.world.map.town import load_town
 
 HOUSE = (50.0, 0.0, 0.3, 20.0, 12.0, 9.0)

@@ -27,7 +27,7 @@ from flcav.perception.weather.config import LeNetConfig
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 SKIES = LeNetConfig(classes=("clear", "fog", "night"))
 COLOURS = np.array([(60, 120, 240), (200, 200, 200), (8, 8, 20)])

@@ -8,7 +8,6 @@ import pytest
 from scipy import stats
 from test_run_recipe import parsed
 
-from flcav.intervals import Estimate, Spread
 from flcav.perception.outcomes import Outcomes
 from flcav.pipeline.comparing import compare
 from flcav.pipeline.provenance import Provenance
@@ -17,7 +16,8 @@ from flcav.pipeline.results import tests
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.running import RESULTS, WORK
-from flcav.verdicts import HELD, UNDECIDED
+from flcav.statistics.estimates import Estimate, Spread
+from flcav.statistics.verdicts import HELD, UNDECIDED
 
 SCENES, PICTURES = 10, 20
 NAMES = np.repeat([f"ring-0-{scene}" for scene in range(SCENES)], PICTURES)

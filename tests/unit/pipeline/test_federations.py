@@ -18,6 +18,7 @@ from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavgm import FedAvgM
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
+from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.client import TaskClient
 from flcav.perception.objects.task import OBJECTS
@@ -37,7 +38,6 @@ from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
 from flcav.pipeline.stages.statistics import keep_statistics, score_statistics
-from flcav.progress import ignore_progress
 
 BUSY_S = 0.05  # CPU time of a training
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-from flcav.intervals import Estimate, SharedScenes, Spread, mean_over_seeds
 from flcav.pipeline.analysis.findings import findings
 from flcav.pipeline.analysis.history import gap_closed, gaps_closed
 from flcav.pipeline.arms import resolve_settings
@@ -17,7 +16,9 @@ from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference
 from flcav.pipeline.results.training import diverges
-from flcav.verdicts import ESTIMATE, HELD, NOT_HELD, UNDECIDED
+from flcav.statistics.estimates import Estimate, Spread
+from flcav.statistics.seeds import SharedScenes, mean_over_seeds
+from flcav.statistics.verdicts import ESTIMATE, HELD, NOT_HELD, UNDECIDED
 
 CAVEAT = "trained road detector"
 MEANS = {

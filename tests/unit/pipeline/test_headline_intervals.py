@@ -12,7 +12,6 @@ from scipy import stats
 from scipy.special import expit, logit
 
 from flcav.config import InputError
-from flcav.intervals import Estimate, Spread
 from flcav.perception.outcomes import Outcomes, compute_interval, compute_measure, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.analysis.differences import list_differences
@@ -24,7 +23,8 @@ from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.training import StageResult, Watched
 from flcav.pipeline.steps import testing
 from flcav.pipeline.steps.testing import RoundsSettings, rounds_step
-from flcav.seeds import stream
+from flcav.statistics.estimates import Estimate, Spread
+from flcav.statistics.streams import stream
 
 WEATHER = task_named("weather")
 SCENES, PICTURES = 12, 20

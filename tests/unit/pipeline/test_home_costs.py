@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flcav.intervals import Estimate
 from flcav.perception.metrics import Matches
 from flcav.perception.objects.outcomes import CLASSES, HIDDEN, KEPT
 from flcav.perception.outcomes import Outcomes, as_measurable, count_once, difference, further_measures
@@ -15,6 +14,7 @@ from flcav.pipeline.analysis.home import list_home_costs
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import HomeCost
 from flcav.pipeline.running import RESULTS
+from flcav.statistics.estimates import Estimate
 
 RUNS = Path(__file__).parents[3] / "reproductions" / "runs"
 OBJECTS = task_named("objects")

@@ -16,6 +16,7 @@ from flcav.federation.runtimes.metered import Outage
 from flcav.federation.stages import Schedule
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.plan import Price
 from flcav.optimization.problem import Problem
@@ -36,7 +37,6 @@ from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages import edge as stage_two
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
-from flcav.progress import Report, ignore_progress
 
 PREDICTED = {"pretrain": 0.4, "edge": 0.6, "cloud": 0.7}
 

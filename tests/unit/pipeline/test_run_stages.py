@@ -11,9 +11,7 @@ import pytest
 from line_task import LineTask, Slope
 from safetensors.numpy import load_file, save
 
-from flcav import files
 from flcav.config import InputError
-from flcav.exchange import write_table
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import FederationState
@@ -21,7 +19,7 @@ from flcav.federation.strategies import FEDAVG, Strategy, of_servers
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
-from flcav.files import write_bytes
+from flcav.interface.progress import Report, ignore_progress
 from flcav.network.clock.records import save_rounds
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.objects.task import OBJECTS
@@ -38,8 +36,10 @@ from flcav.pipeline.stages import centralised
 from flcav.pipeline.stages.centralised import pretrain, train_centrally
 from flcav.pipeline.stages.uploads import choose_planned_uploads, choose_uploads
 from flcav.pipeline.steps.budgets import region_budget, share_budget
-from flcav.progress import Report, ignore_progress
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
+from flcav.storage import files
+from flcav.storage.exchange import write_table
+from flcav.storage.files import write_bytes
 
 START = {"w": np.zeros(3, dtype=np.float32), "count": np.array(0, dtype=np.int64)}
 STAGE_ONE = LedgerEntry("pretrain", "t", "wireless", "up", 0, "suburb/cav0", 4_000_000)

@@ -18,6 +18,7 @@ from flcav.federation.rules import Rules
 from flcav.federation.state import SERVER
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Budget, BudgetExceeded, Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
@@ -35,7 +36,6 @@ from flcav.pipeline.sizes import Training
 from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
-from flcav.progress import ignore_progress
 
 ROUNDS, VEHICLES = 6, 3
 Federate = Callable[..., None]

@@ -9,10 +9,10 @@ import pytest
 
 from flcav.config import InputError
 from flcav.experiments.run_tables import tables
-from flcav.intervals import Spread
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.spread import SpreadRow, difference_key, list_figures, list_spreads, read_spreads, widen_anew
 from flcav.pipeline.tables import append_records
+from flcav.statistics.estimates import Spread
 
 ROOT = Path(__file__).parents[3]
 RUNS = ROOT / "reproductions/runs"

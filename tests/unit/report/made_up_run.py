@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 
 from flcav.geometry import Boxes
-from flcav.intervals import Estimate, Spread
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.placement import Placed, Pole
@@ -15,6 +14,7 @@ from flcav.pipeline.results.tests import Difference, Finding, Test, Tested
 from flcav.pipeline.results.training import Pretrained, Validated
 from flcav.report.pictures.clouds import Detections, Sweep
 from flcav.report.pictures.maps import DENSEST, ErrorMap, poles_of
+from flcav.statistics.estimates import Estimate, Spread
 from flcav.world.map.town import load_town
 
 MEANS = {"grid": (0.412, 0.503, 0.511), "ring": (0.381, 0.447, 0.468)}

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.text import Text
 
-from flcav.intervals import MeanOverSeeds
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE
+from flcav.statistics.seeds import MeanOverSeeds
 from flcav.world.line_of_sight import Viewshed
 
 TESTED, ROUNDS = made_up_run.chart_rows(), made_up_run.rounds()

@@ -7,7 +7,6 @@ import made_up_run
 import pytest
 from jinja2 import UndefinedError
 
-from flcav.intervals import Estimate
 from flcav.network.plan import Price
 from flcav.pipeline.recipe import EDGE, MAIN
 from flcav.pipeline.results.plans import Plan, RoundPlan
@@ -17,6 +16,7 @@ from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.running import RESULTS
 from flcav.report.pages.html import render
 from flcav.report.pages.run_page import page
+from flcav.statistics.estimates import Estimate
 
 DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo"
 PIXEL = b"\x89PNG made up"

@@ -9,7 +9,6 @@ from flcav.config import InputError
 from flcav.geometry import inverse
 from flcav.perception.card import read_lidar
 from flcav.perception.task import KnownLidar
-from flcav.seeds import stream
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.randomisation import (
@@ -21,6 +20,7 @@ from flcav.sources.randomisation import (
     town_files,
 )
 from flcav.sources.recipe import Recipe
+from flcav.statistics.streams import stream
 from flcav.world.map.parameters import BOUNDARIES
 from flcav.world.map.relief import Relief
 from flcav.world.map.surfaces import make_footprint

@@ -9,7 +9,7 @@ from shapely.geometry import Polygon
 
 from flcav.config import InputError
 from flcav.geometry import wrap_angle
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 from flcav.world.map.census import measure_traffic_density
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import KERB_M, TOWNS, Town, load_town

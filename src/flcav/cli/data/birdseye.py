@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import check_finite, check_png
-from flcav.wording import plural
+from flcav.interface.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -26,9 +26,9 @@ def birdseye(
 ) -> None:
     """Draw a frame of a dataset from above: points by height, radar echoes, boxes, the agent."""
     from flcav.dataset.store import Dataset
-    from flcav.files import write_bytes
     from flcav.report import style
     from flcav.report.pictures.birdseye import birdseye, view_frame
+    from flcav.storage.files import write_bytes
 
     dataset = Dataset.open(folder)
     seen = dataset.frame(0 if frame is None else dataset.number(frame))

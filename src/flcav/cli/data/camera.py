@@ -24,9 +24,9 @@ def camera(
     """Draw what the cameras of a frame saw, infrared ones too."""
     from flcav.config import InputError
     from flcav.dataset.store import Dataset
-    from flcav.files import write_bytes
     from flcav.report import style
     from flcav.report.pictures.camera import arrange_cameras, camera_sheet, make_shot
+    from flcav.storage.files import write_bytes
 
     dataset = Dataset.open(folder)
     names = [[*dataset.cameras(i), *dataset.infrareds(i)] for i in range(len(dataset))]

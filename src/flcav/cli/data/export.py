@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import Format, join_choices
-from flcav.wording import plural
+from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
     from flcav.dataset.formats.exporter import LeftOut
@@ -39,11 +39,11 @@ def export(
     ),
 ) -> None:
     """Write a dataset in a format that other software reads: docs/formats.md has the tables."""
-    from flcav import progress
     from flcav.config import parse_config
     from flcav.dataset.formats.export import export as write
     from flcav.dataset.formats.exporter import ExportOptions
     from flcav.dataset.store import Dataset
+    from flcav.interface import progress
 
     every = {
         "labels": labels,

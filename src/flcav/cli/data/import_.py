@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import ImportFormat, join_choices
-from flcav.wording import plural
+from flcav.interface.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -23,11 +23,11 @@ def import_(
 
     Files that need no conversion are linked to, so they have to stay where they are.
     """
-    from flcav import progress
     from flcav.dataset.checks.copies import find_copies
     from flcav.dataset.formats.importing import import_dataset
     from flcav.dataset.layout import read_manifest
     from flcav.dataset.validation import find_leaks
+    from flcav.interface import progress
 
     with progress.show_progress(f"import {out}") as report:
         notes = import_dataset(format, folder, out, split=split, progress=report)

@@ -6,7 +6,7 @@ import typer
 
 from flcav.cli.options import ENGINE, Engine
 from flcav.cli.terminal import when_interrupted
-from flcav.wording import plural
+from flcav.interface.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -24,13 +24,13 @@ def record(
     engine: Engine = ENGINE,
 ) -> None:
     """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
-    from flcav import progress
     from flcav.config import parse_config
     from flcav.dataset.layout import read_manifest, trace_path
     from flcav.dataset.recording.recorder import record as write
-    from flcav.files import check_writable
+    from flcav.interface import progress
     from flcav.sources.embedded import EmbeddedSource
     from flcav.sources.recipe import Recipe, find_recipe, load_recipe
+    from flcav.storage.files import check_writable
     from flcav.world.trace import Trace
 
     check_writable(out)

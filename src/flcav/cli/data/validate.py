@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.wording import plural
+from flcav.interface.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -16,11 +16,11 @@ def validate(
     folders: list[Path] = typer.Argument(metavar="DIR...", help="Datasets; several are also checked for leakage."),
 ) -> None:
     """Check datasets: files, tables, boxes against points and traffic, leakage between splits. Exit 1 on a problem."""
-    from flcav import progress
     from flcav.dataset.checks.copies import find_copies
     from flcav.dataset.layout import read_manifest
     from flcav.dataset.validation import find_leaks
     from flcav.dataset.validation import validate as problems_of
+    from flcav.interface import progress
 
     manifests = {folder: read_manifest(folder) for folder in folders}
     problems = find_leaks({str(folder): manifest for folder, manifest in manifests.items()}) + find_copies(folders)

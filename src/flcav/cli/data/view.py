@@ -7,7 +7,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.wording import plural
+from flcav.interface.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -21,11 +21,11 @@ def view(
     save: Path | None = typer.Option(None, "--save", help="Write this .rrd file instead of opening the viewer."),
 ) -> None:
     """Show a scene in Rerun: points, images, boxes, tracks, map, radar. Needs the extra `view`."""
-    from flcav import progress
     from flcav.config import InputError
     from flcav.dataset.store import Dataset
-    from flcav.extras import format_install_command
-    from flcav.files import atomic_path
+    from flcav.interface import progress
+    from flcav.interface.extras import format_install_command
+    from flcav.storage.files import atomic_path
 
     if find_spec("rerun") is None:
         raise InputError(f"flcav view needs Rerun, which is not installed: {format_install_command('view')}")

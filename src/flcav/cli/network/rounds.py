@@ -7,7 +7,7 @@ import typer
 from flcav.cli.network.radio import NETWORK, POLES, SCENE, SEED
 from flcav.cli.options import check_all_finite, check_finite, check_png
 from flcav.cli.terminal import print_json
-from flcav.wording import plural
+from flcav.interface.wording import plural
 
 BYTES_PER_MB = 1_000_000
 
@@ -65,11 +65,11 @@ def rounds(
 
     from flcav.config import read_config
     from flcav.dataset.store import Dataset
-    from flcav.files import check_writable, write_bytes
     from flcav.network.clock.records import save_rounds
     from flcav.network.clock.rounds import NetworkSettings, simulate_rounds
     from flcav.network.clock.work import ClientWork
     from flcav.network.radio.recorded import link_scene
+    from flcav.storage.files import check_writable, write_bytes
 
     for path in (out, timeline):
         if path is not None:

@@ -52,16 +52,16 @@ def errors(
     counts once per scene, each sign once. `flcav place` reads the table.
     """
     use_threads(threads)
-    from flcav import progress
     from flcav.config import InputError
     from flcav.dataset.store import Dataset
-    from flcav.exchange import check_ending
-    from flcav.files import check_writable, write_bytes
+    from flcav.interface import progress
     from flcav.perception import networks
     from flcav.perception.errors import save_errors
     from flcav.perception.objects.task import ObjectsTask
     from flcav.perception.task import Scores
     from flcav.perception.tasks import task_named
+    from flcav.storage.exchange import check_ending
+    from flcav.storage.files import check_writable, write_bytes
 
     learned = task_named(task)
     if not isinstance(learned, Scores):

@@ -40,7 +40,7 @@ def evaluate(
     KITTI are counted as its benchmark does: easy, moderate, hard.
     """
     use_threads(threads)
-    from flcav import progress
+    from flcav.interface import progress
     from flcav.perception import networks
     from flcav.perception.tasks import task_named
 

@@ -49,10 +49,10 @@ def infer(
     with "constant_velocity" beside them and "truth" where the recording goes on for long enough.
     """
     use_threads(threads)
-    from flcav.files import check_writable
     from flcav.perception import networks
     from flcav.perception.task import Scores
     from flcav.perception.tasks import task_named
+    from flcav.storage.files import check_writable
 
     if pictures is not None:
         check_writable(pictures)
@@ -79,8 +79,8 @@ def infer(
 
 
 def _draw(finding: "Finding", path: Path) -> None:
-    from flcav.files import write_bytes
     from flcav.report import style
     from flcav.report.pictures.inference import draw
+    from flcav.storage.files import write_bytes
 
     write_bytes(path, style.png(draw(finding)))

@@ -6,8 +6,8 @@ import typer
 
 from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device
 from flcav.cli.terminal import when_interrupted
+from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
-from flcav.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -43,9 +43,9 @@ def train(
     Curves for TensorBoard go to OUT/events.
     """
     use_threads(threads)
-    from flcav import progress
     from flcav.cli.options import refuse_unused
     from flcav.dataset.store import Dataset
+    from flcav.interface import progress
     from flcav.perception.device import select_device
     from flcav.perception.tasks import task_named
     from flcav.perception.training.run import CHECKPOINT, WEIGHTS, Request, prepare, train_prepared

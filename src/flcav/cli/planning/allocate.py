@@ -107,9 +107,9 @@ def _plan(
         raise
     more = compute_savings(asked, plan)
     if out is not None:
-        from flcav.files import write_bytes
         from flcav.optimization.allocation.comparison import compare_plan
         from flcav.report.pages.plan_page import plan_page
+        from flcav.storage.files import write_bytes
 
         page = plan_page(compare_plan(asked, plan, shares, more), read_graph(problem))
         write_bytes(out, page.encode())

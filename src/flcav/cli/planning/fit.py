@@ -9,7 +9,7 @@ import typer
 
 from flcav.cli.options import check_all_finite, check_finite, refuse_unused
 from flcav.cli.terminal import only_writer_of, print_json
-from flcav.wording import plural
+from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -145,8 +145,8 @@ def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:
 
 
 def _write(problem: Path, held: str | None, found: "Mapping[str, FittedFields]", k: int, history: str) -> None:
-    from flcav.files import write_bytes
     from flcav.optimization.allocation.problem_file import format_problem, insert_curves
+    from flcav.storage.files import write_bytes
 
     text = format_problem(found, k, history) if held is None else insert_curves(held, found, k, str(problem))
     write_bytes(problem, text.encode())

@@ -7,8 +7,8 @@ import typer
 from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
 from flcav.cli.terminal import only_writer_of, when_interrupted
 from flcav.config import InputError
+from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
-from flcav.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -39,11 +39,11 @@ def history(
     """
     use_threads(1)
     from flcav.cli.steps import live_steps
-    from flcav.files import check_writable
     from flcav.pipeline.analysis.learning_history import history_recipes, save_origin
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import HISTORY, run_several
     from flcav.sources.recipe import find_recipe
+    from flcav.storage.files import check_writable
 
     counts = _parse_counts(samples)
     check_writable(out)

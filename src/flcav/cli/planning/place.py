@@ -9,13 +9,13 @@ import typer
 
 from flcav.cli.options import Method, check_finite, check_png
 from flcav.cli.terminal import print_json
-from flcav.wording import plural
+from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from flcav.cli.planning.place_inputs import Given
-    from flcav.files import Json
+    from flcav.config import Json
     from flcav.optimization.placement.solve import Candidates, Placement
     from flcav.optimization.verification.record import Verification
     from flcav.world.map.town import Town
@@ -71,11 +71,11 @@ def place(
 
     from flcav.cli.planning import place_inputs
     from flcav.config import InputError
-    from flcav.files import check_writable
     from flcav.optimization.placement import solve
     from flcav.optimization.placement.baselines import place_at_random
     from flcav.optimization.placement.cheapest import cover_share
     from flcav.optimization.placement.place import check_inside, find_seen
+    from flcav.storage.files import check_writable
 
     for file in (errors, poles, sensors):
         if file is not None and not file.exists():
@@ -238,10 +238,10 @@ def _draw(
 
     Where the placement is by line of sight (`seen` is given), the map shows what each sensor sees.
     """
-    from flcav.files import write_bytes
     from flcav.report import style
     from flcav.report.charts.figures import town_map
     from flcav.report.pictures.maps import DENSEST, LONGEST, MOST_VISIBLE, ErrorMap
+    from flcav.storage.files import write_bytes
     from flcav.world.line_of_sight import find_viewshed
 
     names = [str(pole) for pole in given.ids]

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from flcav.interface.wording import plural
 from flcav.sensors.frame import Frame
-from flcav.wording import plural
 from flcav.world.trace import Trace
 
 CLOSE_M = 1.0  # points closer to the LiDAR are from its mount or an obstruction

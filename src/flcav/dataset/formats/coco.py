@@ -13,6 +13,7 @@ import numpy as np
 from faster_coco_eval.core import mask as coco_mask
 from numpy.typing import NDArray
 
+from flcav.config import Json
 from flcav.dataset.formats.exporter import (
     Exported,
     ExportOptions,
@@ -24,8 +25,7 @@ from flcav.dataset.formats.exporter import (
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
-from flcav.files import Json
-from flcav.progress import Report
+from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 
 

@@ -15,9 +15,9 @@ from flcav.dataset.formats.nuscenes import export_nuscenes
 from flcav.dataset.formats.opv2v.write import export_opv2v
 from flcav.dataset.formats.yolo import export_yolo
 from flcav.dataset.store import Dataset
-from flcav.files import flush_tree
+from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.locks import LOCK, only_writer
-from flcav.progress import Report, ignore_progress
+from flcav.storage.files import flush_tree
 
 DEFAULTS = ExportOptions()
 

@@ -15,9 +15,9 @@ from flcav.config import Config, InputError
 from flcav.dataset.rectangles import select_rectangles
 from flcav.dataset.store import Dataset
 from flcav.geometry import points_in_boxes, transform_points
-from flcav.progress import Report
+from flcav.interface.progress import Report
+from flcav.interface.wording import plural
 from flcav.sensors.frame import Frame
-from flcav.wording import plural
 
 SPLITS = ("train", "val", "test")
 

@@ -12,8 +12,8 @@ from flcav.dataset.formats.opv2v.read import Opv2vSource
 from flcav.dataset.formats.reading import LogSource
 from flcav.dataset.layout import WORK
 from flcav.dataset.recording.recorder import drop_unbegun, record
+from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.locks import only_writer
-from flcav.progress import Report, ignore_progress
 
 
 class Readable(NamedTuple):

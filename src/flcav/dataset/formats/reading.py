@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flcav.config import InputError, parse_config, shorten
+from flcav.config import InputError, Json, parse_config, shorten
 from flcav.dataset.payloads import open_image, read_image
 from flcav.dataset.store import LazyMapping
 from flcav.dataset.upright import measure_upright
-from flcav.files import Json
 from flcav.geometry import Boxes, angles_of, count_points_in_boxes, inverse, transform_points
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, LinkedFrame, SignViews, Views
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front, compute_truncation

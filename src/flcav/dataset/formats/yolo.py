@@ -22,7 +22,7 @@ from flcav.dataset.formats.exporter import (
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.rectangles import CLASSES, Rectangles, select_rectangles
 from flcav.dataset.store import Dataset
-from flcav.progress import Report
+from flcav.interface.progress import Report
 
 OTHERS = {  # what is labelled -> what is not, and how to have it
     "signs": LeftOut(

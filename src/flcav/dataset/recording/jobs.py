@@ -22,9 +22,9 @@ from flcav.dataset.layout import CALIBRATION, FILES, MANIFEST, TOWN, TRACES, pay
 from flcav.dataset.payloads import PICTURES, POINTS, check_image, encode_payloads
 from flcav.dataset.rows import build_table, encode_frame
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
-from flcav.files import flush_all, flush_tree, sha256, write_bytes, write_in_pieces
 from flcav.sensors.frame import LONGEST_NAME, Frame, LinkedFrame
 from flcav.sources.source import Replayable, Source
+from flcav.storage.files import flush_all, flush_tree, sha256, write_bytes, write_in_pieces
 from flcav.world.trace import Trace
 
 PART_FRAMES = 16  # frames of a part: few are lost by an interruption, and starting a part is cheap beside them

@@ -13,8 +13,8 @@ from flcav.config import InputError, path_within
 from flcav.dataset.layout import TOWN, WORK, read_manifest, table_path, town_path, trace_path
 from flcav.dataset.recording.jobs import PAYLOADS, TRAFFIC, split_scene
 from flcav.dataset.tables import list_files, read_table
-from flcav.files import flush_all, sha256, write_bytes
 from flcav.sources.source import Source, TownSource
+from flcav.storage.files import flush_all, sha256, write_bytes
 
 
 def find_damage(out: Path) -> set[str]:

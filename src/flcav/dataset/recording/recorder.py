@@ -16,7 +16,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from flcav.config import InputError, read_json
+from flcav.config import InputError, Json, read_json
 from flcav.dataset.layout import (
     CALIBRATION,
     FILES,
@@ -44,12 +44,12 @@ from flcav.dataset.recording.mending import find_damage, has_damaged_table, mend
 from flcav.dataset.recording.ray_engine import start_ray_engine
 from flcav.dataset.recording.workers import start_processes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, write_table
-from flcav.files import Json, flush_all, sha256, write_bytes, write_json
+from flcav.interface.progress import DAMAGED, Report, print_progress
 from flcav.machine.locks import LOCK, only_writer
-from flcav.progress import DAMAGED, Report, print_progress
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe, load_recipe
 from flcav.sources.source import Source, TownSource
+from flcav.storage.files import flush_all, sha256, write_bytes, write_json
 
 Header = Mapping[str, Mapping[str, Json]]  # "recipe" -> description of the source, "versions" -> of packages
 

@@ -10,18 +10,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from flcav.files import Json
-from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds
+from flcav.config import Json
 from flcav.pipeline.analysis.findings import name_stage
 from flcav.pipeline.analysis.history import gap_closed
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.placement import Pole
 from flcav.pipeline.results.run import Run
-from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts import figures
-from flcav.verdicts import Claim, Judged, judge
+from flcav.statistics.estimates import Estimate
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import Claim, Judged, judge
+from flcav.storage.records import LEFT_OUT, Record
 
 TASK = "objects"
 FURTHER = "edge FL, as many more rounds"  # instead of those of cloud FL

@@ -3,9 +3,10 @@
 from collections import Counter
 
 from flcav.experiments.arms.run import ARMS, EFFECT, ArmsResult, judge_differences
-from flcav.intervals import LEVEL, MOST_SEEDS, MeanOverSeeds, half_width, plan_seeds
-from flcav.markdown import format_table
-from flcav.verdicts import ESTIMATE, HELD, NOT_HELD, UNDECIDED, verdict
+from flcav.statistics.power import MOST_SEEDS, plan_seeds
+from flcav.statistics.seeds import LEVEL, MeanOverSeeds, half_width
+from flcav.statistics.verdicts import ESTIMATE, HELD, NOT_HELD, UNDECIDED, verdict
+from flcav.storage.markdown import format_table
 
 
 def tables(results: ArmsResult) -> dict[str, str]:

@@ -17,7 +17,7 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.intervals import OWN_SCENES, SharedScenes, share_scenes
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.client import camera_ahead
 from flcav.perception.networks import resolve_network
 from flcav.perception.task import build_network
@@ -26,10 +26,11 @@ from flcav.perception.weather.model import Classifier, LeNet
 from flcav.perception.weather.predict import tensor_of
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
-from flcav.progress import Report, ignore_progress
-from flcav.seeds import derive_seed, stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.statistics.bootstrap import share_scenes
+from flcav.statistics.seeds import OWN_SCENES, SharedScenes
+from flcav.statistics.streams import derive_seed, stream
 from flcav.world.weather import WEATHER_CLASSES
 
 RECIPE: Mapping[str, Any] = {

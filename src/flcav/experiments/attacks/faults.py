@@ -33,13 +33,13 @@ from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.median import Median
 from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights, learned_names
-from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.progress import Report, ignore_progress
-from flcav.records import LEFT_OUT, Record
-from flcav.seeds import stream
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.streams import stream
+from flcav.storage.records import LEFT_OUT, Record
 
 BYZANTINE, ROUNDS, STEPS, LEARNING_RATE = 3, 10, 5, 0.05
 HONEST, LABELS = "none", "label flip"

@@ -36,15 +36,15 @@ from flcav.federation.runtimes.reading import read_round
 from flcav.federation.selection import Selection
 from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import Weights
-from flcav.intervals import OWN_SCENES, MeanOverSeeds, mean_over_seeds
+from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.progress import Report, ignore_progress
-from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.leakage import draw_leakage
-from flcav.seeds import stream
+from flcav.statistics.seeds import OWN_SCENES, MeanOverSeeds, mean_over_seeds
+from flcav.statistics.streams import stream
+from flcav.storage.records import LEFT_OUT, Record
 
 NOISES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # standard deviation as a multiple of the clipping norm
 CLIP, DELTA = 1.0, 1e-5

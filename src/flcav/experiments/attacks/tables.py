@@ -2,8 +2,8 @@
 
 from flcav.experiments.attacks.faults import LIES, STRATEGIES, FaultsResult
 from flcav.experiments.attacks.leakage import LeakageResult, Level
-from flcav.markdown import format_table
-from flcav.verdicts import Claim, judge
+from flcav.statistics.verdicts import Claim, judge
+from flcav.storage.markdown import format_table
 
 
 def fault_tables(results: FaultsResult) -> dict[str, str]:

@@ -9,17 +9,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from flcav.files import Json
-from flcav.intervals import MeanOverSeeds, mean_over_seeds
+from flcav.config import Json
 from flcav.pipeline.analysis.history import gap_closed
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.training import LabelQuality
-from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts import figures
-from flcav.verdicts import Claim, Judged, judge
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import Claim, Judged, judge
+from flcav.storage.records import LEFT_OUT, Record
 
 TASK, TOWN = "objects", "grid"
 PRETRAINED, NO_ROAD, PLAIN, IDEAL, BOTH, GRAPH = (

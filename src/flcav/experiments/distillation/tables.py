@@ -3,7 +3,7 @@
 import numpy as np
 
 from flcav.experiments.distillation.run import ARMS, PRETRAINED, DistillationResult, judge_differences
-from flcav.markdown import format_table
+from flcav.storage.markdown import format_table
 
 
 def tables(results: DistillationResult) -> dict[str, str]:

@@ -15,20 +15,20 @@ from typing import Annotated
 
 import numpy as np
 
+from flcav.config import Json
 from flcav.experiments.cloud_rounds import span_divergence
 from flcav.experiments.exchanges.clock import link_regions, mean_round_s
 from flcav.federation.divergence import RoundDivergence
-from flcav.files import Json
-from flcav.intervals import MeanOverSeeds, mean_over_seeds
 from flcav.network.ledger import Ledger
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.running import WORK
-from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.exchanges import Mark, draw_exchanges
-from flcav.verdicts import Claim, Judged, judge
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import Claim, Judged, judge
+from flcav.storage.records import LEFT_OUT, Record
 
 NONE, NO_CLOUD, WHOLE = "no federation", "no cloud round", "whole weights (FedAvg)"
 ARMS: Mapping[str, Mapping[str, str]] = {  # by what they are about: name in the tables -> arm

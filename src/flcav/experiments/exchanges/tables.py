@@ -15,8 +15,8 @@ from flcav.experiments.exchanges.run import (
     ExchangeResult,
     judge_differences,
 )
-from flcav.markdown import format_table
-from flcav.verdicts import HELD, NOT_HELD, UNDECIDED
+from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED
+from flcav.storage.markdown import format_table
 
 WORDS = {HELD: "higher", NOT_HELD: "lower", UNDECIDED: UNDECIDED}  # of the claim that a difference is positive
 

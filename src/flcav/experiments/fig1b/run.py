@@ -21,6 +21,7 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.fig1b.layers import LAYERS, capture_inputs, capture_outputs
 from flcav.geometry import inverse, transform_points
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.marks import Bars, CloudBoxes, Paths, PictureBoxes
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.task import OBJECTS
@@ -32,7 +33,6 @@ from flcav.perception.trajectory.rasters import LAYERS as RASTER_LAYERS
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.weather.samples import reduce_picture
 from flcav.perception.weather.task import WEATHER
-from flcav.progress import Report, ignore_progress
 from flcav.report import style
 from flcav.report.charts import task_columns as page
 from flcav.report.pictures.clouds import draw_boxes, draw_points

@@ -21,9 +21,9 @@ from flcav.optimization.curves.levels import level_seeds
 from flcav.optimization.graph import Layers, build_graph
 from flcav.pipeline.planning.histories import load_history
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts import curves as curve_charts
+from flcav.storage.records import LEFT_OUT, Record
 
 Array = NDArray[np.float64]
 

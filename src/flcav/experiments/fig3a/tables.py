@@ -1,9 +1,9 @@
 """Markdown tables of Fig. 3a."""
 
 from flcav.experiments.fig3a.run import Fig3a
-from flcav.markdown import format_bullets, format_table
 from flcav.optimization.curves.curves import STAGES
 from flcav.optimization.curves.fitting import explain_exponent
+from flcav.storage.markdown import format_bullets, format_table
 
 
 def tables(results: Fig3a) -> dict[str, str]:

@@ -17,20 +17,20 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.fig3b.cover import TownCover, cover_town, list_kinds
+from flcav.interface.progress import Report, ignore_progress
 from flcav.optimization.placement.baselines import place_by_score
 from flcav.optimization.placement.solve import Candidates, Placement, find_candidates, place_count
 from flcav.perception.errors import Registry
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.task import OBJECTS
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.progress import Report, ignore_progress
-from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.figures import town_map
 from flcav.report.charts.placement import draw_cover
 from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE, ErrorMap, poles_of
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.storage.records import LEFT_OUT, Record
 from flcav.world.line_of_sight import count_visible_actors
 from flcav.world.map.census import measure_traffic_density
 from flcav.world.map.town import Town

@@ -2,7 +2,7 @@
 
 from flcav.experiments.fig3b.cover import ASKED, REACHED
 from flcav.experiments.fig3b.run import COUNTS, Fig3b
-from flcav.markdown import format_table
+from flcav.storage.markdown import format_table
 
 
 def tables(results: Fig3b) -> dict[str, str]:

@@ -3,9 +3,11 @@
 from collections.abc import Mapping, Sequence
 
 from flcav.experiments.fig6a.results import EQUAL, JOINT, MEAN, AllocationSeed, AtBudgets, PlanFinding
-from flcav.intervals import LEVEL, MOST_SEEDS, Estimate, MeanOverSeeds, mean_over_seeds, plan_seeds
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN
-from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, Claim, Judged, judge, signed
+from flcav.statistics.estimates import Estimate
+from flcav.statistics.power import MOST_SEEDS, plan_seeds
+from flcav.statistics.seeds import LEVEL, MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED, Claim, Judged, judge, signed
 
 STAGE_NAMES = {"pretrain": "pretraining", "edge": "edge FL", "cloud": "cloud FL"}
 Gain = tuple[str, str]  # plan, stage

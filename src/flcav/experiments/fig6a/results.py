@@ -4,11 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from flcav.files import Json
-from flcav.intervals import Estimate, MeanOverSeeds
+from flcav.config import Json
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.results.run import LinkUse
-from flcav.records import LEFT_OUT, Record
+from flcav.statistics.estimates import Estimate
+from flcav.statistics.seeds import MeanOverSeeds
+from flcav.storage.records import LEFT_OUT, Record
 
 EQUAL, JOINT = "equal-stages", "joint"  # the plans
 MEAN = "mean of towns"  # place of what the planner's history measures: the mean of the federating towns

@@ -26,13 +26,14 @@ from flcav.experiments.fig6a.results import (
     Planned,
     Reached,
 )
-from flcav.intervals import Estimate, average_estimates, mean_over_seeds
 from flcav.pipeline.planning.histories import load_history
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Budgets, RunRecipe
 from flcav.pipeline.results.run import Run
 from flcav.report import style
 from flcav.report.charts import plans
+from flcav.statistics.estimates import Estimate, average_estimates
+from flcav.statistics.seeds import mean_over_seeds
 
 TASK = "objects"
 PLANS = (EQUAL, JOINT)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 from flcav.experiments.fig6a.findings import STAGE_NAMES
 from flcav.experiments.fig6a.results import EQUAL, JOINT, MEAN, AllocationResult, AtBudgets
-from flcav.markdown import format_bullets, format_signed, format_table
+from flcav.storage.markdown import format_bullets, format_signed, format_table
 
 Row = Sequence[str | float]
 NAMES = {EQUAL: "equal stages", JOINT: "joint"}

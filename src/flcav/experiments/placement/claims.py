@@ -6,8 +6,8 @@ Wang et al., IEEE Network 37(3), 2023, finding iii. All are judged together.
 import numpy as np
 
 from flcav.experiments.placement.records import COVERAGE, FRAMES, RULES, TRAFFIC, PlacementProof, SeedGains
-from flcav.intervals import MeanOverSeeds, mean_over_seeds
-from flcav.verdicts import Claim, Judged, judge
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import Claim, Judged, judge
 
 
 def list_claims(results: PlacementProof) -> dict[str, MeanOverSeeds]:

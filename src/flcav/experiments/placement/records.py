@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from flcav.files import Json
-from flcav.intervals import MeanOverSeeds
+from flcav.config import Json
 from flcav.pipeline.provenance import Provenance
-from flcav.records import LEFT_OUT, Record
+from flcav.statistics.seeds import MeanOverSeeds
+from flcav.storage.records import LEFT_OUT, Record
 
 TOWN, NEAR = "all over the town", "near the errors"  # test frames
 FRAMES = (TOWN, NEAR)

@@ -39,7 +39,6 @@ from flcav.experiments.placement.records import (
     SeedGains,
 )
 from flcav.experiments.placement.spread import pool_over_seeds, spread_over_scenes, spread_over_seeds
-from flcav.intervals import MOST_SEEDS, MeanOverSeeds, half_width, mean_over_seeds
 from flcav.optimization.curves.held_out import rank_correlation
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.task import OBJECTS
@@ -58,6 +57,8 @@ from flcav.pipeline.results.saved import ERRORS, OUTCOMES, WEIGHTS
 from flcav.pipeline.results.training import Pretrained
 from flcav.report import style
 from flcav.report.charts.placement import draw_gains
+from flcav.statistics.power import MOST_SEEDS
+from flcav.statistics.seeds import MeanOverSeeds, half_width, mean_over_seeds
 
 TASK = "objects"
 

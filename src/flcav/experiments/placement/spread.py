@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from flcav.experiments.placement.records import FRAMES, SeedGains
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import Outcomes
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 DRAWS = 1000  # of the scenes
 

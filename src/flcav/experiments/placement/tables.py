@@ -13,8 +13,8 @@ from flcav.experiments.placement.records import (
     PlacementProof,
     RegionProof,
 )
-from flcav.intervals import MOST_SEEDS
-from flcav.markdown import format_table
+from flcav.statistics.power import MOST_SEEDS
+from flcav.storage.markdown import format_table
 
 POOLED = "mean over regions"
 

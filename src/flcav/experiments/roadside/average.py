@@ -22,16 +22,16 @@ from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.posts import posts_of
 from flcav.fusion.sightings import Sighting, tell
 from flcav.geometry import Boxes, inverse, wrap_angle, yaw_of
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.metrics import average_precision, match
 from flcav.perception.metrics.matching import assign_targets
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.progress import Report, ignore_progress
-from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.roadside import draw_errors
-from flcav.seeds import stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.statistics.streams import stream
+from flcav.storage.records import LEFT_OUT, Record
 from flcav.world.map.lanes import map_layers
 
 RECIPE = {

@@ -17,18 +17,19 @@ from flcav.experiments.roadside.labels import RoadLabels, measure_road_labels
 from flcav.fusion.detector import THRESHOLD, road_detector
 from flcav.fusion.road import MIN_RETURNS
 from flcav.geometry import Boxes
-from flcav.intervals import Estimate, bootstrap_over_scenes
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.metrics import match
 from flcav.perception.objects.truth import CARS, LOOKALIKE
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.progress import Report, ignore_progress
-from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.roadside import draw_recall
-from flcav.seeds import stream
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.statistics.bootstrap import bootstrap_over_scenes
+from flcav.statistics.estimates import Estimate
+from flcav.statistics.streams import stream
+from flcav.storage.records import LEFT_OUT, Record
 
 OVERLAP = 0.5  # bird's-eye IoU of a car that was found
 WITHIN_M = 30.0  # horizontal distance of a car from the pole

@@ -23,19 +23,19 @@ from flcav.fusion.detector import THRESHOLD, load_road_network
 from flcav.fusion.registration import Offset, measure_offset, register
 from flcav.fusion.road import MIN_RETURNS
 from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.foreground import frame_reader, pole_backgrounds
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.truth import CARS
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.progress import Report, ignore_progress
-from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.suites import Shown, draw_suites
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.storage.records import LEFT_OUT, Record
 
 CROSSING, STREET = "pole4", "pole2"
 ACROSS_M = 24.0  # from the first suite over the crossing to the second

@@ -19,17 +19,17 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.roadside.fig4 import LIDAR, OVERLAP, find_range, list_cars
 from flcav.fusion.detector import THRESHOLD, load_road_network
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.foreground import frame_reader
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.predict import detect
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.progress import Report, ignore_progress
-from flcav.records import LEFT_OUT, Record
 from flcav.report import style
 from flcav.report.charts.roadside import draw_ranges
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
+from flcav.storage.records import LEFT_OUT, Record
 
 MODELS: Mapping[str, Mapping[str, Any]] = {  # settings of `Lidar`
     **{f"pole_{channels}": {**LIDAR["settings"], "channels": channels} for channels in (16, 32, 64, 128)},

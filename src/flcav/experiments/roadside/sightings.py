@@ -10,13 +10,13 @@ from flcav.fusion.detector import load_road_network, road_detector
 from flcav.fusion.posts import find_posts
 from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, concatenate, inverse, transform_points
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar, ground_truth
-from flcav.progress import Report, ignore_progress
 from flcav.sensors.frame import Frame
 
 SCORE = 0.1  # lowest score of a detection that an agent tells of

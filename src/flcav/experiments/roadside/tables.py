@@ -11,7 +11,7 @@ from flcav.experiments.roadside.fig4 import EDGES_M, Fig4
 from flcav.experiments.roadside.labels import EXACT, RoadLabels
 from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
 from flcav.experiments.roadside.ranges import SensorRanges
-from flcav.markdown import format_table
+from flcav.storage.markdown import format_table
 
 WHEN = ("as stated", "after the pose graph")
 

@@ -26,10 +26,10 @@ from flcav.perception.objects.truth import CARS, select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.pipeline.engine import Notify, Step, run_steps
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.records import LEFT_OUT, Class, Record
 from flcav.report import style
 from flcav.report.charts.clouds import CloudSeries, cloud_statistics
 from flcav.report.pictures.clouds import real_frame
+from flcav.storage.records import LEFT_OUT, Class, Record
 
 RECIPE: dict[str, Any] = {  # of the simulated scenes
     "town": "suburb",

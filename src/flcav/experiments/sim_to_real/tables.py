@@ -6,7 +6,7 @@ import numpy as np
 
 from flcav.experiments.sim_to_real.clouds import CloudNumbers, SeenCar
 from flcav.experiments.sim_to_real.run import LabelledCar, RealScore, SimToReal
-from flcav.markdown import format_table
+from flcav.storage.markdown import format_table
 
 
 def tables(results: SimToReal) -> dict[str, str]:

@@ -7,7 +7,6 @@ import numpy as np
 
 from flcav.dataset.store import Dataset
 from flcav.experiments.studies.run import Study, StudyResult, describe_limits, list_counts, training_rows
-from flcav.markdown import format_bullets, format_table
 from flcav.perception.objects.evaluate import BreakdownRow, ObjectsEvaluation, Score
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.study import STREETS_STUDY, TRACKS
@@ -15,7 +14,8 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.tracking import evaluate_tracks
 from flcav.report import style
 from flcav.report.charts.studies import Bar, precisions
-from flcav.verdicts import Claim, describe_aims
+from flcav.statistics.verdicts import Claim, describe_aims
+from flcav.storage.markdown import format_bullets, format_table
 
 WANTED = {  # aims, for cars on other scenes of the training towns: least value, claim
     "Car AP 3d at 0.5": (0.85, "Car AP3D@0.5 of 0.85"),

@@ -10,17 +10,9 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar, cast, get_type_hints
 
-from flcav.config import InputError
+from flcav.config import InputError, Json
 from flcav.dataset.store import Dataset
 from flcav.experiments.splits import open_split, record_split
-from flcav.files import Json
-from flcav.intervals import (
-    LEVEL,
-    MOST_SEEDS,
-    MeanOverSeeds,
-    mean_over_seeds,
-    plan_seeds,
-)
 from flcav.perception.card import Card
 from flcav.perception.study import RecipeFields, StudyRecipe, test_seed
 from flcav.perception.task import Evaluated, Task
@@ -28,8 +20,10 @@ from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network
 from flcav.pipeline.engine import Notify, Step, Work, run_steps
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.records import LEFT_OUT, from_json, to_json
-from flcav.verdicts import Claim
+from flcav.statistics.power import MOST_SEEDS, plan_seeds
+from flcav.statistics.seeds import LEVEL, MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import Claim
+from flcav.storage.records import LEFT_OUT, from_json, to_json
 
 EvaluationT = TypeVar("EvaluationT", bound=Evaluated)
 VALIDATION = "validation"

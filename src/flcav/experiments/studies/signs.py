@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from flcav.experiments.studies.run import Study, StudyResult, describe_limits, list_counts, training_rows
-from flcav.markdown import format_bullets, format_table
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
 from flcav.perception.signs.task import SIGNS
 from flcav.report import style
 from flcav.report.charts.studies import Bar, precisions
-from flcav.verdicts import Claim, describe_aims
+from flcav.statistics.verdicts import Claim, describe_aims
+from flcav.storage.markdown import format_bullets, format_table
 
 WANTED = 0.75  # aim: least mAP50 on other scenes
 EFFECT = 0.05  # deviation from an aim that the study is to tell

@@ -5,14 +5,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flcav.experiments.studies.run import SeedResult, Study, StudyResult, describe_limits
-from flcav.intervals import MeanOverSeeds
-from flcav.markdown import format_bullets, format_table
 from flcav.perception.trajectory import study
 from flcav.perception.trajectory.evaluate import ALL, PathErrors, TrajectoryEvaluation
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.report import style
 from flcav.report.charts.studies import Bar, path_errors
-from flcav.verdicts import Claim, describe_aims
+from flcav.statistics.seeds import MeanOverSeeds
+from flcav.statistics.verdicts import Claim, describe_aims
+from flcav.storage.markdown import format_bullets, format_table
 
 WANTED = {"tiny": (0.7,), "tiny-cameras": (1.0, 0.7)}  # aims: largest ratio to constant velocity's final error
 EFFECT = 0.05  # deviation from an aim that the study is to tell

@@ -6,15 +6,15 @@ import numpy as np
 
 from flcav.dataset.store import Dataset
 from flcav.experiments.studies.run import Study, StudyResult, describe_limits, list_counts
-from flcav.intervals import Estimate, score_interval
-from flcav.markdown import format_bullets, format_table
 from flcav.perception.weather.evaluate import Classification, evaluate_whole_space
 from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.study import WHOLE_SPACE
 from flcav.perception.weather.task import WEATHER
 from flcav.report import style
 from flcav.report.charts.studies import confusions
-from flcav.verdicts import Claim, describe_aims
+from flcav.statistics.estimates import Estimate, score_interval
+from flcav.statistics.verdicts import Claim, describe_aims
+from flcav.storage.markdown import format_bullets, format_table
 
 WANTED = 0.95  # aim: least accuracy
 EFFECT = 0.02  # deviation from an aim that the study is to tell

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from flcav.config import InputError
 from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.trainable import Trainable
-from flcav.wording import suggest
+from flcav.interface.wording import suggest
 
 if TYPE_CHECKING:
     from flcav.federation.runtimes.simulation import RaySimulation

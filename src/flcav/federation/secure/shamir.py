@@ -5,7 +5,7 @@ import math
 import secrets
 from collections.abc import Mapping
 
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 PRIME = 2**521 - 1  # a Mersenne prime above any secret
 SECRET_BYTES, SHARE_BYTES = 32, 66

@@ -5,7 +5,7 @@ from dataclasses import fields, is_dataclass
 
 from pydantic import TypeAdapter, ValidationError
 
-from flcav.config import InputError, shorten
+from flcav.config import InputError, Json, shorten
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavg import FedAvg
 from flcav.federation.strategies.fedavgm import FedAvgM
@@ -17,7 +17,6 @@ from flcav.federation.strategies.median import Median
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.strategies.trimmed_mean import TrimmedMean
-from flcav.files import Json
 from flcav.plugins import load_named
 
 STRATEGIES: dict[str, type[Strategy]] = {

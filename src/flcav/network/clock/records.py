@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from flcav.config import InputError
-from flcav.parquet import read_parquet, write_parquet
+from flcav.storage.parquet import read_parquet, write_parquet
 
 _TYPES: dict[Any, pa.DataType] = {str: pa.string(), int: pa.int64(), float: pa.float64()}
 

@@ -13,7 +13,7 @@ from flcav.network.radio import propagation as laws
 from flcav.network.radio.budget import Radio, lone_rate_bps, received_dbm
 from flcav.network.radio.propagation import State
 from flcav.network.radio.sight import find_sight, raise_walls, vehicle_boxes
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 from flcav.world.map.town import Town
 from flcav.world.rays.embree import Assembly
 from flcav.world.trace import Trace

@@ -25,6 +25,7 @@ from itertools import islice
 
 import numpy as np
 
+from flcav.interface.wording import plural
 from flcav.network.plan import Price
 from flcav.optimization.allocation.allocate import (
     Allocation,
@@ -38,7 +39,6 @@ from flcav.optimization.allocation.allocate import (
 from flcav.optimization.allocation.vehicles import Shares, TooSlow, split_plan, sum_busy, trains
 from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Clock, Infeasible
-from flcav.wording import plural
 
 HALVINGS = 9  # steps of the bisection over the share of a budget
 ROUNDING = 1e-9  # relative tolerance of budgets and objectives

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array, csr_array
 
+from flcav.interface.wording import plural
 from flcav.optimization.allocation.allocate import TaskPlan
 from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible
-from flcav.wording import plural
 
 Array = NDArray[np.float64]
 

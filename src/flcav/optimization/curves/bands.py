@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flcav.optimization.curves.curves import OwnCurve
 from flcav.optimization.curves.fitting import CurveFit, refit
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from flcav.optimization.curves.curves import OwnCurve
 from flcav.optimization.curves.fitting import CurveFit
 from flcav.optimization.curves.history import Array, History
 from flcav.optimization.curves.levels import Levelled, level_seeds
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 SIMULATED = 400  # histories drawn for the attainable rank correlation
 

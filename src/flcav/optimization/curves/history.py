@@ -22,9 +22,9 @@ import pyarrow.csv
 from numpy.typing import ArrayLike, NDArray
 
 from flcav.config import InputError, shorten
-from flcav.exchange import read_csv
+from flcav.interface.wording import describe_number, hint_share
 from flcav.optimization.curves.curves import STAGES
-from flcav.wording import describe_number, hint_share
+from flcav.storage.exchange import read_csv
 
 Array = NDArray[np.float64]
 

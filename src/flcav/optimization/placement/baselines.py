@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from flcav.optimization.placement.instance import TIE, Array
 from flcav.optimization.placement.solve import Candidates, Placement, describe
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 DRAWS = 200
 

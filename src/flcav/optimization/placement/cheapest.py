@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flcav.config import InputError
+from flcav.interface.wording import hint_share
 from flcav.optimization.placement.greedy import extend_greedily
 from flcav.optimization.placement.instance import TIE, Instance
 from flcav.optimization.placement.program import bound_by_highs, minimise_cost
@@ -26,7 +27,6 @@ from flcav.optimization.placement.solve import (
     improve,
     keep_candidates,
 )
-from flcav.wording import hint_share
 
 NOTHING = 1e-300  # in place of 0, to divide by
 CUTS = 40  # times that a choice is tried to be made at less cost

@@ -4,14 +4,14 @@ AP|R40 is the mean over recalls 1/40, 2/40, ..., 1 of the highest precision at t
 et al., "Disentangling Monocular 3D Object Detection", ICCV 2019, sec. 5; KITTI's measure since then). Average
 orientation similarity (AOS) is the same mean of a weighted precision: a true positive with heading error t counts
 (1 + cos t) / 2 (Geiger et al., "Are we ready for autonomous driving? The KITTI vision benchmark suite", CVPR 2012,
-sec. 2.5, eqs. 1-2). Intervals: see `flcav.intervals`.
+sec. 2.5, eqs. 1-2). Intervals: see `flcav.statistics`.
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flcav.intervals import REDRAWS, bootstrap_over_scenes
 from flcav.perception.metrics.matching import Matches
+from flcav.statistics.bootstrap import REDRAWS, bootstrap_over_scenes
 
 RECALLS = np.arange(1, 41) / 40
 AT_ONCE = 2**15  # bootstrap resamples times detections: arrays of 0.25 MB stay in a processor's cache

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from flcav.interface.wording import plural
 from flcav.perception.task import Result
-from flcav.records import Class
-from flcav.wording import plural
+from flcav.storage.records import Class
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_frames
 from flcav.perception.objects.truth import FrameTruth, select_class
-from flcav.records import Class
 from flcav.sensors.frame import Frame
+from flcav.storage.records import Class
 
 OVERLAP = 0.5  # 3D IoU from which a detection is a true positive
 

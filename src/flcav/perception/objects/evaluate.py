@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.geometry import Boxes, concatenate
+from flcav.interface.wording import plural
 from flcav.perception.metrics import (
     FoundCars,
     average_precision,
@@ -28,9 +29,8 @@ from flcav.perception.objects.calibrate import OVERLAP, Reliability
 from flcav.perception.objects.truth import QUARTERS, FrameTruth, TargetCriteria, select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.perception.task import Evaluated
-from flcav.records import LEFT_OUT, Class
-from flcav.seeds import stream
-from flcav.wording import plural
+from flcav.statistics.streams import stream
+from flcav.storage.records import LEFT_OUT, Class
 from flcav.world.weather import WEATHER_CLASSES
 
 OVERLAPS: tuple[tuple[Kind, float], ...] = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))

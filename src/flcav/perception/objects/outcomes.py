@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.intervals import REDRAWS
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.foreground import frame_reader
 from flcav.perception.metrics import Matches, match, orientation_similarity, right_headings, weighted_precision
 from flcav.perception.objects.model import Second
@@ -16,7 +16,7 @@ from flcav.perception.objects.predict import detect_frames
 from flcav.perception.objects.truth import select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.perception.outcomes import Measure, Outcomes, Times, Values
-from flcav.progress import Report, ignore_progress
+from flcav.statistics.bootstrap import REDRAWS
 
 CLASSES, HIDDEN = "classes", "hidden"
 MEASURED = "3d50"

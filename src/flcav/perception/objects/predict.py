@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.geometry import Boxes, concatenate, inverse, pose
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import LOG_VARIANCES, HeadOutput, Second
 from flcav.perception.objects.samples import move_points
@@ -19,10 +21,8 @@ from flcav.perception.objects.truth import QUARTERS, FrameTruth, asked_of, choos
 from flcav.perception.ops.rotated import nms
 from flcav.perception.ops.sparse import SparseTensor
 from flcav.perception.task import Result
-from flcav.progress import Report, ignore_progress
-from flcav.records import Class
 from flcav.sensors.frame import Frame
-from flcav.wording import plural
+from flcav.storage.records import Class
 
 LOWEST_SCORE = 0.05  # of detections that are evaluated; lower ones change AP by less than its interval
 CANDIDATES = 256  # anchors of highest score per class that enter non-maximum suppression

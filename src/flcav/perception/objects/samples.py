@@ -13,6 +13,7 @@ from flcav.config import InputError
 from flcav.dataset.ground import Ground
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, transform_points
+from flcav.interface.wording import plural
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.card import read_lidar
 from flcav.perception.foreground import frame_reader
@@ -28,7 +29,6 @@ from flcav.perception.objects.truth import (
 )
 from flcav.perception.task import KnownLidar
 from flcav.sensors.frame import Frame
-from flcav.wording import plural
 
 RANGE_SLACK = 0.2  # difference of a LiDAR's range from the one of the training that is not worth a word
 HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one that a network expects

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
+from flcav.config import Json
 from flcav.dataset.store import Dataset
-from flcav.files import Json
 from flcav.geometry import Boxes
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.foreground import frame_reader
 from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, paste_objects
@@ -26,7 +27,6 @@ from flcav.perception.objects.samples import RecordedSweeps, Sample, compare_rig
 from flcav.perception.objects.truth import target_criteria
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, KnownLidar, Practice
-from flcav.progress import Report, ignore_progress
 
 
 class ObjectsTask(ObjectsOutcomes):

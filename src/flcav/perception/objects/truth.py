@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.geometry import Boxes, inverse
-from flcav.intervals import CONFIDENCE
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.objects.config import SecondConfig
-from flcav.records import LEFT_OUT
 from flcav.sensors.frame import Frame
+from flcav.statistics.estimates import CONFIDENCE
+from flcav.storage.records import LEFT_OUT
 from flcav.world.weather import classify_weather
 
 DETECTION_CLASS = {

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.rectangles import CLASSES, HALF_PX, select_rectangles
 from flcav.dataset.store import Dataset
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Registry
 from flcav.perception.images import check_picture
 from flcav.perception.ops.rectangles import iou
@@ -16,7 +17,6 @@ from flcav.perception.signs.config import SignsConfig
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.predict import Detections, detect
 from flcav.perception.signs.samples import find_targets, size_px
-from flcav.progress import Report, ignore_progress
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import unproject_pixels
 from flcav.world.rays.embree import Embree, Solid

@@ -10,11 +10,11 @@ import numpy as np
 from faster_coco_eval import COCO, COCOeval_faster
 from numpy.typing import NDArray
 
+from flcav.interface.wording import plural
 from flcav.perception.signs.predict import Detections
 from flcav.perception.signs.samples import size_px
 from flcav.perception.task import Evaluated
-from flcav.records import Class
-from flcav.wording import plural
+from flcav.storage.records import Class
 
 EDGES_PX = (12.0, 24.0)  # borders between small, medium and large, as roots of a box's area
 LARGEST_PX = 1e5

@@ -6,13 +6,13 @@ from functools import lru_cache
 import numpy as np
 
 from flcav.dataset.store import Dataset
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.outcomes import Outcomes, Times, Values
 from flcav.perception.signs.config import SignsConfig
 from flcav.perception.signs.evaluate import GroundTruth, mean_average_precision
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.predict import Detections, detect
 from flcav.perception.signs.samples import RecordedPictures
-from flcav.progress import Report, ignore_progress
 
 LOWEST_SCORE = 0.01  # score threshold; detections below it hardly change the average precision
 FOUND, WANTED, NEUTRAL = "found", "wanted", "neutral"

@@ -16,7 +16,7 @@ from flcav.perception.signs.model import SignDetector, decode
 from flcav.perception.signs.samples import Sample
 from flcav.perception.signs.targets import assign_anchors
 from flcav.perception.task import Result
-from flcav.records import Class
+from flcav.storage.records import Class
 
 CANDIDATES = 512  # number of best-scoring anchors before non-maximum suppression
 MOST_OVERLAP = 0.5  # IoU above which the lower-scoring of two boxes is suppressed, whatever their classes

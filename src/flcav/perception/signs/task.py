@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from flcav.config import InputError
+from flcav.config import InputError, Json
 from flcav.dataset.store import Dataset
-from flcav.files import Json
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.client import ANNOTATED, camera_ahead
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.signs.augment import draw
@@ -26,7 +26,6 @@ from flcav.perception.signs.predict import class_probabilities
 from flcav.perception.signs.samples import RecordedPictures, Sample
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
-from flcav.progress import Report, ignore_progress
 
 
 class SignsTask(SignsOutcomes):

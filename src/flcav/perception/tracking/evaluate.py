@@ -8,6 +8,7 @@ import numpy as np
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.foreground import frame_reader
 from flcav.perception.metrics import round_or_none
 from flcav.perception.metrics.matching import on_neutral
@@ -17,7 +18,6 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
 from flcav.perception.tracking.tracker import Tracked, Tracker
-from flcav.progress import Report, ignore_progress
 from flcav.sensors.frame import Frame
 
 LONGEST_GAP_S = 1.0  # between two frames of a sequence

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from flcav.config import Config, DamagedFile, InputError
-from flcav.files import write_bytes
+from flcav.interface.progress import DAMAGED
 from flcav.perception.card import Card, DataEntry
 from flcav.perception.training.adamw import AdamW
 from flcav.perception.weights import read_card
-from flcav.progress import DAMAGED
+from flcav.storage.files import write_bytes
 
 TRAINED = ("device", "epochs", "patience", "batch", "learning_rate", "schedule")  # settings in `Card.training`
 DataIdentity = tuple[

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from torch import nn
 
 from flcav.config import DamagedFile, InputError
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import suggest
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 from flcav.perception.training.adamw import AdamW
 from flcav.perception.training.checkpoint import RunState, load_checkpoint, save_checkpoint
-from flcav.progress import Report, ignore_progress
-from flcav.seeds import stream
-from flcav.wording import suggest
+from flcav.statistics.streams import stream
 
 CLIP_NORM = 10.0  # largest norm of the gradient
 Watch = Callable[[int, Mapping[str, float]], None]  # called with the number of steps taken and scalars by name

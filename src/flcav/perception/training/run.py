@@ -14,7 +14,7 @@ from torch.utils.data import ConcatDataset
 
 from flcav.config import DamagedFile
 from flcav.dataset.store import Dataset
-from flcav.files import check_writable
+from flcav.interface.progress import DAMAGED, Report, ignore_progress
 from flcav.machine.locks import only_writer
 from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.card import Card, DataEntry, data_entry, write_card
@@ -23,7 +23,7 @@ from flcav.perception.task import Calibrates, Evaluated, Task, build_network, fi
 from flcav.perception.training.checkpoint import Settings, find_finished_card, part_of
 from flcav.perception.training.loop import Checkpointing, Validation, Watch, train
 from flcav.perception.weights import save_network
-from flcav.progress import DAMAGED, Report, ignore_progress
+from flcav.storage.files import check_writable
 
 WEIGHTS, CARD, CHECKPOINT, EVENTS = "weights.safetensors", "card.md", "checkpoint.pt", "events"
 

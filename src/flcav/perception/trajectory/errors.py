@@ -3,12 +3,12 @@
 import numpy as np
 
 from flcav.dataset.store import Dataset
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.errors import FINAL_ERROR, PerceptionError, Registry
 from flcav.perception.trajectory.evaluate import MISS_M
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import find_medoid, predict
 from flcav.perception.trajectory.samples import Samples
-from flcav.progress import Report, ignore_progress
 from flcav.world.trace import Trace
 
 

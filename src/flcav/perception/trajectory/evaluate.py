@@ -7,11 +7,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.interface.wording import plural
 from flcav.perception.task import Evaluated
 from flcav.perception.trajectory.predict import find_medoid
 from flcav.perception.trajectory.tracks import constant_velocity
-from flcav.records import LEFT_OUT
-from flcav.wording import plural
+from flcav.storage.records import LEFT_OUT
 
 Array = NDArray[np.float64]
 

@@ -5,14 +5,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flcav.dataset.store import Dataset
-from flcav.intervals import REDRAWS
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
 from flcav.perception.trajectory.evaluate import MISS_M, compute_errors
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import predict
 from flcav.perception.trajectory.samples import samples_of
 from flcav.perception.trajectory.tracks import constant_velocity
-from flcav.progress import Report, ignore_progress
+from flcav.statistics.bootstrap import REDRAWS
 
 NUMBERS = {
     "single path FDE m": "single_FDE",

@@ -8,13 +8,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.marks import Light, Paths, RoadUser
 from flcav.perception.task import Result
 from flcav.perception.trajectory.cross_view import Inputs
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.samples import Sample
-from flcav.progress import Report, ignore_progress
-from flcav.records import Class
+from flcav.storage.records import Class
 
 Array = NDArray[np.float64]
 Point = tuple[float, float]  # x, y in the world [m]

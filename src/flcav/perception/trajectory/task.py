@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
+from flcav.config import Json
 from flcav.dataset.store import Dataset
-from flcav.files import Json
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.errors import Registry
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
@@ -21,7 +22,6 @@ from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.outcomes import TrajectoryOutcomes
 from flcav.perception.trajectory.predict import predict
 from flcav.perception.trajectory.samples import Sample, samples_of, select_fitting_frames
-from flcav.progress import Report, ignore_progress
 
 
 class TrajectoryTask(TrajectoryOutcomes):

@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
-from flcav.intervals import CONFIDENCE, bootstrap_over_scenes
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
 from flcav.perception.metrics import interval_words
 from flcav.perception.task import Evaluated
 from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.predict import predict_probabilities
 from flcav.perception.weather.samples import Sample, label_pictures
-from flcav.progress import Report, ignore_progress
-from flcav.records import LEFT_OUT
-from flcav.seeds import stream
-from flcav.wording import plural
+from flcav.statistics.bootstrap import bootstrap_over_scenes
+from flcav.statistics.estimates import CONFIDENCE
+from flcav.statistics.streams import stream
+from flcav.storage.records import LEFT_OUT
 from flcav.world.weather import find_nearest_class
 
 

@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flcav.dataset.store import Dataset
-from flcav.intervals import REDRAWS
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
 from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.predict import predict_probabilities
 from flcav.perception.weather.samples import label_pictures
-from flcav.progress import Report, ignore_progress
+from flcav.statistics.bootstrap import REDRAWS
 
 
 class WeatherOutcomes:

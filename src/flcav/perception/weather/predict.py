@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.images import Picture
 from flcav.perception.task import Result
 from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.samples import stack_pictures
-from flcav.progress import Report, ignore_progress
-from flcav.records import Class
+from flcav.storage.records import Class
 
 BATCH = 256  # images of a batch of inference
 

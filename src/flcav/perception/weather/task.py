@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from flcav.config import Json
 from flcav.dataset.store import Dataset
-from flcav.files import Json
+from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.client import ANNOTATED, camera_ahead
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
@@ -22,7 +23,6 @@ from flcav.perception.weather.model import Classifier, LeNet
 from flcav.perception.weather.outcomes import WeatherOutcomes
 from flcav.perception.weather.predict import predict_probabilities
 from flcav.perception.weather.samples import Sample, label_pictures
-from flcav.progress import Report, ignore_progress
 from flcav.world.weather import WEATHER_CLASSES
 
 

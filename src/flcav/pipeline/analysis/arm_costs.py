@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flcav.intervals import Estimate
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.run import ArmCost, ArmResult, Run
 from flcav.pipeline.results.tests import Test
+from flcav.statistics.estimates import Estimate
 
 
 def list_arm_costs(run: Run) -> tuple[ArmCost, ...]:

@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from flcav.intervals import MeanOverSeeds
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CLOUD, EDGE, ELSEWHERE, MAIN, RunRecipe
 from flcav.pipeline.results.tests import Difference
-from flcav.verdicts import Claim, Judged, judge_known
+from flcav.statistics.seeds import MeanOverSeeds
+from flcav.statistics.verdicts import Claim, Judged, judge_known
 
 Kind = Literal["claim", "primary", "secondary", "loss"]
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-from flcav.intervals import Estimate, measure_spread, widen
 from flcav.perception.outcomes import Outcomes, difference
 from flcav.perception.tasks import task_named
 from flcav.pipeline.analysis.findings import name_stage
@@ -14,6 +13,7 @@ from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAI
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import Difference, Tested
 from flcav.pipeline.spread import difference_key
+from flcav.statistics.estimates import Estimate, measure_spread, widen
 
 
 def list_differences(graph: Graph, work: Path) -> list[Difference]:

@@ -11,13 +11,13 @@ not known: another training on the same frames might say otherwise.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from flcav.intervals import MeanOverSeeds, of_one_training
 from flcav.pipeline.analysis.claims import Asked, ask, judge_asked
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference, Finding, Test
-from flcav.verdicts import ESTIMATE, UNDECIDED, Judged, explain_verdict, signed
+from flcav.statistics.seeds import MeanOverSeeds, of_one_training
+from flcav.statistics.verdicts import ESTIMATE, UNDECIDED, Judged, explain_verdict, signed
 
 WORDS = {
     PRETRAIN: "pretrained",

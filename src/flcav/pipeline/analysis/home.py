@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from flcav.intervals import Estimate, mean_over_seeds
 from flcav.perception.outcomes import (
     Measure,
     Outcomes,
@@ -23,6 +22,8 @@ from flcav.pipeline.recipe import MAIN, PRETRAIN
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import HomeCost
+from flcav.statistics.estimates import Estimate
+from flcav.statistics.seeds import mean_over_seeds
 
 
 def collect_home_costs(graph: Graph, work: Path) -> tuple[HomeCost, ...]:

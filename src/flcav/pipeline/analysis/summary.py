@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flcav.intervals import MeanOverSeeds, mean_over_seeds
 from flcav.pipeline.analysis.claims import ask, judge_asked
 from flcav.pipeline.analysis.findings import name_stage
 from flcav.pipeline.analysis.tests import mean_of_tests
@@ -13,6 +12,7 @@ from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.recipe import MAIN
 from flcav.pipeline.results.run import Mean, Run, Summary
 from flcav.pipeline.results.tests import Difference, Test
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 
 
 def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:

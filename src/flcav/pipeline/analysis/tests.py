@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from flcav.intervals import Estimate, MeanOverSeeds, mean_over_seeds, measure_spread, widen_share
 from flcav.perception.outcomes import Outcomes, Values, share_test_scenes
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting, name_repeat
@@ -13,6 +12,8 @@ from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import RegionalTest, Test, Tested
 from flcav.pipeline.spread import test_key
+from flcav.statistics.estimates import Estimate, measure_spread, widen_share
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 
 
 def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, task: str) -> Test:

@@ -21,13 +21,13 @@ from queue import Queue, SimpleQueue
 from types import ModuleType
 from typing import IO, Any
 
-from flcav.files import flush_tree
 from flcav.machine.processes import ray_session
 from flcav.machine.threads import use_threads
 from flcav.pipeline.engine.engines import KILLED, Engine, Workers, perform
 from flcav.pipeline.engine.source_hash import package_hash
 from flcav.pipeline.engine.step import Record, Step, read_value, remove, reserve_sibling
 from flcav.pipeline.provenance import provenance
+from flcav.storage.files import flush_tree
 
 PIECE_BYTES = 8_000_000
 SENDING = 1 / 20  # of a step's time, at most, for sending files back

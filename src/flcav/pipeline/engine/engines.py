@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flcav.config import Config
+from flcav.interface.progress import Report
 from flcav.machine.locks import only_writer
 from flcav.machine.processes import exit_with_parent, start_server
 from flcav.machine.threads import use_threads
 from flcav.pipeline.engine.step import Record, Step, Work, read_value, write_done, write_started
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.progress import Report
 
 KILLED = "a step's process was killed from outside, most often for want of memory"
 _queue: Any = None  # in a worker process: `Workers.reports`

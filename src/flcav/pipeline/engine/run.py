@@ -19,7 +19,7 @@ from queue import Empty
 from typing import Any
 
 from flcav.config import InputError, read_json
-from flcav.files import write_json
+from flcav.interface.progress import DAMAGED
 from flcav.machine.locks import only_writer
 from flcav.pipeline.engine.engines import Engine, Processes
 from flcav.pipeline.engine.source_hash import Sources, find_definitions
@@ -41,7 +41,7 @@ from flcav.pipeline.engine.step import (
     reserve_sibling,
     take_over,
 )
-from flcav.progress import DAMAGED
+from flcav.storage.files import write_json
 
 
 @contextlib.contextmanager

@@ -13,11 +13,11 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flcav.config import SHOWN, Config, InputError, read_json, shorten
-from flcav.files import Json, flush_tree, write_json
-from flcav.progress import Report, print_progress
-from flcav.records import flatten
-from flcav.wording import plural
+from flcav.config import SHOWN, Config, InputError, Json, read_json, shorten
+from flcav.interface.progress import Report, print_progress
+from flcav.interface.wording import plural
+from flcav.storage.files import flush_tree, write_json
+from flcav.storage.records import flatten
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
 DONE_NOW, DONE_BEFORE, KEPT = FINISHED = ("done", "done before", "kept, of other code")  # notes of finished steps

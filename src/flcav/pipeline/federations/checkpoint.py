@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from flcav.config import InputError, read_json
+from flcav.config import InputError, Json, read_json
 from flcav.federation.state import RoundRecord
-from flcav.files import Json, sha256, write_bytes, write_json
-from flcav.progress import DAMAGED
-from flcav.records import Record
+from flcav.interface.progress import DAMAGED
+from flcav.storage.files import sha256, write_bytes, write_json
+from flcav.storage.records import Record
 
 LAST, BEFORE = "round.json", "round-before.json"  # the last checkpoint, and the one before
 OWN = "own_sha256"  # of all other fields of the record

@@ -19,7 +19,7 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.learning import Learning
 from flcav.pipeline.recipe import EDGE
 from flcav.pipeline.results.training import Pretrained
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 
 @dataclass(frozen=True)

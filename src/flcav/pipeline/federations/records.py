@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from flcav.exchange import write_table
 from flcav.network.ledger import BYTES_PER_MB, Ledger
 from flcav.perception.training.run import event_files
 from flcav.pipeline.federations.checkpoint import LAST, Checkpoint
@@ -15,6 +14,7 @@ from flcav.pipeline.recipe import CLOUD
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import FederatedRound, StageResult
+from flcav.storage.exchange import write_table
 
 ROUNDS, EVENTS = "rounds.parquet", "events"  # of a run, beside its results
 SCHEMA = pa.schema(

@@ -14,7 +14,7 @@ from flcav.federation.rounds import OnRound
 from flcav.federation.state import FederationState, describe_failures
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Weights
-from flcav.files import sha256, write_bytes
+from flcav.interface.progress import Report
 from flcav.network.ledger import BudgetExceeded, Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays, save_network, to_arrays
@@ -23,7 +23,7 @@ from flcav.pipeline.federations.secrets import read_secrets, remove_secrets, wri
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.results.training import diverges
-from flcav.progress import Report
+from flcav.storage.files import sha256, write_bytes
 
 LOSS = "loss"  # begins the note of a round
 

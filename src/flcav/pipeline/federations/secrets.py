@@ -17,7 +17,7 @@ from safetensors.numpy import load_file, save
 
 from flcav.config import InputError
 from flcav.federation.noise import Secret
-from flcav.files import flush_all, sha256, write_bytes, write_in_pieces
+from flcav.storage.files import flush_all, sha256, write_bytes, write_in_pieces
 
 SECRETS, SECRETS_HASH, PART = "secrets.safetensors", "secrets.sha256", ".secrets."
 HASH = re.compile(rb"[0-9a-f]{64}")

@@ -14,7 +14,7 @@ from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Region, RunRecipe, SplitName, find_path
 from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.steps.settings import LearningSettings, RegionInputs
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 
 class Outline:

@@ -11,6 +11,7 @@ from flcav.fusion.detector import road_detector
 from flcav.fusion.labels import label_sample
 from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.road import RoadView, build_road_view, label_ideally
+from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send
 from flcav.perception.metrics import match
@@ -23,7 +24,6 @@ from flcav.perception.task import Task
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.sightings import navigate
 from flcav.pipeline.recipe import EDGE
-from flcav.progress import Report
 
 Spin = tuple[str, int]  # scene, and number in the scene
 

@@ -28,6 +28,7 @@ from flcav.fusion.posts import posts_of
 from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Sighting
 from flcav.geometry import Boxes
+from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Direction, Ledger
 from flcav.network.messages import send
 from flcav.perception.objects.config import SecondConfig
@@ -42,7 +43,6 @@ from flcav.pipeline.labels.quality import LABELS, measure_labels, read_history
 from flcav.pipeline.labels.sightings import make_sighting
 from flcav.pipeline.recipe import EDGE
 from flcav.pipeline.results.training import LabelHistory
-from flcav.progress import Report, ignore_progress
 from flcav.world.map.lanes import map_layers
 
 SURVEYED = np.eye(4)  # road sensors tell of boxes in the world frame

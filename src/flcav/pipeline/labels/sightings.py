@@ -12,8 +12,8 @@ from flcav.geometry import Boxes, transform_points
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import choose_lidar
-from flcav.seeds import stream
 from flcav.sensors.frame import Frame
+from flcav.statistics.streams import stream
 
 
 def navigate(data: Dataset, i: int, frame: Frame, errors: NavigationErrors) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from flcav.config import InputError, parse_config
+from flcav.interface.wording import plural
 from flcav.network.plan import MessageSizes, Price, StagePlan, price
 from flcav.optimization.allocation.allocate import TaskPlan as Allotted
 from flcav.optimization.allocation.baselines import baseline
@@ -18,7 +19,6 @@ from flcav.optimization.problem import Problem
 from flcav.pipeline.arms import PlanRule
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
 from flcav.pipeline.results.plans import Plan, TaskPlan
-from flcav.wording import plural
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from flcav.pipeline.labels.pseudo_labels import select_frames_near
 from flcav.pipeline.labels.sightings import find_told_posts
 from flcav.pipeline.planning.updates import UpdateForm
 from flcav.pipeline.poles import find_sites, read_traces
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 from flcav.world.map.census import measure_traffic_density
 
 

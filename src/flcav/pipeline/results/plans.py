@@ -6,7 +6,7 @@ from typing import Annotated
 
 from flcav.network.plan import MessageSizes, Price
 from flcav.pipeline.results.saved import Saved
-from flcav.records import LEFT_OUT, Record
+from flcav.storage.records import LEFT_OUT, Record
 
 
 @dataclass(frozen=True)

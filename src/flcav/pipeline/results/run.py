@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from flcav.intervals import Estimate, MeanOverSeeds
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
 from flcav.pipeline.results.placement import Placed
@@ -13,8 +12,10 @@ from flcav.pipeline.results.saved import Saved
 from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.results.tests import Difference, Finding, HomeCost, RegionalTest, Test, Tested
 from flcav.pipeline.results.training import Pretrained, StageResult, Watched
-from flcav.records import LEFT_OUT, Record
-from flcav.verdicts import Judged
+from flcav.statistics.estimates import Estimate
+from flcav.statistics.seeds import MeanOverSeeds
+from flcav.statistics.verdicts import Judged
+from flcav.storage.records import LEFT_OUT, Record
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import ClassVar, Self
 
 from flcav.config import read_json
-from flcav.files import write_json
-from flcav.records import Record
+from flcav.storage.files import write_json
+from flcav.storage.records import Record
 
 RESULT, PROBLEM = "result.json", "problem.json"  # the latter: the allocation problem of a plan
 WEIGHTS, LEDGER, ERRORS, OUTCOMES = "weights.safetensors", "ledger.parquet", "errors.parquet", "outcomes.npz"

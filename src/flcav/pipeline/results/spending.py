@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from flcav.federation.privacy import SEEDED
-from flcav.records import LEFT_OUT, Record
+from flcav.storage.records import LEFT_OUT, Record
 
 TOGETHER = "a vehicle's whole data in all tasks and trainings together"
 

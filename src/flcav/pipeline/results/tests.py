@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from flcav.intervals import Estimate, MeanOverSeeds, Spread
 from flcav.pipeline.results.saved import Saved
-from flcav.records import LEFT_OUT
+from flcav.statistics.estimates import Estimate, Spread
+from flcav.statistics.seeds import MeanOverSeeds
+from flcav.storage.records import LEFT_OUT
 
 
 @dataclass(frozen=True)

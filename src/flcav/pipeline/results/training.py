@@ -9,7 +9,7 @@ import numpy as np
 from flcav.federation.divergence import RoundDivergence
 from flcav.pipeline.results.plans import RoundPlan
 from flcav.pipeline.results.saved import Saved
-from flcav.records import LEFT_OUT, Record
+from flcav.storage.records import LEFT_OUT, Record
 
 DIVERGED = 10.0  # loss of no training that gets anywhere, by this factor above the first, and above 1
 

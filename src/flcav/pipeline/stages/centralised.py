@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from flcav.interface.progress import Report
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task
 from flcav.perception.training import Checkpointing, Validation, train, train_steps
@@ -16,8 +17,7 @@ from flcav.pipeline.learning import Learning
 from flcav.pipeline.recipe import PRETRAIN
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import Validated
-from flcav.progress import Report
-from flcav.seeds import derive_seed
+from flcav.statistics.streams import derive_seed
 
 CHECKPOINT, ROUND = "checkpoint.pt", LAST
 VALIDATIONS, APART = 10, 5  # during pretraining; at least so many steps apart

@@ -15,6 +15,7 @@ from flcav.federation.stages import EdgeServer, afford_cloud_rounds, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
 from flcav.perception.client import TaskClient
 from flcav.perception.distillation import SharedSamples
@@ -27,7 +28,6 @@ from flcav.pipeline.planning.course import Driven, Replanning
 from flcav.pipeline.recipe import CLOUD, EDGE
 from flcav.pipeline.stages.clients import Strategies, describe_federation, give_outputs
 from flcav.pipeline.stages.statistics import keep_statistics
-from flcav.progress import Report
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from flcav.federation.stages import Schedule, federate, federate_outputs
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
 from flcav.perception.client import TaskClient
 from flcav.perception.distillation import SharedSamples
@@ -27,7 +28,6 @@ from flcav.pipeline.learning import Learning
 from flcav.pipeline.planning.course import Driven, Replanning
 from flcav.pipeline.recipe import EDGE
 from flcav.pipeline.stages.clients import describe_federation, give_outputs
-from flcav.progress import Report
 
 OnStart = Callable[[int, Weights], None]  # called before a round with its number and weights; changes the clients
 

@@ -11,12 +11,12 @@ from typing import Any
 from safetensors.numpy import load_file, save
 
 from flcav.federation.trainable import Weights, statistics_names
-from flcav.files import write_bytes
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays, to_arrays
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.results.training import StatisticsScore
+from flcav.storage.files import write_bytes
 
 
 def keep_statistics(weights: Weights, folder: Path, region: str) -> None:

@@ -11,7 +11,7 @@ from flcav.perception.client import as_shared
 from flcav.perception.task import Task
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import PRETRAIN
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 
 def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) -> dict[str, tuple[int, ...]]:

@@ -7,7 +7,6 @@ from typing import Literal
 import numpy as np
 
 from flcav.config import Config, InputError, read_config
-from flcav.files import write_json
 from flcav.fusion.distillation import Distillation
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Link
@@ -35,6 +34,7 @@ from flcav.pipeline.results.training import StageResult, Watched, average_last
 from flcav.pipeline.steps.budgets import read_entries
 from flcav.pipeline.steps.settings import StepSettings
 from flcav.pipeline.steps.uploads import UploadSettings, plan_uploads
+from flcav.storage.files import write_json
 
 
 class LabelSettings(Config):

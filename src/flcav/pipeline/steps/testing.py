@@ -3,7 +3,6 @@
 import numpy as np
 
 from flcav.config import InputError
-from flcav.intervals import Estimate
 from flcav.perception.outcomes import as_measurable, compute_interval, compute_measure, score_network
 from flcav.perception.tasks import task_named
 from flcav.pipeline.engine import Work
@@ -16,6 +15,7 @@ from flcav.pipeline.results.tests import Tested
 from flcav.pipeline.results.training import Round, StageResult, Watched
 from flcav.pipeline.steps.before_after import detect_before_after
 from flcav.pipeline.steps.settings import StepSettings
+from flcav.statistics.estimates import Estimate
 
 
 class TestSettings(StepSettings):

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from flcav.intervals import MeanOverSeeds
 from flcav.report import style
+from flcav.statistics.seeds import MeanOverSeeds
 
 COLOURS = (
     style.INK,

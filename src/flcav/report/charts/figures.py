@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
 
-from flcav.intervals import MeanOverSeeds
 from flcav.report import style
 from flcav.report.charts import runs
 from flcav.report.charts.runs import Row
 from flcav.report.pictures import clouds, maps
+from flcav.statistics.seeds import MeanOverSeeds
 
 WIDTH = 3.8  # [inch] of a figure that a phone shows
 ACROSS = 2  # entries of a map's key in a line

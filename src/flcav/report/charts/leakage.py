@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
 
-from flcav.intervals import MeanOverSeeds
 from flcav.report import style
+from flcav.statistics.seeds import MeanOverSeeds
 
 COLOURS = (style.BLUE, style.VERMILLION, style.ORANGE, style.PURPLE)
 NAME_HEIGHT = 0.07  # of the axes: a line of text

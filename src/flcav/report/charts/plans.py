@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from flcav.intervals import MeanOverSeeds
 from flcav.optimization.allocation.budget_sweep import BudgetPoint
 from flcav.report import style
 from flcav.report.charts.figures import WIDTH
+from flcav.statistics.seeds import MeanOverSeeds
 
 TASKS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.VERMILLION, style.RULE)
 SHADES = {"samples": 1.0, "edge rounds": 0.62, "cloud rounds": 0.32}  # opacity by stage

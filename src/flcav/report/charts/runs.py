@@ -6,8 +6,8 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from flcav.intervals import MeanOverSeeds
 from flcav.report import style
+from flcav.statistics.seeds import MeanOverSeeds
 
 Row = Mapping[str, Any]
 

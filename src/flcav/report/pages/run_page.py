@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from flcav.dataset.ground import Ground
 from flcav.dataset.store import Dataset
 from flcav.federation.privacy import SEEDED
-from flcav.files import write_bytes
 from flcav.geometry import Boxes
 from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
@@ -38,6 +37,7 @@ from flcav.report.charts.runs import STAGES, Row
 from flcav.report.charts.timeline import timeline_of_rounds
 from flcav.report.pages import html
 from flcav.report.pictures import clouds, maps
+from flcav.storage.files import write_bytes
 
 CHART_NAMES: dict[str, str] = dict(zip((PRETRAIN, EDGE, CLOUD), STAGES, strict=True))
 OBJECTS = "objects"

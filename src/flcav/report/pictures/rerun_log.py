@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, concatenate, inverse
-from flcav.progress import Report, ignore_progress
+from flcav.interface.progress import Report, ignore_progress
 from flcav.sensors.frame import Frame
 from flcav.sensors.radar.radar import compute_echo_directions
 from flcav.world.map.lanes import map_layers

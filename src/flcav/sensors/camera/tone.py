@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.machine.compiled import compiled
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 STEPS = 4096  # entries of the look-up table
 GRAINS = 65521  # length of the noise table: a prime, so that it does not repeat from row to row

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from flcav.geometry import heading_vectors
 from flcav.machine.compiled import inlined
-from flcav.seeds import stream
 from flcav.sensors.rendering.noise import fade, hash_pair, overlap, sample_noise
+from flcav.statistics.streams import stream
 from flcav.world.meshes.buildings import BAY_M, GABLED_BELOW_M, STOREY_M
 
 PLASTER, BRICK, PANEL = range(3)

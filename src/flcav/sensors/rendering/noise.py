@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.machine.compiled import inlined
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 
 SIDE = 256  # cells along each side of a table, a power of two
 

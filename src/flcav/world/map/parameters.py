@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from flcav.config import Config
-from flcav.wording import suggest
+from flcav.interface.wording import suggest
 from flcav.world.shapes import SHAPES
 
 LARGEST_M = 1000.0

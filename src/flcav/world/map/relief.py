@@ -17,7 +17,7 @@ from shapely.geometry.base import BaseGeometry
 
 from flcav.config import InputError
 from flcav.machine.compiled import compiled
-from flcav.parquet import read_parquet
+from flcav.storage.parquet import read_parquet
 
 Array = NDArray[np.float64]
 

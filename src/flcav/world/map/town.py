@@ -12,8 +12,8 @@ import shapely
 from numpy.typing import NDArray
 
 from flcav.config import InputError, read_config, shorten
-from flcav.seeds import stream
-from flcav.wording import suggest
+from flcav.interface.wording import suggest
+from flcav.statistics.streams import stream
 from flcav.world.map import boundaries, imported, street_furniture
 from flcav.world.map.parameters import GeoReference, TownParameters
 from flcav.world.map.relief import Relief

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 from flcav.world.materials import Material
 from flcav.world.meshes.mesh import Mesh, box, fit_to_size, join_meshes, sheet, tube
 

@@ -20,9 +20,9 @@ import yaml
 from shapely.geometry import LineString
 
 from flcav.config import InputError, shorten
-from flcav.extras import format_install_command
-from flcav.files import find_existing, flush_tree
+from flcav.interface.extras import format_install_command
 from flcav.machine.locks import only_writer
+from flcav.storage.files import find_existing, flush_tree
 from flcav.world.map.parameters import GeoReference, MapSource
 from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString
 
 from flcav.geometry import wrap_angle
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 from flcav.world.map.imported import outline_space
 from flcav.world.map.parameters import TownParameters
 from flcav.world.map.roads import Edge, RoadNet

@@ -13,7 +13,7 @@ from shapely.geometry.base import BaseGeometry
 
 from flcav.config import InputError
 from flcav.geometry import heading_vectors, wrap_angle
-from flcav.seeds import derive_seed, stream
+from flcav.statistics.streams import derive_seed, stream
 from flcav.world.map.roads import read_net
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import KERB_M, Town

@@ -11,7 +11,7 @@ import shapely
 from shapely.geometry import LineString, Point, Polygon
 
 from flcav.config import InputError
-from flcav.seeds import stream
+from flcav.statistics.streams import stream
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.roads import read_net
 from flcav.world.map.surfaces import make_footprint

@@ -38,8 +38,8 @@ from flcav.dataset.formats.reading import (
     unseen_views,
 )
 from flcav.geometry import Boxes, inverse, pose
+from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
-from flcav.wording import plural
 
 CATEGORIES = {  # KITTI's other classes (Person_sitting, Tram, Misc) keep their names
     "Car": "car",

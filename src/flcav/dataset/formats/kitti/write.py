@@ -30,7 +30,7 @@ from flcav.dataset.formats.mounts import find_front_camera
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, transform_points, wrap_angle
-from flcav.progress import Report
+from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 
 CLASSES = {

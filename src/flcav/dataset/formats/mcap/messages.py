@@ -33,10 +33,10 @@ from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
+from flcav.config import Json
 from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
 from flcav.dataset.formats.mounts import quaternion
 from flcav.dataset.payloads import encode_png
-from flcav.files import Json
 from flcav.sensors.frame import Frame
 from flcav.sensors.radar.radar import compute_echo_directions
 

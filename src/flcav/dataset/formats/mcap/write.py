@@ -10,11 +10,11 @@ from google.protobuf.message import Message
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
+from flcav.config import Json
 from flcav.dataset.formats.exporter import Exported, ExportOptions, read_frame
 from flcav.dataset.formats.mcap.messages import JsonMessage, make_messages
 from flcav.dataset.store import Dataset
-from flcav.files import Json
-from flcav.progress import Report
+from flcav.interface.progress import Report
 
 
 def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:

@@ -4,7 +4,7 @@ from hashlib import sha256
 
 import numpy as np
 
-from flcav.files import Json
+from flcav.config import Json
 
 Row = dict[str, Json]
 

@@ -20,7 +20,7 @@ from flcav.dataset.formats.nuscenes.tables import VERSION, constant_rows, token
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
-from flcav.progress import Report
+from flcav.interface.progress import Report
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 
 Array = NDArray[np.float64]

@@ -37,9 +37,9 @@ from flcav.dataset.formats.reading import (
     view_boxes,
 )
 from flcav.geometry import Boxes, heading_vectors, inverse
+from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
-from flcav.wording import plural
 
 Array = NDArray[np.float64]
 

@@ -30,7 +30,7 @@ from flcav.dataset.formats.mounts import agent_velocities, assign_channels, opti
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import yaw_of
-from flcav.progress import Report
+from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
 

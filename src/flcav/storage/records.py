@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from flcav.config import InputError
-from flcav.files import Json
+from flcav.config import InputError, Json
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -54,7 +53,7 @@ def to_rows(records: Iterable["DataclassInstance"]) -> list[dict[str, Json]]:
 
     Fields of a record within a record are columns of their own, named as in "estimate.mean".
 
-    >>> from flcav.intervals import Estimate
+    >>> from flcav.statistics.estimates import Estimate
     >>> to_rows([Estimate(0.5, 0.4, 0.6)])
     [{'mean': 0.5, 'low': 0.4, 'high': 0.6}]
     """

@@ -1,9 +1,9 @@
-"""Sample size determination: how many trainings and test scenes together tell an effect.
+"""Power of t tests, and sample size determination: how many trainings and test scenes together tell an effect.
 
 The variance of a mean over trainings that share their test scenes is sd² / trainings + s² / scenes: more of the one
 leaves the other. So there are effects that no number of trainings tells on the scenes at hand, and others that no
-number of scenes tells of the trainings at hand. Numbers of both are sought for the tests of `flcav.intervals`, at a
-power of 0.8: Student's t of several trainings or seeds, and for one training of known spread the test of `OneTraining`.
+number of scenes tells of the trainings at hand. Numbers of both are sought for the tests of `seeds`, at a power of 0.8:
+Student's t of several trainings or seeds, and for one training of known spread the test of `OneTraining`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -11,13 +11,55 @@ from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
-from scipy.special import chdtri, ndtr, ndtri, stdtrit
+from scipy.special import chdtri, nctdtr, ndtr, ndtri, stdtrit
 
-from flcav.intervals import MOST_SEEDS, POWER, MeanOverSeeds, OneTraining, SharedScenes, power_of_seeds
-from flcav.wording import plural
+from flcav.interface.wording import plural
+from flcav.statistics.seeds import LEVEL, OWN_SCENES, MeanOverSeeds, OneTraining, SharedScenes, standard_error
 
+POWER = 0.8  # chance to tell an effect that a number of seeds is planned for
+MOST_SEEDS = 1000  # that a plan of seeds is sought up to
 MOST_SCENES = 10_000  # test scenes that are sought up to
 QUANTILES = (np.arange(99) + 0.5) / 99  # of an estimated variance
+
+
+def power_of_seeds(
+    effect: float, sd: float, seeds: int, level: float = LEVEL, shared: SharedScenes = OWN_SCENES
+) -> float:
+    """Return the power of the two-sided t test of a mean of `effect` over seeds of standard deviation `sd`.
+
+    It is that of the noncentral t distribution (Cohen, "Statistical Power Analysis for the Behavioral Sciences", 1988).
+    """
+    error, freedom = standard_error(sd, seeds, shared)
+    if error == 0:
+        return float(effect != 0)
+    beyond, limit = abs(effect) / error, stdtrit(freedom, 1 - level / 2)
+    missed, wrong_side = np.nan_to_num(nctdtr(freedom, beyond, [limit, -limit]))  # not a number where next to 0
+    return float(1 - missed + wrong_side)
+
+
+def plan_seeds(
+    effect: float, sd: float, level: float = LEVEL, shared: SharedScenes = OWN_SCENES, power: float = POWER
+) -> int | None:
+    """Return the least number of seeds that tell `effect` with the given power; None for more than `MOST_SEEDS`.
+
+    `sd` is the standard deviation over seeds of the effect: of differences, that of the paired differences.
+    """
+    least, most = 1, MOST_SEEDS
+    if power_of_seeds(effect, sd, most, level, shared) < power:
+        return None
+    while most - least > 1:  # power rises with seeds
+        middle = (least + most) // 2
+        enough = power_of_seeds(effect, sd, middle, level, shared) >= power
+        least, most = (least, middle) if enough else (middle, most)
+    return most
+
+
+def seeds_to_tell(mean: MeanOverSeeds, hypothesis: float = 0.0, level: float = LEVEL) -> int | None:
+    """Return `plan_seeds` for an effect as large as the distance from `hypothesis`, if the spread is known."""
+    if not mean.known:
+        return None
+    shared = SharedScenes(mean.slope * mean.shared.sd, mean.shared.scenes)
+    return plan_seeds(mean.distance(hypothesis), mean.slope * mean.sd, level, shared)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import is_dataclass
 from importlib import import_module
 from typing import Any
 
-from flcav.fields import document_fields
+from flcav.interface.fields import document_fields
 
 
 def lazy_names(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from flcav.intervals import LEVEL, MOST_SEEDS, MeanOverSeeds
-from flcav.records import LEFT_OUT
-from flcav.sample_size import SampleSize, plan_sample
+from flcav.statistics.power import MOST_SEEDS, SampleSize, plan_sample, seeds_to_tell
+from flcav.statistics.seeds import LEVEL, MeanOverSeeds
+from flcav.storage.records import LEFT_OUT
 
 HELD, NOT_HELD, UNDECIDED = "held", "did not hold", "undecided"
 ESTIMATE = "estimate"  # in the place of a verdict, of a difference about which nothing is claimed
@@ -140,7 +140,7 @@ def _judged(claim: Claim, p: float, family: int) -> Judged:
     if said == UNDECIDED and own is not None and own <= LEVEL:
         alone = Alone(own, claim.mean.ends(level))
     size = plan_sample(claim.mean, claim.than, level) if said == UNDECIDED else None
-    return Judged(said, p, family, claim.mean.seeds_to_tell(claim.than, level), size, alone)
+    return Judged(said, p, family, seeds_to_tell(claim.mean, claim.than, level), size, alone)
 
 
 def describe_aims(aims: Mapping[str, Claim]) -> list[str]:

@@ -5,9 +5,20 @@ import pytest
 from scipy import stats
 from scipy.special import expit, logit
 
-from flcav.intervals import Estimate, SharedScenes, Spread, mean_over_seeds, of_one_training
-from flcav.sample_size import plan_sample
-from flcav.verdicts import HELD, NOT_HELD, UNDECIDED, Claim, explain_verdict, judge, judge_known, signed, verdict
+from flcav.statistics.estimates import Estimate, Spread
+from flcav.statistics.power import plan_sample, seeds_to_tell
+from flcav.statistics.seeds import SharedScenes, mean_over_seeds, of_one_training
+from flcav.statistics.verdicts import (
+    HELD,
+    NOT_HELD,
+    UNDECIDED,
+    Claim,
+    explain_verdict,
+    judge,
+    judge_known,
+    signed,
+    verdict,
+)
 
 CLEAR, OPEN = [0.02, 0.03, 0.035, 0.01], [0.02, -0.03, 0.035, -0.01]
 
@@ -65,7 +76,7 @@ def test_a_claim_that_its_own_interval_decides_alone_is_told_with_its_simultaneo
     p = ttest(CLEAR)
     told = f" ({p:.3f} alone; simultaneous interval {low} to {high})"
     assert first.p_cell == f"{5 * p:.3f}{told}"
-    seeds = mean.seeds_to_tell(level=0.01)
+    seeds = seeds_to_tell(mean, level=0.01)
     takes = f"to tell an effect of this size takes about {seeds} seeds"
     assert first.describe() == f"p {5 * p:.3f}, corrected for 5 claims{told}; {takes}"
     assert first.takes_cell == str(seeds)

@@ -9,9 +9,9 @@ from types import ModuleType
 import pytest
 from rich.console import Console
 
-from flcav import progress
+from flcav.interface import progress
+from flcav.interface.progress import DAMAGED, print_progress
 from flcav.pipeline.engine import print_steps
-from flcav.progress import DAMAGED, print_progress
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import flcav
-from flcav.wording import describe_number, hint_share, plural, suggest
+from flcav.interface.wording import describe_number, hint_share, plural, suggest
 
 
 def test_the_closest_known_name_is_suggested_if_it_is_close() -> None:

@@ -4,18 +4,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flcav.intervals import (
+from flcav.statistics.estimates import Estimate, Spread
+from flcav.statistics.power import MOST_SCENES, SampleSize, plan_sample, power_of_one, power_of_seeds, seeds_to_tell
+from flcav.statistics.seeds import (
     OWN_SCENES,
-    Estimate,
     MeanOverSeeds,
     OneTraining,
     SharedScenes,
-    Spread,
     mean_over_seeds,
     of_one_training,
-    power_of_seeds,
 )
-from flcav.sample_size import MOST_SCENES, SampleSize, plan_sample, power_of_one
 
 LEVEL = 0.05 / 6
 LIMITED = (0.04, 0.021, 0.02, 30)  # effect, sd of trainings, of 30 scenes: neither alone tells it
@@ -100,7 +98,7 @@ def test_trainings_at_hand_count_and_scenes_at_hand_may_do() -> None:
     found = plan_sample(mean, 0.0, 0.05)
     assert found is not None
     assert found.scenes == 40
-    assert found.trainings == mean.seeds_to_tell()
+    assert found.trainings == seeds_to_tell(mean)
     assert found.trainings is not None
     assert found.trainings > 5
     assert (found.by_trainings, found.by_scenes) == (True, False)

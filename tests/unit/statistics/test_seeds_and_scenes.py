@@ -9,17 +9,10 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import stdtrit
 
-from flcav.intervals import (
-    OWN_SCENES,
-    MeanOverSeeds,
-    SharedScenes,
-    half_width,
-    mean_over_seeds,
-    plan_seeds,
-    power_of_seeds,
-    share_scenes,
-)
-from flcav.verdicts import (
+from flcav.statistics.bootstrap import share_scenes
+from flcav.statistics.power import plan_seeds, power_of_seeds, seeds_to_tell
+from flcav.statistics.seeds import OWN_SCENES, MeanOverSeeds, SharedScenes, half_width, mean_over_seeds
+from flcav.statistics.verdicts import (
     HELD,
     NOT_HELD,
     UNDECIDED,
@@ -120,7 +113,7 @@ def test_own_scenes_give_the_interval_and_the_p_value_of_a_t_test() -> None:
 
 def test_one_seed_and_shares_without_spread_have_no_interval() -> None:
     single = mean_over_seeds([0.7])
-    assert (single.mean, single.low, single.high, single.p_value(), single.seeds_to_tell()) == (0.7, *[None] * 4)
+    assert (single.mean, single.low, single.high, single.p_value(), seeds_to_tell(single)) == (0.7, *[None] * 4)
     full = mean_over_seeds([1.0, 1.0, 1.0], share=True)
     assert (full.low, full.high, full.p_value(0.9)) == (None, None, None)
 
@@ -188,7 +181,7 @@ def test_seeds_for_a_share_are_planned_on_the_scale_of_its_test() -> None:
     """Near 0.5 log-odds are linear; near 1 a lower value is nearer, in units of the spread."""
     middle, high = [0.50, 0.52, 0.48], [0.96, 0.98, 0.94]
     for values, hypothesis, same in ((middle, 0.51, True), (high, 0.94, False)):
-        share, plain = (mean_over_seeds(values, share=each).seeds_to_tell(hypothesis) for each in (True, False))
+        share, plain = (seeds_to_tell(mean_over_seeds(values, share=each), hypothesis) for each in (True, False))
         assert share is not None
         assert plain is not None
         assert (share == plain) == same

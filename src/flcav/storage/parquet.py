@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flcav.config import InputError
-from flcav.files import write_bytes
+from flcav.storage.files import write_bytes
 
 HARMLESS_BYTES = 1 << 28  # that any table may take in memory
 UNFOLDED = 1000  # most bytes in memory that a byte of a larger table stands for; unlike rows unfold to a few

@@ -4,18 +4,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flcav.intervals import (
+from flcav.statistics.bootstrap import bootstrap_over_scenes
+from flcav.statistics.estimates import (
     Estimate,
     Spread,
-    bootstrap_over_scenes,
     combine_spreads,
     measure_spread,
-    of_one_training,
     pool_spreads,
     score_interval,
     widen,
     widen_share,
 )
+from flcav.statistics.power import seeds_to_tell
+from flcav.statistics.seeds import of_one_training
 
 
 def test_the_interval_over_scenes_is_that_of_redrawing_them_one_by_one():
@@ -134,13 +135,13 @@ def test_the_p_value_of_one_training_is_that_of_its_sources_alone_and_of_its_int
 def test_more_trainings_of_one_run_tell_what_its_scenes_allow():
     found = of_one_training(Estimate(0.05, 0.03, 0.07), 100, Spread(0.04, 8))
     assert found is not None
-    few, many = found.seeds_to_tell(), found.seeds_to_tell(level=0.01)
+    few, many = seeds_to_tell(found), seeds_to_tell(found, level=0.01)
     assert few is not None
     assert many is not None
     assert 5 < few < many, "of trainings alone it takes 8 by the tables of the paired t test"
     blurred = of_one_training(Estimate(0.05, 0.0, 0.1), 100, Spread(0.04, 8))
     assert blurred is not None
-    assert blurred.seeds_to_tell() is None
+    assert seeds_to_tell(blurred) is None
 
 
 @pytest.mark.parametrize(("right", "trials"), [(7, 7), (0, 12), (30, 33)])

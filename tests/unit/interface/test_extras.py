@@ -12,10 +12,10 @@ from packaging.requirements import Requirement
 
 from flcav.config import InputError
 from flcav.dataset.recording import ray_engine
-from flcav.extras import format_install_command
+from flcav.interface.extras import format_install_command
 from flcav.world.opendrive import importing
 
-PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+PROJECT = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
 
 
 @pytest.mark.parametrize("extra", ["ray", "view", "towns"])

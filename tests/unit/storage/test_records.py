@@ -5,7 +5,7 @@ from typing import Annotated
 import pytest
 
 from flcav.config import InputError
-from flcav.records import LEFT_OUT, Class, Record, to_rows
+from flcav.storage.records import LEFT_OUT, Class, Record, to_rows
 
 
 @dataclass(frozen=True)

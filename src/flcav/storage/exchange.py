@@ -7,8 +7,8 @@ import pyarrow as pa
 import pyarrow.csv
 
 from flcav.config import InputError
-from flcav.files import atomic_path
-from flcav.parquet import write_parquet
+from flcav.storage.files import atomic_path
+from flcav.storage.parquet import write_parquet
 
 ENDINGS = (".csv", ".parquet")
 

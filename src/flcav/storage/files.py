@@ -6,13 +6,11 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from typing_extensions import TypeAliasType  # typing has it from Python 3.12 on; pydantic needs it for recursive types
-
-Json = TypeAliasType("Json", "bool | int | float | str | Sequence[Json] | Mapping[str, Json] | None")
+from flcav.config import Json
 
 PIECE_BYTES = 1 << 16
 SYNCING = 8  # files that are flushed at once: the file system commits them together, ten times as fast as in turn

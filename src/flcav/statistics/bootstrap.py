@@ -1,0 +1,63 @@
+"""Bootstrap over scenes: frames of one scene share their traffic, so whole scenes are resampled.
+
+Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 13: percentile intervals.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flcav.statistics.estimates import TAILS
+from flcav.statistics.seeds import OWN_SCENES, SharedScenes
+
+REDRAWS = 1000
+
+
+def bootstrap_over_scenes(
+    measure: Callable[[NDArray[np.int64]], NDArray[np.float64]],
+    scene_of_frame: ArrayLike,
+    n: int = REDRAWS,
+    *,
+    rng: np.random.Generator,
+) -> tuple[float, float]:
+    """Return the ends of the 95 % percentile interval of a measure, from `n` bootstrap resamples of the scenes.
+
+    `measure` takes (n, F) counts, how often each of F frames is in each resample, and returns (n,) values, NaN where it
+    is undefined; such resamples are left out, and both ends are NaN where none is left. `scene_of_frame` (F,) names
+    the scene of each frame.
+    """
+    names, scene = np.unique(np.asarray(scene_of_frame), return_inverse=True)
+    times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=n)
+    draws = measure(times[:, scene])
+    known = draws[np.isfinite(draws)]
+    if not len(known):
+        return float("nan"), float("nan")
+    low, high = np.quantile(known, TAILS)
+    return float(low), float(high)
+
+
+def share_scenes(
+    measures: Sequence[Callable[[NDArray[np.int64]], NDArray[np.float64]]],
+    scenes_of_frames: Sequence[ArrayLike],
+    n: int = REDRAWS,
+    *,
+    rng: np.random.Generator,
+) -> SharedScenes:
+    """Return the spread of the mean over seeds by the test scenes that several seeds share.
+
+    `measures` and `scenes_of_frames` are those of `bootstrap_over_scenes`, one per seed. A scene's weight is drawn from
+    a Poisson distribution of mean 1, the same in all seeds that have it (Poisson bootstrap; Hanley and MacGibbon,
+    Computer Methods and Programs in Biomedicine 83, 2006). The variance is the mean covariance between two seeds, at
+    least 0.
+    """
+    scenes = [np.asarray(each) for each in scenes_of_frames]
+    names, counts = np.unique(np.concatenate([np.unique(each) for each in scenes]), return_counts=True)
+    shared = int((counts > 1).sum())
+    if not shared:
+        return OWN_SCENES
+    times = rng.poisson(1.0, size=(n, len(names)))
+    draws = np.array([of(times[:, np.searchsorted(names, each)]) for of, each in zip(measures, scenes, strict=True)])
+    covariance = np.cov(draws[:, np.isfinite(draws).all(axis=0)])
+    between = covariance[~np.eye(len(draws), dtype=bool)].mean()
+    return SharedScenes(float(np.sqrt(max(between, 0.0))), shared)

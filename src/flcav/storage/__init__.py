@@ -1,0 +1,1 @@
+"""Files that hold results: atomic writing, JSON records, Parquet and CSV tables, Markdown."""
