@@ -13,7 +13,7 @@ from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.selection import Selection
-from flcav.federation.stages import Schedule, federate
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.ledger import Budget, Ledger
 

@@ -17,11 +17,12 @@ from task_drives import Drives
 
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.federation import stages
+from flcav.federation.edge_server import EdgeServer
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes import link as links
 from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account, MeteredGrid
-from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.strategies import FEDAVG, STRATEGIES, Strategy, of_servers, strategy_named
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.fusion.road import RoadView
@@ -115,7 +116,7 @@ def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
     found = Wire()
     monkeypatch.setattr(messages, "carry", found.carry)
     monkeypatch.setattr(
-        stages, "MeteredGrid", lambda grid, account, names: MeteredGrid(WiredGrid(grid, found), account, names)
+        links, "MeteredGrid", lambda grid, account, names: MeteredGrid(WiredGrid(grid, found), account, names)
     )
     return found
 

@@ -8,13 +8,13 @@ import pytest
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 from pydantic import ValidationError
 
-from flcav.federation import stages
 from flcav.federation.records import ARRAYS, ASK, METRICS, NORM, SHARES, VECTOR, to_arrays
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes import link as links
 from flcav.federation.runtimes.metered import Account, BudgetedGrid
 from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.federation.secure.shamir import SHARE_BYTES
-from flcav.federation.stages import Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.median import Median
@@ -71,7 +71,7 @@ def run(
     def link(grid: Any, account: Account, names: Mapping[int, str]) -> LyingGrid:
         return LyingGrid(BudgetedGrid(grid, account, names), names, liar, damage)
 
-    monkeypatch.setattr(stages, "BudgetedGrid", link)
+    monkeypatch.setattr(links, "BudgetedGrid", link)
     clients, state = {f"cav{i}": Vehicle() for i in range(5)}, FederationState()
     account = Account(Ledger(Budget(999.0, 0.0)), "edge", "toy", "wireless")
     return federate(clients, START, SCHEDULE, account, rules=rules, state=state, strategy=strategy).weights, state

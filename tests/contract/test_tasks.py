@@ -19,8 +19,8 @@ from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.fig1b.layers import LAYERS, capture_outputs
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import Trainable

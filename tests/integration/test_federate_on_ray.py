@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from flcav.federation.privacy import Privacy
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.simulation import RaySimulation
-from flcav.federation.stages import Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.krum import Krum

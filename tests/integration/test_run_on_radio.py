@@ -1,4 +1,4 @@
-"""The recipe of the run on the radio, small: stragglers, plans made anew after each round, planned uploads."""
+"""The recipe of the run on the radio, small: stragglers, plans between stages, planned uploads."""
 
 from collections import Counter
 from pathlib import Path
@@ -35,9 +35,9 @@ def radio(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunRecipe, Ru
         "test": {"scenes": 2, "spins": 1, "cavs": 1},
     }
     asked["regions"]["grid"]["speed"] = {"cav1": 0.5, "cav3": 0.3}  # cav3 trains for longer than the deadline
-    asked["budgets_mb"]["wireless"] = 6.97  # two edge rounds and a cloud round, and most of one more
+    asked["budgets_mb"]["wireless"] = 6.97  # three rounds, and most of one more
     asked["arms"] = {"timely": {"federation": asked["federation"] | {"selection": TIMELY}}}
-    limits = {"samples": [3, 3], "edge_rounds": [1, 3], "cloud_rounds": [1, 1]}
+    limits = {"samples": [3, 3], "edge_rounds": [1, 3], "cloud_rounds": [1, 3]}
     asked |= {"retrainings": 1, "training": QUICK, "limits": limits, "horizon_s": 24.0}
     recipe, out = RunRecipe.model_validate(asked), tmp_path_factory.mktemp("radio")
     return out, recipe, run(recipe, out)
@@ -74,17 +74,14 @@ def test_on_the_radio_stragglers_join_what_the_plan_gives_them_and_are_cut_off_a
     assert {"timeline_grid", "timeline_ring"} <= {*draw(result, folder / "work")}
 
 
-def test_on_the_radio_megabytes_of_stragglers_buy_rounds_and_the_plan_says_who_uploads(
+def test_on_the_radio_megabytes_of_stragglers_return_to_the_plan_which_says_who_uploads(
     radio: tuple[Path, RunRecipe, Run],
 ) -> None:
     folder, _, result = radio
     main = result.arms[MAIN]
     first = main.plans[0].tasks["weather"]
     assert (first.edge_rounds, first.cloud_rounds) == (2, 1)
-    edge = {stage.region: stage for stage in main.stages if stage.stage == EDGE}
-    assert edge["grid"].rounds == 3
-    for stage in main.stages:
-        assert [made.round for made in stage.plans or ()] == list(range(1, stage.rounds + 1))
+    assert main.plan.tasks["weather"].cloud_rounds > 1  # bought by what stragglers did not send
     assert main.links["wireless"].used_mb <= main.links["wireless"].budget_mb
     uploads = first.uploads
     assert uploads is not None

@@ -27,7 +27,6 @@ from flcav.pipeline.recipe import (
     MAIN,
     PRETRAIN,
     SPLITS_OF,
-    Arm,
     Budgets,
     Federation,
     Role,
@@ -40,7 +39,7 @@ from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.tests import Difference
 from flcav.pipeline.results.training import Pretrained
-from flcav.pipeline.running import RESULTS, run, run_several
+from flcav.pipeline.running import RESULTS, run
 from flcav.pipeline.sizes import Split, Splits, Training
 from flcav.report.pages.run_page import page, write_report
 from flcav.statistics.verdicts import UNDECIDED
@@ -219,27 +218,6 @@ def test_a_plan_within_a_horizon_counts_the_time_on_the_air(timed: tuple[Path, R
     assert known.earlier is not None
     fast = [len((plan.joins or {})["ring/cav0"]) for plan in (known.earlier[0].tasks["weather"], *plans)]
     assert 4 >= fast[0] >= fast[1] > fast[2] >= 1  # a round trains for 1 s, and narrow bands take as long again
-
-
-def test_the_rest_of_a_stage_is_planned_after_each_round(timed: tuple[Path, RunRecipe, Run]) -> None:
-    beside, recipe = timed[0].parent, timed[1]
-    arms = {"further": Arm(stages=("edge", "more_edge")), "oracle": Arm(central="federate")}
-    asked = recipe.model_copy(update={"replan": "rounds", "arms": arms})
-    _, result = run_several({"out": recipe, "again": asked}, beside, beside=beside)  # the same recordings
-    edge, cloud = result.arms[MAIN].stages
-    for stage, count in ((edge, "edge_rounds"), (cloud, "cloud_rounds")):
-        assert stage.plans is not None
-        assert [made.round for made in stage.plans] == list(range(1, stage.rounds + 1))
-        assert getattr(stage.plans[-1].plan, count) == stage.rounds  # the last plan is what was carried out
-        assert all(made.sent_mb.wireless_mb > 0 and made.reached is not None for made in stage.plans)
-    book = Ledger.load(beside / "again/ledgers/main.parquet").entries
-    for stage in (edge, cloud):
-        sent = [e for e in book if (e.stage, e.link, e.direction) == (stage.stage, "wireless", "up") and e.round]
-        assert {e.round for e in sent} <= set(range(1, stage.rounds + 1))
-    for use in result.arms[MAIN].links.values():
-        assert use.used_mb <= use.budget_mb
-    central = next(each for each in result.arms["oracle"].stages)
-    assert central.rounds == edge.rounds
 
 
 def test_class_probabilities_are_priced_as_they_are_booked(timed: tuple[Path, RunRecipe, Run], tmp_path: Path) -> None:

@@ -13,10 +13,8 @@ from flcav.pipeline.analysis.home import list_home_costs
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results.plans import RoundPlan
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Finding
-from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.spread import read_spreads, widen_anew
 from flcav.storage.markdown import format_bullets, format_table
 
@@ -114,22 +112,8 @@ def _plan(run: Run) -> str:
             sizes = (f"{mb:.3f}" for mb in (own.sample_mb, own.model_mb))
             megabytes = (f"{own.wireless_mb:.1f}", f"{own.wireline_mb:.1f}")
             rows.append([task, made[plan.after], reached, *counts, *sizes, *megabytes, source])
-        for stage, after in run.arms[MAIN].round_plans:
-            if stage.task == task:
-                rows.append(_round_plan(stage, after))
     header = ("samples", "edge rounds", "cloud rounds", "sample MB", "network MB", "wireless MB", "wireline MB")
     return format_table(("task", "made", "reached", *header, "predicted"), rows)
-
-
-def _round_plan(stage: StageResult, after: RoundPlan) -> list[str | float]:
-    """Return the row of a plan that was made after a round: of stage II with the megabytes of the region alone."""
-    own = after.plan
-    made = f"after round {after.round} of stage {f'II in {stage.region}' if stage.region else 'III'}"
-    reached = "" if after.reached is None else f"{after.reached:.3f}"
-    sizes = (f"{mb:.3f}" for mb in (own.sample_mb, own.model_mb))
-    megabytes = (f"{own.wireless_mb:.1f}", f"{own.wireline_mb:.1f}")
-    source = f"planned: {(own.predicted or {})['cloud']:.3f}"
-    return [stage.task, made, reached, own.samples, own.edge_rounds, own.cloud_rounds, *sizes, *megabytes, source]
 
 
 def _budgets(run: Run) -> str:

@@ -9,10 +9,10 @@ os.environ.setdefault("FLWR_TELEMETRY_ENABLED", "0")  # read when Flower is impo
 
 if TYPE_CHECKING:
     from flcav.federation.privacy import Privacy
+    from flcav.federation.rounds import Schedule, federate
     from flcav.federation.rules import Rules
     from flcav.federation.runtimes.metered import Account
     from flcav.federation.selection import Selection
-    from flcav.federation.stages import Schedule, federate
     from flcav.federation.state import FederationState, RoundRecord
     from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy, strategy_named
     from flcav.federation.trainable import LocalUpdate, Trainable, Update
@@ -26,8 +26,8 @@ PLACES = {
     "Upload": "flcav.federation.upload",
     "FederationState": "flcav.federation.state",
     "RoundRecord": "flcav.federation.state",
-    "Schedule": "flcav.federation.stages",
-    "federate": "flcav.federation.stages",
+    "Schedule": "flcav.federation.rounds",
+    "federate": "flcav.federation.rounds",
     "STRATEGIES": "flcav.federation.strategies",
     "FedAvg": "flcav.federation.strategies",
     "Strategy": "flcav.federation.strategies",

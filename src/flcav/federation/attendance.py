@@ -1,13 +1,19 @@
-"""Attendance of a federated round: who is asked, who is to send an update, who fails, and how many are enough."""
+"""Attendance of a federated round: who is asked, who fails, how many are enough; and the updates that arrived."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from flcav.config import InputError
+from flcav.federation.delivery import Lost, TimedOut
 from flcav.federation.rules import Rules
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.strategies import Strategy
-from flcav.federation.strategies.strategy import Robust
+from flcav.federation.strategies.fedavg import RunningMean
+from flcav.federation.strategies.strategy import Averages, Robust
+from flcav.federation.trainable import LocalUpdate
 
 
 class ClientFailed(OSError):
@@ -25,6 +31,20 @@ class Attendance:
     lost: set[str] = field(default_factory=set)  # those of them whom the network lost
     shortage: ClientFailed | TooFewClients | None = None  # why there is no update
     few: bool = False  # whether fewer take part than the rules need
+
+    def note(self, event: Lost | TimedOut) -> None:
+        """Note a client that is lost, or has not answered: the latter with the reason of an earlier failure, if any."""
+        if isinstance(event, TimedOut):
+            self.failed.setdefault(event.client, "no answer")
+        else:
+            self.failed[event.client] = event.reason
+            self.lost |= {event.client} if event.by_network else set()
+
+    def excuse(self, error: Exception) -> None:
+        """Note why the round has no update; raises `TooFewClients` where neither the network nor the rules are why."""
+        if isinstance(error, TooFewClients) and not (self.lost or self.few):
+            raise error
+        self.failed |= {name: str(error) for name in self.chosen if name not in self.failed}
 
     def count(self, rules: Rules) -> None:
         """Note whether too few take part for the rules, by a plan, by chance, or since others are away."""
@@ -62,3 +82,36 @@ class Attendance:
                 strategy.check_clients(sum(name not in self.failed for name in self.chosen))
             except InputError as error:
                 self.shortage = ClientFailed(str(error))  # a minority that sends rubbish does not end a federation
+
+
+class Intake:
+    """The usable updates of a round: all of them or, where a strategy needs no more, their mean as they come in."""
+
+    def __init__(self, weigher: Averages | None = None) -> None:
+        """Add up by the weights of `weigher`; None: keep every update."""
+        self._weigher, self._mean = weigher, RunningMean()
+        self._extra: dict[str, NDArray[np.number]] = {}  # sums of the arrays beside the weights
+        self.updates: dict[str, LocalUpdate] = {}  # by client, where they are kept
+        self.samples: dict[str, int] = {}  # by client
+        self.losses: dict[str, float] = {}  # by client
+
+    def add(self, client: str, update: LocalUpdate) -> None:
+        """Add a client's update."""
+        self.samples[client], self.losses[client] = update.samples, update.loss
+        if self._weigher is None:
+            self.updates[client] = update
+            return
+        self._mean.add(update.weights, self._weigher.weigh(update))
+        for name, array in update.extra.items():
+            self._extra[name] = self._extra.get(name, 0.0) + array.astype(np.float64)
+
+    @property
+    def combinable(self) -> list[LocalUpdate]:
+        """Return what a strategy is given: all updates, or one that stands for them; none where none came."""
+        if self._weigher is None or not self.samples:
+            return [*self.updates.values()]
+        return [LocalUpdate(self._mean.mean(), sum(self.samples.values()), 0.0, extra=self._extra)]
+
+    def mean_loss(self) -> float | None:
+        """Return the mean loss weighted by samples; None where no update came."""
+        return float(np.average([*self.losses.values()], weights=[*self.samples.values()])) if self.samples else None

@@ -1,394 +1,370 @@
-"""Synchronous federated rounds as a Flower strategy: who trains, whose updates count, and how they are combined.
+"""Federated learning: the round loop, and a round from weights to weights. Edge and cloud are two uses of it.
 
-Flower's own strategies sample nodes from the global random state, multiply integer buffers by floats, and skip a whole
+`federate` repeats `Server.run_round`. A round calls the clients that take part, sends them the weights and their local
+work, checks every update as it arrives, combines those that count, and keeps a record. Flower carries the messages;
+its own strategies sample clients from the global random state, multiply integer buffers by floats, and skip a whole
 round where one client fails.
 """
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial
-from itertools import chain
-from typing import Any, TypeVar
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
-from flwr.app import ArrayRecord, ConfigRecord, Message, MessageType, MetricRecord, RecordDict
+from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
-from flwr.serverapp.strategy import Strategy as FlowerStrategy
-from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.federation.acceptance import Expected, ReplyRefused, extra_forms, read_masked, read_norm, read_update
-from flcav.federation.attendance import Attendance, ClientFailed
-from flcav.federation.encoding import unflatten
+from flcav.federation.acceptance import Expected, ReplyRefused, extra_forms, read_norm, read_update
+from flcav.federation.attendance import Attendance, ClientFailed, Intake
+from flcav.federation.checks import check_federation
+from flcav.federation.client import kept_records
+from flcav.federation.delivery import Arrived, list_events
 from flcav.federation.noise import derive_key
-from flcav.federation.privacy import account_epsilon, average_privately, expected_clients
-from flcav.federation.records import (
-    ARRAYS,
-    ASK,
-    CENTRE,
-    CONFIG,
-    COUNT,
-    EXTRA,
-    LOSS,
-    LOST_BY_NETWORK,
-    NORM,
-    SAMPLES,
-    SEND,
-    VECTOR,
-    LocalWork,
-    to_arrays,
-    to_weights,
+from flcav.federation.privacy import (
+    account_epsilon,
+    affordable_rounds,
+    average_privately,
+    expected_clients,
+    find_noise,
+    least_participations,
 )
-from flcav.federation.rules import Rules, SecureAggregation
-from flcav.federation.secure.masks import to_values
-from flcav.federation.secure.messages import SecureSum, TooFewClients
-from flcav.federation.secure.parties import SumLost, settle_complaints
+from flcav.federation.records import ARRAYS, ASK, CENTRE, CONFIG, COUNT, EXTRA, NORM, SEND, LocalWork, to_arrays
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.link import Runtime, open_link
+from flcav.federation.runtimes.metered import Account, open_account
+from flcav.federation.secure.messages import TooFewClients
+from flcav.federation.secure.parties import SumLost
+from flcav.federation.secure.server import SecureRound
 from flcav.federation.state import SERVER, FederationState, RoundRecord
-from flcav.federation.strategies import Strategy
-from flcav.federation.strategies.fedavg import RunningMean, average
-from flcav.federation.strategies.strategy import Averages, Exchanges, Stateful, find_weigher
-from flcav.federation.trainable import LocalUpdate, Weights, forms_of, learned_names
+from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.strategies.fedavg import average_inversely
+from flcav.federation.strategies.fedmd import FedMD
+from flcav.federation.strategies.strategy import Exchanges, Stateful, find_weigher
+from flcav.federation.trainable import Distiller, LocalUpdate, Trainable, Weights, forms_of, learned_names
+from flcav.statistics.streams import derive_seed
 
-OnRound = Callable[[int, Weights, float | None], None]  # aggregated round, its weights, mean training loss
-AnswerT = TypeVar("AnswerT")
+EVERYBODY = Rules()
 WHOLE = (1, 1.0)  # samples and loss of the one update that a strategy is given where the server averages them itself
-ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere; Flower's own limit for updates
-Away = Callable[[int], Mapping[str, str]]  # of a round, by client why it is not there when the round begins
+ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere
+BeforeRound = Callable[[int, Weights], None]  # called with the round's number and the weights that it begins with
+OnRound = Callable[[int, Weights, float | None], None]  # called with number, aggregated weights and mean training loss
+AnswerT = TypeVar("AnswerT")
+logging.getLogger("flwr").setLevel(logging.ERROR)  # Flower logs each message; a stage reports its rounds
 
 
-class Intake:
-    """The usable updates of a round: all of them or, where a strategy needs no more, their mean as they come in."""
+@dataclass(frozen=True)
+class Schedule:
+    """Number of rounds, local steps per round, and a learning rate that decays geometrically over the rounds."""
 
-    def __init__(self, weigher: Averages | None) -> None:
-        """Add up by the weights of `weigher`; None: keep every update."""
-        self._weigher, self._mean = weigher, RunningMean()
-        self._extra: dict[str, NDArray[np.number]] = {}  # sums of the arrays beside the weights
-        self.updates: dict[str, LocalUpdate] = {}  # by client, where they are kept
-        self.samples: dict[str, int] = {}  # by client
-        self.losses: dict[str, float] = {}  # by client
+    rounds: int  # in all, those already done included
+    steps: int  # local optimiser steps per round
+    learning_rate: float  # in the first round
+    final_learning_rate: float  # in the last round, where there are several
+    seed: int  # of the federation; each round derives its own
 
-    def add(self, client: str, update: LocalUpdate) -> None:
-        """Add a client's update."""
-        self.samples[client], self.losses[client] = update.samples, update.loss
-        if self._weigher is None:
-            self.updates[client] = update
-            return
-        self._mean.add(update.weights, self._weigher.weigh(update))
-        for name, array in update.extra.items():
-            self._extra[name] = self._extra.get(name, 0.0) + array.astype(np.float64)
-
-    @property
-    def combinable(self) -> list[LocalUpdate]:
-        """Return what a strategy is given: all updates, or one that stands for them; none where none came."""
-        if self._weigher is None or not self.samples:
-            return [*self.updates.values()]
-        return [LocalUpdate(self._mean.mean(), sum(self.samples.values()), 0.0, extra=self._extra)]
-
-    def mean_loss(self) -> float | None:
-        """Return the mean loss weighted by samples; None where no update came."""
-        return float(np.average([*self.losses.values()], weights=[*self.samples.values()])) if self.samples else None
+    def work(self, round_: int) -> LocalWork:
+        """Return the local work of round `round_`, counted from 1."""
+        progress = (round_ - 1) / max(self.rounds - 1, 1)
+        rate = self.learning_rate * (self.final_learning_rate / self.learning_rate) ** progress
+        return LocalWork(round_, self.steps, rate, derive_seed(self.seed, "round", round_))
 
 
-class Rounds(FlowerStrategy):
-    """Flower strategy of a federation: in each round clients train, and `strategy` combines their updates.
+def _do_nothing(*_: object) -> None:
+    pass
 
-    `rules` say who takes part, what is sent and what is kept private; `work` gives the local training of a round by its
-    number; numbers continue after the `done` rounds. `names` are the clients' names by node. `earlier` is the number of
-    rounds of earlier federations with the same clients, which privacy is accounted with and after which the turns of
-    round-robin go on. `state` is changed in place; `on_round` is called after each aggregation. `centre` is the model
-    that clients are pulled to, if any. `away` tells who is not there when a round begins: they take no part in it.
+
+def federate(
+    clients: Mapping[str, Trainable],
+    weights: Weights,
+    schedule: Schedule,
+    account: Account | None = None,
+    *,
+    strategy: Strategy = FEDAVG,
+    rules: Rules = EVERYBODY,
+    state: FederationState | None = None,
+    done: int = 0,
+    earlier: int = 0,
+    before_round: BeforeRound = _do_nothing,
+    on_round: OnRound = _do_nothing,
+    runtime: Runtime | None = None,
+    centre: Weights | None = None,
+    distiller: Distiller | None = None,
+) -> LocalUpdate:
+    """Run rounds `done + 1 .. schedule.rounds` of a federation, by default of federated averaging.
+
+    In each round every client trains, unless `rules` say otherwise, and `strategy` combines their updates (McMahan et
+    al., AISTATS 2017, algorithm 1). To resume, pass the same strategy and rules, the weights and the number of the last
+    round that `on_round` was given, and the state after it. Noise that is not seeded is drawn by secrets, which are
+    kept in `state`: without it no federation can be repeated, nor gone on with to the same weights. Under a privacy
+    budget the last rounds are those that it affords; without noise it is that for all of them. Where epsilon rests on
+    secret draws of clients, records and ledger do not name them.
+
+    Args:
+        clients: by name; a client is asked for when it is to train, and of updates no more are in memory than the
+            strategy needs.
+        weights: of the model that the first round begins with, arrays by name.
+        schedule: number of rounds, local steps, learning rates and seed.
+        account: the ledger that every message is entered in, and whom the network loses; None: nobody counts.
+        strategy: how updates are combined, and how clients correct their training.
+        rules: who takes part, what is sent, what is kept private, and how many are needed.
+        state: what server and clients keep between rounds, changed in place, with a record of every round.
+        done: number of rounds that are over.
+        earlier: number of rounds of federations before this one with the same clients and rules, which count against
+            a privacy budget, and after which the turns of round-robin go on.
+        before_round: called before each round.
+        on_round: called after each round; `state` is then that of the round.
+        runtime: where clients train: None: in this process; `ClientProcesses` of the same clients; Flower's simulation
+            on Ray. The weights are the same.
+        centre: weights that clients are pulled to by the `personal` of the rules.
+        distiller: the server's network under `FedMD`, whose clients send outputs: after a round it learns from their
+            mean, which is sent down in the next one; in the first it sends its own.
+
+    Returns:
+        The weights after the last round, and of that round the number of samples of all clients and their mean training
+        loss, weighted by samples; without a round to run `weights`, 0 samples and a loss of 0.
+
+    Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
+    no update, and fewer are left than `rules` ask for (by default half of those asked), `TooFewClients` where fewer are
+    left than secure aggregation needs, though `account` lost none, `InputError` where there are no clients, or `rules`
+    or `strategy` ask for what they cannot do, ValueError where `strategy` changes names, shapes or types of the arrays.
+
+    >>> import numpy as np
+    >>> from flcav import federate
+    >>> from flcav.federation import LocalUpdate, Schedule
+    >>> class Vehicle:  # of a task: flcav.perception.TaskClient
+    ...     def __init__(self, samples):
+    ...         self.samples = samples
+    ...     def train(self, weights, *, steps, learning_rate, seed):
+    ...         return LocalUpdate({"w": weights["w"] + self.samples}, self.samples, loss=0.0)
+    >>> schedule = Schedule(rounds=1, steps=1, learning_rate=0.1, final_learning_rate=0.1, seed=0)
+    >>> vehicles = {"cav0": Vehicle(1), "cav1": Vehicle(3)}
+    >>> federate(vehicles, {"w": np.zeros(2)}, schedule).weights["w"]
+    array([2.5, 2.5])
     """
+    check_federation(clients, strategy, rules)
+    state, account, rounds, names = state or FederationState(), account or open_account(), schedule.rounds, [*clients]
+    sent = _find_sent(weights, state, distiller)
+    rules.upload.check_layers(sent)
+    if rules.privacy is not None:
+        privacy = find_noise(rules.privacy, rules.selection, len(names), earlier + rounds)
+        rules = rules.model_copy(update={"privacy": privacy})
+        rounds = affordable_rounds(privacy, rules.selection, names, rounds, earlier)
+    if rounds <= done:
+        return LocalUpdate(weights, 0, 0.0)
+    kept, account = kept_records(strategy, rules), replace(account, concealed=rules.hides_draws)
+    secrets = {party: state.keep_secret(party) for party in rules.secret_parties(names) if party in clients}
+    spent = least_participations(rules.selection, len(names), earlier)
+    with open_link(clients, runtime, account, strategy, rules, state.clients, secrets, spent) as link:
+        server = Server(
+            link.grid, link.names, strategy, rules, schedule.work, state, earlier, centre, account.find_away
+        )
+        for number in range(done + 1, rounds + 1):
+            before_round(number, weights)
+            combined = server.run_round(number, sent)
+            state.clients = link.read_states(kept) if kept else state.clients
+            if distiller is None:
+                weights = combined
+            else:
+                weights = _imitate(distiller, strategy, weights, combined, schedule.work(number))
+                state.server = {name: np.asarray(array) for name, array in combined.items()}
+            on_round(number, weights, state.records[-1].loss)
+            sent = combined
+    last = state.records[-1]
+    return LocalUpdate(weights, last.samples, last.loss or 0.0)
 
-    def __init__(
-        self,
-        strategy: Strategy,
-        rules: Rules,
-        work: Callable[[int], LocalWork],
-        names: Mapping[int, str],
-        state: FederationState,
-        done: int,
-        earlier: int,
-        on_round: OnRound,
-        centre: Weights | None = None,
-        away: Away = lambda _: {},
-    ) -> None:
-        self._strategy, self._rules, self._work, self._names = strategy, rules, work, names
-        self._state, self._done, self._earlier, self._on_round = state, done, earlier, on_round
-        self._centre, self._away = centre, away
-        self._nodes = {name: node for node, name in names.items()}
-        self._expected = Expected(rules, {})  # of the updates of this round
-        self._here = Attendance()  # of this round
-        self._drawn: dict[str, float] = {}  # of unbiased selection: probability of the clients that were drawn
-        self._secure: SecureSum | None = None  # of this round
-        self._begin: Callable[[list[str]], list[Message]]  # masks among clients, of this round
-        self._grid: Grid  # of this round
-        self._shares: dict[str, float] = {}  # of unbiased selection: of all samples, by client
 
-    def summary(self) -> None:
-        """Log nothing: the stage's own records hold the settings."""
+def _find_sent(weights: Weights, state: FederationState, distiller: Distiller | None) -> Weights:
+    """Return what the first round sends down: the weights, or outputs on shared samples, those of the last round."""
+    return weights if distiller is None else state.server or distiller.outputs(weights)
 
-    def configure_train(
-        self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
-    ) -> Iterable[Message]:
-        """Return one training message per chosen client: the round's weights and its local work.
+
+def _imitate(distiller: Distiller, strategy: Strategy, network: Weights, outputs: Weights, work: LocalWork) -> Weights:
+    """Return the weights of the server's network after it has learned from the clients' mean `outputs`."""
+    if not isinstance(strategy, FedMD):
+        raise InputError(f"{type(strategy).__name__} combines weights, and a distiller learns from outputs")
+    seed = derive_seed(work.seed, "server")
+    return distiller.imitate(network, outputs, steps=strategy.steps, learning_rate=work.learning_rate, seed=seed)
+
+
+@dataclass
+class Round:
+    """A round under way: its local work, what it began with, who takes part, and what updates must look like."""
+
+    work: LocalWork
+    start: Weights
+    here: Attendance
+    expected: Expected  # of the updates
+    sent: Weights  # a strategy's arrays beside the weights
+    shares: dict[str, float] = field(default_factory=dict)  # of unbiased selection: of all samples, by client
+    drawn: dict[str, float] = field(default_factory=dict)  # of unbiased selection: probability of the clients drawn
+    masked: SecureRound | None = None  # of secure aggregation
+
+
+@dataclass(frozen=True)
+class Server:
+    """Server of a federation: it runs rounds with the clients at the far end of a Flower grid."""
+
+    grid: Grid
+    names: Mapping[int, str]  # of the clients, by node
+    strategy: Strategy
+    rules: Rules
+    work: Callable[[int], LocalWork]  # local training of a round, by its number
+    state: FederationState  # changed in place
+    earlier: int = 0  # rounds of federations before
+    centre: Weights | None = None  # that clients are pulled to
+    away: Callable[[int], Mapping[str, str]] = lambda _: {}  # by client why it is not there when a round begins
+
+    def run_round(self, number: int, start: Weights) -> Weights:
+        """Return the weights after round `number`, which begins with `start`; a record is added to the state.
+
+        Where fewer clients are left than the strategy needs, or the network lost clients and fewer are left than secure
+        aggregation needs, or where fewer take part than secure aggregation or `least_clients` asks for and none failed,
+        or where clients revealed shares that leave no way to the sum, the weights stay as they were, and the record
+        names those who were chosen as failed, with the reason; where nobody was drawn it names nobody. Raises
+        `ClientFailed` where fewer clients than are wanted sent a usable update, or where fewer take part than are
+        wanted and clients failed to report, `TooFewClients` where so few are left for secure aggregation, `InputError`
+        where the strategy refuses the updates or returns arrays of other names, shapes or types.
+        """
+        round_ = self._call(number, start)  # who takes part
+        updates = self._collect(round_)  # what is sent, and checked as it arrives
+        round_.here.check(self.rules, self.strategy, number)  # whether enough is left
+        try:
+            weights = self._combine(round_, updates)  # how it is combined
+        except (ClientFailed, TooFewClients, SumLost) as error:
+            round_.here.excuse(error)
+            weights, updates = start, Intake()
+        self._keep(round_, updates)  # what is kept
+        return weights
+
+    def _call(self, number: int, start: Weights) -> Round:
+        """Return the round with the clients that are chosen for it, and those of them that are away."""
+        work, selection, clients = self.work(number), self.rules.selection, [*self.names.values()]
+        sent = self.strategy.send(self.state.server) if isinstance(self.strategy, Exchanges) else {}
+        seed = int.from_bytes(self._key("selection", work), "little") if self.rules.hides_draws else work.seed
+        chosen = selection.choose(clients, number, seed, self.earlier)
+        here = Attendance(clients if selection.unbiased else chosen, chosen, self.away(number))
+        extra = extra_forms(self.strategy, self.rules, start, sent)
+        return Round(work, start, here, Expected(self.rules, start, extra), sent)
+
+    def _key(self, purpose: str, work: LocalWork) -> bytes:
+        return derive_key(self.state.keep_secret(SERVER), purpose, work.round, work.seed)
+
+    def _collect(self, round_: Round) -> Intake:
+        """Send the weights and the local work to those who take part; return the updates that count.
 
         Under importance selection all clients train and report the norm of their update, and those that are drawn are
         asked to send it. Under other unbiased selections all first report their number of samples. Where fewer take
         part than `least_clients`, nobody is asked to send an update.
         """
-        start = to_weights(arrays)
-        work, records = self._work(self._done + server_round), {ARRAYS: arrays}
-        sent = self._strategy.send(self._state.server) if isinstance(self._strategy, Exchanges) else {}
-        if sent:
-            records[EXTRA] = to_arrays(sent)
-        self._expected = Expected(self._rules, start, extra_forms(self._strategy, self._rules, start, sent))
-        if self._centre is not None:
-            records[CENTRE] = to_arrays({name: self._centre[name] for name in learned_names(self._centre)})
-        selection, local = self._rules.selection, work.record()
-        chosen = selection.choose([*self._names.values()], work.round, self._draws_by(work), self._earlier)
-        asked = [*self._names.values()] if selection.unbiased else chosen
-        self._here = Attendance(asked, chosen, self._away(work.round))
+        here, selection, local = round_.here, self.rules.selection, {CONFIG: round_.work.record()}
+        records = {ARRAYS: to_arrays(round_.start)} | ({EXTRA: to_arrays(round_.sent)} if round_.sent else {})
+        if self.centre is not None:
+            records[CENTRE] = to_arrays({name: self.centre[name] for name in learned_names(self.centre)})
+        request, wanted = RecordDict({**records, **local}), here.chosen
         if selection.unbiased:
-            self._draw_unbiased(grid, local)
-        if selection.rule == "importance":
-            requests = self._address(chosen, {**records, CONFIG: local, ASK: ConfigRecord({ASK: NORM})})
-            self._drawn = selection.draw(
-                self._receive_norms(chosen, grid.send_and_receive(requests, timeout=ANSWER_S)), work.seed
-            )
-            self._here.chosen, records = [*self._drawn], {ASK: ConfigRecord({ASK: SEND})}
-        self._here.count(self._rules)
-        if self._here.shortage is not None:
-            return []
-        if self._rules.secure is not None:
-            self._grid = grid
-            self._begin = partial(self._begin_securely, grid, {**records, CONFIG: local}, self._rules.secure)
-            return self._begin(self._here.chosen)
-        return self._address(self._senders, {**records, CONFIG: local})
+            self._read_norms(round_, here.asked, RecordDict({**local, ASK: ConfigRecord({ASK: COUNT})}))
+            wanted = [name for name in here.chosen if name in round_.shares]
+            round_.drawn = dict.fromkeys(wanted, selection.inclusion_probability(len(here.asked)))
+        elif selection.rule == "importance":
+            asking = RecordDict({**records, **local, ASK: ConfigRecord({ASK: NORM})})
+            round_.drawn = selection.draw(self._read_norms(round_, here.chosen, asking), round_.work.seed)
+            here.chosen = wanted = [*round_.drawn]
+            request = RecordDict({ASK: ConfigRecord({ASK: SEND}), **local})
+        here.count(self.rules)
+        if here.shortage is not None:
+            return Intake()
+        if self.rules.secure is not None:
+            round_.masked = SecureRound(self.rules.secure, round_.expected, here, {**records, **local}, self._ask)
+            return round_.masked.collect()
+        plain = self.rules.privacy is None and not selection.weighs
+        updates = Intake(find_weigher(self.strategy) if plain else None)
+        read = lambda _, content: read_update(content, round_.expected)  # noqa: E731
+        for name, update in self._ask(here, dict.fromkeys(wanted, request), read):
+            updates.add(name, update)
+        return updates
 
-    @property
-    def _senders(self) -> list[str]:
-        """Return who is asked for an update: all that are chosen, or of an unbiased selection those who reported."""
-        return [*self._drawn] if self._rules.selection.weighs else self._here.chosen
-
-    def _draws_by(self, work: LocalWork) -> int:
-        """Return the seed that the clients of a round are drawn by: that of the round, or one that nobody knows."""
-        if not self._rules.hides_draws:
-            return work.seed
-        return int.from_bytes(self._key("selection", work), "little")
-
-    def _key(self, purpose: str, work: LocalWork) -> bytes:
-        return derive_key(self._state.keep_secret(SERVER), purpose, work.round, work.seed)
-
-    def _draw_unbiased(self, grid: Grid, local: ConfigRecord) -> None:
-        """Ask all clients for their numbers of samples; note the shares, and the probabilities of those chosen."""
-        names = [*self._names.values()]
-        requests = self._address(names, {CONFIG: local, ASK: ConfigRecord({ASK: COUNT})})
-        self._receive_norms(names, grid.send_and_receive(requests, timeout=ANSWER_S))
-        reported = [name for name in self._here.chosen if name in self._shares]
-        self._drawn = dict.fromkeys(reported, self._rules.selection.inclusion_probability(len(names)))
-
-    def _begin_securely(
-        self, grid: Grid, records: dict[str, Any], how: SecureAggregation, clients: list[str]
-    ) -> list[Message]:
-        """Exchange keys and shares among clients, and return the messages to those who are left.
-
-        Nobody is sent a message where too few are left.
-        """
-
-        def exchange(
-            asks: Mapping[str, ConfigRecord], read: Callable[[str, RecordDict], AnswerT]
-        ) -> dict[str, AnswerT]:
-            asked = [each for name, ask in asks.items() for each in self._address([name], {CONFIG: local, ASK: ask})]
-            return dict(self._read([*asks], grid.send_and_receive(asked, timeout=ANSWER_S), read))
-
-        local = records[CONFIG]
-        self._secure = SecureSum(exchange, how.needed(len(self._here.chosen)))
-        try:
-            asks = self._secure.agree(clients)
-        except TooFewClients as error:
-            self._here.shortage, asks = error, {}
-        return [each for name, ask in asks.items() for each in self._address([name], {**records, ASK: ask})]
-
-    def _address(self, clients: Iterable[str], records: dict[str, Any]) -> Iterator[Message]:
-        content = RecordDict(records)
-        for client in clients:
-            yield Message(content=content, message_type=MessageType.TRAIN, dst_node_id=self._nodes[client])
-
-    def aggregate_train(
-        self, server_round: int, replies: Iterable[Message]
-    ) -> tuple[ArrayRecord | None, MetricRecord | None]:
-        """Return the aggregated weights, and as metrics the number of samples and the mean loss weighted by samples.
-
-        Where who was drawn is to stay secret, the record has nothing of the clients, and both numbers are 0.
-
-        Where fewer are left than the strategy needs, or the network lost clients and fewer are left than secure
-        aggregation needs, or where fewer take part than secure aggregation or `least_clients` asks for and none failed,
-        or where clients revealed shares that leave no way to the sum, the weights stay as they were, and the record
-        names those who were chosen as failed, with the reason; where nobody was drawn it names nobody.
-        Raises `ClientFailed` where fewer clients than are wanted sent a usable update, or where fewer take part than
-        are wanted and clients failed to report, `TooFewClients` where so few are left for secure aggregation,
-        ValueError where the strategy returns arrays of other names, shapes or types.
-        """
-        number, here = self._done + server_round, self._here
-        received = Intake(None) if here.shortage else self._receive(replies)
-        here.check(self._rules, self._strategy, number)
-        try:
-            if here.shortage is not None:
-                raise here.shortage
-            weights = self._combine(received, number)
-        except (ClientFailed, TooFewClients, SumLost) as error:
-            if isinstance(error, TooFewClients) and not (here.lost or here.few):
-                raise
-            weights, received = self._expected.start, Intake(None)
-            here.failed |= {name: str(error) for name in here.chosen if name not in here.failed}
-        loss, epsilon = received.mean_loss(), None
-        if self._rules.privacy is not None:
-            rounds, names = self._earlier + number, [*self._names.values()]
-            epsilon = account_epsilon(self._rules.privacy, self._rules.selection, names, rounds)
-        samples = sum(received.samples.values())
-        record = RoundRecord(number, tuple(received.samples), here.failed, epsilon, loss, samples)
-        if self._rules.hides_draws:
-            record = RoundRecord(number, (), epsilon=epsilon)
-        self._state.records.append(record)
-        self._on_round(number, weights, record.loss)
-        return to_arrays(weights), MetricRecord({SAMPLES: record.samples, LOSS: record.loss or 0.0})
-
-    def _receive_norms(self, asked: Iterable[str], replies: Iterable[Message]) -> dict[str, float]:
-        """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
-        told = dict(self._read(asked, replies, lambda _, content: read_norm(content, self._rules)))
-        total = sum(samples for _, samples in told.values())
-        self._shares = {name: samples / max(total, 1) for name, (_, samples) in told.items()}
-        return {name: norm * self._shares[name] for name, (norm, _) in told.items()}
-
-    def _read(
-        self, asked: Iterable[str], replies: Iterable[Message], read: Callable[[str, RecordDict], AnswerT]
+    def _ask(
+        self,
+        here: Attendance,
+        requests: Mapping[str, RecordDict],
+        read: Callable[[str, RecordDict], AnswerT],
+        awaited: list[str] | None = None,
     ) -> Iterator[tuple[str, AnswerT]]:
-        """Yield by client, in the order in which they were asked, what `read` makes of its name and its reply.
+        """Send each client its request, and yield by client, in their order, what `read` makes of its reply.
 
-        Clients that fail, and those whose reply is refused, are noted with the reason.
+        Clients that are lost, do not answer or whose reply is refused are noted `here`, with the reason. `awaited`: who
+        is to answer, where that is more than are sent a request.
         """
-        for name, message in self._in_order(asked, replies):
+        nodes = {name: node for node, name in self.names.items()}
+        messages = (Message(content, nodes[name], MessageType.TRAIN) for name, content in requests.items())
+        replies = self.grid.send_and_receive(messages, timeout=ANSWER_S)
+        for event in list_events(requests if awaited is None else awaited, replies, self.names):
+            if not isinstance(event, Arrived):
+                here.note(event)
+                continue
             try:
-                found = read(name, message.content)
+                answer = read(event.client, event.content)
             except ReplyRefused as error:
-                self._here.failed[name] = str(error)
+                here.failed[event.client] = str(error)
             else:
-                yield name, found
+                yield event.client, answer
 
-    def _in_order(self, asked: Iterable[str], replies: Iterable[Message]) -> Iterator[tuple[str, Message]]:
-        """Yield the replies with content by client, in the order in which they were asked; note the failures.
+    def _read_norms(self, round_: Round, clients: list[str], request: RecordDict) -> dict[str, float]:
+        """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
+        told = dict(self._ask(round_.here, dict.fromkeys(clients, request), lambda _, c: read_norm(c, self.rules)))
+        total = sum(samples for _, samples in told.values())
+        round_.shares = {name: samples / max(total, 1) for name, (_, samples) in told.items()}
+        return {name: norm * round_.shares[name] for name, (norm, _) in told.items()}
 
-        Replies that come in that order are yielded as they come, and not kept.
-        """
-        awaited = deque(self._nodes[name] for name in asked)
-        early: dict[int, Message] = {}
-        for message in chain(replies, [None]):
-            if message is not None:
-                early[message.metadata.src_node_id] = message
-            while awaited and (message is None or awaited[0] in early):
-                node = awaited.popleft()
-                found, name = early.pop(node, None), self._names[node]
-                if found is None:
-                    self._here.failed.setdefault(name, "no answer")  # or what it failed by before
-                elif found.has_error():
-                    self._here.failed[name] = str(found.error.reason)
-                    self._here.lost |= {name} if found.error.code == LOST_BY_NETWORK else set()
-                else:
-                    yield name, found
-
-    def _receive(self, replies: Iterable[Message]) -> Intake:
-        """Return the usable updates, and note what is wrong with the others."""
-        if self._secure is not None:
-            return self._receive_masked(self._secure, replies)
-        plain = self._rules.privacy is None and not self._rules.selection.weighs
-        received = Intake(find_weigher(self._strategy) if plain else None)
-        for name, update in self._read(self._senders, replies, lambda _, content: read_update(content, self._expected)):
-            received.add(name, update)
-        return received
-
-    def _receive_masked(self, secure: SecureSum, replies: Iterable[Message]) -> Intake:
-        """Return the masked updates.
-
-        Where shares that one client sealed for another do not open, the round is begun anew without the liars.
-        """
-        received, complaints, here, peers = Intake(None), {}, self._here, secure.peers
-
-        def read(name: str, content: RecordDict) -> LocalUpdate | Sequence[str]:
-            return read_masked(content, self._expected, [peer for peer in peers if peer != name])
-
-        for name, answer in self._read(here.chosen, replies, read):
-            if isinstance(answer, LocalUpdate):
-                received.add(name, answer)
-            else:
-                complaints[name] = answer
-        if not complaints:
-            return received
-        here.failed |= settle_complaints(complaints)
-        again = self._begin([name for name in peers if name not in here.failed])
-        return Intake(None) if here.shortage else self._receive(self._grid.send_and_receive(again, timeout=ANSWER_S))
-
-    def _average_securely(self, updates: Mapping[str, LocalUpdate], how: SecureAggregation) -> Weights:
-        """Return start + (sum of the clients' changes) / their number; the sum is all that is unmasked."""
-        assert self._secure is not None
-        masked = {name: np.asarray(update.weights[VECTOR], np.uint32) for name, update in updates.items()}
-        summed, liars = self._secure.finish(masked)
-        self._here.failed |= liars
-        total = to_values(summed, how.largest, len(self._secure.peers))
-        return unflatten(total / len(updates), self._expected.start, self._rules)
-
-    def _combine(self, received: Intake, number: int) -> Weights:
-        """Return the weights after round `number`, and change the strategy's state."""
-        privacy, start, updates, each = self._rules.privacy, self._expected.start, received.updates, received.combinable
-        if self._rules.secure is not None:
-            each = [LocalUpdate(self._average_securely(updates, self._rules.secure), *WHOLE)]
-        elif privacy is not None and not privacy.local:
-            sent = self._rules.upload.exchanged(start)
-            names = [name for name in learned_names(start) if name in sent]
-            expected = float(len(self._here.chosen))
-            if self._rules.selection.rule == "poisson":  # by chance more or fewer come
-                expected = expected_clients(self._rules.selection, [*self._names.values()])
-            work = self._work(number)
-            key = None if privacy.seeded else self._key("noise", work)
-            mean = average_privately(start, each, names, privacy, expected, work.seed, key)
-            each = [LocalUpdate(mean, *WHOLE)]
-        elif self._rules.selection.weighs and updates:
-            weights = {name: self._shares[name] / self._drawn[name] for name in updates}
-            each = [LocalUpdate(average_inversely(start, updates, weights), *WHOLE)]
-        if not each:
+    def _combine(self, round_: Round, received: Intake) -> Weights:
+        """Return the weights after a round, and change the strategy's state; raises why there is no update."""
+        if round_.here.shortage is not None:
+            raise round_.here.shortage
+        start, updates = round_.start, self._average_first(round_, received)
+        if not updates:
             return start
-        name = type(self._strategy).__name__
+        name = type(self.strategy).__name__
         try:
-            if isinstance(self._strategy, Stateful):
-                weights, after = self._strategy.step(start, each, self._state.server, len(self._names))
-                self._state.server = {name: np.asarray(array) for name, array in after.items()}
+            if isinstance(self.strategy, Stateful):
+                weights, after = self.strategy.step(start, updates, self.state.server, len(self.names))
+                self.state.server = {name: np.asarray(array) for name, array in after.items()}
             else:
-                weights = self._strategy.combine(start, each)
+                weights = self.strategy.combine(start, updates)
         except ValueError as error:
-            raise InputError(f"strategy {name}, round {number}: {error}") from error
+            raise InputError(f"strategy {name}, round {round_.work.round}: {error}") from error
         if forms_of(weights) != forms_of(start):
             raise InputError(f"{name} returned arrays of other names, shapes or types than the round started from")
         return weights
 
-    def configure_evaluate(
-        self, server_round: int, arrays: ArrayRecord, config: ConfigRecord, grid: Grid
-    ) -> Iterable[Message]:
-        """Return no messages: vehicles have no ground truth for an evaluation."""
-        return []
+    def _average_first(self, round_: Round, received: Intake) -> list[LocalUpdate]:
+        """Return what the strategy combines: the updates or, under masks, central noise or weights, their one mean."""
+        privacy, start, work = self.rules.privacy, round_.start, round_.work
+        if round_.masked is not None:
+            return [LocalUpdate(round_.masked.average(received.updates), *WHOLE)]
+        if privacy is not None and not privacy.local:
+            sent = self.rules.upload.exchanged(start)
+            names = [name for name in learned_names(start) if name in sent]
+            expected = float(len(round_.here.chosen))
+            if self.rules.selection.rule == "poisson":  # by chance more or fewer come
+                expected = expected_clients(self.rules.selection, [*self.names.values()])
+            key = None if privacy.seeded else self._key("noise", work)
+            mean = average_privately(start, received.combinable, names, privacy, expected, work.seed, key)
+            return [LocalUpdate(mean, *WHOLE)]
+        if self.rules.selection.weighs and received.updates:
+            weights = {name: round_.shares[name] / round_.drawn[name] for name in received.updates}
+            return [LocalUpdate(average_inversely(start, received.updates, weights), *WHOLE)]
+        return received.combinable
 
-    def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> MetricRecord | None:
-        """Return None: clients do not evaluate."""
-        return None
-
-
-def average_inversely(start: Weights, updates: Mapping[str, LocalUpdate], weights: Mapping[str, float]) -> Weights:
-    """Return start + sum_i weights_i (w_i - start) of learned arrays; of all others the mean of the updates.
-
-    With weights_i = share_i / probability_i it is the unbiased (Horvitz-Thompson) estimate of the mean of all clients.
-    """
-    names = learned_names(start)
-    moved: dict[str, Any] = {name: np.zeros(start[name].shape) for name in names}
-    for client, update in updates.items():
-        for name in names:
-            moved[name] += weights[client] * (update.weights[name].astype(np.float64) - start[name])
-    mean = average([update.weights for update in updates.values()], [*weights.values()])
-    return mean | {name: (start[name] + array).astype(start[name].dtype) for name, array in moved.items()}
+    def _keep(self, round_: Round, received: Intake) -> None:
+        """Add the record of a round to the state; where who was drawn is to stay secret, it has nothing of clients."""
+        number, epsilon = round_.work.round, None
+        if self.rules.privacy is not None:
+            rounds, names = self.earlier + number, [*self.names.values()]
+            epsilon = account_epsilon(self.rules.privacy, self.rules.selection, names, rounds)
+        record = RoundRecord(number, (), epsilon=epsilon)
+        if not self.rules.hides_draws:
+            about = (round_.here.failed, epsilon, received.mean_loss(), sum(received.samples.values()))
+            record = RoundRecord(number, tuple(received.samples), *about)
+        self.state.records.append(record)

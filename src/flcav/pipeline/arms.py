@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from flcav.config import InputError
+from flcav.federation.checks import check_rules
 from flcav.federation.privacy import affordable_rounds, find_noise
-from flcav.federation.stages import check_rules
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, needs_known_number
@@ -59,8 +59,7 @@ class Setting:
     central: Literal["pretrain", "federate"] | None
     regions: tuple[str, ...]  # that federate
     stages: tuple[str, ...]  # after pretraining
-    replanned: bool  # whether the plan is made anew after stages I and II, from what the run itself reached
-    by_round: bool  # whether it is also made anew after each round of stages II and III
+    replanned: bool  # whether the rest is planned again after stages I and II, from what the run itself reached
 
     @property
     def pretraining(self) -> Mapping[str, Training]:
@@ -111,7 +110,6 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         arm.regions or recipe.with_role("federate"),
         (CENTRAL,) if arm.central else arm.stages,
         learned and recipe.replan != "none",
-        learned and recipe.replan == "rounds",
     )
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flcav.federation.stages import Schedule
+from flcav.federation.rounds import Schedule
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.weights import load_network
 from flcav.pipeline.results.saved import WEIGHTS

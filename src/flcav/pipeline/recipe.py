@@ -159,10 +159,12 @@ class Federation(Rules):
 
 
 def _name_replanning(value: Any) -> Any:
+    if value == "rounds":
+        raise ValueError("plans are updated between stages, not between rounds: write 'stages'")
     return ("stages" if value else "none") if isinstance(value, bool) else value
 
 
-Replanning = Annotated[Literal["none", "stages", "rounds"], BeforeValidator(_name_replanning)]
+Replanning = Annotated[Literal["none", "stages"], BeforeValidator(_name_replanning)]
 
 
 class Arm(Config):
@@ -222,7 +224,7 @@ class RunRecipe(Config):
     regions: Annotated[Mapping[Name, Region], Field(min_length=1)]  # regions by name
     budgets_mb: Budgets  # uplink budgets
     replan: Replanning = (
-        "stages"  # the plan is made anew, from what was reached and sent, after stages I and II; rounds: and each round
+        "stages"  # after stages I and II the rest is planned again, from the scores reached and the megabytes sent
     )
     uploads: Literal["drawn", "planned"] = (
         "drawn"  # samples of stage I: drawn from all vehicles' frames; or the plan says how many each vehicle uploads

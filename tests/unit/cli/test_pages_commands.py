@@ -15,9 +15,9 @@ from flcav.cli.main import app
 from flcav.config import InputError
 from flcav.federation import LocalUpdate, Update
 from flcav.federation.privacy import Privacy
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import Schedule, federate
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import Budget, Ledger

@@ -14,11 +14,11 @@ from flcav.federation.conduct import ANSWERED
 from flcav.federation.noise import draw_secret
 from flcav.federation.privacy import Privacy, account_epsilon
 from flcav.federation.records import ARRAYS, ASK, CONFIG, LOST, read_arrays, to_arrays
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
-from flcav.federation.stages import Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.scaffold import Scaffold

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flcav.federation.edge_server import EdgeServer
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Limits, Rules
 from flcav.federation.runtimes.deadline import ClientLate, TimedClients
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.processes import ClientProcesses
-from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Budget, Ledger

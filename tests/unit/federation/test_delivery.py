@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from regression import ledger
 
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account, Outage
-from flcav.federation.stages import Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.scaffold import Scaffold

@@ -71,21 +71,16 @@ def test_a_cloud_round_records_how_far_regions_were_apart(tmp_path: Path, monkey
     assert first.divergence.trained.whole > 0
     assert second.divergence.begun.whole == 0  # both begin with the cloud's
     assert second.divergence.trained.whole > 0
-    make, stopped = FederationCheckpoints.make_saver, 0
+    save, stopped = FederationCheckpoints.save, 0
 
-    def stopping(checkpoints: FederationCheckpoints, rounds: int) -> Any:
-        keep = make(checkpoints, rounds)
+    def save_once(checkpoints: FederationCheckpoints, round_: int, weights: Any, loss: float | None) -> None:
+        nonlocal stopped
+        save(checkpoints, round_, weights, loss)
+        stopped += 1
+        if stopped == 1:
+            raise KeyboardInterrupt
 
-        def keep_once(round_: int, weights: Any, loss: float | None) -> None:
-            nonlocal stopped
-            keep(round_, weights, loss)
-            stopped += 1
-            if stopped == 1:
-                raise KeyboardInterrupt
-
-        return keep_once
-
-    monkeypatch.setattr(FederationCheckpoints, "make_saver", stopping)
+    monkeypatch.setattr(FederationCheckpoints, "save", save_once)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "resumed")
     assert run(tmp_path / "resumed") == (first, second)

@@ -11,10 +11,12 @@ from regression import START, TRUTH, Regression, ledger, vehicles
 from scipy.stats import trim_mean
 
 from flcav.config import InputError
+from flcav.federation.checks import check_federation
+from flcav.federation.edge_server import EdgeServer
 from flcav.federation.privacy import Privacy
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import EdgeServer, Schedule, check_federation, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, STRATEGIES, of_servers, strategy_named
 from flcav.federation.strategies.fedadam import FedAdam

@@ -12,10 +12,11 @@ from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
 from flcav.federation.attendance import ClientFailed
+from flcav.federation.edge_server import EdgeServer
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
-from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.krum import Krum

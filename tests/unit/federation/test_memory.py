@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 import pytest
 
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import Schedule, federate
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavg import FedAvg

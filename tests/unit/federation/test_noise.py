@@ -11,14 +11,15 @@ from regression import ledger
 from scipy.stats import kstest
 
 from flcav.federation import rounds
+from flcav.federation.edge_server import EdgeServer
 from flcav.federation.noise import SECRET_BYTES, derive_key, draw_secret, secret_noise
 from flcav.federation.privacy import Privacy, add_noise, average_privately, clip_change
 from flcav.federation.records import ARRAYS, read_arrays
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
-from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import Upload

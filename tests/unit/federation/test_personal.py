@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError
+from flcav.federation.edge_server import EdgeServer
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.ledger import Budget, Ledger

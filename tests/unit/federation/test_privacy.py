@@ -19,6 +19,8 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 
 from flcav.config import InputError
+from flcav.federation.checks import check_federation
+from flcav.federation.edge_server import EdgeServer
 from flcav.federation.privacy import (
     Privacy,
     account_epsilon,
@@ -30,10 +32,10 @@ from flcav.federation.privacy import (
     find_noise,
     most_participations,
 )
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
-from flcav.federation.stages import EdgeServer, Schedule, check_federation, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedadam import FedAdam

@@ -10,11 +10,12 @@ import pytest
 from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
+from flcav.federation.edge_server import EdgeServer
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.choice import open_processes
+from flcav.federation.runtimes.link import open_processes
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.processes import ClientProcesses
-from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import LocalUpdate, Weights

@@ -9,7 +9,9 @@ from cryptography.exceptions import InvalidTag
 from flwr.common.serde import recorddict_to_proto
 
 from flcav.config import InputError
+from flcav.federation.checks import check_federation
 from flcav.federation.privacy import Privacy, account_epsilon
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.secure.masks import add_vectors, agree, draw_keys, expand, seal, to_integers, to_values, unseal
@@ -17,7 +19,6 @@ from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.secure.parties import SecureClient, SumLost, settle_complaints, unmask_sum
 from flcav.federation.secure.shamir import find_wrong_shares, join_shares, split_secret
 from flcav.federation.selection import Selection
-from flcav.federation.stages import Schedule, check_federation, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedadam import FedAdam

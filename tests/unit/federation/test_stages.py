@@ -5,8 +5,9 @@ import pytest
 from flwr.supercore.task_identity import TaskIdentity
 from regression import START, TRUTH, ledger, vehicles
 
+from flcav.federation.edge_server import EdgeServer
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.strategies.fedavg import FedAvg, average
 from flcav.network.ledger import BudgetExceeded
 from flcav.network.plan import MessageSizes, StagePlan, price

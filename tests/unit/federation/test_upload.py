@@ -12,12 +12,13 @@ from safetensors.numpy import load, save
 
 from flcav.config import InputError
 from flcav.federation.acceptance import Expected, ReplyRefused, read_update
+from flcav.federation.edge_server import EdgeServer
 from flcav.federation.encoding import encode
 from flcav.federation.records import update_content
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import SCALES, VALUES, Upload, compress, decompress

@@ -10,9 +10,10 @@ from moving import made_links
 
 from flcav.config import InputError
 from flcav.federation.attendance import ClientFailed
+from flcav.federation.edge_server import EdgeServer, edge_seeds
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account, Outage
-from flcav.federation.stages import EdgeServer, Schedule, edge_seeds, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.krum import Krum

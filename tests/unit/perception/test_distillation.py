@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from flcav.federation.edge_server import EdgeServer
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import EdgeServer, Schedule, federate, federate_outputs
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Trainable, Weights
@@ -58,7 +59,7 @@ def run(rounds: int = 3, weights: Weights = START, **how: Any) -> tuple[Weights,
     schedule = replace(SCHEDULE, rounds=rounds)
     strategy = FedMD(steps=3)
     clients = how.pop("clients", VEHICLES)
-    found = federate_outputs(SHARED, clients, weights, schedule, account, strategy=strategy, state=state, **how)
+    found = federate(clients, weights, schedule, account, strategy=strategy, state=state, distiller=SHARED, **how)
     return found.weights, account.ledger
 
 

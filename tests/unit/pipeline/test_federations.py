@@ -241,7 +241,7 @@ def test_both_stages_in_two_processes_end_with_the_bytes_of_one_also_where_label
         folders = [tmp_path / f"{stage}-{processes}-{renewed}" for stage in ("edge", "cloud")]
         how = (Ledger(Budget(1.0, 1.0)), folders[0], ignore_progress)
         edge = EdgeFederation(learning, network, regions["a"], schedule, FEDAVG, 0, *how)
-        federate_edge(replace(edge, before_round=renew if renewed else None), Rules(), processes=processes)
+        federate_edge(replace(edge, relabel=renew if renewed else None), Rules(), processes=processes)
         starts = {name: RegionStart(own, to_arrays(network), earlier=3) for name, own in regions.items()}
         where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), folders[1], ignore_progress)
         federate_cloud(CloudFederation(learning, network, starts, 2, *where), 2, Rules(), processes=processes)
@@ -299,7 +299,7 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
         how, begun = (FEDAVG, earlier, book, folder, report), []
         federation = EdgeFederation(
             *(learning, network, clients["a"], schedule, *how),
-            before_round=lambda round_, weights: begun.append(round_),
+            relabel=lambda round_, weights: begun.append(round_),
         )
         losses = federate_edge(federation, rules)
         assert (folder / "weights.safetensors").exists()

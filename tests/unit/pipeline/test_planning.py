@@ -15,8 +15,8 @@ from flwr.common.serde import recorddict_to_proto
 
 from flcav.config import InputError
 from flcav.experiments.fig6a.run import BUDGETS
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.plan import MessageSizes, Price, price

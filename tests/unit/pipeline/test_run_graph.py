@@ -127,35 +127,11 @@ def test_plans_are_made_anew_between_stages_from_what_the_run_itself_reached() -
         assert not [step.name for step in Graph(fixed, Path()).steps if step.name.startswith("plan-")]
 
 
-def test_rounds_are_planned_anew_by_the_run_itself_and_followed_by_its_arms() -> None:
-    arms = {
-        "densest": {"placement": {"rule": "densest"}},
-        "equal": {"plan": "equal-stages"},
-        "further": {"stages": ["edge", "more_edge"]},
-        "oracle": {"central": "federate"},
-    }
-    between, within = (recipe_of(arms=arms, replan=how) for how in ("stages", "rounds"))
+def test_plans_are_updated_between_stages_or_not_at_all() -> None:
     assert [recipe_of(replan=old).replan for old in (True, False)] == ["stages", "none"]
     assert recipe_of().replan == "stages"
-    plain, steps = ({step.name: step for step in Graph(each, Path()).steps} for each in (between, within))
-    assert list(plain) == list(steps)
-    changed = {name for name in steps if settings_of(plain[name]) != settings_of(steps[name])}
-    grid, cloud, more = "grid-edge-fl-objects", "cloud-fl-objects", "grid-more-edge-fl-objects"
-    followed = {f"{grid}-densest": grid, f"{cloud}-densest": cloud, more: cloud}
-    assert changed == {grid, cloud, *followed, "grid-central-objects-oracle", "plan-after-edge"}
-    for name, own in ((grid, steps[grid]), (cloud, steps[cloud])):
-        assert settings_of(own).replan.frames == {"grid": "grid-validation-objects"}, name
-        assert {"plan", "grid-validation-objects"} <= set(own.needs)
-    for name, other in followed.items():
-        assert settings_of(steps[name]).replan.follows == other
-        assert other in steps[name].needs
-    assert settings_of(steps["grid-central-objects-oracle"]).follows == grid
-    assert grid in steps["grid-central-objects-oracle"].needs
-    assert settings_of(steps["plan-after-edge"]).edges == {"objects": (grid,)}
-    before: set[str] = set()
-    for step in steps.values():
-        assert set(step.needs) <= before, step.name
-        before.add(step.name)
+    with pytest.raises(ValueError, match="between stages, not between rounds"):
+        recipe_of(replan="rounds")
 
 
 def test_uploads_are_planned_where_the_recipe_asks_for_it_and_drawn_as_ever_otherwise() -> None:

@@ -12,8 +12,9 @@ from line_task import LineTask, Slope
 from safetensors.numpy import load_file, save
 
 from flcav.config import InputError
+from flcav.federation.edge_server import EdgeServer
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import EdgeServer, Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy, of_servers
 from flcav.federation.strategies.fedadam import FedAdam
@@ -64,12 +65,13 @@ def edge(folder: Path, strategy: Strategy = FEDAVG, report: Report = ignore_prog
     book = Ledger(Budget(1.0, 0.0))
     book.enter(ROAD)
     states = {"edge": FederationState()}
-    federating = FederationCheckpoints(OBJECTS, folder, book, report, states, str(strategy))
+    federating = FederationCheckpoints(OBJECTS, folder, book, report, states, str(strategy), SCHEDULE.rounds)
     start, done = federating.resume(START)
     clients = {f"grid/cav{i}": Walk() for i in range(2)}
     account = Account(book, "edge", "t", "wireless")
-    keep = federating.make_saver(SCHEDULE.rounds)
-    federate(clients, start, SCHEDULE, account, strategy=strategy, state=states["edge"], done=done, on_round=keep)
+    federate(
+        clients, start, SCHEDULE, account, strategy=strategy, state=states["edge"], done=done, on_round=federating.save
+    )
     assert [record.round for record in states["edge"].records] == [1, 2, 3]
     assert len(federating.losses) == SCHEDULE.rounds
     return load_file(round_path(folder, SCHEDULE.rounds)), book
@@ -79,7 +81,9 @@ def cloud(folder: Path, strategy: Strategy = FEDAVG) -> tuple[Weights, Ledger]:
     """Federate as stage III does: on top of what was spent before, edge servers nested below the cloud."""
     book = Ledger(Budget(10.0, 1.0), [STAGE_ONE, ROAD])
     states = {name: FederationState() for name in ("cloud", "grid", "ring")}
-    federating = FederationCheckpoints(OBJECTS, folder, book, lambda done, total, note="": None, states, str(strategy))
+    federating = FederationCheckpoints(
+        OBJECTS, folder, book, lambda done, total, note="": None, states, str(strategy), SCHEDULE.rounds
+    )
     start, done = federating.resume(START)
     servers: dict[str, Trainable] = {}
     for town, own in (("grid", 1.0), ("ring", -1.0)):
@@ -89,7 +93,7 @@ def cloud(folder: Path, strategy: Strategy = FEDAVG) -> tuple[Weights, Ledger]:
         servers[town] = EdgeServer(vehicles, 2, wireless, model, done, strategy, state=own_state)
     account = Account(book, "cloud", "t", "wireline")
     how: Any = {"strategy": of_servers(strategy), "state": states["cloud"]}
-    federate(servers, start, SCHEDULE, account, **how, done=done, on_round=federating.make_saver(SCHEDULE.rounds))
+    federate(servers, start, SCHEDULE, account, **how, done=done, on_round=federating.save)
     return load_file(round_path(folder, SCHEDULE.rounds)), book
 
 
@@ -226,14 +230,16 @@ def test_the_mean_of_the_last_rounds_is_the_federation_s_result(tmp_path: Path) 
     for number in range(1, 4):
         rounds.append({name: array + np.float32(number**2) for name, array in to_arrays(network).items()})
         write_bytes(round_path(tmp_path, number), save(rounds[-1]))
-    federating = FederationCheckpoints(LINEAR, tmp_path, Ledger(Budget(1.0, 1.0)), lambda done, total, note="": None)
+    federating = FederationCheckpoints(
+        LINEAR, tmp_path, Ledger(Budget(1.0, 1.0)), ignore_progress, {}, "", losses=[0.5] * 3
+    )
     for averaged, last in ((1, rounds[2:]), (2, rounds[1:]), (9, rounds)):
-        federating.finish(network, 3, averaged)
+        federating.finish(network, averaged)
         found = load_file(tmp_path / WEIGHTS)
         for name in found:
             np.testing.assert_allclose(found[name], np.mean([each[name] for each in last], axis=0), rtol=1e-6)
     start = to_arrays(network)
-    federating.finish(network, 3, 2, 0.3)
+    federating.finish(network, 2, 0.3)
     for name, array in load_file(tmp_path / WEIGHTS).items():
         np.testing.assert_allclose(array, 0.7 * (start[name] + (4 + 9) / 2) + 0.3 * start[name], rtol=1e-6)
 

@@ -25,9 +25,9 @@ from flcav.experiments.attacks.drives import (
     spread_over_scenes,
 )
 from flcav.federation.attendance import ClientFailed
+from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.stages import Schedule, federate
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.median import Median

@@ -9,9 +9,10 @@ from flwr.serverapp import Grid
 from flcav.federation.records import CONFIG
 from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.wrapped import WrappedGrid
-from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link
+from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
 
 UNDISCLOSED = "undisclosed"  # in the place of a client's name
+UNLIMITED_MB = 1e12  # budget of whoever does not count
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,11 @@ class Account:
             region, slash, _ = client.rpartition("/")
             client = f"{region}{slash}{UNDISCLOSED}"
         return LedgerEntry(self.stage, self.task, self.link, direction, round_, client, size)
+
+
+def open_account() -> Account:
+    """Return the account of a federation without a budget."""
+    return Account(Ledger(Budget(UNLIMITED_MB, UNLIMITED_MB)), "edge", "federation", "wireless")
 
 
 class BudgetedGrid(WrappedGrid):

@@ -9,8 +9,8 @@ from flwr.serverapp import Grid
 from flcav.federation.client import client_app
 from flcav.federation.encoding import decode, unflatten
 from flcav.federation.noise import draw_secret
-from flcav.federation.records import ARRAYS, VECTOR, LocalWork, read_arrays, to_arrays, to_weights
-from flcav.federation.rounds import Rounds
+from flcav.federation.records import ARRAYS, VECTOR, LocalWork, read_arrays
+from flcav.federation.rounds import Server
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.wrapped import WrappedGrid
@@ -26,14 +26,6 @@ class ReadGrid(WrappedGrid):
     def __init__(self, grid: Grid, names: Mapping[int, str]) -> None:
         self._grid, self._names = grid, names
         self.updates: dict[str, Weights] = {}
-
-    def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
-        """Pass messages on."""
-        return self._grid.push_messages(messages)
-
-    def pull_messages(self, message_ids: Iterable[str]) -> Iterable[Message]:
-        """Pass replies on."""
-        return self._grid.pull_messages(message_ids)
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterable[Message]:
         """Yield the replies, and keep those that are updates."""
@@ -54,8 +46,7 @@ def read_round(
     secrets = {party: draw_secret() for party in rules.secret_parties([*clients]) if party in clients}
     with EmbeddedGrid(client_app(clients, FEDAVG, rules, secrets), [*clients]) as grid:
         reading = ReadGrid(grid, grid.names)
-        app = Rounds(FEDAVG, rules, work, grid.names, FederationState(), 0, 0, lambda *_: None)
-        after = to_weights(app.start(reading, to_arrays(start), 1).arrays)
+        after = dict(Server(reading, grid.names, FEDAVG, rules, work, FederationState()).run_round(1, start))
     seen: dict[str, Weights] = {}
     for name, update in reading.updates.items():
         if rules.secure is None:

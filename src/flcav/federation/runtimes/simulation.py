@@ -4,9 +4,12 @@ Flower pickles its client app for every message. So the clients are put into Ray
 is pickled has a reference to them.
 """
 
+import contextlib
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
+from queue import SimpleQueue
 from typing import Any
 
 from flwr.app import Context, Message, MessageType, RecordDict
@@ -17,12 +20,12 @@ from flwr.simulation import run_simulation
 from flcav.federation.client import PARTITION
 from flcav.federation.records import METRICS, read_arrays, to_arrays
 from flcav.federation.runtimes.embedded import keep_identity
-from flcav.federation.state import Arrays, ClientStates, ReadStates
+from flcav.federation.runtimes.wrapped import WrappedGrid
+from flcav.federation.state import Arrays, ClientStates
 from flcav.federation.trainable import Trainable
 from flcav.machine.processes import ray_session
 
 STARTING_S = 120.0  # for the nodes to be there
-Serve = Callable[[Grid, Mapping[int, str], ReadStates], None]  # grid, names by node, reading of the states
 
 
 class RaySimulation:
@@ -31,35 +34,66 @@ class RaySimulation:
     def __init__(self, count: int) -> None:
         self.count = count
 
-    def run(
+    @contextlib.contextmanager
+    def open(
         self,
         clients: Mapping[str, Trainable],
         make_app: Callable[[Mapping[str, Trainable]], ClientApp],
-        states: Mapping[str, Mapping[str, Arrays]],
-        serve: Serve,
-    ) -> None:
-        """Run `serve` as a server app, whose nodes run `make_app` of the clients; raises what it raises.
+        states: ClientStates,
+    ) -> Iterator["SimulatedGrid"]:
+        """Yield the grid of a simulation, whose nodes run `make_app` of the clients.
 
-        `states` are the arrays that clients have kept from earlier rounds. Raises `InputError` where Ray is not
-        installed.
+        Flower runs its server app until the context ends. `states` are the arrays that clients have kept from earlier
+        rounds. Raises `InputError` where Ray is not installed.
         """
-        raised: list[BaseException] = []
+        ready, ended = SimpleQueue[SimulatedGrid | BaseException](), threading.Event()
         server, names = ServerApp(), [*clients]
 
         @server.main()
         def main(grid: Grid, context: Context) -> None:
             try:
-                nodes = _introduce(grid, names, states)
-                serve(grid, nodes, lambda keys: _read_states(grid, nodes, keys))
+                ready.put(SimulatedGrid(grid, _introduce(grid, names, states)))
             except BaseException as error:
-                raised.append(error)
+                ready.put(error)
+            else:
+                ended.wait()
 
         with ray_session(self.count, "--runtime ray") as ray, keep_identity():
             app = make_app(_Stored(names, ray.put({**clients})))
-            resources = {"num_cpus": 1, "num_gpus": 0.0}
-            run_simulation(server, app, len(names), backend_config={"client_resources": resources})
-        if raised:
-            raise raised[0]
+            resources = {"client_resources": {"num_cpus": 1, "num_gpus": 0.0}}
+
+            def simulate() -> None:
+                try:
+                    run_simulation(server, app, len(names), backend_config=resources)
+                except BaseException as error:
+                    ready.put(error)
+
+            simulation = threading.Thread(target=simulate, daemon=True)
+            simulation.start()
+            try:
+                found = ready.get()
+                if isinstance(found, BaseException):
+                    raise found
+                yield found
+            finally:
+                ended.set()
+                simulation.join()
+
+
+class SimulatedGrid(WrappedGrid):
+    """The grid of a simulation, which knows its clients' names by node."""
+
+    def __init__(self, grid: Grid, names: Mapping[int, str]) -> None:
+        self._grid, self.names = grid, names
+
+    def read_states(self, keys: Iterable[str]) -> ClientStates:
+        """Return the arrays that clients keep between rounds under these records, by client and record."""
+        found: ClientStates = {}
+        for reply in self._grid.send_and_receive(_query(self.names, {})):
+            if reply.has_content():
+                own = {key: read_arrays(reply.content, key) for key in keys if key in reply.content}
+                found |= {self.names[reply.metadata.src_node_id]: own} if own else {}
+        return {name: found[name] for name in self.names.values() if name in found}
 
 
 class _Stored(Mapping[str, Trainable]):
@@ -108,13 +142,3 @@ def _query(nodes: Iterable[int], kept: Mapping[int, Mapping[str, Arrays]]) -> li
         Message(RecordDict({key: to_arrays(own) for key, own in kept.get(node, {}).items()}), node, MessageType.QUERY)
         for node in nodes
     ]
-
-
-def _read_states(grid: Grid, nodes: Mapping[int, str], keys: Iterable[str]) -> ClientStates:
-    """Return the arrays that clients keep between rounds under these records, by client and record."""
-    found: ClientStates = {}
-    for reply in grid.send_and_receive(_query(nodes, {})):
-        if reply.has_content():
-            own = {key: read_arrays(reply.content, key) for key in keys if key in reply.content}
-            found |= {nodes[reply.metadata.src_node_id]: own} if own else {}
-    return {name: found[name] for name in nodes.values() if name in found}

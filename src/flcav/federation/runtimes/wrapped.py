@@ -1,5 +1,7 @@
 """A Flower grid around another one: what a grid adds to is overridden, all else is the inner grid's."""
 
+from collections.abc import Iterable
+
 from flwr.app import Message, RecordDict
 from flwr.serverapp import Grid
 
@@ -27,3 +29,15 @@ class WrappedGrid(Grid):
     def run(self):
         """Return Flower's record of the run."""
         return self._grid.run
+
+    def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
+        """Send messages through the inner grid; return their ids."""
+        return self._grid.push_messages(messages)
+
+    def pull_messages(self, message_ids: Iterable[str]) -> Iterable[Message]:
+        """Return the replies that the inner grid has to these messages."""
+        return self._grid.pull_messages(message_ids)
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterable[Message]:
+        """Return the inner grid's replies to messages."""
+        return self._grid.send_and_receive(messages, timeout=timeout)

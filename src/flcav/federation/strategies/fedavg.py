@@ -1,12 +1,13 @@
 """Federated averaging (McMahan et al., AISTATS 2017, algorithm 1)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.federation.trainable import Update, Weights
+from flcav.federation.trainable import Update, Weights, learned_names
 
 NO_MEAN = "clients cannot be averaged by shares of {}: they must be 0 or more, not all 0"
 
@@ -72,6 +73,20 @@ def average(weights: Sequence[Weights], shares: Sequence[float]) -> dict[str, ND
     for each, share in zip(weights, shares, strict=True):
         mean.add(each, share)
     return mean.mean()
+
+
+def average_inversely(start: Weights, updates: Mapping[str, Update], weights: Mapping[str, float]) -> Weights:
+    """Return start + sum_i weights_i (w_i - start) of learned arrays; of all others the mean of the updates.
+
+    With weights_i = share_i / probability_i it is the unbiased (Horvitz-Thompson) estimate of the mean of all clients.
+    """
+    names = learned_names(start)
+    moved: dict[str, Any] = {name: np.zeros(start[name].shape) for name in names}
+    for client, update in updates.items():
+        for name in names:
+            moved[name] += weights[client] * (update.weights[name].astype(np.float64) - start[name])
+    mean = average([update.weights for update in updates.values()], [*weights.values()])
+    return mean | {name: (start[name] + array).astype(start[name].dtype) for name, array in moved.items()}
 
 
 @dataclass(frozen=True)

@@ -85,8 +85,6 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
     book = Ledger(Budget(budgets.wireless, budgets.wireline), (entry for each in books for entry in each.entries))
     book.save(work.parent / "ledgers" / f"{arm.name}.parquet")
     stages = tuple(StageResult.load(work / step) for step in trained)
-    ended = {each.task: each.plans[-1].plan for each in stages if each.stage == CLOUD and each.plans}
-    plan = replace(plan, tasks={**plan.tasks, **ended})
     return ArmResult(
         plan=plan,
         placed=tuple(Placed.load(work / names.place(arm.name, region)) for region in arm.regions),

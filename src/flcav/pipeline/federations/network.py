@@ -56,20 +56,17 @@ class Fleet:
         return ClientWork(vehicle, self.download_bytes, self.train_s / self.speeds.get(client, 1.0), self.upload_bytes)
 
 
-def link_scenes(
-    split: Frames, placed: Placed, settings: NetworkSettings, most: int, seed: int, known: Sequence[RadioLinks] = ()
-) -> list[RadioLinks]:
+def link_scenes(split: Frames, placed: Placed, settings: NetworkSettings, most: int, seed: int) -> list[RadioLinks]:
     """Return the links of the vehicles in the first `most` scenes of a split to the units on a region's chosen poles.
 
-    Without chosen poles, the unit is on the pole with most traffic. Those of the first scenes may be `known`. Raises
-    `InputError` where there is no pole, and as `link_scene`.
+    Without chosen poles, the unit is on the pole with most traffic. Raises `InputError` where there is no pole, and as
+    `link_scene`.
     """
     if not placed.poles:
         raise InputError(f"federation.network: '{placed.region}' has no poles for roadside units")
     scenes = list(dict.fromkeys(split.data.keys[i].scene for i in split.vehicles))[:most]
     poles = placed.chosen or (placed.densest,)
-    linked = (link_scene(split.data, settings.radio, poles, scene, seed).links for scene in scenes[len(known) :])
-    return [*known, *linked]
+    return [link_scene(split.data, settings.radio, poles, scene, seed).links for scene in scenes]
 
 
 def drive_rounds(

@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ from safetensors.numpy import load_file, save
 
 from flcav.config import InputError
 from flcav.federation.privacy import Privacy
-from flcav.federation.rounds import OnRound
 from flcav.federation.state import FederationState, describe_failures
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Weights
@@ -28,33 +28,24 @@ from flcav.storage.files import sha256, write_bytes
 LOSS = "loss"  # begins the note of a round
 
 
+@dataclass
 class FederationCheckpoints:
     """Checkpoints of a federation: weights, loss, ledger and states after each round, to resume from."""
 
-    def __init__(
-        self,
-        task: Task,
-        folder: Path,
-        book: Ledger,
-        report: Report,
-        states: Mapping[str, FederationState] = {},
-        identity: str = "",
-        score: Callable[[int], Mapping[str, float]] | None = None,
-        privacy: Privacy | None = None,
-    ) -> None:
-        """Keep the checkpoints in `folder`.
-
-        states: by name what federations keep between rounds, restored in place; of stage III also the edge servers'.
-        identity: what the federation is by; a checkpoint of another one is refused. score: the scores on validation
-        frames after a round, by region. privacy: of the updates, whose delta is told with epsilon.
-        """
-        self._task, self._folder, self._book, self._report = task, folder, book, report
-        self._states, self._identity, self._score, self._privacy = states, identity, score, privacy
-        self._hashes: dict[str, str] = {}  # of the files of weights, by name
-        self._told: dict[str, int] = {}  # of how many records failures were told, by state
-        self._goes_on = False  # after rounds that were carried out before, to an end that it has not reached
-        self.losses: list[float | None] = []
-        self.scores: list[Mapping[str, float]] = []
+    task: Task
+    folder: Path
+    book: Ledger
+    report: Report
+    states: Mapping[str, FederationState]  # what federations keep, by name, restored in place; also of edge servers
+    identity: str  # what the federation is by: a checkpoint of another one is refused
+    rounds: int = 0  # of the federation, told with each
+    privacy: Privacy | None = None  # of the updates, whose delta is told with epsilon
+    score: Callable[[int], Mapping[str, float]] | None = None  # on validation frames after a round, by region
+    losses: list[float | None] = field(default_factory=list)  # of each round
+    scores: list[Mapping[str, float]] = field(default_factory=list)
+    _hashes: dict[str, str] = field(default_factory=dict)  # of the files of weights, by name
+    _told: dict[str, int] = field(default_factory=dict)  # of how many records failures were told, by state
+    _goes_on: bool = False  # after rounds that were carried out before, to an end that it has not reached
 
     def resume(self, weights: Weights) -> tuple[Weights, int]:
         """Return the last round's weights, in the order of `weights`, and number, restoring ledger, losses and states.
@@ -62,28 +53,28 @@ class FederationCheckpoints:
         Without a checkpoint, returns `weights` and 0; where one is damaged, the round before. Raises `InputError` for
         the checkpoint of another strategy, and where the last two are damaged.
         """
-        found, damage = find_checkpoint(self._folder)
+        found, damage = find_checkpoint(self.folder)
         number = 0 if found is None else found.round
         if damage:
-            self._report(number, max(number, 1), damage)
-        self._goes_on = bool(damage) or (found is not None and not (self._folder / LEDGER).exists())
+            self.report(number, max(number, 1), damage)
+        self._goes_on = bool(damage) or (found is not None and not (self.folder / LEDGER).exists())
         if found is None:
             return weights, 0
-        if found.by != self._identity:
-            raise InputError(f"{self._folder}: a checkpoint of {found.by}, which {self._identity} cannot go on with")
-        kept = Ledger.load(self._folder / _ledger_name(number)).entries[: found.entries]
-        for entry in kept[len(self._book.entries) :]:
-            self._book.enter(entry)
+        if found.by != self.identity:
+            raise InputError(f"{self.folder}: a checkpoint of {found.by}, which {self.identity} cannot go on with")
+        kept = Ledger.load(self.folder / _ledger_name(number)).entries[: found.entries]
+        for entry in kept[len(self.book.entries) :]:
+            self.book.enter(entry)
         self.losses, self.scores = [*found.losses], [*found.scores]
-        state, names = _state_name(number), [round_path(self._folder, each).name for each in range(1, number + 1)]
+        state, names = _state_name(number), [round_path(self.folder, each).name for each in range(1, number + 1)]
         self._hashes = {name: found.sha256[name] for name in names}
-        arrays = load_file(self._folder / state) if state in found.sha256 else {}
-        for name, own in self._states.items():
+        arrays = load_file(self.folder / state) if state in found.sha256 else {}
+        for name, own in self.states.items():
             begins = f"{name}|"
             mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
             own.restore(mine, found.records[name])
             self._told[name] = len(own.records)
-        last = load_file(round_path(self._folder, number))
+        last = load_file(round_path(self.folder, number))
         return {name: last[name] for name in weights}, number  # files order names otherwise, and noise follows them
 
     def keep_secrets(self, parties: Mapping[str, Sequence[str]]) -> None:
@@ -95,12 +86,12 @@ class FederationCheckpoints:
         asked = {f"{name}|{party}": (name, party) for name, found in parties.items() for party in found}
         if not asked:
             return
-        kept = read_secrets(self._folder, asked, self._goes_on)
+        kept = read_secrets(self.folder, asked, self._goes_on)
         for key, (name, party) in asked.items():
             if key in kept:
-                self._states[name].secrets[party] = kept[key]
-        drawn = {key: self._states[name].keep_secret(party) for key, (name, party) in asked.items()}
-        write_secrets(self._folder, drawn)
+                self.states[name].secrets[party] = kept[key]
+        drawn = {key: self.states[name].keep_secret(party) for key, (name, party) in asked.items()}
+        write_secrets(self.folder, drawn)
 
     @contextlib.contextmanager
     def refusals(self) -> Iterator[None]:
@@ -109,72 +100,67 @@ class FederationCheckpoints:
         That is before it has sent an update; later only where it would exceed a budget, since damaged data can be made
         good.
         """
-        begun = len(self._book.entries)
+        begun = len(self.book.entries)
         try:
             yield
         except InputError as error:
-            used = bool(self.losses) or any(entry.direction == "up" for entry in self._book.entries[begun:])
+            used = bool(self.losses) or any(entry.direction == "up" for entry in self.book.entries[begun:])
             if not used or isinstance(error, BudgetExceeded):
-                remove_secrets(self._folder, used=used)
+                remove_secrets(self.folder, used=used)
             raise
 
-    def make_saver(self, rounds: int) -> OnRound:
-        """Return the callback that saves a checkpoint after each of `rounds` rounds."""
-
-        def keep(round_: int, weights: Weights, loss: float | None) -> None:
-            self.losses.append(loss)
-            self._write(round_path(self._folder, round_).name, save(dict(weights)), self._hashes)
-            self.scores += [self._score(round_)] if self._score is not None else []
-            arrays = {
-                f"{name}|{key}": array for name, own in self._states.items() for key, array in own.to_arrays().items()
-            }
-            hashes = dict(self._hashes)
-            if arrays:
-                self._write(_state_name(round_), save(arrays), hashes)
-            self._book.save(self._folder / _ledger_name(round_))
-            hashes[_ledger_name(round_)] = sha256(self._folder / _ledger_name(round_))
-            records = {name: tuple(own.records) for name, own in self._states.items()}
-            done = (round_, len(self._book.entries), tuple(self.losses), self._identity, hashes, records)
-            Checkpoint(*done, tuple(self.scores)).keep(self._folder)
-            for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
-                (self._folder / name).unlink(missing_ok=True)
-            note = [f"{LOSS} {loss:.3f}" if loss is not None else f"no {LOSS}", *self._tell_privacy()]
-            note += ["the training diverges"] if diverges(self.losses) else []
-            note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self._score else {}).items()]
-            self._report(round_, rounds, ", ".join([*note, *self._tell_failures()]))
-
-        return keep
+    def save(self, round_: int, weights: Weights, loss: float | None) -> None:
+        """Save the checkpoint after a round, and report its loss, privacy, scores and failures."""
+        self.losses.append(loss)
+        self._write(round_path(self.folder, round_).name, save(dict(weights)), self._hashes)
+        self.scores += [self.score(round_)] if self.score is not None else []
+        arrays = {f"{name}|{key}": array for name, own in self.states.items() for key, array in own.to_arrays().items()}
+        hashes = dict(self._hashes)
+        if arrays:
+            self._write(_state_name(round_), save(arrays), hashes)
+        self.book.save(self.folder / _ledger_name(round_))
+        hashes[_ledger_name(round_)] = sha256(self.folder / _ledger_name(round_))
+        records = {name: tuple(own.records) for name, own in self.states.items()}
+        done = (round_, len(self.book.entries), tuple(self.losses), self.identity, hashes, records)
+        Checkpoint(*done, tuple(self.scores)).keep(self.folder)
+        for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
+            (self.folder / name).unlink(missing_ok=True)
+        note = [f"{LOSS} {loss:.3f}" if loss is not None else f"no {LOSS}", *self._tell_privacy()]
+        note += ["the training diverges"] if diverges(self.losses) else []
+        note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self.score else {}).items()]
+        self.report(round_, self.rounds, ", ".join([*note, *self._tell_failures()]))
 
     def _tell_privacy(self) -> list[str]:
         """Return the largest epsilon after the last round, in words, with its delta and limit; none without noise."""
-        spent = [own.records[-1].epsilon for own in self._states.values() if own.records]
+        spent = [own.records[-1].epsilon for own in self.states.values() if own.records]
         private = [epsilon for epsilon in spent if epsilon is not None]
-        if self._privacy is None or not private:
+        if self.privacy is None or not private:
             return []
-        return [PrivacySpent(max(private), self._privacy.delta, self._privacy.seeded).describe()]
+        return [PrivacySpent(max(private), self.privacy.delta, self.privacy.seeded).describe()]
 
     def _tell_failures(self) -> list[str]:
         """Return who failed or was lost since the last note, in words; of stage III in all rounds of edge servers."""
-        records = [record for name, own in self._states.items() for record in own.records[self._told.get(name, 0) :]]
-        self._told = {name: len(own.records) for name, own in self._states.items()}
+        records = [record for name, own in self.states.items() for record in own.records[self._told.get(name, 0) :]]
+        self._told = {name: len(own.records) for name, own in self.states.items()}
         told = describe_failures([record.failed for record in records])
         return [told] if told else []
 
     def _write(self, name: str, data: bytes, hashes: dict[str, str]) -> None:
-        write_bytes(self._folder / name, data)
+        write_bytes(self.folder / name, data)
         hashes[name] = hashlib.sha256(data).hexdigest()
 
-    def finish(self, start: Any, rounds: int, averaged: int, start_share: float = 0.0) -> None:
-        """Write the ledger and the final weights, see `load_round_network`; without rounds those of `start`.
+    def finish(self, start: Any, averaged: int, start_share: float = 0.0) -> tuple[float | None, ...]:
+        """Write the ledger and the final weights, see `load_round_network`; return the loss of each round.
 
-        Secrets are removed.
+        Without rounds the weights are those of `start`. Secrets are removed.
         """
-        network = start
+        network, rounds = start, len(self.losses)
         if rounds:
-            network = load_round_network(self._task, start, self._folder, rounds, averaged, start_share)
-        save_network(self._task, network, self._folder / WEIGHTS)
-        self._book.save(self._folder / LEDGER)
-        remove_secrets(self._folder)
+            network = load_round_network(self.task, start, self.folder, rounds, averaged, start_share)
+        save_network(self.task, network, self.folder / WEIGHTS)
+        self.book.save(self.folder / LEDGER)
+        remove_secrets(self.folder)
+        return tuple(self.losses)
 
 
 def _state_name(round_: int) -> str:

@@ -56,7 +56,6 @@ def make_replan(outline: Outline, stage: str) -> Step:
         plan=names.plan(MAIN, stage),
         watched={task: tuple(step.name for step in list_validations(outline, stage, task)) for task in tasks},
         books={task: (names.pretrain(MAIN, task), *(edges[task] if stage == EDGE else ())) for task in tasks},
-        edges=edges if stage == EDGE and main.by_round else {},
     )
     return make_step(names.plan(MAIN, CLOUD if stage == EDGE else EDGE), replan_step, settings)
 

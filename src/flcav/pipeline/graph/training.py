@@ -8,12 +8,12 @@ from flcav.pipeline.arms import Setting
 from flcav.pipeline.engine import Step
 from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.labels.sources import LABEL_SOURCES
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MORE_EDGE
 from flcav.pipeline.steps.central import CentralSettings, central_step
 from flcav.pipeline.steps.cloud import CloudSettings, cloud_step
 from flcav.pipeline.steps.edge import EdgeSettings, edge_step
 from flcav.pipeline.steps.pretraining import PretrainSettings, pretrain_step
-from flcav.pipeline.steps.settings import RoundPlans, make_step
+from flcav.pipeline.steps.settings import make_step
 
 
 def list_pretraining(outline: Outline, arm: Setting) -> Iterator[Step]:
@@ -42,7 +42,7 @@ def list_edge_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
                 yield _centralise(outline, arm, region, task)
                 continue
             name, inputs = outline.names.edge(arm.name, region, task), outline.inputs(arm, region, task, EDGE)
-            about = _federate(outline, arm, task, EDGE, _replan(outline, arm, task, EDGE, region, name))
+            about = _federate(outline, arm, task, EDGE)
             settings = EdgeSettings(**about, inputs=inputs, scored=averaged, last=arm.stages[-1] == EDGE)
             yield make_step(name, edge_step, settings, outline.vehicles[region])
 
@@ -62,7 +62,7 @@ def list_further_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
         }
         if last == CLOUD:
             name = names.cloud(arm.name, task)
-            about = _federate(outline, arm, task, CLOUD, _replan(outline, arm, task, CLOUD, None, name))
+            about = _federate(outline, arm, task, CLOUD)
             scored = arm.regions if arm.federation.score_statistics else ()
             validation = {region: names.recording(region, "validation", task) for region in scored}
             settings = CloudSettings(**about, regions=inputs, validation=validation)
@@ -71,11 +71,11 @@ def list_further_stages(outline: Outline, arm: Setting) -> Iterator[Step]:
             continue
         for region, own in inputs.items():
             name = names.more_edge(arm.name, region, task)
-            about = _federate(outline, arm, task, last, _replan(outline, arm, task, MORE_EDGE, region, name))
+            about = _federate(outline, arm, task, last)
             yield make_step(name, edge_step, EdgeSettings(**about, inputs=own), outline.vehicles[region])
 
 
-def _federate(outline: Outline, arm: Setting, task: str, stage: str, replan: RoundPlans | None) -> dict[str, Any]:
+def _federate(outline: Outline, arm: Setting, task: str, stage: str) -> dict[str, Any]:
     """Return the fields of `FederationSettings` of a stage of a task."""
     recipe, timed = outline.recipe, arm.federation.network is not None
     given = {name: recipe.speeds(name) for name in outline.federating}
@@ -90,34 +90,15 @@ def _federate(outline: Outline, arm: Setting, task: str, stage: str, replan: Rou
         "navigation": recipe.navigation if LABEL_SOURCES[arm.labels[task]].from_poles else NavigationErrors(),
         "train_s": recipe.tasks[task].train_s if timed else 0.0,
         "speeds": speeds if timed else {},
-        "replan": replan,
     }
 
 
-def _replan(outline: Outline, arm: Setting, task: str, stage: str, region: str | None, own: str) -> RoundPlans | None:
-    """Return how the step `own` plans its rest anew after each round; None where it does not.
-
-    The run itself plans, of stage II each region for itself; others keep to its rounds: further edge rounds to the
-    number of its stage III.
-    """
-    if not arm.by_round or outline.recipe.tasks[task].history is None:
-        return None
-    names, headroom = outline.names, outline.recipe.headroom
-    ours = names.edge(MAIN, region, task) if stage == EDGE and region else names.cloud(MAIN, task)
-    if own != ours:
-        return RoundPlans(headroom=headroom, follows=ours)
-    watched = {name: names.recording(name, "validation", task) for name in ([region] if region else arm.regions)}
-    return RoundPlans(headroom=headroom, first=names.plan(MAIN), frames=watched)
-
-
 def _centralise(outline: Outline, arm: Setting, region: str, task: str) -> Step:
-    by_round = arm.by_round and outline.recipe.tasks[task].history is not None
     inputs = outline.inputs(arm, region, task, CENTRAL)
     settings = CentralSettings(
         learning=outline.learning(arm, task),
         inputs=inputs.model_copy(update={"pools": outline.pools(task)}),
         vehicles=outline.vehicles[region],
         source=arm.central or "pretrain",
-        follows=outline.names.edge(MAIN, region, task) if by_round else None,
     )
     return make_step(outline.names.central(arm.name, region, task), central_step, settings)

@@ -16,7 +16,6 @@ from flcav.optimization.solvers.instance import Infeasible
 from flcav.pipeline.planning.allocation import allocate_tasks, make_task_plan
 from flcav.pipeline.recipe import EDGE, PRETRAIN
 from flcav.pipeline.results.plans import Plan, TaskPlan
-from flcav.pipeline.results.training import StageResult
 
 ROUNDING = 1e-6  # of a round, which there is time for all the same
 Joins = Mapping[str, tuple[int, ...]]  # rounds by vehicle
@@ -28,17 +27,15 @@ def remake_plan(
     stage: Literal["pretrain", "edge"],
     reached: Mapping[str, float],
     used_mb: Price,
-    done: Mapping[str, TaskPlan] = {},
 ) -> Plan:
     """Return the plan of the rest of a run after `stage`, which `plan` was carried out in; fixed plans stay.
 
     `problem` is that of the first plan, `reached` the score of each of its tasks now, `used_mb` what they have sent.
-    Counts are totals, including what is spent. Scores predicted of stages that are over are kept. `done` are the plans
-    of tasks whose stage came out otherwise than planned, with the rounds that were carried out. Where what is left of
+    Counts are totals, including what is spent. Scores predicted of stages that are over are kept. Where what is left of
     the budgets allows no other plan, or in any task a region's vehicles have too little time left for its rounds, the
-    plans of all tasks are those of before: of `done`, or else of `plan`.
+    plans of all tasks stay.
     """
-    states, tasks = {}, {**plan.tasks, **done}
+    states, tasks = {}, {**plan.tasks}
     for task in problem.tasks:
         own = tasks[task.name]
         counts = (own.samples, own.edge_rounds if stage == EDGE else 0, 0)
@@ -67,32 +64,8 @@ def remake_plan(
         assert before.predicted is not None
         past = (PRETRAIN,) if stage == PRETRAIN else (PRETRAIN, EDGE)
         predicted = {**new.predicted, **{each: before.predicted[each] for each in past}}
-        tasks[name] = replace(new, predicted=predicted, joins=joins[name], uploads=before.uploads, ran=before.ran)
+        tasks[name] = replace(new, predicted=predicted, joins=joins[name], uploads=before.uploads)
     return Plan(plan.rule, tasks, stage, dict(reached))
-
-
-def count_carried_out(plan: TaskPlan, stages: Sequence[StageResult], k: int) -> TaskPlan:
-    """Return the plan of a task with the edge rounds that its regions carried out, and who joined them.
-
-    `stages` are the results of stage II; a cloud round has `k` edge rounds. Where regions ran different numbers of
-    rounds, the plan has their mean, weighted by numbers of vehicles. It has at most as many cloud rounds as the last
-    plan of the region with the fewest: for further ones no plan says which vehicles have time.
-    """
-    ran = {each.region or "": each.rounds for each in stages}
-    rounds = round(float(np.average([*ran.values()], weights=[each.clients for each in stages])))
-    last = [each.plans[-1].plan if each.plans else plan for each in stages]
-    cloud = min(own.cloud_rounds for own in (plan, *last))
-    plan = replace(plan, edge_rounds=rounds, cloud_rounds=cloud, ran=ran if len({*ran.values()}) > 1 else None)
-    if plan.joins is None:
-        return plan
-    joins: dict[str, tuple[int, ...]] = {}
-    for each, own in zip(stages, last, strict=True):
-        for name, joined in (own.joins or {}).items():
-            edge = [number for number in joined if number <= each.rounds]
-            later = [number - own.edge_rounds for number in joined if 0 < number - own.edge_rounds <= k * cloud]
-            if name.startswith(f"{each.region}/"):
-                joins[name] = (*edge, *(each.rounds + number for number in later))
-    return replace(plan, joins={name: joins[name] for name in plan.joins})
 
 
 def find_spare(problem: Problem, shares: Shares) -> dict[str, float]:
@@ -106,17 +79,15 @@ def continue_joins(
 ) -> Joins | None:
     """Return the first `over` rounds that vehicles joined by the plan `before`, and the later ones by the `new` one.
 
-    Of `before`, and here, the rounds of a region are counted from its first; where regions ran different numbers of
-    edge rounds, `over` and `new` count their mean. spare_s: what the new plan leaves of each vehicle's time [s], as
-    `find_spare` finds it; a round takes the `round_s` of `task`. No vehicle joins more rounds in all than it has time
-    for: where it would, the later rounds of its region are dealt anew, round robin, to those that have rounds left.
+    spare_s: what the new plan leaves of each vehicle's time [s], as `find_spare` finds it; a round takes the `round_s`
+    of `task`. No vehicle joins more rounds in all than it has time for: where it would, the later rounds of its region
+    are dealt again, round robin, to those that have rounds left.
     Raises `Infeasible` where these are too few for the rounds.
     """
     if before.joins is None or new.joins is None:
         return new.joins
-    more = {name: before.edge_rounds_of(name) - before.edge_rounds for name in new.joins}  # than the mean
-    past = {name: tuple(each for each in before.joins[name] if each <= over + more[name]) for name in new.joins}
-    later = {name: tuple(each + more[name] for each in own if each > over) for name, own in new.joins.items()}
+    past = {name: tuple(each for each in before.joins[name] if each <= over) for name in new.joins}
+    later = {name: tuple(each for each in own if each > over) for name, own in new.joins.items()}
     most = {name: len(joined) + _further(spare_s[name], task.round_s(name)) for name, joined in new.joins.items()}
     for region in dict.fromkeys(name.rpartition("/")[0] for name in later):
         own = [name for name in later if name.rpartition("/")[0] == region]

@@ -1,12 +1,12 @@
-"""Records of plans: samples and rounds of each task, before a run, between its stages and after its rounds."""
+"""Records of plans: samples and rounds of each task, before a run and between its stages."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from flcav.network.plan import MessageSizes, Price
+from flcav.network.plan import MessageSizes
 from flcav.pipeline.results.saved import Saved
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import LEFT_OUT
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,6 @@ class TaskPlan:
         None  # by vehicle the rounds of its region that it joins, of 1 … edge rounds + k · cloud rounds; None: all
     )
 
-    ran: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
-        None  # edge rounds of each region, where they differ; `edge_rounds` is then their mean by vehicles
-    )
-
     uploads: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
         None  # samples that each vehicle of the pretraining regions uploads; None: drawn from the frames of all
     )
@@ -45,14 +41,10 @@ class TaskPlan:
         """Sizes of the task's messages."""
         return MessageSizes(self.sample_mb, self.model_mb, self.exchange_mb, self.labels_mb)
 
-    def edge_rounds_of(self, vehicle: str) -> int:
-        """Return the edge rounds of the region of a vehicle, "region/vehicle"."""
-        return (self.ran or {}).get(vehicle.rpartition("/")[0], self.edge_rounds)
-
     def joins_after_edge(self) -> Mapping[str, tuple[int, ...]]:
         """Return the rounds after stage II that each vehicle joins, numbered from 1; empty: all join all."""
-        own = {name: (self.edge_rounds_of(name), joined) for name, joined in (self.joins or {}).items()}
-        return {name: tuple(each - over for each in joined if each > over) for name, (over, joined) in own.items()}
+        over = self.edge_rounds
+        return {name: tuple(each - over for each in own if each > over) for name, own in (self.joins or {}).items()}
 
 
 @dataclass(frozen=True)
@@ -63,16 +55,3 @@ class Plan(Saved):
     tasks: Mapping[str, TaskPlan]
     after: Annotated[str | None, LEFT_OUT] = None  # stage after which it was made anew; None: before the run
     reached: Annotated[Mapping[str, float] | None, LEFT_OUT] = None  # score then, by task, which it rests on
-
-
-@dataclass(frozen=True)
-class RoundPlan(Record):
-    """The plan of the rest of a stage of a task, made anew after one of the stage's rounds."""
-
-    round: int  # of the stage
-    reached: float | None  # score on validation frames then; None: another federation's plan is followed
-    planned_mb: (
-        Price  # list price of what was done until then: of stage II of the region's rounds, of III of all stages
-    )
-    sent_mb: Price  # what was sent upwards for it
-    plan: TaskPlan  # counts in total; of stage II what the region itself sends, and its vehicles alone

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
 from flcav.pipeline.results.placement import Placed
-from flcav.pipeline.results.plans import Plan, RoundPlan
+from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import Saved
 from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.results.tests import Difference, Finding, HomeCost, RegionalTest, Test, Tested
@@ -57,11 +57,6 @@ class ArmResult:
     def plans(self) -> tuple[Plan, ...]:
         """Return all plans in the order in which they were made."""
         return (*(self.earlier or ()), self.plan)
-
-    @property
-    def round_plans(self) -> list[tuple[StageResult, RoundPlan]]:
-        """Return the plans that were made after rounds, with the stage of each."""
-        return [(stage, made) for stage in self.stages for made in stage.plans or ()]
 
     def sent_mb(self, task: str, link: str) -> float:
         """Return the uplink traffic of a task on a link, over all stages [MB]."""

@@ -7,7 +7,6 @@ from typing import Annotated
 import numpy as np
 
 from flcav.federation.divergence import RoundDivergence
-from flcav.pipeline.results.plans import RoundPlan
 from flcav.pipeline.results.saved import Saved
 from flcav.storage.records import LEFT_OUT, Record
 
@@ -104,7 +103,6 @@ class StageResult(Saved):
     poles: tuple[int, ...]  # whose sensors contributed labels
     losses: tuple[float | None, ...] = ()  # mean training loss of each round
     records: Annotated[tuple[FederatedRound, ...] | None, LEFT_OUT] = None  # of all servers; None: no federation
-    plans: Annotated[tuple[RoundPlan, ...] | None, LEFT_OUT] = None  # after each round; None: not made anew by rounds
     labels: Annotated[tuple[LabelQuality, ...] | None, LEFT_OUT] = None  # before each round; None: not measured
     noise: Annotated[float | None, LEFT_OUT] = None  # that the privacy budget gave for the planned rounds; None: none
     statistics: Annotated[tuple[StatisticsScore, ...] | None, LEFT_OUT] = None  # of stage III; None: not asked for

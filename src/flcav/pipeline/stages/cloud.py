@@ -1,30 +1,28 @@
 """Stage III: edge servers federate with the cloud, vehicles with edge servers."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from flcav.federation.divergence import RoundDivergence, measure_divergence
-from flcav.federation.rounds import OnRound
+from flcav.federation.edge_server import EdgeServer, afford_cloud_rounds
+from flcav.federation.rounds import federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.choice import open_processes
+from flcav.federation.runtimes.link import open_processes
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.processes import ClientProcesses
-from flcav.federation.stages import EdgeServer, afford_cloud_rounds, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedavg import average
-from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.federation.trainable import Trainable, Weights
 from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
 from flcav.perception.client import TaskClient
 from flcav.perception.distillation import SharedSamples
-from flcav.perception.outcomes import score_network
 from flcav.perception.weights import from_arrays, save_network, to_arrays
-from flcav.pipeline.federations.rounds import FederationCheckpoints, load_round_network
-from flcav.pipeline.frames import Frames
+from flcav.pipeline.federations.rounds import FederationCheckpoints
 from flcav.pipeline.learning import Learning, load_stage_network, regional_weights
-from flcav.pipeline.planning.course import Driven, Replanning
 from flcav.pipeline.recipe import CLOUD, EDGE
 from flcav.pipeline.stages.clients import Strategies, describe_federation, give_outputs
 from flcav.pipeline.stages.statistics import keep_statistics
@@ -51,16 +49,9 @@ class CloudFederation:
     book: Ledger
     folder: Path  # of checkpoints, weights and ledger
     report: Report
-    validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
     keeps_statistics: bool = False  # whether each region's statistics of batch normalisation are written, too
     rate: float | None = None  # of the first round, where it is begun anew
-
-    def score(self, round_: int) -> Mapping[str, float]:
-        """Return the scores, by region, of the network that a federation of so many rounds ends with."""
-        task, averaged = self.learning.task, self.learning.training.average_rounds
-        reached = load_round_network(task, self.network, self.folder, round_, averaged)
-        return {name: score_network(task, reached, own.data, own.vehicles) for name, own in self.validation.items()}
 
     def afford(self, rules: Rules, rounds: int) -> int:
         """Return as many of `rounds` as the privacy budget affords in every region; without one all."""
@@ -108,7 +99,6 @@ def federate_cloud(
     rounds: int,
     rules: Rules,
     outages: Mapping[tuple[int, str], Outage] = {},
-    replanning: Replanning | None = None,
     *,
     processes: int = 1,
 ) -> tuple[float | None, ...]:
@@ -116,62 +106,71 @@ def federate_cloud(
 
     Edge rounds are run by `rules`, and lose the vehicles that `outages` names; the cloud's rounds need all edge
     servers. Where rules make arrays personal, the weights have the mean of the regions' own, and each region's model is
-    beside them, as are regional models. A privacy budget may end it before `rounds`. `replanning` is as in
-    `federate_edge`, as are `processes`, in which the vehicles of one region after another train.
+    beside them, as are regional models. A privacy budget may end it before `rounds`. The vehicles of one region after
+    another train, in so many `processes`.
     """
-    own, learning, state = federation, federation.learning, FederationState()
-    own_states = {region: FederationState() for region in own.regions}
-    states = {CLOUD: state, **{f"{EDGE}/{region}": each for region, each in own_states.items()}}
+    own, learning, task = federation, federation.learning, federation.learning.task
+    state, states = FederationState(), {region: FederationState() for region in federation.regions}
     rounds = own.afford(rules, rounds)
-    identity, scored = describe_federation(own.strategies, rules), own.score if own.validation else None
-    kept: Any = (learning.task, own.folder, own.book, own.report, states, identity, scored, rules.privacy)
-    checkpoints = FederationCheckpoints(*kept)
+    checkpoints = FederationCheckpoints(
+        task,
+        own.folder,
+        own.book,
+        own.report,
+        {CLOUD: state, **{f"{EDGE}/{region}": each for region, each in states.items()}},
+        describe_federation(own.strategies, rules),
+        rounds,
+        rules.privacy,
+    )
     rules.check_personal(to_arrays(own.network))
-    parties = {region: rules.secret_parties([*each.clients]) for region, each in own.regions.items()}
     start, done = checkpoints.resume(to_arrays(own.network))
-    checkpoints.keep_secrets({f"{EDGE}/{region}": found for region, found in parties.items()})
-    wireless = Account(own.book, CLOUD, learning.task.name, "wireless", outages)
-    wireline = Account(own.book, CLOUD, learning.task.name, "wireline")
+    parties = {f"{EDGE}/{region}": rules.secret_parties([*each.clients]) for region, each in own.regions.items()}
+    checkpoints.keep_secrets(parties)
     earlier = max(each.earlier for each in own.regions.values())
     schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier, anew=own.rate)
-    how: Any = {"strategy": own.strategies.cloud, "rules": rules.of_servers(), "state": state}
-
-    def make_saver(rounds: int) -> OnRound:
-        keep = checkpoints.make_saver(rounds)
-
-        def keep_whole(round_: int, weights: Weights, loss: float | None) -> None:
-            if len(servers) > 1:
-                both = ([each.begun for each in servers.values()], [each.trained for each in servers.values()])
-                divergence = RoundDivergence(*(measure_divergence(models) for models in both))
-                state.records[-1] = replace(state.records[-1], divergence=divergence)
-            for region, server in servers.items() if own.keeps_statistics else ():
-                keep_statistics(server.trained, own.folder, region)
-            personal = [each.personal for each in own_states.values() if each.personal and rules.personal_arrays]
-            keep(round_, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
-
-        return keep_whole
-
+    wireless = Account(own.book, CLOUD, task.name, "wireless", outages)
     everybody = {name: client for region in own.regions for name, client in own.vehicles(region).items()}
     with checkpoints.refusals(), open_processes(everybody, processes) as runtime:
-        servers = own.open_servers(rules, wireless, done, own_states, runtime)
-        if replanning is None:
-            federate(servers, start, schedule, wireline, **how, done=done, on_round=make_saver(rounds))
-        else:
-            course = replanning.course
-
-            def run_round(weights: Weights, number: int, driven: Driven) -> LocalUpdate | None:
-                if own.afford(rules, number) < number:
-                    return None
-                for server in servers.values():
-                    server.rules, server.account = driven.rules, replace(wireless, outages=driven.outages)
-                asked: Any = {**how, "done": number - 1, "on_round": make_saver(course.rounds)}
-                return federate(servers, weights, course.schedule(schedule, number), wireline, **asked)
-
-            replanning.run(start, done, checkpoints.scores, run_round)
-    checkpoints.finish(own.network, len(checkpoints.losses), learning.training.average_rounds)
+        servers = own.open_servers(rules, wireless, done, states, runtime)
+        federate(
+            servers,
+            start,
+            schedule,
+            Account(own.book, CLOUD, task.name, "wireline"),
+            strategy=own.strategies.cloud,
+            rules=rules.of_servers(),
+            state=state,
+            done=done,
+            on_round=partial(_keep_round, own, servers, state, checkpoints),
+        )
+    losses = checkpoints.finish(own.network, learning.training.average_rounds)
     if rules.personal:
-        _save_regional_models(learning, own.folder, own_states)
-    return tuple(checkpoints.losses)
+        _save_regional_models(learning, own.folder, states)
+    return losses
+
+
+def _keep_round(
+    own: CloudFederation,
+    servers: Mapping[str, EdgeServer],
+    state: FederationState,
+    checkpoints: FederationCheckpoints,
+    number: int,
+    weights: Weights,
+    loss: float | None,
+) -> None:
+    """Keep the divergence of the regions in a cloud round, their statistics, and the checkpoint.
+
+    The checkpoint has the mean of the regions' personal arrays.
+    """
+    regions = [*servers.values()]
+    if len(regions) > 1:
+        both = ([each.begun for each in regions], [each.trained for each in regions])
+        divergence = RoundDivergence(*(measure_divergence(models) for models in both))
+        state.records[-1] = replace(state.records[-1], divergence=divergence)
+    for region, server in servers.items() if own.keeps_statistics else ():
+        keep_statistics(server.trained, own.folder, region)
+    personal = [each.state.personal for each in regions if each.state.personal and each.rules.personal_arrays]
+    checkpoints.save(number, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
 
 
 def _save_regional_models(learning: Learning, folder: Path, states: Mapping[str, FederationState]) -> None:

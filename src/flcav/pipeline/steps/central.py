@@ -20,12 +20,11 @@ class CentralSettings(StepSettings):
     inputs: RegionInputs
     vehicles: int  # of the region, whose local steps it takes
     source: Role  # pretrain: the uploaded samples; federate: the training frames of the region's vehicles
-    follows: str | None = None  # step of the stage II whose number of rounds was planned anew
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Return the names of the steps whose results it takes."""
-        return (*self.inputs.needs, *(() if self.follows is None else (self.follows,)))
+        return self.inputs.needs
 
 
 def central_step(work: Work, settings: CentralSettings) -> None:
@@ -40,10 +39,7 @@ def central_step(work: Work, settings: CentralSettings) -> None:
         parts = [(split, select_group(work, split, inputs))]
     each = (learning.task.samples(split.data, trained.config, frames) for split, frames in parts)
     samples = [own[number] for own in each for number in range(len(own))]  # in memory: each is drawn many times
-    if settings.follows is None:
-        rounds = Plan.load(work.inputs[inputs.plan]).tasks[settings.learning.task].edge_rounds
-    else:
-        rounds = StageResult.load(work.inputs[settings.follows]).rounds
+    rounds = Plan.load(work.inputs[inputs.plan]).tasks[settings.learning.task].edge_rounds
     losses = train_centrally(learning, trained, samples, rounds, settings.vehicles, settings.source)
     save_network(learning.task, trained, work.folder / WEIGHTS)
     about = (CENTRAL, settings.learning.task, inputs.region, rounds, len(samples), 1, ())

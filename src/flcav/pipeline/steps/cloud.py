@@ -1,11 +1,11 @@
 """The step of stage III of a task: edge servers federate with the cloud."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from flcav.federation.edge_server import edge_seeds
 from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.stages import edge_seeds
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.network.ledger import Ledger
 from flcav.perception.weights import to_arrays
@@ -18,7 +18,6 @@ from flcav.pipeline.federations.spent import take_noise
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.learning import Learning, load_stage_network
-from flcav.pipeline.planning.course import Replanning, mean_by_frames
 from flcav.pipeline.planning.updates import follow_plan
 from flcav.pipeline.recipe import CLOUD
 from flcav.pipeline.results.plans import Plan, TaskPlan
@@ -27,9 +26,8 @@ from flcav.pipeline.stages.clients import Strategies, make_clients
 from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
 from flcav.pipeline.stages.statistics import score_statistics
 from flcav.pipeline.steps.budgets import read_entries, share_plan_budget
-from flcav.pipeline.steps.driving import open_network
+from flcav.pipeline.steps.driving import drive_region
 from flcav.pipeline.steps.labelling import label_samples, learn_by_distillation
-from flcav.pipeline.steps.replanning import Rest
 from flcav.pipeline.steps.settings import FederationSettings, RegionInputs
 
 
@@ -42,12 +40,7 @@ class CloudSettings(FederationSettings):
     @property
     def needs(self) -> tuple[str, ...]:
         """Return the names of the steps whose results it takes."""
-        replan = () if self.replan is None else self.replan.needs
-        return (
-            *(step for inputs in self.regions.values() for step in inputs.needs),
-            *replan,
-            *self.validation.values(),
-        )
+        return (*(step for inputs in self.regions.values() for step in inputs.needs), *self.validation.values())
 
     @property
     def first(self) -> RegionInputs:
@@ -89,18 +82,11 @@ def cloud_step(work: Work, settings: CloudSettings, processes: int = 1) -> None:
     book = Ledger(share, read_entries(work, first.pretrain, *settings.edges.values()))
     if settings.distillation is not None:
         learning = learn_by_distillation(learning, settings.distillation)
-    before, rounds, made = len(book.entries), plan.tasks[task].cloud_rounds, None
+    before, rounds = len(book.entries), plan.tasks[task].cloud_rounds
     servers = _open_servers(work, settings, learning, start.config, rounds, book)
     federation = _open_federation(work, settings, learning, start, servers, book)
-    drive = _open_drive(work, settings, federation, rounds)
-    if settings.replan is None:
-        driven = drive(plan.tasks[task], rounds)
-        losses = federate_cloud(federation, rounds, driven.rules, driven.outages, processes=processes)
-    else:
-        course = Rest(work, settings, settings.replan, plan, book).open_cloud(settings.regions)
-        replanning = Replanning(course, drive, lambda scores: mean_by_frames(scores, federation.validation))
-        losses = federate_cloud(federation, rounds, settings.federation, replanning=replanning, processes=processes)
-        driven, made = drive(course.plan, len(losses)), tuple(course.made)
+    driven = _drive(work, settings, federation, plan.tasks[task])
+    losses = federate_cloud(federation, rounds, driven.rules, driven.outages, processes=processes)
     StageResult(
         stage=CLOUD,
         task=task,
@@ -111,7 +97,6 @@ def cloud_step(work: Work, settings: CloudSettings, processes: int = 1) -> None:
         poles=servers.poles,
         losses=losses,
         records=read_rounds(work.folder, None, before, driven.seconds),
-        plans=made,
         noise=noise,
         statistics=_score_statistics(work, settings, federation) if settings.validation else None,
     ).save(work.folder)
@@ -147,11 +132,19 @@ def _open_federation(
         shared = shown.samples
         for at in servers.starts.values():
             send_region_network(book, learning.task, at.weights, at.clients, CLOUD)
-    frames = {} if settings.replan is None else settings.replan.frames
-    watched = {name: Frames.open(work.inputs[step]) for name, step in frames.items()}
-    k, where = settings.federation.edge_rounds_per_cloud_round, (book, work.folder, work.report)
-    kept, rate = bool(settings.validation), settings.federation.cloud_rate
-    return CloudFederation(learning, start, servers.starts, k, strategies, *where, watched, shared, kept, rate)
+    return CloudFederation(
+        learning=learning,
+        network=start,
+        regions=servers.starts,
+        edge_rounds=settings.federation.edge_rounds_per_cloud_round,
+        strategies=strategies,
+        book=book,
+        folder=work.folder,
+        report=work.report,
+        shared=shared,
+        keeps_statistics=bool(settings.validation),
+        rate=settings.federation.cloud_rate,
+    )
 
 
 def _score_statistics(work: Work, settings: CloudSettings, federation: CloudFederation) -> tuple[StatisticsScore, ...]:
@@ -162,21 +155,13 @@ def _score_statistics(work: Work, settings: CloudSettings, federation: CloudFede
     return score_statistics(task, load_stage_network(task, work.folder), work.folder, frames)
 
 
-def _open_drive(
-    work: Work, settings: CloudSettings, federation: CloudFederation, rounds: int
-) -> Callable[[TaskPlan, int], DrivenCloud]:
-    """Return what simulates so many cloud rounds by a plan over the network; `rounds`: those of the first plan."""
-    own, k, how = federation, federation.edge_rounds, settings.federation
-    schedule = own.learning.schedule(rounds, own.learning.training.local_steps, CLOUD, "")
-    networks = {
-        name: open_network(work, settings, own.learning, settings.regions[name], [*at.clients], at.earlier)
-        for name, at in own.regions.items()
-    }
-
-    def drive(by: TaskPlan, rounds: int) -> DrivenCloud:
-        rules, numbers = follow_plan(how, by, after_edge=True), range(1, rounds + 1)
-        seeds = {name: [seed for n in numbers for seed in edge_seeds(schedule, n, name, k)] for name in own.regions}
-        driven = {name: network(rules, seeds[name]) for name, network in networks.items()}
-        return join_regions(driven, k, how.network, update_bytes(to_arrays(own.network)))
-
-    return drive
+def _drive(work: Work, settings: CloudSettings, federation: CloudFederation, plan: TaskPlan) -> DrivenCloud:
+    """Return what the radio network makes of the cloud rounds of a plan."""
+    own, k, how, numbers = federation, federation.edge_rounds, settings.federation, range(1, plan.cloud_rounds + 1)
+    schedule = own.learning.schedule(plan.cloud_rounds, own.learning.training.local_steps, CLOUD, "")
+    rules, driven = follow_plan(how, plan, after_edge=True), {}
+    for name, at in own.regions.items():
+        seeds = [seed for number in numbers for seed in edge_seeds(schedule, number, name, k)]
+        about = (own.learning, settings.regions[name], [*at.clients], at.earlier)
+        driven[name] = drive_region(work, settings, *about, rules, seeds)
+    return join_regions(driven, k, how.network, update_bytes(to_arrays(own.network)))

@@ -1,7 +1,7 @@
 """The step of stage II of a task in a region, and of its further edge rounds."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from flcav.federation.strategies.fedmd import FedMD
@@ -17,7 +17,6 @@ from flcav.pipeline.federations.spent import PrivateRounds, find_budget_noise, p
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.learning import load_stage_network
-from flcav.pipeline.planning.course import Course, Replanning
 from flcav.pipeline.planning.updates import follow_plan
 from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
 from flcav.pipeline.results.plans import Plan, TaskPlan
@@ -25,9 +24,8 @@ from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.stages.clients import make_clients
 from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
 from flcav.pipeline.steps.budgets import open_region_book, read_entries, share_plan_budget
-from flcav.pipeline.steps.driving import open_network
+from flcav.pipeline.steps.driving import drive_region
 from flcav.pipeline.steps.labelling import LabelledSamples, label_samples, learn_by_distillation, score_labels
-from flcav.pipeline.steps.replanning import Rest
 from flcav.pipeline.steps.settings import FederationSettings, RegionInputs
 
 
@@ -42,21 +40,12 @@ class EdgeSettings(FederationSettings):
     @property
     def needs(self) -> tuple[str, ...]:
         """Return the names of the steps whose results it takes."""
-        replan = () if self.replan is None else self.replan.needs
-        return (*self.inputs.needs, *replan, *self.validation.values())
+        return (*self.inputs.needs, *self.validation.values())
 
     @property
     def stage(self) -> str:
-        """Return which of both it is."""
+        """Return EDGE or MORE_EDGE."""
         return EDGE if self.inputs.edge is None else MORE_EDGE
-
-
-@dataclass(frozen=True)
-class _Rounds:
-    """The rounds that a plan gives a region, and their course where that is planned anew after each."""
-
-    planned: int
-    course: Course | None
 
 
 def edge_step(
@@ -73,17 +62,12 @@ def edge_step(
         _label_once(work, settings, plan, labelled.samples)
     noise = _find_noise(work, settings, plan)
     settings = settings.model_copy(update={"federation": take_noise(settings.federation, noise)})
-    rounds = _count_rounds(work, settings, plan, book)
+    own, k = plan.tasks[settings.learning.task], settings.federation.edge_rounds_per_cloud_round
+    rounds = _plan_private(settings, plan).edge if stage == EDGE else own.cloud_rounds * k
     federation = _open_federation(work, settings, labelled, rounds, book)
-    drive = _open_drive(work, settings, federation)
+    driven = _drive(work, settings, federation, own, rounds)
     where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
-    if rounds.course is None:
-        driven = drive(plan.tasks[settings.learning.task], rounds.planned)
-        losses = federate_edge(federation, driven.rules, driven.outages, **where)
-    else:
-        replanning = Replanning(rounds.course, drive, lambda scores: scores[inputs.region])
-        losses = federate_edge(federation, settings.federation, replanning=replanning, **where)
-        driven = drive(rounds.course.plan, len(losses))
+    losses = federate_edge(federation, driven.rules, driven.outages, **where)
     clients, labels = federation.clients, None
     if settings.scored and stage == EDGE:
         labels = score_labels(work, inputs, federation.network.config, labelled.samples)
@@ -97,7 +81,6 @@ def edge_step(
         poles=labelled.poles,
         losses=losses,
         records=read_rounds(work.folder, inputs.region, before, {inputs.region: driven.seconds}),
-        plans=None if rounds.course is None else tuple(rounds.course.made),
         labels=labels,
         noise=noise,
     ).save(work.folder)
@@ -119,18 +102,6 @@ def _label_once(work: Work, settings: EdgeSettings, plan: Plan, samples: RoadAve
         samples.renew(1, to_arrays(trained))
 
 
-def _count_rounds(work: Work, settings: EdgeSettings, plan: Plan, book: Ledger) -> _Rounds:
-    """Return the rounds by the plan; under re-planning their course, or as many as the rounds followed."""
-    inputs, own = settings.inputs, plan.tasks[settings.learning.task]
-    rest = None if settings.replan is None else Rest(work, settings, settings.replan, plan, book)
-    if settings.stage == EDGE:
-        course = None if rest is None else rest.open_edge(inputs.region, inputs.pretrain)
-        return _Rounds(_plan_private(settings, plan).edge if course is None else own.edge_rounds, course)
-    if rest is not None:
-        return _Rounds(rest.count_further(inputs.region, inputs.pretrain), None)
-    return _Rounds(own.cloud_rounds * settings.federation.edge_rounds_per_cloud_round, None)
-
-
 def _plan_private(settings: EdgeSettings, plan: Plan) -> PrivateRounds[Federation]:
     """Return the rounds of stage II and of what follows that the privacy budget affords."""
     own, k = plan.tasks[settings.learning.task], settings.federation.edge_rounds_per_cloud_round
@@ -146,7 +117,7 @@ def _find_noise(work: Work, settings: EdgeSettings, plan: Plan) -> float | None:
 
 
 def _open_federation(
-    work: Work, settings: EdgeSettings, labelled: LabelledSamples, rounds: _Rounds, book: Ledger
+    work: Work, settings: EdgeSettings, labelled: LabelledSamples, rounds: int, book: Ledger
 ) -> EdgeFederation:
     """Return the federation of the region's vehicles, after sending them what they lack."""
     inputs, learning, samples = settings.inputs, settings.learning.resolve(), labelled.samples
@@ -156,12 +127,9 @@ def _open_federation(
     clients = make_clients(learning, start.config, samples)
     earlier = 0 if inputs.edge is None else StageResult.load(work.inputs[inputs.edge]).rounds
     names = (settings.stage, inputs.region)
-    schedule = learning.schedule(rounds.planned, learning.training.local_steps, *names, earlier=earlier)
+    schedule = learning.schedule(rounds, learning.training.local_steps, *names, earlier=earlier)
     strategy, _ = find_strategies(settings.federation)
-    frames = settings.validation
-    if rounds.course is not None and settings.replan is not None:
-        frames = {**settings.replan.frames, **frames}
-    watched = {name: Frames.open(work.inputs[step]) for name, step in frames.items()}
+    watched = {name: Frames.open(work.inputs[step]) for name, step in settings.validation.items()}
     federation = EdgeFederation(
         learning=learning,
         network=start,
@@ -177,7 +145,7 @@ def _open_federation(
     if isinstance(strategy, FedMD):
         return replace(federation, shared=_share_with_vehicles(work, settings, federation, strategy))
     if isinstance(samples, RoadAverageLabels) and settings.stage == EDGE:
-        return replace(federation, before_round=samples.renew)
+        return replace(federation, relabel=samples.renew)
     return federation
 
 
@@ -194,15 +162,9 @@ def _share_with_vehicles(
     return shown.samples
 
 
-def _open_drive(
-    work: Work, settings: EdgeSettings, federation: EdgeFederation
-) -> Callable[[TaskPlan, int], DrivenRounds]:
-    """Return what simulates so many rounds by a plan over the radio network."""
+def _drive(work: Work, settings: EdgeSettings, federation: EdgeFederation, plan: TaskPlan, rounds: int) -> DrivenRounds:
+    """Return what the radio network makes of the rounds of a plan."""
     own, inputs = federation, settings.inputs
-    simulate = open_network(work, settings, own.learning, inputs, [*own.clients], own.earlier)
-
-    def drive(by: TaskPlan, rounds: int) -> DrivenRounds:
-        seeds = [own.schedule.work(number).seed for number in range(1, rounds + 1)]
-        return simulate(follow_plan(settings.federation, by, after_edge=bool(own.earlier)), seeds)
-
-    return drive
+    seeds = [own.schedule.work(number).seed for number in range(1, rounds + 1)]
+    rules = follow_plan(settings.federation, plan, after_edge=bool(own.earlier))
+    return drive_region(work, settings, own.learning, inputs, [*own.clients], own.earlier, rules, seeds)

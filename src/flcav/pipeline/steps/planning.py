@@ -1,7 +1,6 @@
 """Steps that plan a run, and plan the rest of it anew."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -24,13 +23,12 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.planning.allocation import PlanRequest, PlanSettings, make_plan
 from flcav.pipeline.planning.exchanges import Held, Sensors, measure_exchange, measure_labels
 from flcav.pipeline.planning.histories import parse_history
-from flcav.pipeline.planning.stages import count_carried_out, remake_plan
-from flcav.pipeline.planning.terms import price_rounds, settle
+from flcav.pipeline.planning.stages import remake_plan
 from flcav.pipeline.planning.updates import UpdateForm, model_mb
 from flcav.pipeline.recipe import Budgets, FixedPlan, Limits
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import PROBLEM
-from flcav.pipeline.results.training import StageResult, Watched, average_last
+from flcav.pipeline.results.training import Watched, average_last
 from flcav.pipeline.steps.budgets import read_entries
 from flcav.pipeline.steps.settings import StepSettings
 from flcav.pipeline.steps.uploads import UploadSettings, plan_uploads
@@ -104,7 +102,6 @@ class ReplanSettings(StepSettings):
     plan: str  # step of the plan that was carried out in the stage
     watched: Mapping[str, tuple[str, ...]]  # validations of the stage, by task
     books: Mapping[str, tuple[str, ...]]  # steps whose ledgers count, by task
-    edges: Mapping[str, tuple[str, ...]]  # steps of stage II whose rounds were planned anew after each, by task
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -201,21 +198,10 @@ def replan_step(work: Work, settings: ReplanSettings) -> None:
     problem = read_config(Problem, work.inputs[settings.first] / PROBLEM)
     done = Plan.load(work.inputs[settings.plan])
     reached: dict[str, float] = {}
-    used: dict[str, dict[Link, int]] = {task.name: dict.fromkeys(LINKS, 0) for task in problem.tasks}
+    used: dict[Link, int] = dict.fromkeys(LINKS, 0)
     for task in problem.tasks:
         reached[task.name] = average_last([Watched.load(work.inputs[step]) for step in settings.watched[task.name]])
         for entry in read_entries(work, *settings.books[task.name]):
-            used[task.name][entry.link] += entry.bytes * (entry.direction == "up")
-    sent = {task: Price(own["wireless"] / BYTES_PER_MB, own["wireline"] / BYTES_PER_MB) for task, own in used.items()}
-    used_mb = Price(*(sum(own[link] for own in used.values()) / BYTES_PER_MB for link in LINKS))
-    k, groups = problem.edge_rounds_per_cloud_round, problem.tasks[0].edge_groups
-    ran = {
-        task: count_carried_out(done.tasks[task], [StageResult.load(work.inputs[step]) for step in steps], k)
-        for task, steps in settings.edges.items()
-    }
-    made = remake_plan(done, problem, settings.stage, reached, used_mb, ran)
-    booked = {}
-    for task in settings.edges:
-        own = made.tasks[task]
-        booked[task] = settle(own, price_rounds(own, groups, k, 0, own.cloud_rounds), sent[task])
-    replace(made, tasks={**made.tasks, **booked}).save(work.folder)
+            used[entry.link] += entry.bytes * (entry.direction == "up")
+    used_mb = Price(*(used[link] / BYTES_PER_MB for link in LINKS))
+    remake_plan(done, problem, settings.stage, reached, used_mb).save(work.folder)

@@ -56,20 +56,6 @@ class RegionInputs(StepSettings):
         return (*(name for name in named if name is not None), *self.sites, *self.pools.values())
 
 
-class RoundPlans(StepSettings):
-    """Settings of re-planning in a step: after each of its rounds, by the learning curve or as another step did."""
-
-    headroom: float  # fraction of the budgets left unspent
-    first: str | None = None  # step of the first plan, whose problem is solved for the rest
-    follows: str | None = None  # step whose rounds are kept to instead
-    frames: Mapping[str, str] = {}  # recordings of the validation frames that rounds are scored on, by region
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """Return the names of all these steps."""
-        return (*(name for name in (self.first, self.follows) if name is not None), *self.frames.values())
-
-
 class FederationSettings(StepSettings):
     """Settings that the federations of stages II and III have in common."""
 
@@ -82,7 +68,6 @@ class FederationSettings(StepSettings):
     navigation: NavigationErrors = NavigationErrors()  # of the vehicles
     train_s: float = 0.0  # time that a vehicle of speed 1 trains in a round [s], on a network
     speeds: Mapping[str, float] = {}  # by "region/vehicle"; others have 1
-    replan: RoundPlans | None = None  # None: the plan is not made anew after each round
 
 
 def make_step(name: str, run: Callable[..., None], settings: StepSettings, workers: int = 1) -> Step:

@@ -93,7 +93,6 @@ def page(run: Run) -> dict[str, Any]:
         "findings": run.findings,
         "placed": main.placed,
         "plans": main.plans,
-        "round_plans": main.round_plans,
         "uploads": {task: plan.uploads for task, plan in main.plan.tasks.items() if plan.uploads is not None},
         "made": {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"},
         "links": main.links,

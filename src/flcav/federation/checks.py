@@ -1,0 +1,107 @@
+"""Consistency of a federation's settings: which strategies, rules and clients go together."""
+
+from collections.abc import Mapping, Sequence
+
+from flcav.config import InputError
+from flcav.federation.client import check_arguments
+from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
+from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.fedmd import FedMD
+from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust, needs_known_number
+from flcav.federation.trainable import Counts, Trainable
+
+
+def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> None:
+    """Raise `InputError` where these clients cannot federate by this strategy and these rules."""
+    if not clients:
+        raise InputError("a federation of 0 clients: nobody trains")
+    if rules.selection.predicts:
+        raise InputError("selection: a deadline needs 'seconds', the predicted time of a round by client")
+    check_rules(strategy, rules, [*clients])
+    if isinstance(strategy, Corrects):
+        check_arguments(clients, strategy.correct({}, {}).arguments(), type(strategy).__name__)
+    if isinstance(strategy, FedMD):
+        check_arguments(clients, ["own", "imitation_steps"], "FedMD")
+    if rules.upload.layers:
+        check_arguments(clients, ["layers"], f"layers {', '.join(rules.upload.layers)}:")
+    if rules.selection.unbiased:
+        for name, client in clients.items():
+            if not isinstance(client, Counts):
+                told = f"and {name} ({type(client).__name__}) has no 'count_samples'"
+                raise InputError(f"selection: unbiased weights need clients that count their samples, {told}")
+    if isinstance(rules.personal, RegionalModels):
+        check_arguments(clients, ["proximal", "centre"], "personal:")
+
+
+def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
+    """Raise `InputError` where a strategy and rules do not go together, or not with so many clients."""
+    told, selection = type(strategy).__name__, rules.selection
+    selection.check_clients(names)
+    planned = selection.rule == "planned"
+    any_number = planned or selection.rule in ("poisson", "importance")  # all at most; too few make no update
+    chosen = len(names) if any_number else len(selection.choose(names, 1, 0))
+    if short := rules.tell_shortage(chosen):
+        raise InputError(short)
+    single = isinstance(strategy, Robust | Exchanges)  # looks at each update
+    if selection.weighs:
+        if single:
+            kind = "unbiased" if selection.unbiased else "importance"
+            raise InputError(f"{told} looks at each update, and {kind} selection gives each a weight of its own")
+        if rules.privacy is not None and selection.rule == "importance":
+            raise InputError("privacy: importance selection reads norms of the updates, which no noise covers")
+    if selection.unbiased and (alike := _count_alike(strategy, rules)):
+        raise InputError(f"selection: {alike} has clients count the same, and 'unbiased' weighs them by samples")
+    if rules.privacy is not None and rules.privacy.amplified(selection) and isinstance(rules.least_clients, int):
+        raise InputError(
+            f"privacy: epsilon of {selection.rule} selection rests on secret draws, and rounds without an update for a "
+            "number of 'least_clients' would tell of them"
+        )
+    if isinstance(strategy, FedMD):
+        _check_outputs(rules)
+    if isinstance(rules.personal, RegionalModels) and isinstance(strategy, Corrects):
+        raise InputError(f"{told} corrects local steps, and so does the pull of regional models, 'personal'")
+    if rules.privacy is not None and planned:
+        raise InputError("privacy: rounds of a plan have other numbers of clients, and noise is for one number")
+    if isinstance(strategy, Robust):
+        if selection.rule not in ("poisson", "planned"):
+            strategy.check_clients(chosen)
+        elif needs_known_number(strategy):
+            raise InputError(f"{told} needs a known number of clients, and {selection.rule} selection has any")
+    if rules.secure is not None:
+        _check_secure(told, rules, rules.secure, chosen, single)
+    if rules.privacy is not None:
+        if isinstance(strategy, Exchanges):
+            raise InputError(f"{told} sends further arrays beside the weights, which the noise does not cover")
+        if rules.privacy.where == "central" and single:
+            raise InputError(f"{told} looks at each update, and central noise covers their sum alone")
+
+
+def _count_alike(strategy: Strategy, rules: Rules) -> str | None:
+    """Return what has all clients count the same, whatever their samples; None where nothing does."""
+    alike = {"FedMD": isinstance(strategy, FedMD), "privacy": rules.privacy, "secure aggregation": rules.secure}
+    return next((name for name, there in alike.items() if there), None)
+
+
+def _check_outputs(rules: Rules) -> None:
+    if rules.upload.layers:
+        raise InputError("FedMD sends class probabilities, and 'upload.layers' names arrays of weights")
+    if isinstance(rules.personal, RegionalModels):
+        raise InputError("FedMD's vehicles have networks of their own, which regional models, 'personal', cannot pull")
+    if rules.privacy is not None:
+        raise InputError("FedMD sends class probabilities, and noise is for changes of weights")
+
+
+def _check_secure(told: str, rules: Rules, secure: SecureAggregation, chosen: int, single: bool) -> None:
+    needed = secure.needed(chosen)
+    if single:
+        raise InputError(f"{told} looks at each update, and secure aggregation shows their sum alone")
+    if rules.selection.rule in ("poisson", "importance"):
+        raise InputError(f"secure aggregation needs a known number of clients, and {rules.selection.rule} draws any")
+    if rules.upload.compression != "none":
+        raise InputError(f"secure aggregation sums integers of 32 bits, and {rules.upload.compression} sends others")
+    if rules.privacy is not None and rules.privacy.where == "central":
+        raise InputError("secure aggregation goes with local noise: a server that adds noise clips each update first")
+    if not max(chosen / 2, 1) < needed <= chosen:
+        raise InputError(
+            f"secure.threshold: more than half of the {chosen} clients of a round, 2 or more, and not {needed}"
+        )

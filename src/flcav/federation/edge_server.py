@@ -1,0 +1,96 @@
+"""Edge server of stage III: a client of the cloud, whose local training is k edge rounds with its region's vehicles.
+
+Wang et al., IEEE Network 37(3), 2023.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from flcav.federation.privacy import count_affordable
+from flcav.federation.rounds import EVERYBODY, Schedule, federate
+from flcav.federation.rules import RegionalModels, Rules
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.runtimes.processes import ClientProcesses
+from flcav.federation.state import FederationState
+from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.trainable import Distiller, LocalUpdate, Trainable, Weights
+from flcav.federation.upload import name_like
+from flcav.statistics.streams import derive_seed
+
+
+@dataclass
+class EdgeServer:
+    """A region's edge server as a client of the cloud: its local training is k edge rounds with its vehicles."""
+
+    vehicles: Mapping[str, Trainable]  # of the region, by name
+    edge_rounds: int  # k >= 1, per cloud round
+    account: Account  # of the wireless link
+    own: Weights  # the region's model at the end of stage II
+    cloud_rounds_done: int = 0
+    strategy: Strategy = FEDAVG  # of aggregation in the region
+    rules: Rules = EVERYBODY  # of the region's rounds
+    state: FederationState = field(default_factory=FederationState)  # of the region's rounds
+    earlier: int = 0  # rounds of stage II, which a privacy budget counts
+    runtime: ClientProcesses | None = None  # where the vehicles train; None: in this process
+    distiller: Distiller | None = None  # where vehicles send outputs
+    begun: Weights = field(default_factory=dict)  # that its last cloud round began with
+    trained: Weights = field(default_factory=dict)  # that the edge rounds of that came to
+
+    def train(
+        self, weights: Weights, *, steps: int, learning_rate: float, seed: int, layers: Sequence[str] = ()
+    ) -> LocalUpdate:
+        """Return the update of the region after k edge rounds from the cloud's `weights`; raises as `federate` does.
+
+        The first cloud round starts from the server's own stage II model instead: the cloud has not averaged yet, and
+        its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are;
+        of regional models these are all, and vehicles are pulled to the cloud's from the second cloud round on.
+        Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles
+        keep to. Under central noise the region counts by its number of vehicles, whoever took part.
+        """
+        start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own
+        regional = isinstance(self.rules.personal, RegionalModels)
+        centre = weights if regional and self.cloud_rounds_done else None
+        done = self.cloud_rounds_done * self.edge_rounds
+        schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
+        self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
+        if self.distiller is not None:
+            self.state.server = {}  # the first edge round begins with the outputs of the cloud's network
+        found = federate(
+            self.vehicles,
+            start,
+            schedule,
+            self.account,
+            strategy=self.strategy,
+            rules=self.rules,
+            state=self.state,
+            done=done,
+            earlier=self.earlier,
+            runtime=self.runtime,
+            centre=centre,
+            distiller=self.distiller,
+        )
+        self.begun, self.trained = start, found.weights
+        names = [*found.weights] if regional else name_like(found.weights, self.rules.personal_arrays)
+        self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
+        if self.rules.privacy is not None and not self.rules.privacy.local:  # no noise covers numbers of samples
+            return replace(found, samples=len(self.vehicles))
+        return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody
+
+
+def afford_cloud_rounds(rules: Rules, names: Sequence[str], rounds: int, edge_rounds: int, earlier: int) -> int:
+    """Return how many of `rounds` cloud rounds, of `edge_rounds` edge rounds each, a region's privacy budget affords.
+
+    names: the region's clients, who took part in `earlier` rounds.
+    """
+    if rules.privacy is None or rounds == 0:
+        return rounds
+    return count_affordable(rules.privacy, rules.selection, names, rounds * edge_rounds, earlier) // edge_rounds
+
+
+def edge_seeds(schedule: Schedule, cloud_round: int, region: str, edge_rounds: int) -> list[int]:
+    """Return the seeds of a region's edge rounds in a cloud round of `schedule`, as `EdgeServer` derives them."""
+    seed, done = derive_seed(schedule.work(cloud_round).seed, region), (cloud_round - 1) * edge_rounds
+    own = Schedule(done + edge_rounds, 0, 1.0, 1.0, seed)
+    return [own.work(done + number).seed for number in range(1, edge_rounds + 1)]

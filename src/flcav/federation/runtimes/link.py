@@ -1,0 +1,110 @@
+"""Links of a federation's server to its clients, by runtime: in this process, with client processes, or on Ray.
+
+What crosses a link is lost where the network loses it, held to the budget where it leaves, and entered in the ledger.
+"""
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Union
+
+from flwr.serverapp import Grid
+
+from flcav.config import InputError
+from flcav.federation.client import client_app
+from flcav.federation.noise import Secret
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.deadline import TimedClients
+from flcav.federation.runtimes.embedded import EmbeddedGrid
+from flcav.federation.runtimes.metered import Account, BudgetedGrid, MeteredGrid
+from flcav.federation.runtimes.outages import LossyGrid
+from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
+from flcav.federation.state import ClientStates, ReadStates
+from flcav.federation.strategies import Strategy
+from flcav.federation.trainable import Trainable
+from flcav.interface.wording import suggest
+
+if TYPE_CHECKING:
+    from flcav.federation.runtimes.simulation import RaySimulation
+
+RUNTIMES = "embedded", "ray"
+Runtime = Union[ClientProcesses, "RaySimulation"]  # where clients train, other than in this process
+
+
+@dataclass(frozen=True)
+class Link:
+    """A server's end of the link to its clients."""
+
+    grid: Grid
+    names: Mapping[int, str]  # of the clients, by node
+    read_states: ReadStates  # of what clients keep between rounds
+
+
+@contextlib.contextmanager
+def open_link(
+    clients: Mapping[str, Trainable],
+    runtime: Runtime | None,
+    account: Account,
+    strategy: Strategy,
+    rules: Rules,
+    states: ClientStates,
+    secrets: Mapping[str, Secret],
+    spent: int,
+) -> Iterator[Link]:
+    """Yield the link to `clients`, on which `account` counts and loses messages.
+
+    Args:
+        clients: by name.
+        runtime: where they train; None: in this process.
+        account: ledger of the messages, and the clients that the network loses.
+        strategy: whose part on the clients they play.
+        rules: what they answer, and in which form.
+        states: what they have kept from earlier rounds.
+        secrets: by which they draw noise that is not seeded.
+        spent: rounds of earlier federations that count against their privacy budget.
+    """
+    make_app = partial(client_app, strategy=strategy, rules=rules, secrets=secrets, spent=spent)
+    limit_s, names = rules.limits.train_s, [*clients]
+    timed = clients if limit_s is None else TimedClients(clients, limit_s)
+    if runtime is None:
+        opened = EmbeddedGrid(make_app(timed), names, states)
+    elif isinstance(runtime, ClientProcesses):
+        opened = EmbeddedGrid(make_app(RemoteClients(clients, runtime, limit_s)), names, states, runtime.count)
+    else:
+        timing = (lambda each: each) if limit_s is None else (lambda each: TimedClients(each, limit_s))
+        opened = runtime.open(clients, lambda each: make_app(timing(each)), states)
+    with opened as inner:
+        lossy = LossyGrid(inner, account, inner.names) if account.outages else inner
+        metered = MeteredGrid(BudgetedGrid(lossy, account, inner.names), account, inner.names)
+        yield Link(metered, inner.names, inner.read_states)
+
+
+@contextlib.contextmanager
+def open_processes(clients: Mapping[str, Trainable], count: int) -> Iterator[ClientProcesses | None]:
+    """Yield `count` processes for `clients`; None, for this one, where one is enough or they cannot be pickled."""
+    try:
+        own = ClientProcesses(clients, count) if count > 1 else None
+    except InputError:
+        own = None
+    with own or contextlib.nullcontext() as processes:
+        yield processes
+
+
+@contextlib.contextmanager
+def open_runtime(name: str, clients: Mapping[str, Trainable], count: int) -> Iterator[Runtime | None]:
+    """Yield what `federate` takes as its `runtime`.
+
+    embedded: messages within this process, and clients in `count` processes where these are several. ray: Flower's
+    simulation with `count` actors. Raises `InputError` for another name.
+    """
+    match name:
+        case "embedded":
+            with open_processes(clients, count) as processes:
+                yield processes
+        case "ray":
+            from flcav.federation.runtimes.simulation import RaySimulation
+
+            yield RaySimulation(count)
+        case _:
+            raise InputError(f"runtime '{name}': choose one of {', '.join(RUNTIMES)}{suggest(name, RUNTIMES)}")
