@@ -15,8 +15,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.rounds import Schedule, federate
+from flcav.federation.runtimes.metered import Account
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.task import build_network

@@ -28,10 +28,10 @@ from flcav.pipeline.alone import WORK, list_needed
 from flcav.pipeline.engine import Step, ignore_steps, run_steps
 from flcav.pipeline.engine.engines import perform
 from flcav.pipeline.engine.step import Record, read_record
-from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, load_run_recipe
 from flcav.pipeline.results.saved import LEDGER, RESULT, WEIGHTS
+from flcav.pipeline.steps.graph import Graph
 from flcav.statistics.streams import stream
 from flcav.storage.files import sha256
 

@@ -8,7 +8,7 @@ import pytest
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 from pydantic import ValidationError
 
-from flcav.federation.records import ARRAYS, ASK, METRICS, NORM, SHARES, VECTOR, to_arrays
+from flcav.federation.messages.records import ARRAYS, ASK, METRICS, NORM, SHARES, VECTOR, to_arrays
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes import link as links

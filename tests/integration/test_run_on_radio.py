@@ -10,12 +10,11 @@ from flcav.experiments.run_tables import tables
 from flcav.network.clock.records import ClientTiming, load_rounds
 from flcav.network.ledger import Ledger
 from flcav.pipeline.alone import TRAIN_TIMES, Federations, name_results
-from flcav.pipeline.federations.network import TOO_SLOW
-from flcav.pipeline.federations.timing import TrainTimes
-from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe, load_run_recipe
+from flcav.pipeline.radio.driving import TOO_SLOW
+from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe, Training, load_run_recipe
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.running import SPREAD, run
-from flcav.pipeline.sizes import Training
+from flcav.pipeline.training.timing import TrainTimes
 from flcav.report.pages.run_page import draw
 
 pytestmark = pytest.mark.slow

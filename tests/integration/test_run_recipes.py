@@ -15,12 +15,10 @@ from flcav.federation.privacy import Privacy
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
-from flcav.pipeline.analysis.learning_history import ORIGIN, HistoryOrigin
+from flcav.pipeline.analysis.histories import ORIGIN, HistoryOrigin
 from flcav.pipeline.engine import Step, ignore_steps, run_side_by_side
 from flcav.pipeline.forecast import forecast_run
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.graph.graph import Graph
-from flcav.pipeline.planning.histories import parse_history
 from flcav.pipeline.recipe import (
     CLOUD,
     EDGE,
@@ -31,6 +29,9 @@ from flcav.pipeline.recipe import (
     Federation,
     Role,
     RunRecipe,
+    Split,
+    Splits,
+    Training,
     load_run_recipe,
 )
 from flcav.pipeline.results import tests as results
@@ -40,7 +41,8 @@ from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.tests import Difference
 from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.running import RESULTS, run
-from flcav.pipeline.sizes import Split, Splits, Training
+from flcav.pipeline.steps.graph import Graph
+from flcav.pipeline.tables import parse_history
 from flcav.report.pages.run_page import page, write_report
 from flcav.statistics.verdicts import UNDECIDED
 from flcav.world.opendrive.importing import import_town

@@ -42,14 +42,13 @@ from flcav.perception.task import find_configuration
 from flcav.pipeline.alone import federate_regions
 from flcav.pipeline.comparing import compare
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe, load_run_recipe
-from flcav.pipeline.results.placement import ErrorRegistry, Placed
-from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.plans import ErrorRegistry, Placed, Plan
 from flcav.pipeline.results.run import Run, Summary
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import FederatedRound, Pretrained, StageResult, Watched
 from flcav.pipeline.running import RESULTS, run, run_seeds
+from flcav.pipeline.steps.graph import Graph
 from flcav.report.pages.run_page import write_report
 from flcav.statistics.verdicts import ESTIMATE, UNDECIDED, verdict
 from flcav.world.map.town import load_town

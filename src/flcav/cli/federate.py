@@ -45,7 +45,7 @@ def federate(
     from flcav.cli.steps import live_steps
     from flcav.pipeline.alone import TRAIN_TIMES, federate_regions, measure_times, name_results
     from flcav.pipeline.recipe import load_run_recipe
-    from flcav.pipeline.results.spending import TOGETHER
+    from flcav.pipeline.results.training import TOGETHER
     from flcav.sources.recipe import find_recipe
     from flcav.storage.files import check_writable
 

@@ -128,7 +128,7 @@ def _run(
 
 def _tell(results: "list[Run]", summary: "Summary | None") -> None:
     from flcav.pipeline.analysis.caveats import PLACED_BARE
-    from flcav.pipeline.results.spending import TOGETHER
+    from flcav.pipeline.results.training import TOGETHER
 
     if summary is None:
         for finding in results[0].findings:

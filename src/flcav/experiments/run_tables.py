@@ -8,8 +8,8 @@ import numpy as np
 from flcav.experiments.cloud_rounds import cloud_tables
 from flcav.federation.state import FAILED
 from flcav.network.ledger import LINKS
+from flcav.pipeline.analysis.costs import list_home_costs
 from flcav.pipeline.analysis.findings import findings, name_stage
-from flcav.pipeline.analysis.home import list_home_costs
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN

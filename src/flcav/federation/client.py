@@ -10,8 +10,8 @@ from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
-from flcav.federation.acceptance import Expected, extra_forms, is_usable
-from flcav.federation.conduct import (
+from flcav.federation.messages.acceptance import Expected, extra_forms, is_usable
+from flcav.federation.messages.conduct import (
     ANSWERED,
     RequestRefused,
     Requests,
@@ -20,10 +20,8 @@ from flcav.federation.conduct import (
     keep_answered,
     recall_answered,
 )
-from flcav.federation.encoding import encode, flatten, is_local
-from flcav.federation.noise import Secret, derive_key
-from flcav.federation.privacy import change_norm
-from flcav.federation.records import (
+from flcav.federation.messages.encoding import encode, flatten, is_local
+from flcav.federation.messages.records import (
     ARRAYS,
     ASK,
     CENTRE,
@@ -46,6 +44,8 @@ from flcav.federation.records import (
     to_arrays,
     to_metrics,
 )
+from flcav.federation.noise import Secret, derive_key
+from flcav.federation.privacy import change_norm
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.secure.masks import to_integers
 from flcav.federation.secure.messages import answer_secretly, complain, mask_update

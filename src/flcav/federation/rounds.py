@@ -16,11 +16,24 @@ from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
 from flcav.config import InputError
-from flcav.federation.acceptance import Expected, ReplyRefused, extra_forms, read_norm, read_update
 from flcav.federation.attendance import Attendance, ClientFailed, Intake
 from flcav.federation.checks import check_federation
 from flcav.federation.client import kept_records
-from flcav.federation.delivery import Arrived, list_events
+from flcav.federation.masked_rounds import SecureRound
+from flcav.federation.messages.acceptance import Expected, ReplyRefused, extra_forms, read_norm, read_update
+from flcav.federation.messages.delivery import Arrived, list_events
+from flcav.federation.messages.records import (
+    ARRAYS,
+    ASK,
+    CENTRE,
+    CONFIG,
+    COUNT,
+    EXTRA,
+    NORM,
+    SEND,
+    LocalWork,
+    to_arrays,
+)
 from flcav.federation.noise import derive_key
 from flcav.federation.privacy import (
     account_epsilon,
@@ -30,13 +43,11 @@ from flcav.federation.privacy import (
     find_noise,
     least_participations,
 )
-from flcav.federation.records import ARRAYS, ASK, CENTRE, CONFIG, COUNT, EXTRA, NORM, SEND, LocalWork, to_arrays
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.link import Runtime, open_link
 from flcav.federation.runtimes.metered import Account, open_account
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.secure.parties import SumLost
-from flcav.federation.secure.server import SecureRound
 from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.fedavg import average_inversely

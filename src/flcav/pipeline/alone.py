@@ -14,21 +14,19 @@ from flcav.config import InputError
 from flcav.interface.progress import DAMAGED
 from flcav.pipeline.arms import check_federations
 from flcav.pipeline.engine import Notify, Stale, Step, print_steps, run_steps
-from flcav.pipeline.federations.checkpoint import LAST, Checkpoint
-from flcav.pipeline.federations.rounds import LOSS
-from flcav.pipeline.federations.spent import Training, compose_trainings
-from flcav.pipeline.federations.timing import TrainTimes, read_times, summarise_times
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
 from flcav.pipeline.results.saved import WEIGHTS, Saved
-from flcav.pipeline.results.spending import PrivacySpent
-from flcav.pipeline.results.training import Round, StageResult, Watched
+from flcav.pipeline.results.training import PrivacySpent, Round, StageResult, Watched
 from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.steps.edge import EdgeSettings, edge_step
+from flcav.pipeline.steps.graph import Graph
 from flcav.pipeline.steps.settings import make_step
+from flcav.pipeline.training.checkpoints import LAST, LOSS, Checkpoint
+from flcav.pipeline.training.private_rounds import Training, compose_trainings
+from flcav.pipeline.training.timing import TrainTimes, read_times, summarise_times
 from flcav.storage.files import atomic_path
 from flcav.storage.records import LEFT_OUT
 

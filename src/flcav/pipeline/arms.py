@@ -18,8 +18,19 @@ from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.labels.sources import LABEL_SOURCES
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, Arm, Federation, Placement, RunRecipe
-from flcav.pipeline.sizes import Training
+from flcav.pipeline.recipe import (
+    CENTRAL,
+    CLOUD,
+    EDGE,
+    MAIN,
+    MORE_EDGE,
+    PRETRAIN,
+    Arm,
+    Federation,
+    Placement,
+    RunRecipe,
+    Training,
+)
 
 PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
 PLANNED = ("plan",)  # fields of `Setting` that decide the plan, and the errors that sensors are placed by

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import InputError
-from flcav.pipeline.analysis.differences import compare_tests
-from flcav.pipeline.analysis.tests import mean_of_tests, mean_over_trainings
+from flcav.pipeline.analysis.differences import compare_tests, mean_of_tests, mean_over_trainings
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Test
 from flcav.pipeline.running import WORK, seed_folders

@@ -23,17 +23,17 @@ from flcav.perception.outcomes import score_network
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import Setting, check_federations
-from flcav.pipeline.federations.spent import Training, compose_trainings, find_budget_noise, plan_private_rounds
 from flcav.pipeline.frames import Frames, deal_frames, make_recording_recipe, record_frames
-from flcav.pipeline.graph.graph import Graph
-from flcav.pipeline.planning.allocation import PlanRequest, make_plan
-from flcav.pipeline.planning.exchanges import measure_exchange
-from flcav.pipeline.planning.histories import parse_history
-from flcav.pipeline.planning.updates import model_mb
+from flcav.pipeline.plan.allocation import PlanRequest, make_plan
+from flcav.pipeline.plan.exchanges import measure_exchange
+from flcav.pipeline.plan.updates import model_mb
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, SPLITS_OF, RunRecipe
-from flcav.pipeline.results.spending import PrivacySpent
-from flcav.pipeline.stages.clients import make_clients
+from flcav.pipeline.results.training import PrivacySpent
+from flcav.pipeline.steps.graph import Graph
 from flcav.pipeline.steps.planning import FirstPlanSettings, frame_plan
+from flcav.pipeline.tables import parse_history
+from flcav.pipeline.training.learning import make_clients
+from flcav.pipeline.training.private_rounds import Training, compose_trainings, find_budget_noise, plan_private_rounds
 from flcav.storage.records import LEFT_OUT, Record
 
 STEPS = 3  # that are timed

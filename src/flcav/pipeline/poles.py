@@ -13,7 +13,7 @@ from flcav.optimization.placement.solve import coverage
 from flcav.perception.errors import PerceptionError
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import Placement
-from flcav.pipeline.results.placement import Placed, Pole
+from flcav.pipeline.results.plans import Placed, Pole
 from flcav.statistics.streams import stream
 from flcav.world.map.census import measure_traffic_density
 from flcav.world.trace import Trace

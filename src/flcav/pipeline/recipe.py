@@ -1,10 +1,10 @@
-"""The schema of a run recipe: tasks, regions, uplink budgets, sensor placement, federation, and arms to compare.
+"""The schema of a run recipe: tasks, regions, uplink budgets, sensor placement, federation, sizes, and arms to compare.
 
 `find_path` is where the files that it names are looked for.
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -15,10 +15,9 @@ from flcav.federation.rules import Rules
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors
 from flcav.network.clock.rounds import NetworkSettings
-from flcav.pipeline.sizes import SIZES, Splits, Training
-from flcav.pipeline.stragglers import Stragglers, draw_stragglers
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
+from flcav.statistics.streams import stream
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.weather import WeatherSchedule
 
@@ -38,6 +37,91 @@ SPLITS_OF: Mapping[Role, tuple[SplitName, ...]] = {  # splits of a region, by it
     "federate": ("validation", "registry", "edge", "test"),
     "unseen": ("validation", "test"),
 }
+
+
+class Split(Config):
+    """Size of a data split in one region: `scenes` x `spins` x `cavs` frames."""
+
+    scenes: int = Field(ge=1, le=10**6)  # traffic runs
+    spins: int = Field(ge=1, le=10**6)  # frames of each vehicle in a scene
+    cavs: int = Field(ge=1, le=8)  # vehicles that record; of the split `edge` also the default of a region's `vehicles`
+    every_s: float = Field(default=4.0, ge=2.0)  # time between two frames [s]; nearer ones would be alike
+
+
+class Splits(Config):
+    """Sizes of all data splits. Each split has traffic of its own, so that no scene is in two of them."""
+
+    pool: Split  # pretraining regions: candidates for the upload of stage I
+    validation: Split  # every region: scored during training
+    registry: Split  # federating regions: errors are registered here
+    edge: Split  # federating regions: the vehicles' training data
+    test: Split  # every region: scored once, at the end
+
+    @field_validator("test")
+    @classmethod
+    def _several_scenes(cls, test: Split) -> Split:
+        if test.scenes < 2:
+            raise ValueError("test frames of two scenes or more are wanted: intervals are over scenes")
+        return test
+
+
+class Training(Config):
+    """Training of a task's networks. Rates are fractions of the task's own learning rate."""
+
+    batch: int | None = Field(default=None, ge=1, le=4096)  # samples per optimiser step; default: the task's
+    steps: int = Field(default=1400, ge=1, le=10**6)  # optimiser steps of pretraining, with the task's own schedule
+    local_steps: int = Field(default=16, ge=1, le=10**6)  # optimiser steps of one vehicle in one round
+    local_rate: float = Field(default=0.5, gt=0)  # learning rate of the first round after pretraining
+    final_rate: float = Field(default=0.1, gt=0)  # learning rate of their last, and of further rounds after them
+    average_rounds: int = Field(default=3, ge=1)  # last rounds of a federation whose models its result averages
+    start_share: float = Field(default=0.3, ge=0, lt=1)  # of the pretrained weights in the result of stage II
+
+
+SIZES: Mapping[str, tuple[Splits, Training]] = {
+    "toy": (  # seconds: a smoke test, its scores mean nothing
+        Splits(
+            pool=Split(scenes=2, spins=3, cavs=4),
+            validation=Split(scenes=1, spins=2, cavs=3),
+            registry=Split(scenes=1, spins=2, cavs=2),
+            edge=Split(scenes=1, spins=2, cavs=2),
+            test=Split(scenes=3, spins=1, cavs=2),
+        ),
+        Training(steps=12, local_steps=1),
+    ),
+    "demo": (  # under ten minutes on two cores
+        Splits(
+            pool=Split(scenes=16, spins=5, cavs=4),
+            validation=Split(scenes=8, spins=2, cavs=3),
+            registry=Split(scenes=8, spins=3, cavs=4),
+            edge=Split(scenes=16, spins=5, cavs=4),
+            test=Split(scenes=30, spins=1, cavs=4),
+        ),
+        Training(steps=1000),
+    ),
+    "full": (
+        Splits(
+            pool=Split(scenes=20, spins=5, cavs=4),
+            validation=Split(scenes=10, spins=2, cavs=3),
+            registry=Split(scenes=10, spins=3, cavs=4),
+            edge=Split(scenes=24, spins=5, cavs=4),
+            test=Split(scenes=40, spins=2, cavs=4),
+        ),
+        Training(),
+    ),
+}
+
+
+class Stragglers(Config):
+    """Share of each federating region's vehicles that train slower, and by what factor."""
+
+    share: float = Field(gt=0, le=1)  # of the vehicles, rounded to whole ones
+    slower: float = Field(gt=1, le=1000)  # times as long as a vehicle of speed 1
+
+
+def draw_stragglers(how: Stragglers, vehicles: Sequence[str], seed: int, region: str) -> dict[str, float]:
+    """Return the speed of each straggler among a region's vehicles; others have 1."""
+    drawn: list[int] = stream(seed, "stragglers", region).permutation(len(vehicles)).tolist()
+    return {vehicles[number]: 1 / how.slower for number in sorted(drawn[: round(how.share * len(vehicles))])}
 
 
 class FixedPlan(Config):

@@ -12,8 +12,8 @@ from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.pipeline.engine import Notify
 from flcav.pipeline.frames import make_recording_recipe
-from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.recipe import SPLITS_OF
+from flcav.pipeline.steps.outline import Outline
 
 RIG = "rig"  # reported in the place of a step
 

@@ -6,17 +6,17 @@ from pathlib import Path
 
 from flcav.config import InputError
 from flcav.pipeline.analysis.collect import collect_results
-from flcav.pipeline.analysis.history import make_history_points
+from flcav.pipeline.analysis.histories import make_history_points
 from flcav.pipeline.analysis.summary import summarise
 from flcav.pipeline.arms import check_federations
 from flcav.pipeline.engine import Notify, Stale, print_steps, run_side_by_side, run_steps, stopwatch
-from flcav.pipeline.federations.records import save_rounds
-from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import RunRecipe, load_run_recipe
 from flcav.pipeline.results.run import Run, Summary
 from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.spread import list_spreads
+from flcav.pipeline.steps.graph import Graph
 from flcav.pipeline.tables import append_records
+from flcav.pipeline.training.records import save_rounds
 
 WORK, HISTORY, SPREAD = "work", "history.csv", "spread.csv"
 RESULTS = Run.file

@@ -30,10 +30,10 @@ from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger
 from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import group_frames
-from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import EDGE, SPLITS_OF, RunRecipe
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import LEDGER
+from flcav.pipeline.steps.graph import Graph
 from flcav.sensors.frame import Frame
 
 SCENES = 2

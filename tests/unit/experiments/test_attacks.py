@@ -14,9 +14,9 @@ from flcav.experiments.attacks.faults import LIES, STRATEGIES, Liar, choose_liar
 from flcav.experiments.attacks.inference import invert, membership_advantage, membership_auc, name_nearest
 from flcav.experiments.attacks.leakage import attack, make_level, split_members
 from flcav.experiments.attacks.tables import fault_tables
+from flcav.federation.reading import read_round
 from flcav.federation.rounds import Schedule
 from flcav.federation.rules import Rules, SecureAggregation
-from flcav.federation.runtimes.reading import read_round
 from flcav.statistics.seeds import OWN_SCENES
 
 START = draw_head(1)

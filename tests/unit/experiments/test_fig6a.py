@@ -18,7 +18,7 @@ from flcav.experiments.fig6a.results import (
 from flcav.experiments.fig6a.run import BUDGETS, PLANS, STAGES, _collect, budget_recipes, draw_allocation, summarise
 from flcav.experiments.fig6a.tables import tables
 from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.results.placement import Placed, Pole
+from flcav.pipeline.results.plans import Placed, Pole
 from flcav.pipeline.results.run import LinkUse
 from flcav.report.charts.plans import predicted_and_realised
 from flcav.sources.recipe import recipe_path

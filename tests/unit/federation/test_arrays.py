@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from flwr.app import Array, ArrayRecord
 
-from flcav.federation.records import to_arrays, to_weights
+from flcav.federation.messages.records import to_arrays, to_weights
 from flcav.federation.runtimes.blocks import SharedBlock
 from flcav.federation.strategies.fedavg import BLOCK, RunningMean
 

@@ -10,10 +10,10 @@ import pytest
 from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 
 from flcav.federation.client import client_app
-from flcav.federation.conduct import ANSWERED
+from flcav.federation.messages.conduct import ANSWERED
+from flcav.federation.messages.records import ARRAYS, ASK, CONFIG, LOST, read_arrays, to_arrays
 from flcav.federation.noise import draw_secret
 from flcav.federation.privacy import Privacy, account_epsilon
-from flcav.federation.records import ARRAYS, ASK, CONFIG, LOST, read_arrays, to_arrays
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import EmbeddedGrid

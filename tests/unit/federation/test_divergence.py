@@ -14,13 +14,10 @@ from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.federations.checkpoint import LAST, Checkpoint
-from flcav.pipeline.federations.rounds import FederationCheckpoints
-from flcav.pipeline.learning import Learning
-from flcav.pipeline.recipe import CLOUD
-from flcav.pipeline.sizes import Training
-from flcav.pipeline.stages.clients import Strategies, make_clients
-from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
+from flcav.pipeline.recipe import CLOUD, Training
+from flcav.pipeline.steps.cloud import CloudFederation, RegionStart, federate_cloud
+from flcav.pipeline.training.checkpoints import LAST, Checkpoint, FederationCheckpoints
+from flcav.pipeline.training.learning import Learning, Strategies, make_clients
 
 
 def test_divergence_is_the_mean_relative_distance_from_the_mean() -> None:

@@ -8,7 +8,7 @@ import pytest
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.records import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
+from flcav.federation.messages.records import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
 from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account, MeteredGrid, Outage
 from flcav.federation.runtimes.outages import LossyGrid

@@ -12,9 +12,9 @@ from scipy.stats import kstest
 
 from flcav.federation import rounds
 from flcav.federation.edge_server import EdgeServer
+from flcav.federation.messages.records import ARRAYS, read_arrays
 from flcav.federation.noise import SECRET_BYTES, derive_key, draw_secret, secret_noise
 from flcav.federation.privacy import Privacy, add_noise, average_privately, clip_change
-from flcav.federation.records import ARRAYS, read_arrays
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.embedded import EmbeddedGrid

@@ -11,10 +11,10 @@ from regression import ledger
 from safetensors.numpy import load, save
 
 from flcav.config import InputError
-from flcav.federation.acceptance import Expected, ReplyRefused, read_update
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.encoding import encode
-from flcav.federation.records import update_content
+from flcav.federation.messages.acceptance import Expected, ReplyRefused, read_update
+from flcav.federation.messages.encoding import encode
+from flcav.federation.messages.records import update_content
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import update_bytes

@@ -286,7 +286,7 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     def detections(network, frames, **how):
         return [seen_cars[len(frames[0].lidar["lidar"])]]
 
-    monkeypatch.setattr("flcav.pipeline.labels.sightings.detect_in", detections)
+    monkeypatch.setattr("flcav.pipeline.labels.road_average.detect_in", detections)
     truth = FrameTruth("s", boxes(BOTH, z=-1.0), Boxes.empty(), Boxes.empty())
     monkeypatch.setattr(quality, "asked_of", lambda frame, config: truth)
     how, errors = Distillation(), NavigationErrors(position_m=0.05, heading_deg=0.1)

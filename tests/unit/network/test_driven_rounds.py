@@ -23,12 +23,18 @@ from flcav.network.clock.rounds import NetworkSettings, RoundRules
 from flcav.network.ledger import Budget, Ledger
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.wireline import Wireline
-from flcav.pipeline.federations import prediction
-from flcav.pipeline.federations.network import DrivenRounds, Fleet, drive_rounds, join_regions
-from flcav.pipeline.federations.prediction import link_drive, measure_uplinks, predict_air_s
 from flcav.pipeline.poles import Sites
-from flcav.pipeline.recipe import CLOUD
-from flcav.pipeline.stragglers import Stragglers, draw_stragglers
+from flcav.pipeline.radio import driving as prediction
+from flcav.pipeline.radio.driving import (
+    DrivenRounds,
+    Fleet,
+    drive_rounds,
+    join_regions,
+    link_drive,
+    measure_uplinks,
+    predict_air_s,
+)
+from flcav.pipeline.recipe import CLOUD, Stragglers, draw_stragglers
 
 GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing
 MB = 1_000_000

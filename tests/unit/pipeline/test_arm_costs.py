@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Annotation
 
-from flcav.pipeline.analysis.arm_costs import list_arm_costs
+from flcav.pipeline.analysis.costs import list_arm_costs
 from flcav.pipeline.results.run import Run
 from flcav.report import style
 from flcav.report.charts import figures

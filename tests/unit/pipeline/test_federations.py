@@ -26,18 +26,21 @@ from flcav.perception.task import Task
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, find_strategies
-from flcav.pipeline.federations.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
-from flcav.pipeline.learning import Learning, load_stage_network
-from flcav.pipeline.planning.updates import UpdateForm, model_mb, update_forms
-from flcav.pipeline.recipe import Federation
+from flcav.pipeline.plan.updates import UpdateForm, model_mb, update_forms
+from flcav.pipeline.recipe import Federation, Training
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.results.training import StatisticsScore
-from flcav.pipeline.sizes import Training
-from flcav.pipeline.stages import statistics
-from flcav.pipeline.stages.clients import Strategies, make_clients
-from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
-from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
-from flcav.pipeline.stages.statistics import keep_statistics, score_statistics
+from flcav.pipeline.steps.cloud import (
+    CloudFederation,
+    RegionStart,
+    federate_cloud,
+    keep_statistics,
+    score_statistics,
+)
+from flcav.pipeline.steps.edge import EdgeFederation, federate_edge
+from flcav.pipeline.training import statistics
+from flcav.pipeline.training.learning import Learning, Strategies, load_stage_network, make_clients
+from flcav.pipeline.training.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
 
 BUSY_S = 0.05  # CPU time of a training
 

@@ -7,12 +7,11 @@ from dataclasses import replace
 import pytest
 
 from flcav.pipeline.analysis.findings import findings
-from flcav.pipeline.analysis.history import gap_closed, gaps_closed
+from flcav.pipeline.analysis.histories import gap_closed, gaps_closed
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results import tests as results
-from flcav.pipeline.results.placement import Placed
-from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.plans import Placed, Plan
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference
 from flcav.pipeline.results.training import diverges

@@ -14,9 +14,8 @@ from scipy.special import expit, logit
 from flcav.config import InputError
 from flcav.perception.outcomes import Outcomes, compute_interval, compute_measure, difference
 from flcav.perception.tasks import task_named
-from flcav.pipeline.analysis.differences import list_differences
-from flcav.pipeline.analysis.history import gaps_closed
-from flcav.pipeline.analysis.tests import collect_test
+from flcav.pipeline.analysis.differences import collect_test, list_differences
+from flcav.pipeline.analysis.histories import gaps_closed
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results import tests as results
 from flcav.pipeline.results.saved import OUTCOMES

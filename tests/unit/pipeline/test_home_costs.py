@@ -10,7 +10,7 @@ from flcav.perception.metrics import Matches
 from flcav.perception.objects.outcomes import CLASSES, HIDDEN, KEPT
 from flcav.perception.outcomes import Outcomes, as_measurable, count_once, difference, further_measures
 from flcav.perception.tasks import TASKS, task_named
-from flcav.pipeline.analysis.home import list_home_costs
+from flcav.pipeline.analysis.costs import list_home_costs
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import HomeCost
 from flcav.pipeline.running import RESULTS

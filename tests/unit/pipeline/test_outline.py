@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from flcav.config import InputError
-from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.recipe import RunRecipe
+from flcav.pipeline.steps.outline import Outline
 
 
 def outline_of(network: str) -> Outline:

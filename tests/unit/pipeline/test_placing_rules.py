@@ -16,7 +16,7 @@ from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.poles import Sites, find_passed, place_sensors
 from flcav.pipeline.recipe import EDGE, MAIN, Placement, RunRecipe
-from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.results.plans import Placed
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.training import StageResult
 

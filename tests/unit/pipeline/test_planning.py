@@ -31,15 +31,14 @@ from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.planning import allocation
-from flcav.pipeline.planning.allocation import PlanRequest, PlanSettings, make_plan
-from flcav.pipeline.planning.histories import HistoryPoint, load_history, parse_history
-from flcav.pipeline.planning.stages import remake_plan
-from flcav.pipeline.planning.updates import model_mb
+from flcav.pipeline.plan import allocation
+from flcav.pipeline.plan.allocation import PlanRequest, PlanSettings, make_plan
+from flcav.pipeline.plan.replanning import remake_plan
+from flcav.pipeline.plan.updates import model_mb
 from flcav.pipeline.recipe import FixedPlan, Limits, load_run_recipe
 from flcav.pipeline.results.plans import TaskPlan
 from flcav.pipeline.spread import read_spreads
-from flcav.pipeline.tables import append_records
+from flcav.pipeline.tables import HistoryPoint, append_records, load_history, parse_history
 
 RECIPES = Path(__file__).parents[3] / "recipes/runs"
 FITTED: dict[tuple[bytes, ...], CurveFit] = {}

@@ -12,11 +12,10 @@ from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
 from flcav.pipeline.analysis.collect import list_trainings
 from flcav.pipeline.arms import name_repeat
-from flcav.pipeline.federations.spent import Training, compose_trainings, plan_private_rounds
-from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, RunRecipe
-from flcav.pipeline.results.spending import PrivacySpent
-from flcav.pipeline.results.training import StageResult
+from flcav.pipeline.results.training import PrivacySpent, StageResult
+from flcav.pipeline.steps.graph import Graph
+from flcav.pipeline.training.private_rounds import Training, compose_trainings, plan_private_rounds
 
 PRIVACY = {"clip": 1.0, "noise": 1.0}
 

@@ -8,8 +8,8 @@ import numpy as np
 from flcav.network.plan import Price
 from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import Infeasible
-from flcav.pipeline.planning.stages import continue_joins, remake_plan
-from flcav.pipeline.planning.updates import follow_plan
+from flcav.pipeline.plan.replanning import continue_joins, remake_plan
+from flcav.pipeline.plan.updates import follow_plan
 from flcav.pipeline.recipe import Federation
 from flcav.pipeline.results.plans import Plan, TaskPlan
 

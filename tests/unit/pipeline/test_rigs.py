@@ -12,10 +12,10 @@ from flcav.dataset.recording.recorder import record
 from flcav.pipeline import alone, running
 from flcav.pipeline.alone import federate_regions
 from flcav.pipeline.engine import Notify
-from flcav.pipeline.graph.outline import Outline
 from flcav.pipeline.recipe import RunRecipe
 from flcav.pipeline.rigs import RIG, compare_rigs, tell_rigs
 from flcav.pipeline.running import run, run_several
+from flcav.pipeline.steps.outline import Outline
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 

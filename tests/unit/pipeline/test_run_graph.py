@@ -7,9 +7,9 @@ import pytest
 
 from flcav.config import InputError
 from flcav.pipeline.engine import Step
-from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.recipe import MAIN, RunRecipe, load_run_recipe
-from flcav.pipeline.steps.uploads import UploadSettings
+from flcav.pipeline.steps.graph import Graph
+from flcav.pipeline.steps.planning import UploadSettings
 from flcav.sources.recipe import recipe_path
 
 OBJECTS = {"objects": {"history": "objects"}}

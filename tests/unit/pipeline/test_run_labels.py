@@ -16,8 +16,8 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels import pseudo_labels
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold, select_frames_near
 from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
-from flcav.pipeline.planning import exchanges
-from flcav.pipeline.planning.exchanges import Held, Sensors, measure_labels
+from flcav.pipeline.plan import exchanges
+from flcav.pipeline.plan.exchanges import Held, Sensors, measure_labels
 from flcav.pipeline.recipe import RunRecipe
 
 

@@ -6,8 +6,7 @@ from typing import Any
 import pytest
 
 from flcav.config import InputError, parse_config
-from flcav.pipeline.recipe import SPLITS_OF, RunRecipe, load_run_recipe
-from flcav.pipeline.sizes import SIZES
+from flcav.pipeline.recipe import SIZES, SPLITS_OF, RunRecipe, load_run_recipe
 
 RUNS = Path(__file__).parents[3] / "recipes" / "runs"
 WHOLE: dict[str, Any] = {

@@ -27,16 +27,15 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
 from flcav.perception.training import train
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.federations.checkpoint import find_checkpoint
-from flcav.pipeline.federations.records import ROUNDS, SCHEMA
-from flcav.pipeline.federations.rounds import FederationCheckpoints, round_path
-from flcav.pipeline.learning import Learning
+from flcav.pipeline.recipe import Training
 from flcav.pipeline.results.saved import WEIGHTS
-from flcav.pipeline.sizes import Training
-from flcav.pipeline.stages import centralised
-from flcav.pipeline.stages.centralised import pretrain, train_centrally
-from flcav.pipeline.stages.uploads import choose_planned_uploads, choose_uploads
-from flcav.pipeline.steps.budgets import region_budget, share_budget
+from flcav.pipeline.steps import centralised
+from flcav.pipeline.steps.centralised import pretrain, train_centrally
+from flcav.pipeline.steps.settings import region_budget, share_budget
+from flcav.pipeline.training.checkpoints import FederationCheckpoints, find_checkpoint, round_path
+from flcav.pipeline.training.learning import Learning
+from flcav.pipeline.training.messages import choose_planned_uploads, choose_uploads
+from flcav.pipeline.training.records import ROUNDS, SCHEMA
 from flcav.statistics.streams import derive_seed
 from flcav.storage import files
 from flcav.storage.exchange import write_table

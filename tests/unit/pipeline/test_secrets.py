@@ -22,7 +22,12 @@ from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Budget, BudgetExceeded, Ledger
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.federations.secrets import (
+from flcav.pipeline.recipe import Training
+from flcav.pipeline.results.saved import LEDGER, WEIGHTS
+from flcav.pipeline.steps.cloud import CloudFederation, RegionStart, federate_cloud
+from flcav.pipeline.steps.edge import EdgeFederation, federate_edge
+from flcav.pipeline.training.learning import Learning, Strategies, make_clients
+from flcav.pipeline.training.secrets import (
     PART,
     SECRETS,
     SECRETS_HASH,
@@ -30,12 +35,6 @@ from flcav.pipeline.federations.secrets import (
     remove_secrets,
     write_secrets,
 )
-from flcav.pipeline.learning import Learning
-from flcav.pipeline.results.saved import LEDGER, WEIGHTS
-from flcav.pipeline.sizes import Training
-from flcav.pipeline.stages.clients import Strategies, make_clients
-from flcav.pipeline.stages.cloud import CloudFederation, RegionStart, federate_cloud
-from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
 
 ROUNDS, VEHICLES = 6, 3
 Federate = Callable[..., None]

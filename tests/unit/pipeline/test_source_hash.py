@@ -14,7 +14,7 @@ from flcav.experiments.splits import record_split
 from flcav.experiments.studies import STUDIES, study_named
 from flcav.pipeline.engine.source_hash import PACKAGES, Sources, find_definitions
 from flcav.pipeline.recipe import Federation
-from flcav.pipeline.steps import cloud, edge, pretraining, recording, testing
+from flcav.pipeline.steps import centralised, cloud, edge, recording, testing
 
 TOY = {
     "__init__.py": """
@@ -152,7 +152,7 @@ def test_one_constant_of_a_module_is_reached_or_all_where_the_module_is_passed_o
 STEPS = {
     "recording": record_split,
     "frames": recording.record_step,
-    "pretraining": pretraining.pretrain_step,
+    "pretraining": centralised.pretrain_step,
     "evaluation": testing.test_step,
     "stage II": edge.edge_step,
     "stage III": cloud.cloud_step,

@@ -6,9 +6,8 @@ from typing import Any
 import pytest
 
 from flcav.config import InputError, parse_config
-from flcav.pipeline.graph.graph import Graph
-from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.stragglers import Stragglers, draw_stragglers
+from flcav.pipeline.recipe import RunRecipe, Stragglers, draw_stragglers
+from flcav.pipeline.steps.graph import Graph
 
 RECIPE: dict[str, Any] = {
     "tasks": {"objects": {"history": "objects", "train_s": 2.0}},

@@ -7,8 +7,7 @@ import numpy as np
 from flcav.geometry import Boxes
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results.placement import Placed, Pole
-from flcav.pipeline.results.plans import Plan, TaskPlan
+from flcav.pipeline.results.plans import Placed, Plan, Pole, TaskPlan
 from flcav.pipeline.results.run import ArmResult, LinkUse, Run, Spent
 from flcav.pipeline.results.tests import Difference, Finding, Test, Tested
 from flcav.pipeline.results.training import Pretrained, Validated

@@ -14,13 +14,12 @@ from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.state import RoundRecord
 from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
 from flcav.pipeline.analysis.caveats import PLACED_BARE
-from flcav.pipeline.federations.checkpoint import Checkpoint
-from flcav.pipeline.federations.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import LEDGER
-from flcav.pipeline.results.spending import PrivacySpent
-from flcav.pipeline.results.training import FederatedRound, LabelQuality, StageResult
+from flcav.pipeline.results.training import FederatedRound, LabelQuality, PrivacySpent, StageResult
+from flcav.pipeline.training.checkpoints import Checkpoint
+from flcav.pipeline.training.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 from flcav.report.pages import html
 from flcav.report.pages.run_page import page
 

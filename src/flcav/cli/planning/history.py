@@ -39,7 +39,7 @@ def history(
     """
     use_threads(1)
     from flcav.cli.steps import live_steps
-    from flcav.pipeline.analysis.learning_history import history_recipes, save_origin
+    from flcav.pipeline.analysis.histories import history_recipes, save_origin
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import HISTORY, run_several
     from flcav.sources.recipe import find_recipe

@@ -12,10 +12,10 @@ from typing import Annotated
 
 from flcav.config import Json
 from flcav.pipeline.analysis.findings import name_stage
-from flcav.pipeline.analysis.history import gap_closed
+from flcav.pipeline.analysis.histories import gap_closed
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
-from flcav.pipeline.results.placement import Pole
+from flcav.pipeline.results.plans import Pole
 from flcav.pipeline.results.run import Run
 from flcav.report import style
 from flcav.report.charts import figures

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from flcav.config import Json
-from flcav.pipeline.analysis.history import gap_closed
+from flcav.pipeline.analysis.histories import gap_closed
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import Run

@@ -26,10 +26,10 @@ from flcav.experiments.fig6a.results import (
     Planned,
     Reached,
 )
-from flcav.pipeline.planning.histories import load_history
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Budgets, RunRecipe
 from flcav.pipeline.results.run import Run
+from flcav.pipeline.tables import load_history
 from flcav.report import style
 from flcav.report.charts import plans
 from flcav.statistics.estimates import Estimate, average_estimates

@@ -51,7 +51,7 @@ from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.poles import find_sites, read_traces
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.results.plans import Placed
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import ERRORS, OUTCOMES, WEIGHTS
 from flcav.pipeline.results.training import Pretrained

@@ -20,8 +20,8 @@ from flwr.supercore.run import Run
 from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.federation.client import PARTITION
-from flcav.federation.encoding import encode
-from flcav.federation.records import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, read_arrays, to_arrays
+from flcav.federation.messages.encoding import encode
+from flcav.federation.messages.records import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, read_arrays, to_arrays
 from flcav.federation.rules import Rules
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 from flcav.federation.upload import Upload

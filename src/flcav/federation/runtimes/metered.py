@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from flwr.app import Message
 from flwr.serverapp import Grid
 
-from flcav.federation.records import CONFIG
+from flcav.federation.messages.records import CONFIG
 from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from flwr.app import ConfigRecord, Error, Message, RecordDict
 from flwr.serverapp import Grid
 
-from flcav.federation.records import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
+from flcav.federation.messages.records import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
 from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.wrapped import WrappedGrid

@@ -18,7 +18,7 @@ from flwr.serverapp import Grid, ServerApp
 from flwr.simulation import run_simulation
 
 from flcav.federation.client import PARTITION
-from flcav.federation.records import METRICS, read_arrays, to_arrays
+from flcav.federation.messages.records import METRICS, read_arrays, to_arrays
 from flcav.federation.runtimes.embedded import keep_identity
 from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.federation.state import Arrays, ClientStates

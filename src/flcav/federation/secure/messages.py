@@ -8,8 +8,8 @@ from typing import Any, Protocol, TypeVar
 from flwr.app import ConfigRecord, Context, Message, RecordDict
 
 from flcav.config import shorten
-from flcav.federation.acceptance import ReplyRefused, read_entry
-from flcav.federation.records import ASK, CIPHERS, KEYS, MASKED, MASKS, NAMES, SHARES, UNMASK
+from flcav.federation.messages.acceptance import ReplyRefused, read_entry
+from flcav.federation.messages.records import ASK, CIPHERS, KEYS, MASKED, MASKS, NAMES, SHARES, UNMASK
 from flcav.federation.rules import SecureAggregation
 from flcav.federation.secure.masks import Vector, add_vectors, is_public_key
 from flcav.federation.secure.parties import SEALED_BYTES, PublicKeys, SecureClient, find_liars, unmask_sum

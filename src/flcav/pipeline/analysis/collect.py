@@ -6,25 +6,27 @@ from pathlib import Path
 
 from flcav.network.ledger import LINKS, Budget, Ledger
 from flcav.perception.tasks import task_named
-from flcav.pipeline.analysis.arm_costs import list_arm_costs
 from flcav.pipeline.analysis.caveats import list_caveats, list_cut, list_diverged, list_unreached
-from flcav.pipeline.analysis.differences import list_differences
+from flcav.pipeline.analysis.costs import collect_home_costs, list_arm_costs
+from flcav.pipeline.analysis.differences import (
+    collect_regional_tests,
+    collect_test,
+    list_differences,
+    number_retrainings,
+)
 from flcav.pipeline.analysis.findings import findings
-from flcav.pipeline.analysis.history import gaps_closed
-from flcav.pipeline.analysis.home import collect_home_costs
-from flcav.pipeline.analysis.tests import collect_regional_tests, collect_test, number_retrainings
+from flcav.pipeline.analysis.histories import gaps_closed
 from flcav.pipeline.arms import Setting, name_repeat
-from flcav.pipeline.federations.spent import Training, compose_trainings
-from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
-from flcav.pipeline.results.placement import Placed
-from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.plans import Placed, Plan
 from flcav.pipeline.results.run import ArmResult, LinkUse, Run, Spent
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import Pretrained, StageResult, Watched
 from flcav.pipeline.rigs import compare_rigs
+from flcav.pipeline.steps.graph import Graph
+from flcav.pipeline.training.private_rounds import Training, compose_trainings
 
 
 def collect_results(graph: Graph, work: Path) -> Run:

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flcav.pipeline.analysis.claims import ask, judge_asked
-from flcav.pipeline.analysis.findings import name_stage
-from flcav.pipeline.analysis.tests import mean_of_tests
+from flcav.pipeline.analysis.differences import mean_of_tests
+from flcav.pipeline.analysis.findings import ask, judge_asked, name_stage
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.recipe import MAIN

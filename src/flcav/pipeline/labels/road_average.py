@@ -1,4 +1,4 @@
-"""Labels by the road average in a region's rounds: vehicles tell what they detect, the edge server averages.
+"""Labels by the road average in a region's rounds: vehicles send what they detect, the edge server averages.
 
 Before each round every vehicle detects with the weights that the round begins with, in its frames and in what it
 recorded around them, sends boxes and its own poses up, and receives the road average of its frames' windows; its

@@ -1,9 +1,10 @@
-"""Records of plans: samples and rounds of each task, before a run and between its stages."""
+"""Records of plans and of placed sensors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
+from flcav.config import InputError
 from flcav.network.plan import MessageSizes
 from flcav.pipeline.results.saved import Saved
 from flcav.storage.records import LEFT_OUT
@@ -55,3 +56,48 @@ class Plan(Saved):
     tasks: Mapping[str, TaskPlan]
     after: Annotated[str | None, LEFT_OUT] = None  # stage after which it was made anew; None: before the run
     reached: Annotated[Mapping[str, float] | None, LEFT_OUT] = None  # score then, by task, which it rests on
+
+
+@dataclass(frozen=True)
+class ErrorRegistry(Saved):
+    """Number of registered errors of a pretrained network in a region; their table is in the same folder."""
+
+    region: str
+    task: str
+    counts: Mapping[str, int]  # by kind
+    dropped: int  # false positives without a place in the town
+
+
+@dataclass(frozen=True)
+class Pole:
+    """A candidate site of a roadside sensor."""
+
+    pole: int
+    covered: int  # errors within range
+    actors: float  # road users within range on average
+
+
+@dataclass(frozen=True)
+class Placed(Saved):
+    """Placement of a region's roadside sensors."""
+
+    region: str
+    rule: str
+    chosen: tuple[int, ...]  # poles
+    errors: int  # registered
+    covered: int  # errors within range of a chosen pole
+    range_m: float
+    poles: tuple[Pole, ...]  # all candidates
+
+    @property
+    def first(self) -> int:
+        """Return the pole that was chosen first; raises `InputError` where no sensor was placed."""
+        if not self.chosen:
+            found = f"candidate poles: {len(self.poles)}, errors to cover: {self.errors}"
+            raise InputError(f"region {self.region!r}: no sensor was placed ({found})")
+        return self.chosen[0]
+
+    @property
+    def densest(self) -> int:
+        """Return the pole with the most road users within range on average."""
+        return max(self.poles, key=lambda site: site.actors).pole

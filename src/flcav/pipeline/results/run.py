@@ -6,12 +6,10 @@ from typing import Annotated, ClassVar
 
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.results.placement import Placed
-from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.plans import Placed, Plan
 from flcav.pipeline.results.saved import Saved
-from flcav.pipeline.results.spending import PrivacySpent
 from flcav.pipeline.results.tests import Difference, Finding, HomeCost, RegionalTest, Test, Tested
-from flcav.pipeline.results.training import Pretrained, StageResult, Watched
+from flcav.pipeline.results.training import Pretrained, PrivacySpent, StageResult, Watched
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.statistics.verdicts import Judged

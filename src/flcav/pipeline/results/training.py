@@ -1,4 +1,4 @@
-"""Records of training: pretraining, federated stages with their rounds, and validation scores."""
+"""Records of training: pretraining, federated stages with their rounds, privacy spent, and validation scores."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from flcav.federation.divergence import RoundDivergence
+from flcav.federation.privacy import SEEDED
 from flcav.pipeline.results.saved import Saved
 from flcav.storage.records import LEFT_OUT, Record
 
@@ -137,3 +138,21 @@ def average_regions(watched: Sequence[Watched]) -> tuple[Round, ...]:
 def average_last(watched: Sequence[Watched]) -> float:
     """Return the mean over regions of the score after each one's last round, weighted by frames."""
     return float(np.average([each.rounds[-1].score for each in watched], weights=[each.frames for each in watched]))
+
+
+TOGETHER = "a vehicle's whole data in all tasks and trainings together"
+
+
+@dataclass(frozen=True)
+class PrivacySpent(Record):
+    """Epsilon and delta of differential privacy, of one client's whole data."""
+
+    epsilon: float
+    delta: float
+    seeded: bool  # whether who knows the run's seed can draw the noise again
+    noise: Annotated[tuple[float, ...] | None, LEFT_OUT] = None  # found for the planned rounds; None: it was given
+
+    def describe(self) -> str:
+        """Return it in words; of seeded noise with whom it does not hold against."""
+        found = "" if self.noise is None else f", noise {' and '.join(f'{each:g}' for each in self.noise)} x clip"
+        return f"epsilon {self.epsilon:.2f} at delta {self.delta:g}{found}" + (f" ({SEEDED})" if self.seeded else "")

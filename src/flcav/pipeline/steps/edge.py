@@ -1,32 +1,161 @@
-"""The step of stage II of a task in a region, and of its further edge rounds."""
+"""Stage II of a task in a region, and its further edge rounds: the vehicles federate with their edge server."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+from flcav.federation.privacy import count_affordable
+from flcav.federation.rounds import BeforeRound, Schedule, federate
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.link import Runtime, open_runtime
+from flcav.federation.runtimes.metered import Account, Outage
+from flcav.federation.runtimes.processes import ClientProcesses
+from flcav.federation.state import FederationState
+from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedmd import FedMD
+from flcav.federation.trainable import Trainable, Weights
+from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
+from flcav.perception.client import TaskClient
 from flcav.perception.distillation import SharedSamples
+from flcav.perception.outcomes import score_network
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.arms import find_strategies
-from flcav.pipeline.engine import Work
-from flcav.pipeline.federations.network import DrivenRounds
-from flcav.pipeline.federations.outputs import send_region_network, share_frames
-from flcav.pipeline.federations.records import read_rounds
-from flcav.pipeline.federations.spent import PrivateRounds, find_budget_noise, plan_private_rounds, take_noise
+from flcav.pipeline.arms import Setting, find_strategies
+from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
-from flcav.pipeline.learning import load_stage_network
-from flcav.pipeline.planning.updates import follow_plan
+from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.plan.updates import follow_plan
+from flcav.pipeline.radio.driving import DrivenRounds
 from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
-from flcav.pipeline.stages.clients import make_clients
-from flcav.pipeline.stages.edge import EdgeFederation, federate_edge
-from flcav.pipeline.steps.budgets import open_region_book, read_entries, share_plan_budget
-from flcav.pipeline.steps.driving import drive_region
-from flcav.pipeline.steps.labelling import LabelledSamples, label_samples, learn_by_distillation, score_labels
-from flcav.pipeline.steps.settings import FederationSettings, RegionInputs
+from flcav.pipeline.steps.outline import Outline
+from flcav.pipeline.steps.regions import (
+    LabelledSamples,
+    drive_region,
+    label_samples,
+    learn_by_distillation,
+    score_labels,
+)
+from flcav.pipeline.steps.settings import (
+    FederationSettings,
+    RegionInputs,
+    make_step,
+    open_region_book,
+    read_entries,
+    share_plan_budget,
+)
+from flcav.pipeline.training.checkpoints import FederationCheckpoints, load_round_network
+from flcav.pipeline.training.learning import (
+    Learning,
+    describe_federation,
+    give_outputs,
+    load_stage_network,
+    make_clients,
+)
+from flcav.pipeline.training.messages import send_region_network, share_frames
+from flcav.pipeline.training.private_rounds import PrivateRounds, find_budget_noise, plan_private_rounds, take_noise
+from flcav.pipeline.training.records import read_rounds
+from flcav.pipeline.training.timing import time_clients
+
+
+@dataclass(frozen=True)
+class EdgeFederation:
+    """A region's federation: what its rounds begin with, and where they are kept."""
+
+    learning: Learning
+    network: Any  # that the rounds begin with
+    clients: Mapping[str, TaskClient]  # vehicles, by name
+    schedule: Schedule
+    strategy: Strategy
+    earlier: int  # rounds with the same vehicles before, which a privacy budget counts
+    book: Ledger
+    folder: Path  # of checkpoints, weights and ledger
+    report: Report
+    validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
+    shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
+    relabel: BeforeRound | None = None  # changes the clients' labels before each round
+
+    @property
+    def start_share(self) -> float:
+        """Return the share of the network's own weights in the result: none in further rounds."""
+        return 0.0 if self.earlier else self.learning.training.start_share
+
+    def score(self, round_: int) -> Mapping[str, float]:
+        """Return the scores, by region, of the network that a federation of so many rounds ends with."""
+        task, averaged = self.learning.task, self.learning.training.average_rounds
+        reached = load_round_network(task, self.network, self.folder, round_, averaged, self.start_share)
+        return {name: score_network(task, reached, own.data, own.vehicles) for name, own in self.validation.items()}
+
+    def afford(self, rules: Rules, rounds: int) -> int:
+        """Return as many of `rounds` as the privacy budget affords; without one all."""
+        if rules.privacy is None:
+            return rounds
+        return count_affordable(rules.privacy, rules.selection, [*self.clients], rounds, self.earlier)
+
+    def prepare(self, clients: Mapping[str, Trainable], where: Runtime | None, number: int, weights: Weights) -> None:
+        """Have the clients' samples labelled again before a round, where labels change, and hand them on to `where`."""
+        if self.relabel is not None:
+            self.relabel(number, weights)
+            if isinstance(where, ClientProcesses):
+                where.renew(clients)
+
+
+def federate_edge(
+    federation: EdgeFederation,
+    rules: Rules,
+    outages: Mapping[tuple[int, str], Outage] = {},
+    *,
+    processes: int = 1,
+    runtime: str = "embedded",
+    timed: bool = False,
+) -> tuple[float | None, ...]:
+    """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
+
+    A privacy budget may end it before the schedule's end. Vehicles train in so many `processes` of a `runtime` of
+    `RUNTIMES`, to the same weights; where that is `timed`, their times are kept, see `read_times`, unless nobody is to
+    know who was drawn. The vehicles that `outages` name by round are lost in it.
+    """
+    own, learning, state = federation, federation.learning, FederationState()
+    checkpoints = FederationCheckpoints(
+        learning.task,
+        own.folder,
+        own.book,
+        own.report,
+        {EDGE: state},
+        describe_federation(own.strategy, rules),
+        own.schedule.rounds,
+        rules.privacy,
+        own.score if own.validation else None,
+    )
+    start, done = checkpoints.resume(to_arrays(own.network))
+    checkpoints.keep_secrets({EDGE: rules.secret_parties([*own.clients])})
+    clients: Mapping[str, Trainable] = own.clients
+    if own.shared is not None:
+        clients = give_outputs(own.clients, own.shared, to_arrays(own.network))
+    if timed and not rules.hides_draws:
+        clients = time_clients(clients, own.folder)
+    with checkpoints.refusals(), open_runtime(runtime, clients, processes) as where:
+        if done < own.afford(rules, own.schedule.rounds):
+            federate(
+                clients,
+                start,
+                own.schedule,
+                Account(own.book, EDGE, learning.task.name, "wireless", outages),
+                strategy=own.strategy,
+                rules=rules,
+                state=state,
+                done=done,
+                earlier=own.earlier,
+                before_round=partial(own.prepare, clients, where),
+                on_round=checkpoints.save,
+                runtime=where,
+                distiller=own.shared,
+            )
+    return checkpoints.finish(own.network, learning.training.average_rounds, own.start_share)
 
 
 class EdgeSettings(FederationSettings):
@@ -168,3 +297,21 @@ def _drive(work: Work, settings: EdgeSettings, federation: EdgeFederation, plan:
     seeds = [own.schedule.work(number).seed for number in range(1, rounds + 1)]
     rules = follow_plan(settings.federation, plan, after_edge=bool(own.earlier))
     return drive_region(work, settings, own.learning, inputs, [*own.clients], own.earlier, rules, seeds)
+
+
+def list_edge_steps(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
+    """Yield stage II of an arm for a task, in each of its regions."""
+    averaged = any(LABEL_SOURCES[each.labels[task]].averaged for each in outline.settings.values())
+    for region in arm.regions:
+        name, inputs = outline.names.edge(arm.name, region, task), outline.inputs(arm, region, task, EDGE)
+        about = outline.federation(arm, task, EDGE)
+        settings = EdgeSettings(**about, inputs=inputs, scored=averaged, last=arm.stages[-1] == EDGE)
+        yield make_step(name, edge_step, settings, outline.vehicles[region])
+
+
+def list_more_edge_steps(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
+    """Yield the further edge rounds of an arm for a task, in each of its regions."""
+    for region in arm.regions:
+        name, inputs = outline.names.more_edge(arm.name, region, task), outline.inputs(arm, region, task, MORE_EDGE)
+        settings = EdgeSettings(**outline.federation(arm, task, MORE_EDGE), inputs=inputs)
+        yield make_step(name, edge_step, settings, outline.vehicles[region])

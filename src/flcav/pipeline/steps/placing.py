@@ -1,22 +1,23 @@
-"""Steps that register a region's errors and place its roadside sensors."""
+"""The steps that register a region's errors and place its roadside sensors."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from flcav.config import InputError
 from flcav.perception.errors import THRESHOLD, RegistersErrors, load_errors, save_errors
 from flcav.perception.tasks import task_named
-from flcav.pipeline.engine import Work
-from flcav.pipeline.federations.messages import release_network, report_errors
+from flcav.pipeline.arms import Setting
+from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.learning import load_stage_network
 from flcav.pipeline.poles import find_passed, find_sites, place_sensors, read_traces
-from flcav.pipeline.recipe import Budgets, Placement
-from flcav.pipeline.results.placement import ErrorRegistry
-from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.recipe import EDGE, Budgets, Placement
+from flcav.pipeline.results.plans import ErrorRegistry, Plan
 from flcav.pipeline.results.saved import ERRORS, LEDGER
 from flcav.pipeline.results.training import Pretrained
-from flcav.pipeline.steps.budgets import open_region_book, share_plan_budget
-from flcav.pipeline.steps.settings import StepSettings
+from flcav.pipeline.steps.outline import Outline
+from flcav.pipeline.steps.recording import make_recording
+from flcav.pipeline.steps.settings import StepSettings, make_step, open_region_book, share_plan_budget
+from flcav.pipeline.training.learning import load_stage_network
+from flcav.pipeline.training.messages import release_network, report_errors
 
 
 class ErrorsSettings(StepSettings):
@@ -86,3 +87,33 @@ def place_step(work: Work, settings: PlaceSettings) -> None:
     passed = find_passed(sites, edge or drive, settings.how.group_range_m)
     rule = (settings.how, sites, found, settings.weights, traces, settings.seed or 0, passed)
     place_sensors(settings.region, *rule).save(work.folder)
+
+
+def list_placements(outline: Outline, arm: Setting, region: str) -> Iterator[Step]:
+    """Yield the steps that register a region's errors, and that place an arm's sensors there."""
+    recipe, names = outline.recipe, outline.names
+    errors = {task: names.errors(arm.name, region, task) for task in arm.placement.tasks}
+    for task, name in errors.items():
+        settings = ErrorsSettings(
+            task=task,
+            region=region,
+            plan=names.plan(arm.name),
+            pretrained=names.pretrain(arm.name, task),
+            registry=names.recording(region, "registry", task),
+            vehicles=outline.vehicles,
+            budgets_mb=recipe.budgets_mb,
+        )
+        yield make_step(name, errors_step, settings)
+    recorded = recipe.regions[region].data is not None
+    if recorded:
+        yield make_recording(outline, region, EDGE, outline.placing_task)
+    settings = PlaceSettings(
+        region=region,
+        how=arm.placement,
+        errors=errors,
+        weights={task: recipe.tasks[task].weight for task in errors},
+        registry=names.recording(region, "registry", outline.placing_task),
+        edge=names.recording(region, EDGE, outline.placing_task) if recorded else None,
+        seed=recipe.seed if arm.placement.rule == "random" else None,
+    )
+    yield make_step(names.place(arm.name, region), place_step, settings)

@@ -1,6 +1,7 @@
-"""Steps that plan a run, and plan the rest of it anew."""
+"""The steps that plan a run, and plan the rest of it again after a stage."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -11,27 +12,28 @@ from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Link
 from flcav.network.plan import MessageSizes, Price
 from flcav.network.radio.links import RadioLinks
+from flcav.optimization.allocation.uploads import Asked, share_by_held, share_by_links
 from flcav.optimization.problem import Problem
 from flcav.perception.client import as_shared
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
-from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.engine import Work
-from flcav.pipeline.federations.prediction import link_drive, predict_air_s
+from flcav.pipeline.arms import PlanRule, Setting
+from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.planning.allocation import PlanRequest, PlanSettings, make_plan
-from flcav.pipeline.planning.exchanges import Held, Sensors, measure_exchange, measure_labels
-from flcav.pipeline.planning.histories import parse_history
-from flcav.pipeline.planning.stages import remake_plan
-from flcav.pipeline.planning.updates import UpdateForm, model_mb
-from flcav.pipeline.recipe import Budgets, FixedPlan, Limits
+from flcav.pipeline.plan.allocation import PlanRequest, PlanSettings, make_plan
+from flcav.pipeline.plan.exchanges import Held, Sensors, measure_exchange, measure_labels
+from flcav.pipeline.plan.replanning import remake_plan
+from flcav.pipeline.plan.updates import UpdateForm, model_mb, update_forms
+from flcav.pipeline.radio.driving import link_drive, measure_uplinks, predict_air_s
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, Budgets, FixedPlan, Limits
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import PROBLEM
 from flcav.pipeline.results.training import Watched, average_last
-from flcav.pipeline.steps.budgets import read_entries
-from flcav.pipeline.steps.settings import StepSettings
-from flcav.pipeline.steps.uploads import UploadSettings, plan_uploads
+from flcav.pipeline.steps.outline import Outline
+from flcav.pipeline.steps.settings import StepSettings, make_step, read_entries
+from flcav.pipeline.steps.testing import list_validations
+from flcav.pipeline.tables import parse_history, read_history
 from flcav.storage.files import write_json
 
 
@@ -66,6 +68,14 @@ class AirSettings(Config):
     range_m: float  # of the traffic that the unit's pole is chosen by [m]
     drives: Mapping[str, str]  # recording, by region
     recorded: tuple[str, ...]  # regions that are recorded datasets
+
+
+class UploadSettings(Config):
+    """Settings of planned uploads."""
+
+    regions: tuple[str, ...]  # that pretrain
+    network: NetworkSettings | None  # vehicles upload by what their uplinks carry; None: by the frames they have
+    range_m: float  # of the traffic that the unit's pole is chosen by [m]
 
 
 class FirstPlanSettings(StepSettings):
@@ -205,3 +215,142 @@ def replan_step(work: Work, settings: ReplanSettings) -> None:
             used[entry.link] += entry.bytes * (entry.direction == "up")
     used_mb = Price(*(used[link] / BYTES_PER_MB for link in LINKS))
     remake_plan(done, problem, settings.stage, reached, used_mb).save(work.folder)
+
+
+def plan_uploads(work: Work, plan: Plan, pools: Mapping[str, Sequence[str]], how: UploadSettings, seed: int) -> Plan:
+    """Return the plan with the number of samples that each vehicle uploads, of every task.
+
+    pools: by task the steps that recorded the pools, of the regions in `how`. With a `network` there, vehicles upload
+    by what their uplinks carry, as measured in the pools of the first task; otherwise by the frames they have.
+    """
+    opened = {
+        task: {region: Frames.open(work.inputs[step]) for region, step in zip(how.regions, steps, strict=True)}
+        for task, steps in pools.items()
+    }
+    asked = {}
+    for task, splits in opened.items():
+        held = {name: len(frames) for region, split in splits.items() for name, frames in list_frames(region, split)}
+        asked[task] = Asked(plan.tasks[task].samples, plan.tasks[task].sample_mb, held)
+    if how.network is None:
+        shares = {task: share_by_held(own) for task, own in asked.items()}
+    else:
+        mbps: dict[str, float] = {}
+        for region, split in next(iter(opened.values())).items():
+            found = measure_uplinks(region, split, how.network, how.range_m, seed)
+            mbps |= {name: found.get(name, 0.0) for own in asked.values() for name in own.held if _in(name, region)}
+        shares = share_by_links(asked, mbps)
+    return replace(plan, tasks={task: replace(own, uploads=shares[task]) for task, own in plan.tasks.items()})
+
+
+def list_frames(region: str, split: Frames) -> list[tuple[str, list[int]]]:
+    """Return the frames of each vehicle of a split, "region/vehicle", in the order of their names."""
+    found: dict[str, list[int]] = {}
+    for frame in split.vehicles:
+        found.setdefault(f"{region}/{split.data.keys[frame].agent}", []).append(frame)
+    return sorted(found.items())
+
+
+def _in(vehicle: str, region: str) -> bool:
+    return vehicle.startswith(f"{region}/")
+
+
+def make_plan_step(outline: Outline, arm: Setting) -> Step:
+    """Return the step that makes an arm's first plan."""
+    recipe, air, uploads = outline.recipe, _predict_air(outline), None
+    if recipe.uploads == "planned":
+        network, range_m = recipe.federation.network, recipe.placement.range_m
+        uploads = UploadSettings(regions=recipe.with_role("pretrain"), network=network, range_m=range_m)
+    held = _count_held(outline)
+    settings = FirstPlanSettings(
+        rule=arm.plan,
+        seed=recipe.seed,
+        budgets_mb=recipe.budgets_mb,
+        headroom=recipe.headroom,
+        limits=recipe.limits,
+        horizon_s=recipe.horizon_s,
+        edge_rounds_per_cloud_round=recipe.federation.edge_rounds_per_cloud_round,
+        tasks={task: _plan_task(outline, task) for task in recipe.tasks},
+        held=held,
+        speeds=_list_speeds(outline, held, timed=air is not None),
+        updates=tuple(update_forms(outline.settings.values())),
+        uploads=uploads,
+        air=air,
+    )
+    return make_step(outline.names.plan(arm.name), plan_step, settings)
+
+
+def make_replan_step(outline: Outline, stage: str) -> Step:
+    """Return the step that plans the rest of the run anew after stage I or II, from what the run itself reached."""
+    names, main = outline.names, outline.settings[MAIN]
+    tasks = [name for name, task in outline.recipe.tasks.items() if task.history is not None]
+    edges = {task: tuple(names.edge(MAIN, region, task) for region in main.regions) for task in tasks}
+    settings = ReplanSettings(
+        stage="edge" if stage == EDGE else "pretrain",
+        first=names.plan(MAIN),
+        plan=names.plan(MAIN, stage),
+        watched={task: tuple(step.name for step in list_validations(outline, stage, task)) for task in tasks},
+        books={task: (names.pretrain(MAIN, task), *(edges[task] if stage == EDGE else ())) for task in tasks},
+    )
+    return make_step(names.plan(MAIN, CLOUD if stage == EDGE else EDGE), replan_step, settings)
+
+
+def _plan_task(outline: Outline, task: str) -> PlannedTask:
+    own = outline.recipe.tasks[task]
+    return PlannedTask(
+        network=own.network,
+        weight=own.weight,
+        train_s=own.train_s,
+        fixed=own.plan,
+        history=None if own.history is None else read_history(task, own.history, outline.beside),
+        pools=tuple(outline.pools(task).values()),
+        labels=_label_task(outline, task),
+    )
+
+
+def _label_task(outline: Outline, task: str) -> LabelSettings | None:
+    """Return what the messages of labels are predicted from; None where no arm labels by the road average."""
+    arms = [arm for arm in outline.settings.values() if arm.central is None]
+    averaging = outline.averaging(task)
+    if not averaging:
+        return None
+    most = {"window_s": outline.window_s(task), "pose_graph": any(each.pose_graph for each in averaging)}
+    placements, own = [arm.placement for arm in arms], outline.recipe.placement
+    split = "registry" if task in (*own.tasks, outline.placing_task) else "validation"
+    return LabelSettings(
+        distillation=averaging[0].model_copy(update=most),  # the largest messages of any arm
+        drives={region: outline.names.recording(region, split, task) for region in outline.federating},
+        recorded=tuple(outline.recorded),
+        poles=tuple(sorted({pole for each in placements for pole in each.poles})),
+        count=max((each.count for each in placements if each.rule not in ("fixed", "none")), default=0),
+        traffic_m=own.range_m,
+        near_m=own.group_range_m,
+    )
+
+
+def _predict_air(outline: Outline) -> AirSettings | None:
+    """Return what a plan within a horizon predicts times on the network from; None without a network."""
+    recipe, network = outline.recipe, outline.recipe.federation.network
+    if network is None or recipe.horizon_s is None:
+        return None
+    names, task = outline.names, outline.placing_task
+    drives = {region: names.recording(region, "registry", task) for region in outline.federating}
+    recorded = tuple(outline.recorded)
+    return AirSettings(network=network, range_m=recipe.placement.range_m, drives=drives, recorded=recorded)
+
+
+def _count_held(outline: Outline) -> dict[str, dict[str, int]]:
+    """Return the vehicles of each federating region with their numbers of training frames."""
+    recipe, each = outline.recipe, outline.recipe.sized_splits.edge
+    return {
+        region: outline.recorded.get(region)
+        or {f"cav{number}": each.scenes * each.spins for number in range(recipe.vehicles(region))}
+        for region in outline.federating
+    }
+
+
+def _list_speeds(outline: Outline, held: dict[str, dict[str, int]], timed: bool) -> dict[str, float]:
+    """Return the speed of every vehicle, "region/vehicle"; empty where no region gives any, and no message is timed."""
+    speeds = {region: outline.recipe.speeds(region) for region in held}
+    if not timed and not any(speeds.values()):
+        return {}
+    return {f"{region}/{cav}": speeds[region].get(cav, 1.0) for region, own in held.items() for cav in own}

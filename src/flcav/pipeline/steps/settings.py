@@ -1,15 +1,19 @@
-"""Settings of steps: those that the steps of training have in common."""
+"""Settings that several kinds of steps have in common, and the shares of tasks and regions in the budgets."""
 
 from collections.abc import Callable, Mapping
+
+import numpy as np
 
 from flcav.config import Config
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors
+from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.perception.tasks import task_named
-from flcav.pipeline.engine import Step
-from flcav.pipeline.learning import Learning
-from flcav.pipeline.recipe import Budgets, Federation
-from flcav.pipeline.sizes import Training
+from flcav.pipeline.engine import Step, Work
+from flcav.pipeline.recipe import Budgets, Federation, Training
+from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.saved import LEDGER
+from flcav.pipeline.training.learning import Learning
 
 
 class StepSettings(Config):
@@ -22,7 +26,7 @@ class StepSettings(Config):
 
 
 class LearningSettings(Config):
-    """Settings of a task's training, from which `flcav.pipeline.learning.Learning` is made."""
+    """Settings of a task's training, from which `flcav.pipeline.training.learning.Learning` is made."""
 
     task: str
     network: str | None  # name of the configuration; None: the task's first
@@ -73,3 +77,41 @@ class FederationSettings(StepSettings):
 def make_step(name: str, run: Callable[..., None], settings: StepSettings, workers: int = 1) -> Step:
     """Return the step that calls `run` with its settings, after those that they name, on so many workers at most."""
     return Step(name, run, {"settings": settings}, tuple(dict.fromkeys(settings.needs)), workers=workers)
+
+
+def share_budget(budget: Budget, planned: Mapping[str, tuple[float, float]], task: str) -> Budget:
+    """Return a task's share of both budgets, in proportion to its planned traffic [MB wireless, wireline].
+
+    Shares are rounded down to bytes, so that their sum never exceeds the budget.
+    """
+    parts = []
+    for link, whole_mb in enumerate((budget.wireless_mb, budget.wireline_mb)):
+        total = sum(each[link] for each in planned.values())
+        share = planned[task][link] / total if total else 1 / len(planned)
+        parts.append(whole_mb if len(planned) == 1 else np.floor(share * whole_mb * 1e6) / 1e6)
+    return Budget(*map(float, parts))
+
+
+def share_plan_budget(plan: Plan, budgets_mb: Budgets, task: str) -> Budget:
+    """Return the share of both budgets that a plan gives to a task."""
+    planned = {name: (own.wireless_mb, own.wireline_mb) for name, own in plan.tasks.items()}
+    return share_budget(Budget(budgets_mb.wireless, budgets_mb.wireline), planned, task)
+
+
+def region_budget(stage_one: Ledger, vehicles: Mapping[str, int], region: str) -> Budget:
+    """Return the budget of a region's stage II: its share, by vehicles, of the wireless budget that stage I left."""
+    share = vehicles[region] / sum(vehicles.values())
+    return Budget(share * stage_one.left_mb("wireless"), 0.0)
+
+
+def read_entries(work: Work, *steps: str) -> list[LedgerEntry]:
+    """Return the ledger entries of several steps, one after another."""
+    return [entry for step in steps for entry in Ledger.load(work.inputs[step] / LEDGER).entries]
+
+
+def open_region_book(work: Work, share: Budget, pretrained: str, vehicles: Mapping[str, int], region: str) -> Ledger:
+    """Return an empty ledger of a region's stage II; `share`: the task's in both budgets, before stage I.
+
+    `pretrained` is the step of stage I, `vehicles` the number of each federating region.
+    """
+    return Ledger(region_budget(Ledger(share, read_entries(work, pretrained)), vehicles, region))

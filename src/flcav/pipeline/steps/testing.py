@@ -1,20 +1,29 @@
-"""Steps that test networks, validate rounds and look at a sweep before and after."""
+"""The steps that test networks, validate rounds, and look at a sweep before and after."""
+
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
 from flcav.config import InputError
+from flcav.geometry import Boxes
+from flcav.perception.metrics.matching import assign_targets, on_neutral
+from flcav.perception.objects.predict import detect_in
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.truth import FrameTruth, asked_of
 from flcav.perception.outcomes import as_measurable, compute_interval, compute_measure, score_network
 from flcav.perception.tasks import task_named
-from flcav.pipeline.engine import Work
-from flcav.pipeline.federations.rounds import load_round_network
+from flcav.pipeline.arms import Setting
+from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.learning import load_stage_network
-from flcav.pipeline.recipe import PRETRAIN
+from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.saved import OUTCOMES
-from flcav.pipeline.results.tests import Tested
+from flcav.pipeline.results.tests import SweepComparison, SweepDetections, Tested
 from flcav.pipeline.results.training import Round, StageResult, Watched
-from flcav.pipeline.steps.before_after import detect_before_after
-from flcav.pipeline.steps.settings import StepSettings
+from flcav.pipeline.steps.outline import Outline
+from flcav.pipeline.steps.settings import StepSettings, make_step
+from flcav.pipeline.training.checkpoints import load_round_network
+from flcav.pipeline.training.learning import load_stage_network
 from flcav.statistics.estimates import Estimate
 
 
@@ -111,3 +120,81 @@ def look_step(work: Work, settings: LookSettings) -> None:
     """Detect objects in one test sweep with the networks of two steps."""
     before, after = work.inputs[settings.before], work.inputs[settings.after]
     detect_before_after(before, after, Frames.open(work.inputs[settings.frames])).save(work.folder)
+
+
+SHOWN_SCORE = 0.3  # lowest score of a detection that is shown
+
+
+def detect_before_after(before: Path, after: Path, split: Frames) -> SweepComparison:
+    """Return the detections of two networks in the test frame with the most targets.
+
+    `before`, `after`: folders of the steps that trained the networks. Detections score `SHOWN_SCORE` or more.
+    """
+    networks = {name: load_stage_network(OBJECTS, folder) for name, folder in (("before", before), ("after", after))}
+    config = networks["before"].config
+    truths = [asked_of(split.data.frame(i), config) for i in split.vehicles]
+    best = int(np.argmax([len(truth.targets) for truth in truths]))
+    frame, truth = split.data.frame(split.vehicles[best]), truths[best]
+    seen = {
+        name: _matched(detect_in(network, [frame], score_threshold=SHOWN_SCORE)[0], truth)
+        for name, network in networks.items()
+    }
+    return SweepComparison(split.vehicles[best], _rows(truth.targets), seen["before"], seen["after"])
+
+
+def _matched(found: Boxes, truth: FrameTruth) -> SweepDetections:
+    """Match detections to targets at IoU 0.5; detections of neutral objects are left out."""
+    target = assign_targets(found, truth.targets, 0.5)
+    counts = (target >= 0) | ~on_neutral(found, truth.neutral)
+    hits = target[counts]
+    reached = np.isin(np.arange(len(truth.targets)), hits)
+    return SweepDetections(_rows(found[counts]), tuple((hits >= 0).tolist()), tuple(reached.tolist()))
+
+
+def _rows(boxes: Boxes) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, boxes.array().tolist()))
+
+
+LOOK = "look"
+
+
+def list_tests(outline: Outline, arm: Setting) -> Iterator[Step]:
+    """Yield the tests of an arm; of the run itself also the look at a sweep, and the validations of all stages."""
+    names = outline.names
+    for stage, region, task in outline.tested(arm):
+        trained, frames = names.stage(arm.name, stage, region, task), names.recording(region, "test", task)
+        about = {"task": task, "region": region, "trained": trained, "frames": frames, "seed": outline.recipe.seed}
+        for model in outline.models(arm, stage):
+            yield make_step(names.test(trained, region, model), test_step, TestSettings(**about, model=model))
+    if arm.name == MAIN:
+        yield from _list_looks(outline, arm)
+        for stage in (PRETRAIN, *arm.stages):
+            for task in outline.recipe.tasks:
+                yield from list_validations(outline, stage, task)
+
+
+def list_validations(outline: Outline, stage: str, task: str) -> Iterator[Step]:
+    """Yield the validations of a stage of the run itself in the federating regions."""
+    names, main = outline.names, outline.settings[MAIN]
+    for region in main.regions:
+        trained, training = names.stage(MAIN, stage, region, task), main.training[task]
+        settings = RoundsSettings(
+            task=task,
+            region=region,
+            stage=stage,
+            start=names.pretrain(MAIN, task),
+            trained=trained,
+            frames=names.recording(region, "validation", task),
+            averaged=training.average_rounds,
+            share=training.start_share if stage == EDGE else 0.0,
+        )
+        yield make_step(names.rounds(trained, region), rounds_step, settings)
+
+
+def _list_looks(outline: Outline, main: Setting) -> Iterator[Step]:
+    """Yield the look at a sweep of the first region before and after the stages; none where no objects are learned."""
+    if OBJECTS.name in outline.recipe.tasks:
+        names, region, stage = outline.names, main.regions[0], main.stages[-1]
+        before, after = (names.stage(MAIN, each, region, OBJECTS.name) for each in (PRETRAIN, stage))
+        frames = names.recording(region, "test", OBJECTS.name)
+        yield make_step(LOOK, look_step, LookSettings(before=before, after=after, frames=frames))

@@ -14,23 +14,22 @@ from flcav.geometry import Boxes
 from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
-from flcav.pipeline.analysis.arm_costs import list_arm_costs
 from flcav.pipeline.analysis.caveats import PLACED_BARE
+from flcav.pipeline.analysis.costs import list_arm_costs, list_home_costs
 from flcav.pipeline.analysis.findings import WORDS
-from flcav.pipeline.analysis.home import list_home_costs
 from flcav.pipeline.arms import Names, resolve_settings
-from flcav.pipeline.federations.network import CLOCK
-from flcav.pipeline.federations.records import list_rounds
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.graph.testing import LOOK
 from flcav.pipeline.labels.sources import choose_labels
+from flcav.pipeline.radio.driving import CLOCK
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results.placement import Placed
+from flcav.pipeline.results.plans import Placed
 from flcav.pipeline.results.run import ArmCost, LinkUse, Run
 from flcav.pipeline.results.saved import ERRORS
-from flcav.pipeline.results.spending import TOGETHER
 from flcav.pipeline.results.tests import SweepComparison, SweepDetections
+from flcav.pipeline.results.training import TOGETHER
 from flcav.pipeline.running import WORK
+from flcav.pipeline.steps.testing import LOOK
+from flcav.pipeline.training.records import list_rounds
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.report.charts.runs import STAGES, Row

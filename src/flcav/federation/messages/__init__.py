@@ -1,0 +1,1 @@
+"""Messages of a federation: their records, their encoding, what is asked, what is accepted, and what arrives."""

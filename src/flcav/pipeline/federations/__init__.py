@@ -1,1 +1,0 @@
-"""Federations of a run: stage II alone, checkpoints, messages and network of the rounds, their records."""

@@ -1,0 +1,1 @@
+"""Plans under both uplink budgets: before a run and between its stages."""

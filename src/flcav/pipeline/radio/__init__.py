@@ -1,0 +1,1 @@
+"""Radio network of a run's vehicles."""

@@ -1,0 +1,208 @@
+"""Centralised training: stage I of a task, with its uploads, and training on ground truth in place of stage II.
+
+The latter is a control that takes as many optimiser steps as stage II.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flcav.interface.progress import Report
+from flcav.network.ledger import Ledger
+from flcav.perception.outcomes import score_network
+from flcav.perception.task import Task
+from flcav.perception.training import Checkpointing, Validation, train, train_steps
+from flcav.perception.weights import save_network
+from flcav.pipeline.arms import Setting
+from flcav.pipeline.engine import Step, Work
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.labels.pseudo_labels import fit_label_threshold
+from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.recipe import CENTRAL, PRETRAIN, Budgets, Role
+from flcav.pipeline.results.plans import Plan
+from flcav.pipeline.results.saved import LEDGER, WEIGHTS
+from flcav.pipeline.results.training import Pretrained, StageResult, Validated
+from flcav.pipeline.steps.outline import Outline
+from flcav.pipeline.steps.planning import list_frames
+from flcav.pipeline.steps.regions import select_group
+from flcav.pipeline.steps.settings import LearningSettings, RegionInputs, StepSettings, make_step, share_plan_budget
+from flcav.pipeline.training.checkpoints import LAST
+from flcav.pipeline.training.learning import Learning, load_stage_network
+from flcav.pipeline.training.messages import choose_planned_uploads, choose_uploads, upload_samples
+from flcav.statistics.streams import derive_seed
+
+CHECKPOINT, ROUND = "checkpoint.pt", LAST
+VALIDATIONS, APART = 10, 5  # during pretraining; at least so many steps apart
+
+
+def pretrain(
+    learning: Learning, samples: Sequence[Any], validation: Sequence[Frames], folder: Path, report: Report
+) -> tuple[Validated, ...]:
+    """Pretrain with the task's schedule of the learning rate; return the validations on the way.
+
+    Writes the weights of the last step. An interrupted training resumes after its last validation.
+    """
+    task, steps = learning.task, learning.training.steps
+    every = max(steps // VALIDATIONS, min(APART, steps))
+    network = learning.build_network()
+    history = train(
+        task,
+        network,
+        samples,
+        steps=steps,
+        batch=learning.batch,
+        seed=derive_seed(learning.seed, PRETRAIN),
+        checkpointing=Checkpointing(folder / CHECKPOINT, every),
+        validation=Validation(lambda now: mean_score(task, now, validation), every),
+        progress=report,
+    )
+    save_network(task, network, folder / WEIGHTS)
+    (folder / CHECKPOINT).unlink()
+    means = history.losses[: every * len(history.scores)].reshape(-1, every).mean(axis=1)
+    return tuple(
+        Validated(every * number, float(loss), float(score))
+        for number, (loss, score) in enumerate(zip(means, history.scores, strict=True), start=1)
+    )
+
+
+def mean_score(task: Task, network: Any, splits: Sequence[Frames]) -> float:
+    """Return the task's measure on the vehicles' frames, as the mean over `splits`."""
+    return float(np.mean([score_network(task, network, split.data, split.vehicles) for split in splits]))
+
+
+def train_centrally(
+    learning: Learning, network: Any, samples: Sequence[Any], rounds: int, clients: int, name: str
+) -> tuple[float, ...]:
+    """Train centrally, in place, for as many steps as a federation of `clients` takes in `rounds`, at the same rates.
+
+    Returns the mean loss of each round.
+    """
+    schedule = learning.schedule(rounds, learning.training.local_steps * clients, "more", name)
+    losses = []
+    for round_ in range(1, rounds + 1):
+        work = schedule.work(round_)
+        losses.append(
+            train_steps(
+                learning.task,
+                network,
+                samples,
+                steps=work.steps,
+                batch=learning.batch,
+                learning_rate=work.learning_rate,
+                seed=work.seed,
+            )
+        )
+    return tuple(losses)
+
+
+class PretrainSettings(StepSettings):
+    """Settings of stage I of a task."""
+
+    learning: LearningSettings
+    plan: str
+    pools: Mapping[str, str]  # recordings of the candidates for upload, by region
+    validation: tuple[str, ...]  # recordings of the frames that it is validated on
+    budgets_mb: Budgets  # of the run
+    upload_seed: int  # of the draw of uploads, the same in retrainings
+    thresholded: bool  # whether detections serve as labels, from some score on
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Return the names of the steps whose results it takes."""
+        return (self.plan, *self.pools.values(), *self.validation)
+
+
+def pretrain_step(work: Work, settings: PretrainSettings) -> None:
+    """Run stage I of a task: upload the planned samples, train on them, fix the score threshold of pseudo-labels."""
+    task, learning = settings.learning.task, settings.learning.resolve()
+    plan = Plan.load(work.inputs[settings.plan])
+    opened = {region: Frames.open(work.inputs[step]) for region, step in settings.pools.items()}
+    watched = [Frames.open(work.inputs[step]) for step in settings.validation]
+    uploads = plan.tasks[task].uploads
+    if uploads is None:
+        pools = {region: split.vehicles for region, split in opened.items()}
+        chosen = choose_uploads(pools, plan.tasks[task].samples, settings.upload_seed)
+    else:
+        held = {region: dict(list_frames(region, split)) for region, split in opened.items()}
+        chosen = choose_planned_uploads(held, uploads, settings.upload_seed)
+    book, samples = Ledger(share_plan_budget(plan, settings.budgets_mb, task)), list[Any]()
+    for region, frames in chosen.items():
+        if frames:
+            received = upload_samples(book, learning.task, learning.config, region, opened[region], frames)
+            samples += [received[number] for number in range(len(received))]  # in memory: each is drawn many times
+    book.save(work.folder / LEDGER)
+    validated = pretrain(learning, samples, watched, work.folder, work.report)
+    trained = load_stage_network(learning.task, work.folder)
+    Pretrained(
+        task=task,
+        network=learning.network or next(iter(learning.task.configurations)),
+        uploaded=chosen,
+        validated=validated,
+        steps=learning.training.steps,
+        threshold=fit_label_threshold(trained, watched) if settings.thresholded else None,
+    ).save(work.folder)
+
+
+def list_pretraining(outline: Outline, arm: Setting) -> Iterator[Step]:
+    """Yield stage I of an arm, for each task."""
+    recipe, names = outline.recipe, outline.names
+    for task in recipe.tasks:
+        kinds = [LABEL_SOURCES[each.labels[task]] for each in outline.settings.values()]
+        settings = PretrainSettings(
+            learning=outline.learning(arm, task),
+            plan=names.plan(arm.name),
+            pools=outline.pools(task),
+            validation=tuple(names.recording(region, "validation", task) for region in recipe.with_role("pretrain")),
+            budgets_mb=recipe.budgets_mb,
+            upload_seed=recipe.seed,
+            thresholded=any(kind.from_detections for kind in kinds),
+        )
+        yield make_step(names.pretrain(arm.name, task), pretrain_step, settings)
+
+
+class CentralSettings(StepSettings):
+    """Settings of centralised training for a region."""
+
+    learning: LearningSettings
+    inputs: RegionInputs
+    vehicles: int  # of the region, whose local steps it takes
+    source: Role  # pretrain: the uploaded samples; federate: the training frames of the region's vehicles
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Return the names of the steps whose results it takes."""
+        return self.inputs.needs
+
+
+def central_step(work: Work, settings: CentralSettings) -> None:
+    """Continue training centrally on ground truth, for as many optimiser steps as stage II takes in the region."""
+    learning, inputs = settings.learning.resolve(), settings.inputs
+    trained = load_stage_network(learning.task, work.inputs[inputs.pretrain])
+    if settings.source == "pretrain":
+        uploaded = Pretrained.load(work.inputs[inputs.pretrain]).uploaded
+        parts = [(Frames.open(work.inputs[inputs.pools[name]]), frames) for name, frames in uploaded.items()]
+    else:
+        split = Frames.open(work.inputs[inputs.frames])
+        parts = [(split, select_group(work, split, inputs))]
+    each = (learning.task.samples(split.data, trained.config, frames) for split, frames in parts)
+    samples = [own[number] for own in each for number in range(len(own))]  # in memory: each is drawn many times
+    rounds = Plan.load(work.inputs[inputs.plan]).tasks[settings.learning.task].edge_rounds
+    losses = train_centrally(learning, trained, samples, rounds, settings.vehicles, settings.source)
+    save_network(learning.task, trained, work.folder / WEIGHTS)
+    about = (CENTRAL, settings.learning.task, inputs.region, rounds, len(samples), 1, ())
+    StageResult(*about, losses).save(work.folder)
+
+
+def list_central_steps(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
+    """Yield the centralised training of an arm for a task, in each of its regions."""
+    for region in arm.regions:
+        inputs = outline.inputs(arm, region, task, CENTRAL)
+        settings = CentralSettings(
+            learning=outline.learning(arm, task),
+            inputs=inputs.model_copy(update={"pools": outline.pools(task)}),
+            vehicles=outline.vehicles[region],
+            source=arm.central or "pretrain",
+        )
+        yield make_step(outline.names.central(arm.name, region, task), central_step, settings)

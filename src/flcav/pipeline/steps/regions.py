@@ -1,0 +1,127 @@
+"""A region's vehicles in the steps of stages II and III: their labelled samples, and the radio of their rounds."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from flcav.federation.rules import RegionalModels, Rules
+from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.strategies import exchanges_more
+from flcav.fusion.distillation import Distillation
+from flcav.network.clock.records import save_rounds
+from flcav.network.ledger import Ledger
+from flcav.perception.objects.distillation.loss import DistillationTerms, DistilledObjects
+from flcav.perception.weights import to_arrays
+from flcav.pipeline.engine import Work
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.labels.pseudo_labels import annotated_samples, pseudo_label_samples, select_frames_near
+from flcav.pipeline.labels.quality import measure_labels, read_history
+from flcav.pipeline.labels.road_average import RoadAverageLabels
+from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.poles import find_sites
+from flcav.pipeline.radio.driving import CLOCK, DrivenRounds, Fleet, drive_rounds, link_scenes
+from flcav.pipeline.results.plans import Placed
+from flcav.pipeline.results.training import LabelQuality, Pretrained
+from flcav.pipeline.steps.settings import FederationSettings, RegionInputs
+from flcav.pipeline.training.learning import Learning, load_stage_network
+
+
+@dataclass(frozen=True)
+class LabelledSamples:
+    """The labelled samples of a region's vehicles."""
+
+    samples: Mapping[str, Sequence[Any]]  # by "region/vehicle"
+    poles: tuple[int, ...]  # whose sensors contributed labels
+
+
+def select_group(work: Work, split: Frames, inputs: RegionInputs) -> tuple[int, ...]:
+    """Return the vehicles' frames near a roadside sensor of any arm, so that all arms have the same frames.
+
+    Without such frames the region has no labels from the road, and all frames are those of the group.
+    """
+    return _select_near(work, split, inputs) or split.vehicles
+
+
+def _select_near(work: Work, split: Frames, inputs: RegionInputs) -> tuple[int, ...]:
+    placed = [Placed.load(work.inputs[step]) for step in inputs.sites]
+    numbers = {pole for each in placed for pole in each.chosen}
+    if not numbers:
+        return ()
+    sites = find_sites(split, split if inputs.recorded else None)
+    return select_frames_near(split, sites.position[np.isin(sites.number, list(numbers)), :2], inputs.group_range_m)
+
+
+def label_samples(
+    work: Work, settings: FederationSettings, inputs: RegionInputs, book: Ledger, stage: str
+) -> LabelledSamples:
+    """Return the labelled samples of a region's vehicles; messages enter `book`, under `stage`.
+
+    Labels "road-average" are to be renewed: in stage II before each round; after it, where `inputs` has a stage II to
+    go on from, once, and vehicles still have what road sensors saw.
+    """
+    task = settings.learning.resolve().task
+    split, kind = Frames.open(work.inputs[inputs.frames]), LABEL_SOURCES[settings.labels]
+    frames, frozen = select_group(work, split, inputs), load_stage_network(task, work.inputs[inputs.pretrain])
+    if not kind.from_detections:
+        return LabelledSamples(annotated_samples(task, frozen.config, split, frames, inputs.region), ())
+    near = kind.from_poles and _select_near(work, split, inputs)
+    poles = Placed.load(work.inputs[inputs.place]).chosen if near else ()
+    threshold = Pretrained.load(work.inputs[inputs.pretrain]).threshold
+    assert threshold is not None  # fixed wherever labels come from detections
+    if settings.distillation is not None:
+        folder = work.folder if inputs.edge is None else None
+        where: Any = (split, frames, poles, inputs.region, book, stage, folder, work.report)
+        averaged = RoadAverageLabels(settings.distillation, settings.navigation, frozen.config, threshold, *where)
+        if inputs.edge is None:
+            averaged.send_views()
+        return LabelledSamples(averaged, poles)
+    first = book if inputs.edge is None else None  # later labels are those of stage II
+    where = (split, frames, poles, inputs.region, work.report, first, kind.trained, settings.navigation)
+    return LabelledSamples(pseudo_label_samples(frozen, threshold, *where), poles)
+
+
+def learn_by_distillation(learning: Learning, how: Distillation) -> Learning:
+    """Return the settings of a training whose loss is that of federated distillation."""
+    on = ("regression" in how.terms, "contrastive" in how.terms)
+    return replace(learning, task=DistilledObjects(DistillationTerms(*on, how.contrastive_weight, how.temperature)))
+
+
+def score_labels(
+    work: Work, inputs: RegionInputs, config: Any, samples: Mapping[str, Sequence[Any]]
+) -> tuple[LabelQuality, ...]:
+    """Return the quality of the labels of a stage II before each round; of labels that stay, before the first."""
+    if isinstance(samples, RoadAverageLabels):
+        return read_history(work.folder).rounds
+    split = Frames.open(work.inputs[inputs.frames])
+    return (measure_labels(1, split, select_group(work, split, inputs), inputs.region, samples, config),)
+
+
+def drive_region(
+    work: Work,
+    settings: FederationSettings,
+    learning: Learning,
+    inputs: RegionInputs,
+    clients: Sequence[str],
+    earlier: int,
+    rules: Rules,
+    seeds: Sequence[int],
+) -> DrivenRounds:
+    """Return what the radio network makes of a region's rounds by `rules`, and write their clock.
+
+    `seeds` are those of the rounds, which follow `earlier` ones. Without a network no client is lost.
+    """
+    how, network = settings.federation, settings.federation.network
+    if network is None:
+        return DrivenRounds(rules, {}, ())
+    weights = to_arrays(learning.build_network())
+    both = isinstance(how.personal, RegionalModels)  # the region's and the global model go down together
+    down = update_bytes(weights, exchanging=both)
+    up = update_bytes(weights, how.upload, exchanging=exchanges_more(how.strategy))
+    fleet = Fleet(inputs.region, tuple(clients), down, up, settings.train_s, settings.speeds)
+    split, placed = Frames.open(work.inputs[inputs.frames]), Placed.load(work.inputs[inputs.place])
+    scenes = link_scenes(split, placed, network, earlier + len(seeds), learning.seed)
+    driven = drive_rounds(fleet, scenes, network, rules, seeds, earlier)
+    save_rounds(driven.records, work.folder / f"{CLOCK}-{inputs.region}.parquet")
+    return driven
