@@ -105,7 +105,7 @@ def test_plans_that_were_made_anew_are_told() -> None:
     told["plans"] = (first, Plan("joint", {"objects": later}, "pretrain", {"objects": 0.471}))
     text = Page(render(told, {})).text
     assert "objects after stage I 0.471 320 6 5 216.0 128.1 0.530" in text
-    assert "made anew between stages" in text
+    assert "updated between stages" in text
 
 
 def test_values_are_escaped() -> None:
@@ -131,7 +131,7 @@ def test_missing_results_are_not_passed_over() -> None:
 def test_plans_after_rounds_and_the_uploads_of_vehicles_are_on_the_page_where_there_are_any() -> None:
     run = made_up_run.run()
     plain = " ".join(Page(render(page(run), PICTURES)).words)
-    assert "made anew after each round" not in plain
+    assert "updated after each round" not in plain
     own = run.arms[MAIN].plan.tasks["objects"]
     made = RoundPlan(2, 0.4567, Price(9.4, 0.0), Price(7.7, 0.0), replace(own, edge_rounds=17))
     stage = StageResult(EDGE, "objects", "grid", 17, 9, 4, (), plans=(made,))
@@ -141,6 +141,7 @@ def test_plans_after_rounds_and_the_uploads_of_vehicles_are_on_the_page_where_th
     told = " ".join(" ".join(words).split())
     assert "objects II grid 2 0.457 9.4 7.7 0.0 0.0 17 3 0.530" in told
     assert "suburb/cav0 211 suburb/cav1 109" in told
+    assert "updated after each round" in told
 
 
 def test_a_placed_pole_is_told_with_what_it_covers_and_with_its_ties() -> None:
