@@ -185,7 +185,8 @@ def describe_limits(aims: Collection[Claim], effect: float) -> list[str]:
         return []
     seeds = plan_seeds(effect, widest, LEVEL / len(aims))
     count = f"more than {MOST_SEEDS}" if seeds is None else seeds
-    return [f"At the largest of these standard deviations it takes {count} seeds to detect a deviation of {effect} from an aim."]
+    at = "At the largest of these standard deviations"
+    return [f"{at}, detecting a deviation of {effect} from an aim takes {count} seeds."]
 
 
 def list_counts(counts: Sequence[int]) -> str:
