@@ -1,4 +1,7 @@
-"""Write docs/commands.md, every command with its options and an example that is run: python tools/commands_page.py."""
+"""Write docs/commands.md, a list of the commands, and a page of each group of them: python tools/commands_page.py.
+
+A group's page, in docs/commands/, has its commands with their options and an example that is run.
+"""
 
 import os
 import re
@@ -20,20 +23,22 @@ from flcav.cli.main import app
 from flcav.storage.markdown import format_table
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "commands.md"
+INDEX = ROOT / "docs" / "commands.md"
+GROUPS = INDEX.with_suffix("")  # the folder of the groups' pages
 SHOWN = Path(__file__).with_name("commands.yaml")
 WIDEST = 1000  # pixels of a picture
 INTRO = """\
 # Commands
 
-Every command of `flcav` with its arguments and options, and an example with its output. `flcav COMMAND --help`
-prints the same descriptions. The exit code is 0 for success, 2 for bad input (with one sentence about it on stderr),
-130 after Ctrl-C, and 1 for any other failure. `--json` prints one JSON object and nothing else. Terms are in the
-[glossary](glossary.md).
-
-This page is made by `python tools/commands_page.py`, which runs the examples of `tools/commands.yaml` one after the
-other in one folder, with a copy of the repository's `recipes/` in it. In their output `...` stands for the folder
-that flcav is installed in.
+The commands of `flcav` by group. The page of a group shows the arguments and options of its commands, and an example
+with its output. `flcav COMMAND --help` prints the same descriptions. The exit code is 0 for success, 2 for bad input
+(with one sentence about it on stderr), 130 after Ctrl-C, and 1 for any other failure. `--json` prints one JSON object
+and nothing else. Terms are in the [glossary](glossary.md).
+"""
+MADE = """\
+These pages are made by `python tools/commands_page.py`, which runs the examples of `tools/commands.yaml` in the order
+of the pages in one folder, with a copy of the repository's `recipes/` in it: an example may read files of an earlier
+one. In their output `...` stands for the folder that flcav is installed in.
 """
 
 
@@ -51,9 +56,14 @@ class Section(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     title: str
-    said: str
+    said: str  # with links as from the group's page
     files: Mapping[str, str] = {}
     commands: Mapping[str, Example]
+
+    @property
+    def slug(self) -> str:
+        """Return the name of the group's page without its suffix."""
+        return self.title.lower().replace(" ", "-")
 
 
 def sections() -> tuple[Section, ...]:
@@ -70,30 +80,52 @@ def commands_of(command: click.Command, words: tuple[str, ...] = ()) -> Iterator
         yield from commands_of(each, (*words, name))
 
 
-def page(printed: Mapping[str, str]) -> str:
-    """Return the page; `printed` holds the example of each command, as a block of a console."""
+def pages(printed: Mapping[str, str]) -> dict[Path, str]:
+    """Return the text of every page by its path; `printed` has the console block of each command."""
     known = dict(commands_of(typer.main.get_command(app)))
+    groups = {GROUPS / f"{section.slug}.md": group_page(section, known, printed) for section in sections()}
+    return {INDEX: index_page(known), **groups}
+
+
+def index_page(known: Mapping[str, click.Command]) -> str:
+    """Return the list of all commands by group, each with the first sentence of its help."""
     parts = [INTRO]
     for section in sections():
-        parts.append(f"## {section.title}\n\n{section.said}\n")
-        parts += (f"`{name}`:\n\n```yaml\n{text}```\n" for name, text in section.files.items() if name.endswith("yaml"))
-        parts += (f"`{name}`:\n\n```csv\n{text}```\n" for name, text in section.files.items() if name.endswith("csv"))
-        for name, example in section.commands.items():
-            shown = f"![What flcav {name} draws]({picture_of(name)})\n" if example.picture else ""
-            parts += filter(None, (described(name, known[name], printed[name]), shown))
+        rows = (
+            (f"[flcav {name}]({GROUPS.name}/{section.slug}.md#flcav-{name.replace(' ', '-')})", summary(known[name]))
+            for name in section.commands
+        )
+        parts.append(f"## {section.title}\n\n{format_table(('command', 'description'), rows)}\n")
+    listed = "\n".join(f"{section.title} <{GROUPS.name}/{section.slug}>" for section in sections())
+    return "\n".join((*parts, MADE, f"```{{toctree}}\n:hidden:\n{listed}\n```\n"))
+
+
+def summary(command: click.Command) -> str:
+    """Return the first paragraph of a command's help."""
+    return " ".join((command.help or "").split("\n\n")[0].split())
+
+
+def group_page(section: Section, known: Mapping[str, click.Command], printed: Mapping[str, str]) -> str:
+    """Return the page of a group of commands."""
+    parts = [f"# Commands: {section.title.lower()}\n\n{section.said}\n"]
+    parts += (f"`{name}`:\n\n```yaml\n{text}```\n" for name, text in section.files.items() if name.endswith("yaml"))
+    parts += (f"`{name}`:\n\n```csv\n{text}```\n" for name, text in section.files.items() if name.endswith("csv"))
+    for name, example in section.commands.items():
+        shown = f"![What flcav {name} draws]({picture_of(name).name})\n" if example.picture else ""
+        parts += filter(None, (described(name, known[name], printed[name]), shown))
     return "\n".join(parts)
 
 
 def described(name: str, command: click.Command, printed: str) -> str:
-    """Return the part of the page about a command."""
+    """Return the part of a page about a command."""
     said = "\n\n".join(" ".join(each.split()) for each in (command.help or "").split("\n\n"))
     options = format_table(("option", "description", "default"), map(row, command.params))
-    return f"### flcav {name}\n\n{said}\n\n{options}\n\n{printed}\n"
+    return f"## flcav {name}\n\n{said}\n\n{options}\n\n{printed}\n"
 
 
-def picture_of(name: str) -> str:
-    """Return where the picture of a command's example lies, beside the page."""
-    return f"commands/{name.replace(' ', '-')}.png"
+def picture_of(name: str) -> Path:
+    """Return the path of the picture of a command's example, beside its group's page."""
+    return GROUPS / f"{name.replace(' ', '-')}.png"
 
 
 def row(parameter: click.Parameter) -> tuple[str, str, str]:
@@ -110,8 +142,8 @@ def row(parameter: click.Parameter) -> tuple[str, str, str]:
 
 
 def examples_in(text: str) -> dict[str, str]:
-    """Return the example of each command on a page."""
-    return dict(re.findall(r"^### flcav (.*?)\n.*?^(```console\n.*?^```)$", text, re.M | re.S))
+    """Return the example of each command on a group's page."""
+    return dict(re.findall(r"^## flcav (.*?)\n.*?^(```console\n.*?^```)$", text, re.M | re.S))
 
 
 def run_examples(folder: Path) -> dict[str, str]:
@@ -126,7 +158,7 @@ def run_examples(folder: Path) -> dict[str, str]:
             blocks += [f"$ {line}\n" for line in example.shown]
             printed[name] = "```console\n" + "".join(blocks) + "```"
             if example.picture:
-                copy_picture(folder / example.picture, PAGE.parent / picture_of(name))
+                copy_picture(folder / example.picture, picture_of(name))
     return printed
 
 
@@ -160,5 +192,6 @@ def output_of(line: str, folder: Path) -> str:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as scratch:
-        PAGE.write_text(page(run_examples(Path(scratch) / "examples")), encoding="utf-8")
-    print(PAGE)
+        for path, text in pages(run_examples(Path(scratch) / "examples")).items():
+            path.write_text(text, encoding="utf-8")
+            print(path)

@@ -1,4 +1,6 @@
-"""The Sphinx directive `public-names PACKAGE`: every public name of a package, its docstring, fields and methods.
+"""The Sphinx directive `public-names PACKAGE [KIND]`: a table of a package's public names, then each in full.
+
+KIND is `functions`, `records` (all classes) or `constants`; without it names of all kinds are shown, in this order.
 
 Docstrings are plain text with `code` and doctest examples; they are escaped, so that nothing in them is taken for
 markup. Fields of records and models are listed with their types, defaults and the comments beside them.
@@ -20,18 +22,21 @@ from sphinx.util.docutils import SphinxDirective
 
 from flcav.interface.fields import HEADING, written_fields
 
+KINDS = ("functions", "records", "constants")
 WHOLE = "flcav"  # the package whose names are not said again of the others
 
 
 class PublicNames(SphinxDirective):
-    """Documents `__all__` of the package that is its argument, without what `flcav` itself has."""
+    """Documents `__all__` of the package that is its first argument, without what `flcav` itself has."""
 
     required_arguments = 1
+    optional_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Return the documentation of each name, by autodoc."""
-        package = self.arguments[0]
-        rst = "\n".join(autodoc_of(package, name) for name in public_names(package))
+        """Return the table of names, and the documentation of each, by autodoc."""
+        package, *kinds = self.arguments
+        names = [name for kind in kinds or KINDS for name in public_names(package) if kind_of(package, name) == kind]
+        rst = "\n".join((table_of(package, names), *(autodoc_of(package, name) for name in names)))
         return self.parse_text_to_nodes(f"```{{eval-rst}}\n{rst}\n```")
 
 
@@ -40,6 +45,28 @@ def public_names(package: str) -> tuple[str, ...]:
     names = importlib.import_module(package).__all__
     whole = () if package == WHOLE else public_names(WHOLE)
     return tuple(name for name in names if name not in whole)
+
+
+def kind_of(package: str, name: str) -> str:
+    """Return which of `KINDS` a public name is."""
+    value = getattr(importlib.import_module(package), name)
+    return "records" if isinstance(value, type) else "functions" if callable(value) else "constants"
+
+
+def table_of(package: str, names: Sequence[str]) -> str:
+    """Return a table of functions and classes: links, and the first sentence of each docstring."""
+    rows = [
+        f"   * - :py:obj:`{name} <{package}.{name}>`\n     - {escaped(first_sentence(package, name))}"
+        for name in names
+        if kind_of(package, name) != "constants"
+    ]
+    return "\n".join((".. list-table::\n   :widths: 20 80\n", *rows, "")) if rows else ""
+
+
+def first_sentence(package: str, name: str) -> str:
+    """Return the first sentence of a public name's docstring."""
+    said = inspect.getdoc(getattr(importlib.import_module(package), name)) or ""
+    return re.split(r"(?<=[\w)`]\.) (?=[A-Z])", " ".join(said.split("\n\n")[0].split()))[0]
 
 
 def autodoc_of(package: str, name: str) -> str:

@@ -35,7 +35,7 @@ def explain_verdict(decided: str) -> str:
     return {
         HELD: "the claim held in this run",
         NOT_HELD: "the claim did not hold in this run",
-        UNDECIDED: "this run does not decide",
+        UNDECIDED: "the result is inconclusive",
     }[decided]
 
 
@@ -79,7 +79,7 @@ class Judged:
         if self.verdict != UNDECIDED:
             return said
         takes = f"about {self.seeds} {word}" if self.seeds else f"more than {MOST_SEEDS} {word}"
-        return f"{said}; to tell an effect of this size takes {self.size.describe(word) if self.size else takes}"
+        return f"{said}; detecting an effect of this size takes {self.size.describe(word) if self.size else takes}"
 
     @property
     def p_cell(self) -> str:

@@ -23,7 +23,7 @@ from flcav.federation.trainable import Weights
 from flcav.network.ledger import Budget, Ledger
 
 ROOT = Path(__file__).parents[3]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 COMMANDS = dict(commands_page.commands_of(typer.main.get_command(app)))
 
 

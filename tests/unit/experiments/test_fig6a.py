@@ -119,10 +119,10 @@ def test_seeds_that_disagree_decide_nothing() -> None:
     mixed = results_of(((0.48, 0.58, 0.60), (0.5, 0.6, 0.65)), ((0.5, 0.6, 0.65), (0.5, 0.6, 0.63)))
     assert verdicts(mixed)[:2] == ["undecided", "undecided"]
     assert "1 of 2 seeds agree in sign, and so does their mean, but that is undecided" in mixed.findings[1].sentence
-    assert "corrected for 6 claims; to tell an effect of this size takes about 136 seeds" in (
+    assert "corrected for 6 claims; detecting an effect of this size takes about 136 seeds" in (
         mixed.findings[0].sentence
     )
-    assert "To tell the predicted difference of +0.040 takes 23 seeds" in mixed.findings[0].sentence
+    assert "Detecting the predicted difference of +0.040 takes 23 seeds" in mixed.findings[0].sentence
 
 
 def test_one_seed_is_judged_by_its_scenes() -> None:

@@ -24,7 +24,16 @@ def test_committed_tables_are_those_of_the_committed_numbers(folder: Path) -> No
 @pytest.mark.parametrize("folder", PAGES, ids=lambda folder: folder.name)
 def test_pages_have_the_fixed_form(folder: Path) -> None:
     page = (folder / "README.md").read_text()
-    parts = ["**Claim.**", "**Command.**", "**Expected.**", "## Obtained", "## Limits"]
+    parts = [
+        "| question |",
+        "| **verdict** |",
+        "| **key figure** |",
+        "**Claim.**",
+        "**Command.**",
+        "**Expected.**",
+        "## Obtained",
+        "## Limits",
+    ]
     places = [page.index(part) for part in parts]
     assert places == sorted(places)
     assert "<!-- end -->" in page
@@ -33,10 +42,41 @@ def test_pages_have_the_fixed_form(folder: Path) -> None:
 @pytest.mark.parametrize("folder", PAGES, ids=lambda folder: folder.name)
 def test_pages_count_looks_and_say_what_they_can_tell(folder: Path) -> None:
     page = (folder / "README.md").read_text()
-    looks = re.search(r"^## (Changes after|What was changed after)[^\n]*\n(?P<rows>.*?)(?=^## |\Z)", page, re.M | re.S)
+    looks = re.search(r"^## Appendix: changes after evaluations\n(?P<rows>.*)\Z", page, re.M | re.S)
     assert looks, "a section of what was changed after which look"
+    assert not re.search(r"^## ", looks["rows"], re.M), "it is the last section"
+    looks = re.match(r"(?P<rows>.*?)(?=^### |\Z)", looks["rows"], re.M | re.S)
+    assert looks
     assert looks["rows"].count("\n|") >= 3, "a table of it"
-    assert re.search(r"[Pp]ower|[Nn]o comparison|compares no|to tell|that tell", page), "power, or no comparison"
+    assert re.search(r"[Pp]ower|[Nn]o comparison|compares no|to detect|that detect|detecting a", page), (
+        "power, or no comparison"
+    )
+
+
+def box_of(page: str) -> tuple[str, str, str]:
+    """Return question, verdict and key figure of a page."""
+    rows = r"\| question \| (.*) \|\n\|---\|---\|\n\| \*\*verdict\*\* \| (.*) \|\n\| \*\*key figure\*\* \| (.*) \|\n"
+    box = re.match(rf"# .*\n\n{rows}", page)
+    assert box, "a page begins with a box"
+    return box[1], box[2], box[3]
+
+
+@pytest.mark.parametrize("folder", MADE, ids=lambda folder: folder.name)
+def test_the_key_figure_is_one_of_the_tables(folder: Path) -> None:
+    *_, figure = box_of((folder / "README.md").read_text())
+    number, count = r"(?<![\w.])[+-]?\d*\.?\d+(?!\w|\.\d)", r"\d+ (seeds|trainings)"
+    texts = (re.sub(count, "", figure), " ".join(tables_of(folder).values()))
+    shown, known = ({*re.findall(number, text.replace("−", "-"))} for text in texts)
+    assert shown <= known, "numbers of the key figure stand in the tables of the results"
+
+
+def test_the_index_has_the_question_and_the_verdict_of_every_page() -> None:
+    index = (REPRODUCTIONS.parent / "docs" / "reproductions.md").read_text()
+    rows = re.findall(r"^\| \[[^]]*\]\(\.\./reproductions/(.*)/README\.md\) \| (.*) \| (.*) \|$", index, re.M)
+    pages = {path.parent.relative_to(REPRODUCTIONS).as_posix(): path for path in REPRODUCTIONS.rglob("README.md")}
+    assert {name: said for name, *said in rows} == {
+        name: [*box_of(path.read_text())[:2]] for name, path in pages.items()
+    }
 
 
 def test_every_table_is_on_its_page() -> None:

@@ -57,7 +57,7 @@ def test_a_finding_names_its_verdict(off_m, verdict):
 def test_cameras_are_measured_against_constant_velocity_too():
     found = tables(replace(results(7.0, 7.1), network="tiny-cameras"))["findings"].splitlines()
     assert [line.split("**")[1] for line in found[:2]] == ["reached", "not reached"]
-    assert "seeds to tell 0.05 from an aim" in found[2]
+    assert "detecting a deviation of 0.05 from an aim takes" in found[2]
 
 
 def test_errors_have_a_row_for_each_slice_and_predictor():

@@ -72,7 +72,7 @@ def test_each_finding_tells_its_own_numbers_frames_and_verdict() -> None:
     assert "0.412 (pretrained) and 0.503 (edge FL): +0.091, 95 % interval +0.055 to +0.127" in edge.sentence
     assert "p 0.002, corrected for 3 claims: the claim held in this run" in edge.sentence
     assert "0.503 (edge FL) and 0.495 (edge + cloud FL): −0.008" in cloud.sentence
-    assert "nor any number of scenes for one training): this run does not decide" in cloud.sentence
+    assert "nor any number of scenes for one training): the result is inconclusive" in cloud.sentence
     assert "0.544 (edge FL (densest)) and 0.503 (edge FL)" in pole.sentence
     assert pole.question == "Does the placed pole beat the pole with the densest traffic?"
     for finding in (edge, cloud, pole):
@@ -96,7 +96,7 @@ def test_without_a_spread_of_retraining_no_claim_has_held() -> None:
     alone = replace(difference(EDGE, (MAIN, PRETRAIN), 0.091, 0.055, 0.127), spread=None)
     (edge,) = told(alone)
     assert edge.verdict == UNDECIDED
-    assert "is not known, so this run does not decide" in edge.sentence
+    assert "is not known, so the result is inconclusive" in edge.sentence
 
 
 def test_a_run_with_retrainings_is_judged_by_the_mean_of_its_trainings() -> None:

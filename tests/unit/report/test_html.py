@@ -103,7 +103,7 @@ def test_plans_that_were_made_anew_are_told() -> None:
     told["plans"] = (first, Plan("joint", {"objects": later}, "pretrain", {"objects": 0.471}))
     text = Page(render(told, {})).text
     assert "objects after stage I 0.471 320 6 5 216.0 128.1 0.530" in text
-    assert "made anew between stages" in text
+    assert "updated between stages" in text
 
 
 def test_values_are_escaped() -> None:

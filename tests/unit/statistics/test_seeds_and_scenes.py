@@ -156,7 +156,7 @@ def test_verdicts_name_the_side_and_unknown_spreads_do_not_count() -> None:
     assert found[4].p is None
     assert found[4].describe() == "the spread over seeds is not known"
     assert found[0].describe() == "p < 0.001, corrected for 4 claims"
-    assert f"to tell an effect of this size takes about {found[3].seeds} seeds" in found[3].describe()
+    assert f"detecting an effect of this size takes about {found[3].seeds} seeds" in found[3].describe()
     assert (format_p(0.0004), format_p(0.0404)) == ("< 0.001", "0.040")
 
 

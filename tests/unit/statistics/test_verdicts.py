@@ -57,7 +57,7 @@ def test_a_claim_without_a_known_spread_counts_in_no_family() -> None:
 
 
 def test_the_words_say_what_was_decided():
-    assert explain_verdict(UNDECIDED) == "this run does not decide"
+    assert explain_verdict(UNDECIDED) == "the result is inconclusive"
     assert explain_verdict(NOT_HELD) == "the claim did not hold in this run"
     assert (signed(-0.0125), signed(2, 1)) == ("−0.013", "+2.0")
 
@@ -77,7 +77,7 @@ def test_a_claim_that_its_own_interval_decides_alone_is_told_with_its_simultaneo
     told = f" ({p:.3f} alone; simultaneous interval {low} to {high})"
     assert first.p_cell == f"{5 * p:.3f}{told}"
     seeds = seeds_to_tell(mean, level=0.01)
-    takes = f"to tell an effect of this size takes about {seeds} seeds"
+    takes = f"detecting an effect of this size takes about {seeds} seeds"
     assert first.describe() == f"p {5 * p:.3f}, corrected for 5 claims{told}; {takes}"
     assert first.takes_cell == str(seeds)
 

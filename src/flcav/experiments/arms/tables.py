@@ -65,8 +65,8 @@ def _power(results: ArmsResult) -> str:
         "difference in AP50",
         "standard deviation over seeds",
         f"half width of the interval of {len(results.seeds)} seeds",
-        f"seeds that tell {EFFECT}",
-        "if undecided: seeds that tell a difference of the size found",
+        f"seeds that detect {EFFECT}",
+        "if undecided: seeds that detect a difference of the observed size",
     )
     return format_table(header, rows)
 

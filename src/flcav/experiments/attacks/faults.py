@@ -1,4 +1,4 @@
-"""Byzantine clients: three of ten vehicles lie about what they learned, under four strategies.
+"""Byzantine clients: three of ten vehicles send wrong updates, under four strategies.
 
 Lies: the change of the weights with its sign turned and multiplied by 4 (Li et al., "RSA", AAAI 2019); the change
 multiplied by the number of clients, as in model replacement (Bagdasaryan et al., "How To Backdoor Federated Learning",

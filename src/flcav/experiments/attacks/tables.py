@@ -15,10 +15,10 @@ def fault_tables(results: FaultsResult) -> dict[str, str]:
     for (lie, name), one in zip(pairs, judged, strict=True):
         found = results.gained[lie][name].describe(sign=True)
         gained.append([lie, name, found, one.p_cell, one.verdict, one.takes_cell])
-    claim, seeds = "claim that it is positive", "if undecided: seeds that tell an effect of the size found"
+    claim, seeds = "claim that it is positive", "if undecided: seeds that detect an effect of the observed size"
     return {
-        "accuracy": format_table((f"lie of 3 of 10 vehicles, {len(results.seeds)} seeds", *STRATEGIES), rows),
-        "gained": format_table(("lie", "strategy", "accuracy - FedAvg's", "p, corrected", claim, seeds), gained),
+        "accuracy": format_table((f"attack by 3 of 10 clients, {len(results.seeds)} seeds", *STRATEGIES), rows),
+        "gained": format_table(("attack", "strategy", "accuracy - FedAvg's", "p, corrected", claim, seeds), gained),
     }
 
 

@@ -76,7 +76,7 @@ def _differences(results: ExchangeResult) -> str:
         f"{results.measure} - that of whole weights, {OWN}",
         "p, corrected",
         "verdict",
-        "if undecided: seeds that tell a difference of the size found",
+        "if undecided: seeds that detect a difference of the observed size",
         *([f"the same, {UNSEEN}"] if UNSEEN in results.places else []),
     )
     return format_table(header, rows)

@@ -88,7 +88,7 @@ def _needed(results: AtBudgets, difference: MeanOverSeeds, judged: Judged) -> st
     predicted = results.summary.predicted_difference[CLOUD]
     seeds = plan_seeds(predicted, difference.sd, LEVEL / max(judged.family, 1))
     count = f"more than {MOST_SEEDS}" if seeds is None else seeds
-    return f"To tell the predicted difference of {signed(predicted)} takes {count} seeds."
+    return f"Detecting the predicted difference of {signed(predicted)} takes {count} seeds."
 
 
 def _ranking(results: AtBudgets, history: Ranges, difference: MeanOverSeeds, judged: Judged) -> PlanFinding:
@@ -202,7 +202,7 @@ def _accuracy(results: AtBudgets, claim: Claim, judged: Judged) -> PlanFinding:
         f"average (from {signed(min(errors))} to {signed(max(errors))}), where {claim.than:.3f} are predicted to lie "
         f"between the plans; {judged.describe()}."
     )
-    return _finding("Is the prediction exact enough to tell the plans apart?", judged.verdict, sentence)
+    return _finding("Is the prediction exact enough to distinguish the plans?", judged.verdict, sentence)
 
 
 def _budgets(results: AtBudgets) -> PlanFinding:

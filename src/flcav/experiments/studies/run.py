@@ -179,13 +179,14 @@ def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int
 
 
 def describe_limits(aims: Collection[Claim], effect: float) -> list[str]:
-    """Return a sentence on what the findings can tell: the seeds that tell a deviation of `effect` from an aim."""
+    """Return a sentence on what the findings can tell: the seeds that detect a deviation of `effect` from an aim."""
     widest = max(aim.mean.sd for aim in aims)
     if not widest:  # one seed
         return []
     seeds = plan_seeds(effect, widest, LEVEL / len(aims))
     count = f"more than {MOST_SEEDS}" if seeds is None else seeds
-    return [f"At the largest of these standard deviations it takes {count} seeds to tell {effect} from an aim."]
+    at = "At the largest of these standard deviations"
+    return [f"{at}, detecting a deviation of {effect} from an aim takes {count} seeds."]
 
 
 def list_counts(counts: Sequence[int]) -> str:

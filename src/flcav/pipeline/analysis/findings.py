@@ -160,7 +160,7 @@ def _finding(
     after = test.result
     place, question = f"{each.region}, {each.task}", asked.question
     loss = asked.kind == "loss"
-    open_, undecided = (ESTIMATE, "") if loss else (UNDECIDED, ", so this run does not decide")
+    open_, undecided = (ESTIMATE, "") if loss else (UNDECIDED, ", so the result is inconclusive")
     if same is not None:
         return Finding(place, question, open_, f"{same}: there is nothing to compare{undecided}.")
     mean, low, high = each.estimate.mean, each.estimate.low, each.estimate.high
