@@ -29,6 +29,7 @@ from flcav.dataset.formats.kitti.files import Calibration as KittiCalibration
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import (
     AgentNames,
+    ImportFormat,
     LogSource,
     annotate,
     assign_split,
@@ -75,13 +76,13 @@ class KittiSource(LogSource):
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where `folder` has no frames, none of `split`, or a file of a frame is missing."""
-        self._folder, self._split = folder, split
+        self.folder, self.split = folder, split
         shots = _find_shots(folder)
         split_of: dict[str, str | None] = {}
         for shot in shots:
             assign_split(split_of, shot.scene, shot.split, folder)
         chosen = set(choose_split(folder, split_of, split))
-        self._split_of = {scene: own for scene, own in split_of.items() if scene in chosen}
+        self.split_of = {scene: own for scene, own in split_of.items() if scene in chosen}
         self._shots: dict[str, list[Shot]] = defaultdict(list)
         self._agent: dict[Shot, str] = {}
         self._calibration: dict[str, Calibration] = {}
@@ -96,9 +97,9 @@ class KittiSource(LogSource):
             agent = self._agent[shot] = names.of(shot.vehicle, text)
             self._calibration.setdefault(agent, mounted)
         if not any(shot.exported for shot in every):
-            self._beams, self._range_m = BEAMS, RANGE_M
+            self.beams, self.range_m = BEAMS, RANGE_M
         bare = sum(not _path(shot, "label_2").is_file() for shot in every)
-        self._labelled = not bare
+        self.labelled = not bare
         self.notes = (f"no label_2 of {bare} of {plural(len(every), 'frame')}, so no boxes there",) if bare else ()
         if blind := sum(not _path(shot, CAMERA).is_file() for shot in every):
             self.notes += (f"no {CAMERA} of {blind} of {plural(len(every), 'frame')}, so LiDAR alone there",)
@@ -112,6 +113,9 @@ class KittiSource(LogSource):
         for shot in sorted(self._shots[scene], key=lambda shot: (shot.spin, shot.vehicle)):
             agent = self._agent[shot]
             yield _read_frame(shot, agent, self._calibration[agent])
+
+
+IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne"))
 
 
 def _calibrate(calibrated: KittiCalibration) -> Calibration:

@@ -22,6 +22,7 @@ from flcav.dataset.formats.opv2v.write import FOLDERS, KMH, from_carla
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
     AgentNames,
+    ImportFormat,
     LogSource,
     Picture,
     annotate,
@@ -68,16 +69,16 @@ class Opv2vSource(LogSource):
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where there is no scenario, none of `split`, or a file of a frame is missing."""
-        self._folder, self._split = folder, split
-        self._folders = found = _find_scenarios(folder)
+        self.folder, self.split = folder, split
+        self.folders = found = _find_scenarios(folder)
         split_of = {scene: _split_of(path) for scene, path in found.items()}
-        self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
+        self.split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._calibration: dict[str, Calibration] = {}
         self._track: dict[str, dict[str, str]] = {}
         names = AgentNames()
         self._blind: set[str] = set()  # agents with a camera of which there is no picture
         self._frames = self._lost = self._unseen = 0  # frames in the folder, without a file, without a picture
-        self._shots = {scene: self._open(scene, found[scene], names) for scene in self._split_of}
+        self._shots = {scene: self._open(scene, found[scene], names) for scene in self.split_of}
         blind, agents, frames = len(self._blind), len(self._calibration), plural(self._frames, "frame")
         if not agents:
             raise InputError(f"{folder}: none of {frames} has both a YAML file and a point cloud")
@@ -172,6 +173,9 @@ class Opv2vSource(LogSource):
             agent_at_trigger={name: world @ inverse(mounts[name]) for name, world in placed.items()},
             files=files,
         )
+
+
+IMPORT = ImportFormat(Opv2vSource, ("data_protocol.yaml", "*/data_protocol.yaml", "*/*/data_protocol.yaml"))
 
 
 def _read_points(stem: Path) -> NDArray[np.float32]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flcav.dataset.formats.exporter import (
     Exported,
+    ExportFormat,
     ExportOptions,
     LeftOut,
     check_rectified,
@@ -61,7 +62,7 @@ class Vehicle(TypedDict):
 
 
 def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write one scenario for each scene of `dataset`: see `Exporter`.
+    """Write one scenario for each scene of `dataset`: see `ExportFormat`.
 
     Spins that not every agent of a scene has are left out.
     """
@@ -97,6 +98,9 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
         (folder / "data_protocol.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False), encoding="utf-8")
         counts["scenarios"] += 1
     return exported
+
+
+EXPORT = ExportFormat(export_opv2v, ("validation", "min_points", "calibration"))
 
 
 def _shared_spins(dataset: Dataset, scene: str) -> set[int]:
