@@ -48,6 +48,12 @@ def save_network(
     """Write weights, configuration (JSON) and card (JSON) of a network to a safetensors file, atomically.
 
     The same network gives the same bytes.
+
+    Args:
+        task: the task, by whose name the file is recognised.
+        network: the network.
+        path: the file.
+        card: data, settings and metrics of its training; None: unknown.
     """
     tensors = {name: tensor.contiguous().cpu() for name, tensor in network.state_dict().items()}
     metadata = {config_key(task): _adapter(task).dump_json(network.config).decode()}

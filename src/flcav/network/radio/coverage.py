@@ -33,10 +33,16 @@ class Coverage:
 
 
 def cover_town(town: Town, units: Mapping[str, Array], radio: Radio, step_m: float = 2.0) -> Coverage:
-    """Return the coverage of a town by `units`, name -> mount (3,) [m, world], on a grid of `step_m`.
+    """Return the radio coverage of a town by roadside units, on a grid.
 
     Rates are those of a vehicle alone in the band, without shadowing: medians over it. Raises `InputError` as
     `links.check_units`, and for a step below `FINEST_M`.
+
+    Args:
+        town: the town.
+        units: name -> (3,) position of the unit's antenna [m, world].
+        radio: settings of the links.
+        step_m: distance of the grid's points [m].
     """
     check_units(town, units, radio)
     if not step_m >= FINEST_M:

@@ -31,10 +31,17 @@ class RecordedScene:
 def link_scene(
     data: Dataset, radio: Radio, poles: Sequence[int] = (), scene: str | None = None, seed: int = 0
 ) -> RecordedScene:
-    """Return the links of a scene, by default the first, to units on `poles`, by default those recorded from.
+    """Return the radio links of a recorded scene's vehicles to roadside units on poles.
 
     Raises `InputError` where the dataset has no such scene, no traffic, town, connected vehicles or poles, and as
     `links.link_vehicles`.
+
+    Args:
+        data: the dataset.
+        radio: settings of the links.
+        poles: numbers of the town's poles; empty: those recorded from.
+        scene: name of the scene; None: the first.
+        seed: seed of shadowing and losses.
     """
     scenes = list(dict.fromkeys(key.scene for key in data.keys))
     name = scenes[0] if scene is None else scene
