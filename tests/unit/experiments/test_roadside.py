@@ -16,6 +16,7 @@ from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
 from flcav.experiments.roadside.ranges import SHARED, Model, SensorRanges
 from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of
+from flcav.pipeline.provenance import provenance
 from flcav.sensors.rig import RIGS, Rig
 from flcav.sources.recipe import Recipe
 from flcav.world.map.town import load_town
@@ -133,7 +134,7 @@ def test_the_sensors_of_a_range_are_read_by_the_placement(tmp_path: Path) -> Non
         Model("many", 64, all_to_20, find_range(SENSOR_EDGES_M, cars, all_to_20)),
     )
     assert models[1].range_m == 20.0
-    results = SensorRanges(8, cars, models)
+    results = SensorRanges(8, cars, models, provenance())
     files = {name: tmp_path / f"{name}.csv" for name in ("errors", "poles", "sensors")}
     files["errors"].write_text("x,y,z\n1,2,0\n")
     files["poles"].write_text("id,x,y,z\n1,0,0,6\n")

@@ -20,6 +20,7 @@ from flcav.experiments.roadside.tables import fig4_tables
 from flcav.fusion.association import Pairs, Shot
 from flcav.fusion.registration import Offset
 from flcav.geometry import Boxes
+from flcav.pipeline.provenance import provenance
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
 
 NONE = np.zeros(0, np.int64)
@@ -86,7 +87,8 @@ def test_a_camera_has_a_row_for_each_choice_of_extrinsics() -> None:
     camera = CameraResult("left", 20, 10, 9, dict.fromkeys((CALIBRATED, CORRECTED, EXACT), told), True)
     intervals = 9
     arms = ("first suite alone", "three suites as calibrated", "three suites registered")
-    result = Fig4((), (0,) * intervals, dict.fromkeys(arms, (0,) * intervals), dict.fromkeys(arms, 0.0), (camera,))
+    found, ranges = dict.fromkeys(arms, (0,) * intervals), dict.fromkeys(arms, 0.0)
+    result = Fig4((), (0,) * intervals, found, ranges, (camera,), provenance())
     rows = fig4_tables(result)["cameras"].splitlines()
     assert len(rows) == 2 + 3
     assert rows[2] == "| left | as calibrated | 30 cm, 2.50° | 4.2 | 10 | 9 | 5 (0.50) | 8 | 6 (0.75) | 2 | 1 | 12.3 |"
@@ -94,13 +96,3 @@ def test_a_camera_has_a_row_for_each_choice_of_extrinsics() -> None:
     assert Fig4.from_json(result.as_json(), "x") == result
     moving = replace(result, cameras=(replace(camera, settled=False),))
     assert [each.sentences()[-1].endswith("; the pairs had not settled") for each in (result, moving)] == [False, True]
-
-
-def test_a_result_of_before_the_cameras_is_read() -> None:
-    arms = dict.fromkeys(("first suite alone", "three suites as calibrated", "three suites registered"), (0,) * 9)
-    old = {"suites": [], "cars": [0] * 9, "found": arms, "range_m": dict.fromkeys(arms, 0.0)}
-    result = Fig4.from_json(old, "x")
-    assert result.cameras is None
-    assert "cameras" not in result.as_json()
-    assert len(fig4_tables(result)["cameras"].splitlines()) == 2
-    assert len(result.sentences()) == 3

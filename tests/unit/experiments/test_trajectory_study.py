@@ -11,6 +11,7 @@ from flcav.experiments.studies.trajectory import CAMERAS, STUDY, tables
 from flcav.perception.card import Card
 from flcav.perception.trajectory.config import FUTURE, PAST
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
+from flcav.pipeline.provenance import provenance
 from flcav.statistics.seeds import mean_over_seeds
 
 
@@ -42,7 +43,9 @@ def results(*off_m: float) -> StudyResult[TrajectoryEvaluation]:
     rows = [evaluated(off).numbers() for off in off_m]
     means = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
     nothing = Recorded((), {}, {})
-    return StudyResult("trajectory", "tiny", "full", 3, 3, nothing, tuple(runs), {"held-out scenes": means})
+    return StudyResult(
+        "trajectory", "tiny", "full", 3, 3, nothing, tuple(runs), {"held-out scenes": means}, provenance()
+    )
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ traffic too. The verdicts on all differences are corrected together.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 from flcav.config import Json
 from flcav.pipeline.analysis.findings import name_stage
@@ -22,7 +21,7 @@ from flcav.report.charts import figures
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import Claim, Judged, judge
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 TASK = "objects"
 FURTHER = "edge FL, as many more rounds"  # instead of those of cloud FL
@@ -121,7 +120,7 @@ class ArmsSummary:
     ap70: Mapping[str, Mapping[str, MeanOverSeeds]]
     differences: Mapping[str, MeanOverSeeds]
     gap_closed: Mapping[str, MeanOverSeeds]
-    road_share: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # of the ideal detector's gain; None: older results
+    road_share: MeanOverSeeds  # of the ideal detector's gain
 
 
 @dataclass(frozen=True)
@@ -130,9 +129,8 @@ class ArmsResult(Record):
 
     seeds: tuple[ArmsSeed, ...]
     summary: ArmsSummary
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
-    note: Annotated[str | None, LEFT_OUT] = None  # of older results
+    recipe: Mapping[str, Json]
+    provenance: Provenance
 
 
 def compare_arms(recipe: RunRecipe, runs: Sequence[Run]) -> ArmsResult:

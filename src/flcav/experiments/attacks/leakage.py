@@ -7,7 +7,6 @@ and their sum alone.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +43,7 @@ from flcav.report import style
 from flcav.report.charts.leakage import draw_leakage
 from flcav.statistics.seeds import OWN_SCENES, MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 NOISES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # standard deviation as a multiple of the clipping norm
 CLIP, DELTA = 1.0, 1e-5
@@ -93,7 +92,7 @@ class LeakageResult(Record):
     levels: tuple[Level, ...]  # ascending noise
     masked: Level  # a single masked update
     summed: Level  # the sum of all updates, which secure aggregation shows
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return a sentence per level, and one on what epsilon rests on."""

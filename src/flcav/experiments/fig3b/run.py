@@ -8,7 +8,7 @@ As many drives in other towns show how many sensors each takes.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from flcav.report.charts.placement import draw_cover
 from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE, ErrorMap, poles_of
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 from flcav.world.line_of_sight import count_visible_actors
 from flcav.world.map.census import measure_traffic_density
 from flcav.world.map.town import Town
@@ -81,8 +81,8 @@ class Fig3b(Record):
     errors: int
     zones: tuple[Zone, ...]  # densest in errors first
     placed: tuple[Placed, ...]
-    towns: Annotated[tuple[TownCover, ...] | None, LEFT_OUT] = None  # None in older results
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    towns: tuple[TownCover, ...]
+    provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return zones and placements in words."""
@@ -98,7 +98,7 @@ class Fig3b(Record):
                 if each.count == count
             ]
             told.append(f"{count} sensor{'s' if count > 1 else ''}, errors covered by the poles of {'; '.join(rules)}")
-        for town in self.towns or ():
+        for town in self.towns:
             first = f"{town.town}: {town.errors} errors; one sensor covers {town.shares[0]:.0%}"
             told.append(f"{first}, {town.poles} cover {town.shares[-1]:.0%}")
         return told

@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
 
 from flcav.config import Json
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.results.run import LinkUse
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 EQUAL, JOINT = "equal-stages", "joint"  # the plans
 MEAN = "mean of towns"  # place of what the planner's history measures: the mean of the federating towns
@@ -103,6 +102,5 @@ class AllocationResult(Record):
 
     history: Mapping[str, tuple[float, float]]  # least and most of each count in the planner's history
     budgets: tuple[AtBudgets, ...]
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
-    note: Annotated[str | None, LEFT_OUT] = None  # of older results
+    recipe: Mapping[str, Json]
+    provenance: Provenance

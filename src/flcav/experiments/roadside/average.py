@@ -7,7 +7,6 @@ all scenes and spins together.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
@@ -31,7 +30,7 @@ from flcav.report.charts.roadside import draw_errors
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import stream
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 from flcav.world.map.lanes import map_layers
 
 RECIPE = {
@@ -109,10 +108,8 @@ class RoadAverageResult(Record):
     joint: Mapping[str, Point]  # at `JOINT`, by arm
     clean: Mapping[str, float]  # without errors, by arm
     snapped: Snapped
-    residuals: Annotated[Mapping[str, tuple[Residual, Residual]] | None, LEFT_OUT] = (
-        None  # of `CORRECTED` as stated and after the pose graph; None in older results
-    )
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    residuals: Mapping[str, tuple[Residual, Residual]]  # of `CORRECTED` as stated and after the pose graph
+    provenance: Provenance
 
     @property
     def won_back(self) -> float:

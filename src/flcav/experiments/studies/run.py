@@ -8,7 +8,7 @@ but not the choice of the training scenes.
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar, cast, get_type_hints
+from typing import Any, Generic, TypeVar, cast, get_type_hints
 
 from flcav.config import InputError, Json
 from flcav.dataset.store import Dataset
@@ -23,7 +23,7 @@ from flcav.pipeline.provenance import Provenance, provenance
 from flcav.statistics.power import MOST_SEEDS, plan_seeds
 from flcav.statistics.seeds import LEVEL, MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import Claim
-from flcav.storage.records import LEFT_OUT, from_json, to_json
+from flcav.storage.records import from_json, to_json
 
 EvaluationT = TypeVar("EvaluationT", bound=Evaluated)
 VALIDATION = "validation"
@@ -60,7 +60,7 @@ class StudyResult(Generic[EvaluationT]):
     recipes: Recorded
     seeds: tuple[SeedResult[EvaluationT], ...]
     summary: Mapping[str, Mapping[str, MeanOverSeeds]]  # by test and name of the number
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # None in older results
+    provenance: Provenance
 
     def tested(self, test: str) -> list[EvaluationT]:
         """Return the evaluations of a test, one per seed."""
