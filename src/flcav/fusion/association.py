@@ -201,14 +201,6 @@ def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: Vi
     )
 
 
-def project_cars(cars: Boxes, view: View) -> Array:
-    """Return the boxes (N, 4) x1 y1 x2 y2 [px] around what the picture shows of the outlines of cars, LiDAR frame.
-
-    NaN for cars that are not wholly before the camera, or outside the picture.
-    """
-    return _sides(outline(cars), view)
-
-
 def outline(cars: Boxes) -> Array:
     """Return the (N, K, 3) points of cars' outlines, in the frame of their boxes [m]."""
     own = OUTLINE * (0.5, 0.5, 1.0) - (0, 0, 0.5)
@@ -239,7 +231,7 @@ def _sides(points: Array, view: View) -> Array:
 
 
 def _project_with_slope(cars: Boxes, view: View) -> tuple[Array, Array]:
-    """Return `project_cars`, and its (N, 4, 6) derivative by an error of the extrinsics."""
+    """Return the boxes (N, 4) of `_sides` of cars, and their (N, 4, 6) derivative by an error of the extrinsics."""
     points, step = outline(cars), 1e-5
     moved = [
         _sides(points, replace(view, camera_from_lidar=apply_error(view.camera_from_lidar, step * axis)))

@@ -12,13 +12,13 @@ from flcav.fusion.association import (
     SIDE_PX,
     Shot,
     View,
+    _sides,
     apply_error,
     correct_extrinsics,
     fit_extrinsics,
     measure_error,
     outline,
     pair,
-    project_cars,
     spread_of_calibration,
 )
 from flcav.fusion.registration import measure_offset
@@ -79,9 +79,9 @@ def share_right(found, truth) -> tuple[float, float]:
 
 def test_cars_are_projected_as_by_a_pinhole():
     cars = street(3)
-    np.testing.assert_allclose(project_cars(cars, TRUE), pinhole(cars, EXACT), atol=1e-9)
+    np.testing.assert_allclose(_sides(outline(cars), TRUE), pinhole(cars, EXACT), atol=1e-9)
     behind = replace(cars, center=cars.center * (-1, 1, 1))
-    assert np.isnan(project_cars(behind, TRUE)).all()
+    assert np.isnan(_sides(outline(behind), TRUE)).all()
 
 
 def test_an_error_turns_and_shifts_the_extrinsics():

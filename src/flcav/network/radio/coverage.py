@@ -10,7 +10,7 @@ from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.network.radio.budget import Radio, lone_rate_bps, received_dbm
 from flcav.network.radio.links import check_units, walls_of
-from flcav.network.radio.propagation import State, path_loss_db
+from flcav.network.radio.propagation import path_loss_db
 from flcav.network.radio.sight import find_sight
 from flcav.world.map.town import Town
 
@@ -61,8 +61,3 @@ def cover_town(town: Town, units: Mapping[str, Array], radio: Radio, step_m: flo
         rate[row] = lone_rate_bps(received_dbm(np.take_along_axis(loss, best, 1)[:, 0], radio), radio)
         state[row] = np.take_along_axis(seen, best, 1)[:, 0]
     return Coverage(tuple(units), sites, x, y, rate, state)
-
-
-def share_in_state(coverage: Coverage, state: State) -> float:
-    """Return the fraction of the places that are in `state`."""
-    return float((coverage.state == state).mean())
