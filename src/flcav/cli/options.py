@@ -40,7 +40,7 @@ class Device(StrEnum):
     cuda = "cuda"
 
 
-class Engine(StrEnum):
+class EngineName(StrEnum):
     """Execution engine, see `flcav.dataset.recording.recorder` and `flcav.pipeline.engine`."""
 
     processes = "processes"
@@ -77,7 +77,7 @@ def join_choices(choices: Iterable[str]) -> str:
 
 OWN = "or one of your own as module:NAME"
 ANY_TASK = f"{join_choices(TASKS)}, {OWN}"
-ENGINE = typer.Option(Engine.processes, "--engine", help="Backend: processes on this machine, or a Ray cluster.")
+ENGINE = typer.Option(EngineName.processes, "--engine", help="Backend: processes on this machine, or a Ray cluster.")
 STALE = typer.Option(
     Stale.refuse,
     "--stale",

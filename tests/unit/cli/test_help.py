@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from flcav.cli.main import app, run
-from flcav.cli.options import Device, Engine, Method
+from flcav.cli.options import Device, EngineName, Method
 from flcav.dataset.formats.formats import EXPORTS, IMPORTS
 from flcav.dataset.recording.recorder import ENGINES
 from flcav.perception.device import select_device
@@ -82,7 +82,7 @@ def test_what_can_be_chosen_is_listed(path, shown):
 
 
 def test_choices_are_those_that_there_are():
-    assert [*Engine] == [*ENGINES]
+    assert [*EngineName] == [*ENGINES]
     for device in Device:
         if device != Device.cuda:
             select_device(device)
@@ -111,7 +111,7 @@ def test_tasks_and_networks_are_named(shown):
         (("infer", "poetry", "d"), "task 'poetry'", TASKS),
         (("errors", "poetry", "--data", "d", "--out", "o.csv"), "task 'poetry'", TASKS),
         (("export", "poetry", "d", "--out", "o"), "export format 'poetry'", EXPORTS),
-        (("record", "r", "--out", "o", "--engine", "steam"), "'--engine'", Engine),
+        (("record", "r", "--out", "o", "--engine", "steam"), "'--engine'", EngineName),
         (("infer", "weather", "d", "--device", "steam"), "'--device'", Device),
         (("place", "--method", "steam"), "'--method'", Method),
         (("export",), "'FORMAT'", ()),

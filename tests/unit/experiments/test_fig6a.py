@@ -13,7 +13,7 @@ from flcav.experiments.fig6a.results import (
     AllocationSeed,
     AtBudgets,
     Planned,
-    Reached,
+    StageAP,
 )
 from flcav.experiments.fig6a.run import BUDGETS, PLANS, STAGES, _collect, budget_recipes, draw_allocation, summarise
 from flcav.experiments.fig6a.tables import tables
@@ -33,7 +33,7 @@ HISTORY = {"samples": (80.0, 320.0), "edge_rounds": (0.0, 6.0), "cloud_rounds": 
 def seed_of(number: int, equal: tuple[float, ...], joint: tuple[float, ...]) -> AllocationSeed:
     """Return what one seed reached: AP50 after each stage with either plan."""
     reached = {EQUAL: equal, JOINT: joint}
-    realised = {name: {str(s): Reached(ap) for s, ap in zip(STAGES, aps)} for name, aps in reached.items()}
+    realised = {name: {str(s): StageAP(ap) for s, ap in zip(STAGES, aps)} for name, aps in reached.items()}
     differences = {s: Estimate(b - a, b - a - 0.05, b - a + 0.05) for s, a, b in zip(STAGES, equal, joint)}
     plan = Planned(118, 6, 6, 175.0, 70.0, predicted_error=0.38)
     book = {"wireless": LinkUse(180.0, 175.0, 176.0), "wireline": LinkUse(110.0, 70.0, 69.5)}

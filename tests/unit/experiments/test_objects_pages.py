@@ -7,7 +7,7 @@ from flcav.experiments.sim_to_real.clouds import CloudNumbers, SeenCar, Street
 from flcav.experiments.sim_to_real.run import FrameResult, LabelledCar, RealScore, SimToReal, draw_clouds
 from flcav.experiments.studies import objects as objects_tables
 from flcav.experiments.studies.objects import STUDY
-from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
+from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResult
 from flcav.geometry import Boxes
 from flcav.perception.card import Card
 from flcav.perception.images import CameraView
@@ -64,7 +64,7 @@ def study(aps):
     for test in ("suburb", "tracks"):
         rows = [seed.tests[test].numbers() for seed in seeds]
         summary[test] = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
-    recipes = Recorded(({"town": "suburb"},), {}, {})
+    recipes = StudyRecordings(({"town": "suburb"},), {}, {})
     return StudyResult("objects", "small", "full", 8, 8, recipes, seeds, summary, provenance())
 
 

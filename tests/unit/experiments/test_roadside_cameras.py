@@ -17,7 +17,7 @@ from flcav.experiments.roadside.cameras import (
 )
 from flcav.experiments.roadside.fig4 import Fig4
 from flcav.experiments.roadside.tables import fig4_tables
-from flcav.fusion.association import Pairs, Shot
+from flcav.fusion.association import PairedShot, Pairs
 from flcav.fusion.registration import Offset
 from flcav.geometry import Boxes
 from flcav.pipeline.provenance import provenance
@@ -53,7 +53,7 @@ def found(*places: tuple[float, float]) -> Boxes:
 def test_actors_are_those_that_overlap_by_half() -> None:
     cars = found((20.3, 0.0), (30.0, 5.0), (40.0, 0.0), (10.0, 30.0), (60.0, 0.0))
     boxes = np.array([(102, 100, 141, 131), (300, 100, 395, 160), (130, 100, 170, 130)], dtype=float)
-    _, known = name_actors(frame(), "lidar", "left", Shot(cars, boxes))
+    _, known = name_actors(frame(), "lidar", "left", PairedShot(cars, boxes))
     assert known.cars.tolist() == [0, 1, -1, 3, -1]  # a bus is no car, and at 60 m there is nothing
     assert known.boxes.tolist() == [0, 2, -1]
     assert known.visible.tolist() == [True, False, False, False, False]
@@ -65,7 +65,7 @@ def test_without_annotated_actors_nobody_is_known() -> None:
     views = {"left": Views(none, none, NONE, np.zeros(0), np.zeros(0))}
     boxes = whole.annotations.boxes[:0]
     empty = Annotations(np.zeros(0, str), boxes, np.zeros((0, 3)), np.zeros((0, 3)), NONE, np.zeros(0), views=views)
-    shot = Shot(found((20.0, 0.0)), np.array([(100.0, 100.0, 140.0, 130.0)]))
+    shot = PairedShot(found((20.0, 0.0)), np.array([(100.0, 100.0, 140.0, 130.0)]))
     _, known = name_actors(replace(whole, annotations=empty), "lidar", "left", shot)
     assert (known.cars.tolist(), known.boxes.tolist(), known.visible.tolist()) == ([-1], [-1], [False])
 

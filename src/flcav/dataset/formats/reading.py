@@ -89,7 +89,7 @@ class ImportFormat(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Picture:
+class LogPicture:
     """A camera's image file with what projects into it."""
 
     path: Path
@@ -164,7 +164,7 @@ def difference_tracks(track: NDArray[np.str_], time_s: Array, center: Array) -> 
     return velocity
 
 
-def view_boxes(boxes: Boxes, pictures: Mapping[str, Picture]) -> dict[str, Views]:
+def view_boxes(boxes: Boxes, pictures: Mapping[str, LogPicture]) -> dict[str, Views]:
     """Return the rectangles that `boxes` (world frame) fill in each image, with the share outside it.
 
     They are those of the boxes and not of what is in them, so somewhat larger than of a simulated actor. Which pixels
@@ -174,7 +174,7 @@ def view_boxes(boxes: Boxes, pictures: Mapping[str, Picture]) -> dict[str, Views
     return {name: _view_corners(corners, picture) for name, picture in pictures.items()}
 
 
-def _view_corners(corners: Array, picture: Picture) -> Views:
+def _view_corners(corners: Array, picture: LogPicture) -> Views:
     amodal = np.full((len(corners), 4), np.nan)
     corners = transform_points(inverse(picture.world_from_camera), corners.reshape(-1, 3)).reshape(-1, 8, 3)
     ahead = (corners[:, :, 2] >= NEAR_M).sum(axis=1)

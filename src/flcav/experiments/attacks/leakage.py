@@ -72,7 +72,7 @@ class Attacked:
 
 
 @dataclass(frozen=True)
-class Level:
+class NoiseLevel:
     """One amount of noise, or secure aggregation."""
 
     name: str
@@ -89,9 +89,9 @@ class LeakageResult(Record):
     clip: float
     delta: float
     rounds: int
-    levels: tuple[Level, ...]  # ascending noise
-    masked: Level  # a single masked update
-    summed: Level  # the sum of all updates, which secure aggregation shows
+    levels: tuple[NoiseLevel, ...]  # ascending noise
+    masked: NoiseLevel  # a single masked update
+    summed: NoiseLevel  # the sum of all updates, which secure aggregation shows
     provenance: Provenance
 
     def sentences(self) -> list[str]:
@@ -181,7 +181,7 @@ def share_recognised(start: Weights, sent: Mapping[str, Weights], own: Mapping[s
 
 def make_level(
     test: Pictures, name: str, epsilon: float | None, seeds: Sequence[Attacked], *, by_sum: bool = False
-) -> Level:
+) -> NoiseLevel:
     """Return a level with the means over its seeds: of the accuracy over the scenes of `test`, too."""
     leaked = tuple(each.by_sum if by_sum else each.by_update for each in seeds)
     spread = {"accuracy": spread_over_scenes(test, [each.right.astype(float) for each in seeds])}
@@ -190,4 +190,4 @@ def make_level(
         values = [getattr(each, key) for each in leaked]
         share = key != "membership_advantage"
         means[key] = mean_over_seeds(values, share=share, shared=spread.get(key, OWN_SCENES))
-    return Level(name, epsilon, leaked, means)
+    return NoiseLevel(name, epsilon, leaked, means)

@@ -64,7 +64,7 @@ class Zone:
 
 
 @dataclass(frozen=True)
-class Placed:
+class ChosenPoles:
     """The poles that one rule chooses, and the errors they cover."""
 
     rule: str
@@ -80,7 +80,7 @@ class Fig3b(Record):
     frames: int
     errors: int
     zones: tuple[Zone, ...]  # densest in errors first
-    placed: tuple[Placed, ...]
+    placed: tuple[ChosenPoles, ...]
     towns: tuple[TownCover, ...]
     provenance: Provenance
 
@@ -158,9 +158,9 @@ def _count_zones(
     return tuple(sorted(zones, key=lambda zone: (-zone.errors, zone.pole)))
 
 
-def _place(candidates: Candidates, town: Town, scores: Mapping[str, NDArray[np.float64]]) -> Sequence[Placed]:
-    def tell(rule: str, count: int, placed: Placement) -> Placed:
-        return Placed(rule, count, tuple(int(town.poles.id[pole]) for pole in placed.chosen), placed.covered)
+def _place(candidates: Candidates, town: Town, scores: Mapping[str, NDArray[np.float64]]) -> Sequence[ChosenPoles]:
+    def tell(rule: str, count: int, placed: Placement) -> ChosenPoles:
+        return ChosenPoles(rule, count, tuple(int(town.poles.id[pole]) for pole in placed.chosen), placed.covered)
 
     rows = []
     for count in COUNTS:

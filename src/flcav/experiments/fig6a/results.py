@@ -33,7 +33,7 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Reached:
+class StageAP:
     """AP50 after a stage."""
 
     ap50: float
@@ -46,7 +46,7 @@ class AllocationSeed:
     seed: int
     plans: Mapping[str, Planned]
     predicted: Mapping[str, Mapping[str, float]]  # AP50 by plan and stage
-    realised: Mapping[str, Mapping[str, Mapping[str, Reached]]]  # by `MEAN` or town, plan and stage
+    realised: Mapping[str, Mapping[str, Mapping[str, StageAP]]]  # by `MEAN` or town, plan and stage
     differences: Mapping[str, Mapping[str, Estimate]]  # joint - equal by `MEAN` or town, and stage, over test scenes
     poles: Mapping[str, Mapping[str, int]]  # by plan and town
     ledger: Mapping[str, Mapping[str, LinkUse]]  # by plan and link

@@ -50,7 +50,7 @@ CHEAPEST = 16  # channels of a sensor of cost 1
 
 
 @dataclass(frozen=True)
-class Model:
+class LidarModel:
     """A LiDAR model on the poles."""
 
     name: str
@@ -70,7 +70,7 @@ class SensorRanges(Record):
 
     sweeps: int  # of each model
     cars: tuple[int, ...]  # that some model has returns of, in each interval of `EDGES_M`
-    models: tuple[Model, ...]
+    models: tuple[LidarModel, ...]
     provenance: Provenance
 
     def sentences(self) -> list[str]:
@@ -119,7 +119,7 @@ def measure_ranges(out: Path, progress: Report = ignore_progress) -> tuple[Senso
             sweeps += 1
             progress(number + 1, len(data), town)
     models = tuple(
-        Model(
+        LidarModel(
             name,
             Lidar.model_validate(dict(settings)).channels,
             tuple(found[name].tolist()),

@@ -40,7 +40,7 @@ class SeedResult(Generic[EvaluationT]):
 
 
 @dataclass(frozen=True)
-class Recorded:
+class StudyRecordings:
     """The recording recipes of all splits."""
 
     train: tuple[RecipeFields, ...]
@@ -57,7 +57,7 @@ class StudyResult(Generic[EvaluationT]):
     scale: str
     epochs: int
     patience: int
-    recipes: Recorded
+    recipes: StudyRecordings
     seeds: tuple[SeedResult[EvaluationT], ...]
     summary: Mapping[str, Mapping[str, MeanOverSeeds]]  # by test and name of the number
     provenance: Provenance
@@ -141,7 +141,7 @@ def run_study(
         scale,
         recipe.epochs,
         recipe.patience,
-        Recorded(recipe.train, recipe.validation, recipe.tests),
+        StudyRecordings(recipe.train, recipe.validation, recipe.tests),
         runs,
         summarise(study, runs),
         provenance(),

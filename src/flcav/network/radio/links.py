@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.network.radio import propagation as laws
 from flcav.network.radio.budget import Radio, lone_rate_bps, received_dbm
-from flcav.network.radio.propagation import State
+from flcav.network.radio.propagation import PathState
 from flcav.network.radio.sight import find_sight, raise_walls, vehicle_boxes
 from flcav.statistics.streams import stream
 from flcav.world.map.town import Town
@@ -155,4 +155,4 @@ def _losses(
         moved, correlation, shadow
     )
     path_loss = laws.path_loss_db(distance, state, radio.frequency_ghz, radio.environment)
-    return path_loss + np.where(paths.state == State.NLOSV, blocked, 0.0) + shadowing
+    return path_loss + np.where(paths.state == PathState.NLOSV, blocked, 0.0) + shadowing

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from flcav.config import Config
 from flcav.network.clock.rounds import NetworkSettings
-from flcav.optimization.allocation.uploads import Asked, share_by_held, share_by_links
+from flcav.optimization.allocation.uploads import UploadDemand, share_by_held, share_by_links
 from flcav.pipeline.engine import Work
 from flcav.pipeline.federations.prediction import measure_uplinks
 from flcav.pipeline.frames import Frames
@@ -33,7 +33,7 @@ def plan_uploads(work: Work, plan: Plan, pools: Mapping[str, Sequence[str]], how
     asked = {}
     for task, splits in opened.items():
         held = {name: len(frames) for region, split in splits.items() for name, frames in list_frames(region, split)}
-        asked[task] = Asked(plan.tasks[task].samples, plan.tasks[task].sample_mb, held)
+        asked[task] = UploadDemand(plan.tasks[task].samples, plan.tasks[task].sample_mb, held)
     if how.network is None:
         shares = {task: share_by_held(own) for task, own in asked.items()}
     else:

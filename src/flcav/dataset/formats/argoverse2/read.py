@@ -23,8 +23,8 @@ from flcav.dataset.formats.reading import (
     FARTHEST,
     AgentNames,
     ImportFormat,
+    LogPicture,
     LogSource,
-    Picture,
     annotate,
     check_sizes,
     choose_split,
@@ -139,7 +139,7 @@ class Argoverse2Source(LogSource):
             taken = {name: t for name in seen if (t := _nearest(cameras[name], sweep)) is not None}
             then = {name: poses.at(t) for name, t in taken.items()}
             pictures = {
-                name: Picture(
+                name: LogPicture(
                     log.folder / "sensors" / "cameras" / name / f"{t}.jpg", lenses[name], then[name] @ mounts[name]
                 )
                 for name, t in taken.items()

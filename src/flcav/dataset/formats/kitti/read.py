@@ -18,6 +18,7 @@ from flcav.config import InputError
 from flcav.dataset.formats.kitti.files import (
     PICTURES,
     SUFFIXES,
+    KittiCalibration,
     Objects,
     check_objects,
     read_calibration,
@@ -25,7 +26,6 @@ from flcav.dataset.formats.kitti.files import (
     read_points,
     read_split,
 )
-from flcav.dataset.formats.kitti.files import Calibration as KittiCalibration
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import (
     AgentNames,
@@ -56,7 +56,7 @@ FOLDERS = ("training", "testing")
 LISTS = ("train", "val", "test")
 
 
-class Shot(NamedTuple):
+class KittiShot(NamedTuple):
     """A frame of the benchmark, and where it belongs in a dataset."""
 
     folder: Path  # "training" or "testing"
@@ -83,8 +83,8 @@ class KittiSource(LogSource):
             assign_split(split_of, shot.scene, shot.split, folder)
         chosen = set(choose_split(folder, split_of, split))
         self.split_of = {scene: own for scene, own in split_of.items() if scene in chosen}
-        self._shots: dict[str, list[Shot]] = defaultdict(list)
-        self._agent: dict[Shot, str] = {}
+        self._shots: dict[str, list[KittiShot]] = defaultdict(list)
+        self._agent: dict[KittiShot, str] = {}
         self._calibration: dict[str, Calibration] = {}
         every = [shot for shot in shots if shot.scene in chosen]
         _check_complete(every)
@@ -129,7 +129,7 @@ def _calibrate(calibrated: KittiCalibration) -> Calibration:
     )
 
 
-def _read_frame(shot: Shot, agent: str, calibration: Calibration) -> LinkedFrame:
+def _read_frame(shot: KittiShot, agent: str, calibration: Calibration) -> LinkedFrame:
     pictures = {CAMERA: path} if (path := _path(shot, CAMERA)).is_file() else {}
     files = {LIDAR: _path(shot, "velodyne"), **pictures}
     points, calibrated = read_points(files[LIDAR]), read_calibration(_path(shot, "calib"))
@@ -165,7 +165,7 @@ def _read_frame(shot: Shot, agent: str, calibration: Calibration) -> LinkedFrame
     )
 
 
-def _find_shots(folder: Path) -> list[Shot]:
+def _find_shots(folder: Path) -> list[KittiShot]:
     """Return the frames of `training` and `testing` in the order of their numbers, in folders with a point cloud.
 
     A frame is one that is listed, or that any of its files is there of.
@@ -185,13 +185,13 @@ def _find_shots(folder: Path) -> list[Shot]:
         for number in sorted(numbers) if found["velodyne"] else ():
             split = listed.get((part, number), "test" if part == "testing" else None)
             where = origin.get(number, (f"kitti-{part}-{number}", 0, "ego", 0.0))
-            shots.append(Shot(folder / part, number, split, *where, number in origin))
+            shots.append(KittiShot(folder / part, number, split, *where, number in origin))
     if not shots:
         raise InputError(f"{folder}: no KITTI folder; it holds no 'training/velodyne' with point clouds")
     return shots
 
 
-def _check_complete(shots: list[Shot]) -> None:
+def _check_complete(shots: list[KittiShot]) -> None:
     """Raise `InputError` where a file of a frame is missing: images may be, and all labels of a folder."""
     labelled = {shot.folder for shot in shots if _path(shot, "label_2").is_file()}
     for shot in shots:
@@ -219,5 +219,5 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
     return found
 
 
-def _path(shot: Shot, part: str) -> Path:
+def _path(shot: KittiShot, part: str) -> Path:
     return shot.folder / part / f"{shot.number}.{SUFFIXES[part]}"

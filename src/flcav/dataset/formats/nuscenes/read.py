@@ -22,8 +22,8 @@ from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
     AgentNames,
     ImportFormat,
+    LogPicture,
     LogSource,
-    Picture,
     annotate,
     assign_split,
     check_sizes,
@@ -251,7 +251,7 @@ class NuscenesSource(LogSource):
         own = self._notes[spin.sample]
         boxes = self._boxes[own]
         pictures = {
-            name: Picture(
+            name: LogPicture(
                 path[name],
                 pinhole(calibration.intrinsics[name], *self._pixels(data[name]), self._tables / MOUNTED),
                 poses[name] @ mounts[name],

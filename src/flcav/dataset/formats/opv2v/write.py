@@ -51,7 +51,7 @@ KMH = 3.6
 FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built without libyaml has only the slow one
 
 
-class Vehicle(TypedDict):
+class Opv2vVehicle(TypedDict):
     """A vehicle in OPV2V's file of a frame."""
 
     angle: list[float]  # roll, yaw, pitch [degrees]
@@ -156,7 +156,7 @@ def from_carla(values: Sequence[float]) -> Array:
     return MIRROR @ matrix @ MIRROR
 
 
-def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed_m_s: float) -> set[str]:
+def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], speed_m_s: float) -> set[str]:
     """Write the files of a frame; return the sensors whose measurements they hold."""
     lidar, points = next(iter(frame.lidar.items()))
     folder.mkdir(parents=True, exist_ok=True)
@@ -188,7 +188,9 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed
     return {lidar, *cameras}
 
 
-def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> tuple[dict[int, Vehicle], Counter[LeftOut]]:
+def _vehicles(
+    frame: Frame, numbers: dict[str, int], min_points: int
+) -> tuple[dict[int, Opv2vVehicle], Counter[LeftOut]]:
     """Return number -> OPV2V's box of each vehicle with at least `min_points` points of the first LiDAR in its box.
 
     Other actors are counted by reason.
@@ -196,7 +198,7 @@ def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> tuple[d
     truth, boxes = frame.annotations, frame.annotations.boxes
     few = count_points_in_boxes(frame, *next(iter(frame.lidar.items()))) < min_points
     labelled, left_out = select_objects("OPV2V", boxes.label, VEHICLES, {lacks_points(min_points): few})
-    vehicles: dict[int, Vehicle] = {}
+    vehicles: dict[int, Opv2vVehicle] = {}
     for i in np.flatnonzero(labelled):
         tall = boxes.size[i, 2]
         placed = boxes.pose(int(i))
