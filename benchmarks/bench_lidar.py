@@ -20,7 +20,7 @@ from flcav.world.map.town import load_town
 from flcav.world.materials import Material
 from flcav.world.rays.embree import Solid
 from flcav.world.scene import Scene
-from flcav.world.static import Part, build_static_world
+from flcav.world.static import TownPart, build_static_world
 from flcav.world.traffic.traffic import simulate
 from flcav.world.weather import WEATHERS
 
@@ -124,7 +124,7 @@ def split_cost_of_slopes(name: str, repeats: int) -> dict[str, float]:
         own = [int(np.flatnonzero(scene.trace.actor == f"cav{i}")[0]) for i in range(4)]
         poses.append([scene.world_from_actor(actor) @ mount.agent_from_sensor() for actor in own])
         world = build_static_world(town)
-        ground = world.part <= Part.SIDEWALK
+        ground = world.part <= TownPart.SIDEWALK
         meshes.append((world.mesh.vertices, world.mesh.faces, ground))
     shear = np.eye(4)
     shear[2, 0] = SLOPE

@@ -10,7 +10,7 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, transform_points
 from flcav.report import style
-from flcav.report.pictures.birdseye import View, birdseye
+from flcav.report.pictures.birdseye import BirdseyeView, birdseye
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
@@ -33,12 +33,12 @@ def main(out: Path) -> None:
     print(f"{out / 'frame.png'}: the first frame from above")
 
 
-def seen_from_above(frame: Frame) -> View:
+def seen_from_above(frame: Frame) -> BirdseyeView:
     """Return the frame in its agent's coordinates, heights above the ground."""
     points = transform_points(frame.agent_from_sensor["lidar"], frame.lidar["lidar"][:, :3].astype(np.float64))
     points[:, 2] += frame.world_from_agent[2, 3]
     boxes = frame.annotations.boxes.transform(inverse(frame.world_from_agent))
-    return View(points, boxes, frame.annotations.returns, f"{frame.key} in the town {RECIPE['town']!r}")
+    return BirdseyeView(points, boxes, frame.annotations.returns, f"{frame.key} in the town {RECIPE['town']!r}")
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ import torch
 from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.rounds import Schedule, federate
+from flcav.federation.runtimes.metered import Account
 from flcav.network.ledger import Budget, Ledger
 from flcav.perception.client import TaskClient
 from flcav.perception.objects.model import second_tiny

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.rounds import Schedule, federate
+from flcav.federation.runtimes.metered import Account
 from flcav.federation.strategies.fedavg import FedAvg, average
 from flcav.federation.trainable import Update, Weights
 from flcav.network.ledger import Budget, Ledger

@@ -9,7 +9,7 @@ from matplotlib.colors import TwoSlopeNorm
 
 from flcav.geometry import Boxes, inverse, pose, transform_points
 from flcav.report import style
-from flcav.report.pictures.birdseye import HEIGHT_COLOURS, HEIGHTS_M, View, draw_view
+from flcav.report.pictures.birdseye import HEIGHT_COLOURS, HEIGHTS_M, BirdseyeView, draw_view
 from flcav.report.pictures.clouds import GROUND_M, draw_boxes, on_page
 from flcav.sensors.lidar.lidar import Lidar, scan
 from flcav.sensors.radar.radar import Radar, sweep_radar
@@ -63,7 +63,7 @@ def lidar_in_weather(scene: Scene, own: int, path: Path) -> None:
     for axes, (title, weather) in zip(figure.subplots(2, 2).flat, SHOWN.items()):
         points = sweep(scene, own, LIDAR, weather)
         length, width, _ = scene.trace.size[own]
-        draw_view(axes, View(points, boxes, np.ones(len(boxes), int), title, 40.0, agent_size=(length, width)))
+        draw_view(axes, BirdseyeView(points, boxes, np.ones(len(boxes), int), title, 40.0, agent_size=(length, width)))
         axes.set_title(f"{title}: {len(points):,} points")
     bar = figure.colorbar(
         ScalarMappable(HEIGHTS_M, HEIGHT_COLOURS), ax=figure.axes, location="bottom", fraction=0.02, pad=0.01, aspect=90

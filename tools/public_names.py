@@ -109,14 +109,19 @@ def as_written(app: Sphinx, what: str, name: str, value: Any, *said: Any) -> tup
 
 
 def as_rst(paragraph: str) -> str:
-    """Return a paragraph of a docstring as reStructuredText: examples and lists as they are, the rest escaped.
+    """Return a paragraph of a docstring as reStructuredText: examples and lists as they are, `Args:` as a field list.
 
     >>> as_rst("Return `a`s of *args, see x_.")
     'Return ``a``\\\\ s of \\\\*args, see x\\\\_.'
+    >>> as_rst("Args:\\n    seed: seed of the draws.")
+    ':param seed: seed of the draws.'
     """
     first = paragraph.lstrip()
     if first.startswith(">>>"):
         return paragraph
+    if first.startswith("Args:\n"):
+        listed = re.findall(r"^(\w+): (.*(?:\n +.*)*)", textwrap.dedent(paragraph.partition("\n")[2]), re.M)
+        return "\n".join(f":param {name}: {escaped(' '.join(said.split()))}" for name, said in listed)
     if paragraph.startswith(" ") or (not first.startswith("- ") and re.search(r"\n +", paragraph)):
         return "\n".join(f"| {escaped(line)}" for line in paragraph.split("\n"))
     return escaped(paragraph)

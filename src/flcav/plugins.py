@@ -1,4 +1,4 @@
-"""Plug-ins: tasks, strategies and study charts of users, named `module:NAME` on the command line or in a recipe."""
+"""Plug-ins: tasks, strategies, formats and study charts of users, named `module:NAME` in commands and recipes."""
 
 import importlib
 import re

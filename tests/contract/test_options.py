@@ -12,8 +12,7 @@ import typer
 from flcav.cli.main import app, run
 from flcav.cli.reproduce import ATTACKS, RECORDED, TARGETS
 from flcav.config import InputError
-from flcav.dataset.formats.export import FORMATS
-from flcav.dataset.formats.importing import READABLE
+from flcav.dataset.formats.formats import EXPORTS, IMPORTS
 from flcav.perception.errors import RegistersErrors
 from flcav.perception.task import Scores
 from flcav.perception.tasks import TASKS, task_named
@@ -24,8 +23,8 @@ SINGLE = ("fig1b", "fig3a", "sim-to-real", *map(str, (*RECORDED, *ATTACKS)))  # 
 STUDIES = tuple(target for target in TARGETS if target not in SINGLE)
 # command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
 CHOICES: dict[str, dict[str, str]] = {
-    "export": {name: f"{name} none --out out" for name in FORMATS},
-    "import": {name: f"{name} none --out out" for name in READABLE},
+    "export": {name: f"{name} none --out out" for name in EXPORTS},
+    "import": {name: f"{name} none --out out" for name in IMPORTS},
     "train": {
         **{task: f"{task} --data none --validation none --out out" for task in TASKS},
         "unvalidated": "weather --data none --out out",

@@ -2,8 +2,10 @@
 
 import dataclasses
 import importlib
+import inspect
 import pydoc
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ import pytest
 import flcav
 
 pytest.importorskip("sphinx", reason="sphinx is not installed: the extra 'docs'")
+from docutils import nodes
 from docutils.core import publish_doctree
 from public_names import as_rst, kind_of, public_names
 
@@ -44,6 +47,30 @@ def test_every_package_with_public_names_is_documented():
 def test_a_docstring_is_shown_as_it_was_written(text: str, shown: str):
     tree = publish_doctree(as_rst(text), settings_overrides={"report_level": 2, "halt_level": 2})
     assert " ".join(tree.astext().split()) == " ".join(shown.split())
+
+
+def arguments(owner: Callable) -> list[str]:
+    listed = (inspect.getdoc(owner) or "").partition("\nArgs:\n")[2].partition("\n\n")[0]
+    return re.findall(r"^    (\w+): ", listed, re.M)
+
+
+@pytest.mark.parametrize("package", sorted({package for package, _ in DOCUMENTED}))
+def test_arguments_of_long_lists_are_documented_one_by_one(package: str):
+    """The parameters of a function with four or more are those of its `Args:`; a shorter list may have none."""
+    for name in public_names(package):
+        owner = getattr(importlib.import_module(package), name)
+        if not inspect.isfunction(owner):
+            continue
+        taken = [*inspect.signature(owner).parameters]
+        if len(taken) >= 4 or arguments(owner):
+            assert arguments(owner) == taken, name
+
+
+def test_arguments_are_shown_as_fields():
+    text = "Args:\n    seed: of `a` for b_.\n    out: a folder,\n        new."
+    tree = publish_doctree(as_rst(text), settings_overrides={"report_level": 2, "halt_level": 2})
+    fields = [[each.astext() for each in field.children] for field in tree.findall(nodes.field)]
+    assert fields == [["param seed", "of a for b_."], ["param out", "a folder, new."]]
 
 
 def test_examples_are_left_alone():

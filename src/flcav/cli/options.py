@@ -40,27 +40,7 @@ class Device(StrEnum):
     cuda = "cuda"
 
 
-class Format(StrEnum):
-    """Format of an export, see `flcav.dataset.formats.export`."""
-
-    kitti = "kitti"
-    yolo = "yolo"
-    coco = "coco"
-    nuscenes = "nuscenes"
-    opv2v = "opv2v"
-    mcap = "mcap"
-
-
-class ImportFormat(StrEnum):
-    """Format of an import, see `flcav.dataset.formats.importing`."""
-
-    kitti = "kitti"
-    nuscenes = "nuscenes"
-    argoverse2 = "argoverse2"
-    opv2v = "opv2v"
-
-
-class Engine(StrEnum):
+class EngineName(StrEnum):
     """Execution engine, see `flcav.dataset.recording.recorder` and `flcav.pipeline.engine`."""
 
     processes = "processes"
@@ -95,8 +75,9 @@ def join_choices(choices: Iterable[str]) -> str:
     return f"{', '.join(others)} or {last}"
 
 
-ANY_TASK = f"{join_choices(TASKS)}, or one of your own as module:NAME"
-ENGINE = typer.Option(Engine.processes, "--engine", help="Backend: processes on this machine, or a Ray cluster.")
+OWN = "or one of your own as module:NAME"
+ANY_TASK = f"{join_choices(TASKS)}, {OWN}"
+ENGINE = typer.Option(EngineName.processes, "--engine", help="Backend: processes on this machine, or a Ray cluster.")
 STALE = typer.Option(
     Stale.refuse,
     "--stale",

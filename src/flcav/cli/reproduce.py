@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import typer
 
-from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale, join_choices, refuse_unused
+from flcav.cli.options import ENGINE, JOBS, STALE, EngineName, Stale, join_choices, refuse_unused
 from flcav.cli.terminal import only_writer_of, when_interrupted
 from flcav.experiments.studies import STUDIES
 from flcav.interface.wording import plural
@@ -113,7 +113,7 @@ def reproduce(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
     ),
     jobs: int = JOBS,
-    engine: Engine = ENGINE,
+    engine: EngineName = ENGINE,
     stale: Stale = STALE,
     kitti: Path | None = typer.Option(None, "--kitti", help="sim-to-real: a folder of real frames in KITTI's layout."),
     weights: Path | None = typer.Option(
@@ -212,7 +212,7 @@ def _write_figures(out: Path, numbers: "Json", pictures: Mapping[str, bytes], se
         typer.echo(sentence)
 
 
-def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
     from flcav.experiments.arms.run import compare_arms, draw_arms, judge_differences
     from flcav.storage.files import write_bytes, write_json
 
@@ -230,7 +230,7 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
 
 
 @when_interrupted()
-def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.fig6a.run import BUDGETS, budget_recipes, compare_plans, draw_allocation, plans_differ
     from flcav.pipeline.running import run_several
@@ -254,7 +254,7 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engi
             typer.echo(f"Budgets {each.name}. {finding.question} {finding.verdict}. {finding.sentence}")
 
 
-def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
     from flcav.experiments.distillation.run import compare_labels, draw_labels
 
     results = compare_labels(*_run_seeds(Target.distillation, "distillation", out, seeds, scale, jobs, engine, stale))
@@ -262,7 +262,7 @@ def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, 
 
 
 def _federation_exchange(
-    target: Target, out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale
+    target: Target, out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale
 ) -> None:
     from flcav.experiments.exchanges.run import compare_exchanges, draw_results
     from flcav.experiments.scales import shrink_recipe
@@ -272,7 +272,7 @@ def _federation_exchange(
     _write_figures(out, results.as_json(), {"exchange.png": draw_results(results)}, results.sentences())
 
 
-def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
     from flcav.experiments.maps import import_map
     from flcav.experiments.placement.claims import describe_claims
     from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps
@@ -291,7 +291,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: Engine, sta
     _write_figures(out, results.as_json(), draw_proof(results), [*results.sentences(), *describe_claims(results)])
 
 
-COMPARISONS: Mapping[str, Callable[[Path, int, str, int, Engine, Stale], None]] = {
+COMPARISONS: Mapping[str, Callable[[Path, int, str, int, EngineName, Stale], None]] = {
     Target.demo_arms: _demo_arms,
     Target.distillation: _distillation,
     **{target: partial(_federation_exchange, Target(target)) for target in EXCHANGES},
@@ -308,7 +308,7 @@ def _run_seeds(
     seeds: int,
     scale: str,
     jobs: int,
-    engine: Engine,
+    engine: EngineName,
     stale: Stale,
     shrink: "Callable[[RunRecipe], RunRecipe] | None" = None,
     beside: Path | None = None,
@@ -338,7 +338,9 @@ def _load_sized(name: str, scale: str, shrink: "Callable[[RunRecipe], RunRecipe]
 
 
 @when_interrupted()
-def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int, engine: Engine, stale: Stale) -> None:
+def _sim_to_real(
+    out: Path, kitti: Path | None, weights: Path | None, jobs: int, engine: EngineName, stale: Stale
+) -> None:
     from flcav.cli.steps import live_steps
     from flcav.config import InputError
     from flcav.experiments.sim_to_real.run import draw_clouds, draw_frame, run_sim_to_real
@@ -362,7 +364,7 @@ def _sim_to_real(out: Path, kitti: Path | None, weights: Path | None, jobs: int,
 
 
 @when_interrupted()
-def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: Engine, stale: Stale) -> None:
+def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.studies import study_named
     from flcav.experiments.studies.run import results_as_json, run_study

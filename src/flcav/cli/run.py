@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import AGENTS, ENGINE, JOBS, STALE, Engine, Stale
+from flcav.cli.options import AGENTS, ENGINE, JOBS, STALE, EngineName, Stale
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.config import InputError
 from flcav.interface.wording import plural
@@ -36,7 +36,7 @@ def run(
     dry: bool = DRY,
     jobs: int = JOBS,
     seeds: int = SEEDS,
-    engine: Engine = ENGINE,
+    engine: EngineName = ENGINE,
     stale: Stale = STALE,
     as_json: bool = AS_JSON,
 ) -> None:
@@ -75,7 +75,7 @@ def demo(
     seed: int | None = typer.Option(None, "--seed", min=0, help="Seed of traffic, sensors and training, if not 1."),
     recipe: Path = typer.Option(Path("recipes/runs/demo.yaml"), "--recipe", help="Another run recipe."),
     jobs: int = JOBS,
-    engine: Engine = ENGINE,
+    engine: EngineName = ENGINE,
     stale: Stale = STALE,
 ) -> None:
     """Run recipes/runs/demo.yaml: pretraining, a roadside sensor, edge FL and cloud FL on three towns."""
@@ -88,7 +88,7 @@ def _run(
     out: Path,
     jobs: int,
     seeds: int,
-    engine: Engine,
+    engine: EngineName,
     stale: Stale,
     as_json: bool,
     title: str,

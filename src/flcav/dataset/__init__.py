@@ -1,10 +1,15 @@
-"""Datasets: recording, reading, validation, and export to other formats."""
+"""Datasets: recording, reading, validation, export to other formats and import of them."""
 
 from typing import TYPE_CHECKING
 
 from flcav.interface.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from flcav.dataset.formats.export import export
+    from flcav.dataset.formats.exporter import Exported, ExportFormat, ExportOptions, read_frame
+    from flcav.dataset.formats.formats import EXPORTS, IMPORTS
+    from flcav.dataset.formats.importing import import_dataset
+    from flcav.dataset.formats.reading import ImportFormat, LogSource, annotate
     from flcav.dataset.recording.recorder import record
     from flcav.dataset.store import Dataset
     from flcav.dataset.validation import validate
@@ -13,6 +18,17 @@ PLACES = {
     "validate": "flcav.dataset.validation",
     "record": "flcav.dataset.recording.recorder",
     "Dataset": "flcav.dataset.store",
+    "EXPORTS": "flcav.dataset.formats.formats",
+    "export": "flcav.dataset.formats.export",
+    "ExportOptions": "flcav.dataset.formats.exporter",
+    "Exported": "flcav.dataset.formats.exporter",
+    "ExportFormat": "flcav.dataset.formats.exporter",
+    "read_frame": "flcav.dataset.formats.exporter",
+    "IMPORTS": "flcav.dataset.formats.formats",
+    "import_dataset": "flcav.dataset.formats.importing",
+    "ImportFormat": "flcav.dataset.formats.reading",
+    "LogSource": "flcav.dataset.formats.reading",
+    "annotate": "flcav.dataset.formats.reading",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, PLACES)

@@ -33,7 +33,7 @@ class TableFile(StrictModel):
     sha256: str
 
 
-class Counts(StrictModel):
+class DatasetCounts(StrictModel):
     """Counts of the contents of a dataset."""
 
     frames: int
@@ -50,7 +50,7 @@ class Manifest(StrictModel):
     format: int
     recipe: Mapping[str, Json]
     versions: dict[str, str]
-    counts: Counts
+    counts: DatasetCounts
     scenes: list[str]
     tables: dict[str, TableFile]
 

@@ -45,7 +45,7 @@ OUTLINE = np.array(
 
 
 @dataclass(frozen=True)
-class View:
+class AssociatedCamera:
     """A camera beside a LiDAR: its extrinsics, how far they may be off, its intrinsics and its picture's size."""
 
     camera_from_lidar: Array  # (4, 4), optical frame
@@ -56,7 +56,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Shot:
+class PairedShot:
     """Cars detected by a LiDAR and boxes detected in a camera's picture at one instant."""
 
     cars: Boxes  # (N,) LiDAR frame
@@ -82,7 +82,7 @@ class Association:
     """The pairs of each shot, and the view that they were made with."""
 
     pairs: tuple[Pairs, ...]
-    view: View
+    view: AssociatedCamera
     settled: bool  # whether the pairs stayed; False: they still changed after the last round
 
 
@@ -99,7 +99,7 @@ def apply_error(camera_from_lidar: Array, error: Array) -> Array:
     return moved @ camera_from_lidar
 
 
-def measure_error(true: Array, view: View) -> float:
+def measure_error(true: Array, view: AssociatedCamera) -> float:
     """Return the squared error of a view's extrinsics in its standard deviations: 6 in the mean, if those are right.
 
     `true`: the camera's (4, 4) pose of the LiDAR. The error is what `apply_error` takes to the true extrinsics.
@@ -109,7 +109,7 @@ def measure_error(true: Array, view: View) -> float:
     return float(error @ np.linalg.solve(view.covariance, error))
 
 
-def correct_extrinsics(shots: Sequence[Shot], calibrated: View, rounds: int = ROUNDS) -> Association:
+def correct_extrinsics(shots: Sequence[PairedShot], calibrated: AssociatedCamera, rounds: int = ROUNDS) -> Association:
     """Return the pairs of all shots of one camera, and its view with corrected extrinsics and their covariance.
 
     The extrinsics of `calibrated` are the prior of the fit. Without a pair they stay. After `rounds` fits the pairs are
@@ -131,7 +131,7 @@ def _list_partners(pairs: Sequence[Pairs]) -> list[tuple[list[int], list[int]]]:
     return [(each.car.tolist(), each.box.tolist()) for each in pairs]
 
 
-def pair(shot: Shot, view: View) -> Pairs:
+def pair(shot: PairedShot, view: AssociatedCamera) -> Pairs:
     """Return the pairs of a shot's cars and boxes of least cost, and what remains alone.
 
     Pairs with a squared distance beyond the `GATE` of their sides are none. The cost is -2 log of the density of the
@@ -167,7 +167,9 @@ def pair(shot: Shot, view: View) -> Pairs:
     )
 
 
-def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: View) -> View:
+def fit_extrinsics(
+    shots: Sequence[PairedShot], pairs: Sequence[Pairs], calibrated: AssociatedCamera
+) -> AssociatedCamera:
     """Return the view whose extrinsics fit the pairs best, and their covariance.
 
     By least squares of the sides' offsets in standard deviations, under a Cauchy loss, and of the error of `calibrated`
@@ -201,14 +203,6 @@ def fit_extrinsics(shots: Sequence[Shot], pairs: Sequence[Pairs], calibrated: Vi
     )
 
 
-def project_cars(cars: Boxes, view: View) -> Array:
-    """Return the boxes (N, 4) x1 y1 x2 y2 [px] around what the picture shows of the outlines of cars, LiDAR frame.
-
-    NaN for cars that are not wholly before the camera, or outside the picture.
-    """
-    return _sides(outline(cars), view)
-
-
 def outline(cars: Boxes) -> Array:
     """Return the (N, K, 3) points of cars' outlines, in the frame of their boxes [m]."""
     own = OUTLINE * (0.5, 0.5, 1.0) - (0, 0, 0.5)
@@ -222,12 +216,12 @@ def side_px(box: Array) -> float:
     return float(np.hypot(SIDE_PX, SIDE_SHARE * np.sqrt((box[2] - box[0]) * (box[3] - box[1]))))
 
 
-def sides_inside(boxes: Array, view: View) -> NDArray[np.bool_]:
+def sides_inside(boxes: Array, view: AssociatedCamera) -> NDArray[np.bool_]:
     """Return (..., 4) whether each side of boxes (..., 4) lies inside the picture: not on its border."""
     return (boxes > BORDER_PX) & (boxes < np.array(view.size * 2) - BORDER_PX)
 
 
-def _sides(points: Array, view: View) -> Array:
+def _sides(points: Array, view: AssociatedCamera) -> Array:
     """Return the boxes (N, 4) around what the picture shows of outlines (N, K, 3), LiDAR frame; NaN where nothing."""
     n, k, _ = points.shape
     seen = transform_points(view.camera_from_lidar, points.reshape(-1, 3))
@@ -238,8 +232,8 @@ def _sides(points: Array, view: View) -> Array:
     return np.where(np.asarray(shapely.area(shown))[:, None] > 0, shapely.bounds(shown), np.nan)
 
 
-def _project_with_slope(cars: Boxes, view: View) -> tuple[Array, Array]:
-    """Return `project_cars`, and its (N, 4, 6) derivative by an error of the extrinsics."""
+def _project_with_slope(cars: Boxes, view: AssociatedCamera) -> tuple[Array, Array]:
+    """Return the boxes (N, 4) of `_sides` of cars, and their (N, 4, 6) derivative by an error of the extrinsics."""
     points, step = outline(cars), 1e-5
     moved = [
         _sides(points, replace(view, camera_from_lidar=apply_error(view.camera_from_lidar, step * axis)))

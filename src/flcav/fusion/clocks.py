@@ -26,7 +26,7 @@ LEAST_EVIDENCE = 2.0  # log-likelihood that an offset has above none: two standa
 
 
 @dataclass(frozen=True)
-class Trace:
+class ObjectPath:
     """The path of an object by road sensors alone."""
 
     times_s: Array  # (T,) increasing, two or more
@@ -56,7 +56,7 @@ def set_clocks(sightings: Sequence[Sighting], at_s: float) -> list[Sighting]:
     return [replace(each, time_s=each.time_s - offset.get(each.agent, 0.0)) for each in sightings]
 
 
-def trace_objects(surveyed: Sequence[Sighting], at_s: float) -> list[Trace]:
+def trace_objects(surveyed: Sequence[Sighting], at_s: float) -> list[ObjectPath]:
     """Return the paths of moving objects that road sensors tell of at two instants or more."""
     found: dict[int, dict[float, list[tuple[Array, float]]]] = {}
     told = [tell(each) for each in surveyed]
@@ -69,7 +69,7 @@ def trace_objects(surveyed: Sequence[Sighting], at_s: float) -> list[Trace]:
         times = np.array(sorted(seen))
         places = np.array([_average(seen[time]) for time in times.tolist()])
         if len(times) > 1 and np.linalg.norm(places[-1] - places[0]) >= LEAST_SPEED_MPS * (times[-1] - times[0]):
-            traces.append(Trace(times, places))
+            traces.append(ObjectPath(times, places))
     return traces
 
 
@@ -79,7 +79,7 @@ def _average(seen: Sequence[tuple[Array, float]]) -> Array:
     return weights @ places / weights.sum()
 
 
-def estimate_offset(own: Sequence[Sighting], traces: Sequence[Trace]) -> float:
+def estimate_offset(own: Sequence[Sighting], traces: Sequence[ObjectPath]) -> float:
     """Return by how much a vehicle's clock is fast [s]; 0 where `traces` do not tell.
 
     own: what the vehicle tells of, and where it was itself.

@@ -15,9 +15,17 @@ Coordinate = TypeVar("Coordinate", float, Array)
 
 
 def pose(x: float, y: float, z: float = 0.0, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Array:
-    """Return the (4, 4) `world_from_body` of a body at x, y, z [m] with Tait-Bryan angles yaw, pitch, roll [rad].
+    """Return the (4, 4) `world_from_body` of a body from its position and its Tait-Bryan angles.
 
-    Intrinsic z-y'-x'' rotation; a positive pitch turns the nose down (right-hand rule about the left axis).
+    Intrinsic z-y'-x'' rotation.
+
+    Args:
+        x: position to the east [m].
+        y: position to the north [m].
+        z: height [m].
+        yaw: heading, counter-clockwise from x [rad].
+        pitch: inclination; positive turns the nose down [rad] (right-hand rule about the left axis).
+        roll: bank; positive turns the right side down [rad].
     """
     cy, sy, cp, sp, cr, sr = (
         np.cos(yaw),

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from flcav.config import Config
 from flcav.network.plan import MessageSizes
-from flcav.optimization.curves.curves import STAGES, Additive, Curve, NonNegative, OwnCurve, Positive, Shared
+from flcav.optimization.curves.curves import STAGES, Additive, Curve, NonNegative, OwnCurve, Positive, SharedCurve
 from flcav.storage.records import LEFT_OUT
 
 MOST = 10**9  # largest count
@@ -98,7 +98,7 @@ class AllocationTask(Quantities):
     @property
     def learners(self) -> tuple[Learner, ...]:
         """The learning curves of the task or of its cluster's members, with weights that sum to the task's."""
-        if not isinstance(self.curve, Shared):
+        if not isinstance(self.curve, SharedCurve):
             return (Learner(self.name, self.weight, self.curve),)
         total = sum(member.weight for member in self.curve.members)
         return tuple(
@@ -146,7 +146,7 @@ class AllocationTask(Quantities):
         limits = self.limits
         ranges = (limits.samples, limits.edge_rounds, limits.cloud_rounds)
         for field, curve in (("curve", self.curve), ("upper", self.upper or self.curve)):
-            for each in (member.curve for member in curve.members) if isinstance(curve, Shared) else (curve,):
+            for each in (member.curve for member in curve.members) if isinstance(curve, SharedCurve) else (curve,):
                 if not isinstance(each, Additive) and limits.samples[0] == 0:
                     raise ValueError(
                         f"limits.samples of task {self.name!r} must start at 1 or more: its error at 0 is infinite"
@@ -175,7 +175,7 @@ class AllocationTask(Quantities):
 
 
 def _members(curve: Curve) -> list[tuple[str, float]]:
-    return [(member.name, member.weight) for member in curve.members] if isinstance(curve, Shared) else []
+    return [(member.name, member.weight) for member in curve.members] if isinstance(curve, SharedCurve) else []
 
 
 class Budgets(Quantities):

@@ -40,7 +40,7 @@ RIG_FIELDS = ("vehicle_rig", "pole_rig")
 
 
 @dataclass(frozen=True)
-class Learning(Record):
+class TrainingProgress(Record):
     """Steps, final loss and validation scores of a training."""
 
     steps: int
@@ -67,7 +67,7 @@ class Card(Config):
     parameters: int
     seed: int
     samples: int
-    training: Mapping[str, Json]  # settings such as epochs and batch, and the fields of `Learning`
+    training: Mapping[str, Json]  # settings such as epochs and batch, and the fields of `TrainingProgress`
     data: tuple[DataEntry, ...]  # training data, one entry per dataset
     validation: DataEntry | None = None  # validation data; None without
     metrics: Mapping[str, Json]  # evaluation on the validation data; empty without
@@ -78,9 +78,9 @@ class Card(Config):
     processor: str | None = None  # kind of processor, see `flcav.perception.device.processor_of`
 
     @property
-    def learning(self) -> Learning:
+    def learning(self) -> TrainingProgress:
         """Return the record of the training; raises `InputError` if `training` lacks its fields."""
-        return Learning.from_json(self.training, f"card of {self.task}, {self.network}")
+        return TrainingProgress.from_json(self.training, f"card of {self.task}, {self.network}")
 
     def markdown(self) -> str:
         """Return the card as Markdown, numbers rounded to 4 decimals; the metadata keeps all digits."""

@@ -114,10 +114,17 @@ class TrainedWeights:
 
 
 class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
-    """A federated client: local training of a task's network on the client's own samples, by so many `threads`.
+    """A federated client: local training of a task's network on the client's own samples.
 
     It satisfies the protocol `Trainable` of `flcav.federation`, which this layer does not import. Raises `InputError`
     without samples.
+
+    Args:
+        task: the task.
+        config: configuration of the network.
+        samples: samples of the client.
+        batch: number of samples in a batch; None: that of the task.
+        threads: number of CPU threads.
     """
 
     def __init__(
@@ -147,11 +154,21 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
         layers: Sequence[str] = (),
         centre: Mapping[str, NDArray[np.number]] | None = None,
     ) -> TrainedWeights:
-        """Train for `steps` steps from `weights` at a constant learning rate; deterministic in its arguments.
+        """Train from given weights at a constant learning rate; deterministic in its arguments.
 
-        The gradient of each step is g + proximal (w - centre) + shift, by name of parameter; `centre` is by default
-        `weights`. With a `shift` the result has the mean of g. With `layers`, patterns of names, all other parameters
-        stay as they are. Raises `InputError` if `weights` do not fit the network, or no parameter is named by `layers`.
+        The gradient of each step is g + proximal (w - centre) + shift, by name of parameter; with a `shift` the result
+        has the mean of g. Raises `InputError` if `weights` do not fit the network, or no parameter is named by
+        `layers`.
+
+        Args:
+            weights: first weights, by name of parameter or buffer.
+            steps: number of optimiser steps.
+            learning_rate: step size.
+            seed: seed of the batches and the augmentation.
+            proximal: coefficient of the proximal term.
+            shift: added to the gradient, by name of parameter; None: nothing.
+            layers: patterns of the names of parameters that are trained; empty: all.
+            centre: weights of the proximal term; None: `weights`.
         """
         use_threads(self.threads)
         network = self.task.build(self.config)

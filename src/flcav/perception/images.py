@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageEnhance, UnidentifiedImageError
 
 from flcav.config import InputError
-from flcav.dataset.formats.kitti import Calibration, read_calibration
+from flcav.dataset.formats.kitti import KittiCalibration, read_calibration
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.payloads import open_image
 from flcav.dataset.store import Dataset
@@ -165,7 +165,7 @@ def recorded_view(data: Dataset, number: int, lidar: str) -> CameraView | None:
     )
 
 
-def kitti_view(picture: Picture, calibration: Calibration) -> CameraView:
+def kitti_view(picture: Picture, calibration: KittiCalibration) -> CameraView:
     """Return the view of KITTI's left colour camera relative to the LiDAR.
 
     The fourth column of its 3 x 4 projection matrix becomes a translation of the extrinsics.

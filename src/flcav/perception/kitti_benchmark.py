@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.dataset.formats.kitti import Calibration, KittiFolder, KittiFrame
+from flcav.dataset.formats.kitti import KittiCalibration, KittiFolder, KittiFrame
 from flcav.dataset.formats.kitti.files import ASSUMED_SIZE
 from flcav.dataset.formats.kitti.read import BEAMS, HEIGHT_M, RANGE_M
 from flcav.dataset.formats.kitti.write import FRAMES
@@ -181,7 +181,7 @@ def _compare(boxes: Boxes, frame: KittiFrame, size: tuple[int, ...]) -> _Found:
     )
 
 
-def project_boxes(boxes: Boxes, calibration: Calibration, size: Sequence[int]) -> Array:
+def project_boxes(boxes: Boxes, calibration: KittiCalibration, size: Sequence[int]) -> Array:
     """Return (D, 4) rectangles [px] of boxes (LiDAR frame) within an image of `size` (height, width); 0 outside it."""
     height, width = size
     rectangles = np.zeros((len(boxes), 4))

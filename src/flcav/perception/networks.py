@@ -89,11 +89,23 @@ def train(
 ) -> TrainedNetwork:
     """Train a network on recorded frames with their ground truth; weights, card and curves are written to `out`.
 
-    `network` names one of the task's configurations (None: its first), `device` is "auto", "cpu" or "cuda", `agents`
-    selects frames as in `flcav.perception.agents.choose_frames`. With `validation`, a dataset of other scenes, the best
-    epoch is kept, and training stops early after `patience` epochs without a better one. An interrupted training is
-    resumed; the result of a finished one is loaded. Raises `InputError` if task, network, data, device or agents are
-    unusable, and if `out` holds weights of other settings; `OSError` if `out` cannot be written.
+    An interrupted training is resumed; the result of a finished one is loaded. Raises `InputError` if task, network,
+    data, device or agents are unusable, and if `out` holds weights of other settings; `OSError` if `out` cannot be
+    written.
+
+    Args:
+        task: a name of `TASKS`, `module:NAME`, or the task itself.
+        data: dataset or its folder, or several.
+        out: folder of weights, card and curves.
+        validation: dataset of other scenes, by which the best epoch is kept; None: the last one is.
+        network: name of one of the task's configurations; None: its first.
+        epochs: number of passes over the samples.
+        patience: number of epochs without a better one after which a validated training stops.
+        seed: seed of first weights, order and augmentation.
+        device: "auto", "cpu" or "cuda".
+        agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
+        threads: number of CPU threads; another number gives other weights.
+        progress: callback for the epochs done so far and in total.
 
     >>> from flcav import train
     >>> trained = train("weather", "data", out="networks/weather", epochs=2, seed=1)
@@ -125,10 +137,19 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a network on recorded frames by the metrics of its task.
 
-    For the task `objects`, data may also be a folder in KITTI's layout, which is evaluated as its benchmark counts. For
-    that task alone, `within` ("AHEAD,SIDE" in metres) limits the range, `around` looks to all four sides,
-    and `tracks` adds the tracking metrics MOTA and AMOTA. Raises `InputError` if task, data, weights, device, agents or
-    range are unusable.
+    Raises `InputError` if task, data, weights, device, agents or range are unusable.
+
+    Args:
+        task: a name of `TASKS`, `module:NAME`, or the task itself.
+        data: dataset or its folder; of the task `objects` also one in KITTI's layout, counted as by its benchmark.
+        network: the network or its file of weights; None: that of the package.
+        agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
+        within: "AHEAD,SIDE" [m], to which the range is limited; of the task `objects`.
+        around: whether to look to all four sides, by quarter turns, and not ahead alone; of the task `objects`.
+        tracks: whether to add the tracking metrics MOTA and AMOTA; of the task `objects`.
+        device: "auto", "cpu" or "cuda".
+        threads: number of CPU threads.
+        progress: callback for the frames done so far and in total.
 
     >>> from flcav import evaluate
     >>> found = evaluate("objects", "data")  # the network of the package
@@ -176,6 +197,16 @@ def compare_networks(
     Raises `InputError` where task, data, weights, device or agents are unusable, where the networks use different
     frames, or these hold nothing to find.
 
+    Args:
+        task: a name of `TASKS`, `module:NAME`, or the task itself.
+        data: dataset or its folder.
+        first: the network or its file of weights; None: that of the package.
+        second: the same of the network that is compared with it.
+        agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
+        device: "auto", "cpu" or "cuda".
+        threads: number of CPU threads.
+        progress: callback for the frames done so far and in total.
+
     >>> from flcav.perception import compare_networks
     >>> same = compare_networks("weather", "data", None, None)  # the network of the package, with itself
     >>> same.difference.mean, same.verdict
@@ -212,9 +243,17 @@ def infer(
 ) -> Inference:
     """Run a network on files, folders of files, or dataset folders: point clouds or images, by task.
 
-    Detections that score below `threshold` are left out (None: the task's default). For the task `objects` alone,
-    `around` looks to all four sides. Raises `InputError` if task, weights, device or agents are unusable; for a bad
-    file, when the iteration reaches it.
+    Raises `InputError` if task, weights, device or agents are unusable; for a bad file, when the iteration reaches it.
+
+    Args:
+        task: a name of `TASKS`, `module:NAME`, or the task itself.
+        inputs: files, folders of files, or folders of datasets.
+        network: the network or its file of weights; None: that of the package.
+        threshold: score below which detections are left out; None: the task's default.
+        around: whether to look to all four sides, by quarter turns, and not ahead alone; of the task `objects`.
+        agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
+        device: "auto", "cpu" or "cuda".
+        threads: number of CPU threads.
 
     >>> from flcav import infer
     >>> first = next(iter(infer("objects", "data", threshold=0.5)))
@@ -252,9 +291,18 @@ def register_errors(
 ) -> Registry:
     """Return the mistakes of a network on recorded frames with their positions in the town, each once.
 
-    Detections that score below `threshold` are ignored (None: the task's default). For the task `objects` alone,
-    `around` looks to all four sides. Raises `InputError` for a task whose
-    mistakes have no position, and if data, weights, device or agents are unusable.
+    Raises `InputError` for a task whose mistakes have no position, and if data, weights, device or agents are unusable.
+
+    Args:
+        task: a name of `TASKS`, `module:NAME`, or the task itself.
+        data: dataset or its folder.
+        network: the network or its file of weights; None: that of the package.
+        threshold: score below which detections are ignored; None: the task's default.
+        around: whether to look to all four sides, by quarter turns, and not ahead alone; of the task `objects`.
+        agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
+        device: "auto", "cpu" or "cuda".
+        threads: number of CPU threads.
+        progress: callback for the frames done so far and in total.
 
     >>> from flcav import register_errors
     >>> errors = register_errors("objects", "data")

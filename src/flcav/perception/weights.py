@@ -48,6 +48,12 @@ def save_network(
     """Write weights, configuration (JSON) and card (JSON) of a network to a safetensors file, atomically.
 
     The same network gives the same bytes.
+
+    Args:
+        task: the task, by whose name the file is recognised.
+        network: the network.
+        path: the file.
+        card: data, settings and metrics of its training; None: unknown.
     """
     tensors = {name: tensor.contiguous().cpu() for name, tensor in network.state_dict().items()}
     metadata = {config_key(task): _adapter(task).dump_json(network.config).decode()}
@@ -85,14 +91,6 @@ def read_card(path: Path | str) -> Card:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"]))
         raise DamagedFile(f"{path}: weights with a damaged card ({f'{field}: ' * bool(field)}{first['msg']})") from None
-
-
-def load_weights(task: Task[ConfigT, NetworkT, SampleT], network: NetworkT, path: Path) -> None:
-    """Load the weights at `path` into `network`, in place; raises `InputError` if their configuration differs."""
-    config, tensors = _read(task, path)
-    if config != network.config:
-        raise InputError(f"{path}: weights of another network ({_difference(config, network.config)})")
-    _fill(network, tensors, path)
 
 
 def to_arrays(network: nn.Module) -> dict[str, NDArray[np.number]]:
@@ -168,8 +166,3 @@ def _fill(network: nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> N
     except RuntimeError as error:
         reason = str(error)[:200]
         raise InputError(f"{path}: weights of another network ({reason})") from None
-
-
-def _difference(theirs: Any, ours: Any) -> str:
-    names = [name for name in vars(ours) if not name.startswith("_") and getattr(theirs, name) != getattr(ours, name)]
-    return ", ".join(f"{name} {getattr(theirs, name)} instead of {getattr(ours, name)}" for name in names)[:300]

@@ -36,9 +36,17 @@ def run(
 
     The files are results.json, history.csv, ledgers, rounds.parquet, and TensorBoard's event files.
 
-    Towns, datasets and histories are looked for in `beside` (None: the working directory). `jobs` workers compute, of
-    one thread each; `engine` and `stale` are those of `run_steps`. Raises `InputError` where a part of the recipe
-    cannot be used, and where `out` holds another run or, if `stale` refuses that, one of other code.
+    Args:
+        recipe: of the run, or the path of its YAML file.
+        out: folder of the run.
+        beside: folder that towns, datasets and histories are looked for in; None: the working directory.
+        jobs: number of workers, of one thread each.
+        notify: called with a step's name, its progress and a note.
+        stale: what becomes of finished steps of other code or arguments: refuse, redo or keep (see `run_steps`).
+        engine: processes of this machine, or ray: actors of a cluster.
+
+    Raises `InputError` where a part of the recipe cannot be used, and where `out` holds another run or, if `stale`
+    refuses that, one of other code.
 
     >>> import flcav
     >>> few = {"scenes": 2, "spins": 1, "cavs": 1}
@@ -85,7 +93,17 @@ def run_seeds(
 ) -> tuple[tuple[Run, ...], Summary]:
     """Run or finish a recipe with `seeds` consecutive seeds, its own first; return all runs and their summary.
 
-    Each seed has a folder in `out`, beside summary.json and a common history.csv. Other arguments are those of `run`.
+    Each seed has a folder in `out`, beside summary.json and a common history.csv. Raises as `run`.
+
+    Args:
+        recipe: of the runs, but for their seeds.
+        out: folder of all runs.
+        seeds: number of runs.
+        beside: folder that towns, datasets and histories are looked for in; None: the working directory.
+        jobs: number of workers, of one thread each.
+        notify: called with a step's name, its progress and a note.
+        stale: what becomes of finished steps of other code or arguments: refuse, redo or keep (see `run_steps`).
+        engine: processes of this machine, or ray: actors of a cluster.
     """
     recipes = {
         f"seed{seed}": recipe.model_copy(update={"seed": seed}) for seed in range(recipe.seed, recipe.seed + seeds)

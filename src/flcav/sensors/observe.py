@@ -12,7 +12,7 @@ from flcav.sensors.calibration import CalibrationError, build_calibration, pertu
 from flcav.sensors.camera.camera import photograph
 from flcav.sensors.camera.infrared import render_thermal
 from flcav.sensors.frame import Array, Calibration, CameraImage, Frame
-from flcav.sensors.labels.annotate import Sight, Sweep, annotate
+from flcav.sensors.labels.annotate import InstanceImage, Sweep, annotate
 from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.lidar.lidar import Lidar, point_times_s, scan
 from flcav.sensors.navigation import measure_inertia, measure_position
@@ -58,11 +58,11 @@ def observe(
     for name, mounted in rig.cameras.items():
         at = carrier.go_to(name)
         exposures[name] = photograph(scene, at, mounted.settings, weather, rng(name), hidden=carrier.own)
-        sights[name] = Sight(mounted.settings, at, scene.offset_s, exposures[name].instance)
+        sights[name] = InstanceImage(mounted.settings, at, scene.offset_s, exposures[name].instance)
     for name, mounted in rig.infrareds.items():
         at = carrier.go_to(name)
         infrared[name] = render_thermal(scene, at, mounted.settings, weather, rng(name), hidden=carrier.own)
-        sights[name] = Sight(mounted.settings, at, scene.offset_s, _actors_seen(carrier, at, mounted.settings))
+        sights[name] = InstanceImage(mounted.settings, at, scene.offset_s, _actors_seen(carrier, at, mounted.settings))
     for name, mounted in rig.radars.items():
         at = carrier.go_to(name)
         radar[name], actor = sweep_radar(

@@ -41,7 +41,7 @@ LAND_M = 150.0  # width of open ground beyond the town's bounds
 TOWNS_KEPT = 4  # size of the cache of meshes
 
 
-class Part(IntEnum):
+class TownPart(IntEnum):
     """The kind of object that a face of the town belongs to."""
 
     GROUND = 0
@@ -94,7 +94,7 @@ def list_signs_and_signals(town: Town) -> SignsAndSignals:
     """Return the signs and signal heads of a town, with their faces in `build_town_mesh`; without posts and masts."""
     world, signs, signals = build_static_world(town), town.signs, town.signals
     face = np.full(len(world.part), -1, np.int32)
-    for part, first in ((Part.SIGN, 0), (Part.SIGNAL, len(signs.kind))):
+    for part, first in ((TownPart.SIGN, 0), (TownPart.SIGNAL, len(signs.kind))):
         face[world.part == part] = first + world.row[world.part == part]
     return SignsAndSignals(
         kind=(*signs.kind, *_head_kinds(signals)),
@@ -129,12 +129,12 @@ def build_static_world(town: Town) -> StaticWorld:
     return _WORLDS[key]
 
 
-Owned = tuple[Part, int, Mesh]  # kind of object, its row, its mesh in the world frame
+Owned = tuple[TownPart, int, Mesh]  # kind of object, its row, its mesh in the world frame
 
 
 def _parts(town: Town) -> Iterator[Owned]:
     """Yield the meshes of all static objects of a town."""
-    yield Part.GROUND, 0, _ground(town)
+    yield TownPart.GROUND, 0, _ground(town)
     yield from _decks(town)
     yield from chain(_roads(town), _sidewalks(town), _buildings(town), _plants(town), _furniture(town))
 
@@ -154,18 +154,18 @@ def _ground(town: Town) -> Mesh:
 
 def _roads(town: Town) -> Iterator[Owned]:
     return (
-        (Part.ROAD, row, _plate(polygon, 0.0, Material.ROAD, town.relief)) for row, polygon in enumerate(town.roads)
+        (TownPart.ROAD, row, _plate(polygon, 0.0, Material.ROAD, town.relief)) for row, polygon in enumerate(town.roads)
     )
 
 
 def _decks(town: Town) -> Iterator[Owned]:
     """Yield the decks of bridges, each as its road, its underside and its two sides."""
     for row, deck in enumerate(() if town.relief is None else town.relief.decks):
-        yield Part.DECK, row, drape_area(deck.outline, deck.surface, 0.0, Material.ROAD)
+        yield TownPart.DECK, row, drape_area(deck.outline, deck.surface, 0.0, Material.ROAD)
         under = drape_area(deck.outline, deck.surface, 0.0, Material.WALL)
-        yield Part.DECK, row, replace(under, vertices=_lower(under.vertices, town))
+        yield TownPart.DECK, row, replace(under, vertices=_lower(under.vertices, town))
         for side in deck.sides:
-            yield Part.DECK, row, sheet(np.stack((_lower(side, town), side)), Material.WALL)
+            yield TownPart.DECK, row, sheet(np.stack((_lower(side, town), side)), Material.WALL)
 
 
 def _lower(top: NDArray, town: Town) -> NDArray:
@@ -177,14 +177,14 @@ def _lower(top: NDArray, town: Town) -> NDArray:
 def _sidewalks(town: Town) -> Iterator[Owned]:
     """Yield the sidewalks, each as its surface and its kerb face."""
     for row, polygon in enumerate(town.sidewalks):
-        yield Part.SIDEWALK, row, _plate(polygon, KERB_M, Material.SIDEWALK, town.relief)
+        yield TownPart.SIDEWALK, row, _plate(polygon, KERB_M, Material.SIDEWALK, town.relief)
         ring = np.concatenate((polygon, polygon[:1]))
         heights = (GROUND_M, KERB_M)
         if town.relief is not None:
-            yield Part.SIDEWALK, row, drape_wall(ring, town.relief, heights, Material.SIDEWALK)
+            yield TownPart.SIDEWALK, row, drape_wall(ring, town.relief, heights, Material.SIDEWALK)
             continue
         kerb = sheet(np.stack([np.c_[ring, np.full(len(ring), z)] for z in heights]), Material.SIDEWALK)
-        yield Part.SIDEWALK, row, kerb
+        yield TownPart.SIDEWALK, row, kerb
 
 
 def _plate(polygon: NDArray[np.float64], z: float, material: Material, relief: Relief | None) -> Mesh:
@@ -202,7 +202,7 @@ def _buildings(town: Town) -> Iterator[Owned]:
     rng = stream(0, "facades", town.name)
     foot = find_lowest_ground(town, town.buildings)
     for row, (x, y, yaw, length, width, height) in enumerate(town.buildings):
-        yield Part.BUILDING, row, transform_mesh(make_building(length, width, height, rng), x, y, foot[row], yaw)
+        yield TownPart.BUILDING, row, transform_mesh(make_building(length, width, height, rng), x, y, foot[row], yaw)
 
 
 def find_lowest_ground(town: Town, rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -216,25 +216,29 @@ def find_lowest_ground(town: Town, rows: NDArray[np.float64]) -> NDArray[np.floa
 def _plants(town: Town) -> Iterator[Owned]:
     rng = stream(0, "leaves", town.name)
     for row, (x, y, height, radius) in enumerate(town.trees):
-        yield Part.TREE, row, transform_mesh(make_tree(height, radius, rng), x, y, town.ground(x, y))
+        yield TownPart.TREE, row, transform_mesh(make_tree(height, radius, rng), x, y, town.ground(x, y))
 
 
 def _furniture(town: Town) -> Iterator[Owned]:
     """Yield clutter, lamps, signs with their posts, sensor masts and signals."""
     pieces = [(kind, *values) for kind, rows in town.clutter for values in rows]
     for row, (kind, x, y, yaw, length, width, height) in enumerate(pieces):
-        yield Part.CLUTTER, row, transform_mesh(make_clutter(kind, length, width, height), x, y, town.ground(x, y), yaw)
+        yield (
+            TownPart.CLUTTER,
+            row,
+            transform_mesh(make_clutter(kind, length, width, height), x, y, town.ground(x, y), yaw),
+        )
     for row, (x, y, height) in enumerate(town.posts):
-        yield Part.POLE, row, transform_mesh(map_pole(height), x, y, town.ground(x, y))
+        yield TownPart.POLE, row, transform_mesh(map_pole(height), x, y, town.ground(x, y))
     for row, (x, y, height) in enumerate(town.lamps):
-        yield Part.LAMP, row, transform_mesh(make_lamp(height), x, y, town.ground(x, y))
+        yield TownPart.LAMP, row, transform_mesh(make_lamp(height), x, y, town.ground(x, y))
     for row, ((x, y, z), yaw, kind) in enumerate(zip(town.signs.position, town.signs.yaw, town.signs.kind)):
         foot = town.ground(x, y)
-        yield Part.SIGN, row, transform_mesh(sign_plate(kind, z - foot), x, y, foot, yaw)
-        yield Part.POST, row, transform_mesh(sign_post(z - foot), x, y, foot, yaw)
+        yield TownPart.SIGN, row, transform_mesh(sign_plate(kind, z - foot), x, y, foot, yaw)
+        yield TownPart.POST, row, transform_mesh(sign_post(z - foot), x, y, foot, yaw)
     for row, ((x, y, z), yaw) in enumerate(zip(town.poles.position, town.poles.yaw)):
         foot = town.ground(x, y)
-        yield Part.MAST, row, transform_mesh(sensor_mast(z - foot), x, y, foot, yaw)
+        yield TownPart.MAST, row, transform_mesh(sensor_mast(z - foot), x, y, foot, yaw)
     yield from _signals(town)
 
 
@@ -246,5 +250,5 @@ def _signals(town: Town) -> Iterator[Owned]:
         left = left_vectors(yaw)
         reach = float(left @ ((x, y) - foot))
         ground = town.ground(*foot)
-        yield Part.SIGNAL, row, transform_mesh(signal_head(kind, z - ground), x, y, ground, yaw)
-        yield Part.POST, row, transform_mesh(signal_mast(z - ground, reach), foot[0], foot[1], ground, yaw)
+        yield TownPart.SIGNAL, row, transform_mesh(signal_head(kind, z - ground), x, y, ground, yaw)
+        yield TownPart.POST, row, transform_mesh(signal_mast(z - ground, reach), foot[0], foot[1], ground, yaw)

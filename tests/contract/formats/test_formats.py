@@ -19,8 +19,9 @@ from shapely.geometry import MultiPoint
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.formats.export import FORMATS, export
+from flcav.dataset.formats.export import export
 from flcav.dataset.formats.exporter import ExportOptions
+from flcav.dataset.formats.formats import EXPORTS, export_format
 from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
@@ -49,13 +50,13 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 def _options(name: str) -> ExportOptions:
-    return ExportOptions(validation=0.3) if "validation" in FORMATS[name].options else ExportOptions()
+    return ExportOptions(validation=0.3) if "validation" in export_format(name).options else ExportOptions()
 
 
 @pytest.fixture(scope="module")
 def exported(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("exports")
-    for name in FORMATS:
+    for name in EXPORTS:
         export(dataset, name, root / name, _options(name))
     export(dataset, "yolo", root / "yolo_actors", ExportOptions(validation=0.3, labels="actors"))
     return {path.name: path for path in root.iterdir()}
@@ -388,7 +389,7 @@ def test_the_assumed_calibration_moves_the_sensors_only(name: str, dataset: Data
             np.testing.assert_allclose(np.linalg.norm(away, axis=1), 0.1, atol=2e-4)
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", EXPORTS)
 def test_an_export_that_ends_early_leaves_nothing(name: str, dataset: Dataset, tmp_path: Path):
     def full_disk(done: int, total: int, note: str) -> None:
         raise OSError(28, "No space left on device")
@@ -405,7 +406,7 @@ def test_an_export_that_ends_early_leaves_nothing(name: str, dataset: Dataset, t
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", EXPORTS)
 def test_progress_reaches_the_end(name: str, dataset: Dataset, tmp_path: Path):
     calls = []
     export(dataset, name, tmp_path / "out", progress=lambda done, total, note: calls.append((done, total)))
@@ -413,7 +414,7 @@ def test_progress_reaches_the_end(name: str, dataset: Dataset, tmp_path: Path):
     assert calls[-1] == (len(dataset), len(dataset))
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", EXPORTS)
 def test_equal_exports_are_equal_bytes(name: str, dataset: Dataset, exported: dict[str, Path], tmp_path: Path):
     export(dataset, name, tmp_path / "out", _options(name))
     files = {path.relative_to(tmp_path / "out"): path for path in (tmp_path / "out").rglob("*") if path.is_file()}
@@ -423,7 +424,7 @@ def test_equal_exports_are_equal_bytes(name: str, dataset: Dataset, exported: di
 
 
 def test_targets_that_are_refused(dataset: Dataset, tmp_path: Path):
-    with pytest.raises(InputError, match="format 'waymo': unknown; known formats: kitti, yolo, coco"):
+    with pytest.raises(InputError, match="export format 'waymo': choose one of kitti, yolo, coco"):
         export(dataset, "waymo", tmp_path / "out")
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="is a file"):
@@ -481,7 +482,7 @@ def test_a_data_yaml_names_folders_to_train_and_to_validate(split: str, tmp_path
     assert pictures[split] == (2 if split == "train" else 4)
 
 
-@pytest.mark.parametrize("name", [name for name in FORMATS if "validation" in FORMATS[name].options])
+@pytest.mark.parametrize("name", [name for name in EXPORTS if "validation" in export_format(name).options])
 def test_a_share_to_validate_is_refused_of_a_dataset_recorded_for_it(name: str, tmp_path: Path):
     record(PaintedSource(2, spins=1, split="test"), tmp_path / "dataset")
     with pytest.raises(InputError, match="its recipe says 'split: test', so --validation is not for it"):
@@ -551,7 +552,7 @@ def _count_objects(name: str, out: Path) -> int:
 
 
 @pytest.mark.parametrize("options", [{}, {"min_points": 20, "min_pixels": 6, "labels": "actors"}])
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", EXPORTS)
 def test_every_object_is_written_or_left_out_for_a_reason(name: str, options: dict[str, object], tmp_path: Path):
     record(PaintedSource(2, spins=3, cut=1), tmp_path / "dataset")
     dataset = Dataset.open(tmp_path / "dataset")
@@ -561,7 +562,7 @@ def test_every_object_is_written_or_left_out_for_a_reason(name: str, options: di
         source = sum((truth.views[camera].pixels > 0).sum() + len(truth.signs[camera]) for truth, camera in images)
     else:
         source = sum(len(frame.annotations) for frame in frames)
-    taken = {option: value for option, value in options.items() if option in FORMATS[name].options}
+    taken = {option: value for option, value in options.items() if option in export_format(name).options}
     exported = export(dataset, name, tmp_path / "out", ExportOptions.model_validate(taken))
     left_out = Counter[str]()
     for each, number in exported.left_out.items():
@@ -594,7 +595,7 @@ def test_a_class_that_a_format_lacks_is_named(name: str, lacks: bool, exported: 
     assert trams > 0
 
 
-@pytest.mark.parametrize("name", [name for name in FORMATS if name != "mcap"])  # which holds all: see above
+@pytest.mark.parametrize("name", [name for name in EXPORTS if name != "mcap"])  # which holds all: see above
 def test_every_measurement_is_a_file_or_left_out(name: str, dataset: Dataset, tmp_path: Path):
     left_out = export(dataset, name, tmp_path / "out").left_out
     frames = [dataset.frame(i) for i in range(len(dataset))]
@@ -610,15 +611,15 @@ VALUES = {"labels": "actors", "validation": 0.5, "min_pixels": 6, "min_points": 
 
 
 @pytest.mark.parametrize("option", ExportOptions.model_fields)
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", EXPORTS)
 def test_an_option_changes_the_export_or_is_refused(
     name: str, option: str, dataset: Dataset, exported: dict[str, Path], tmp_path: Path
 ):
-    if option not in FORMATS[name].options:
+    if option not in export_format(name).options:
         with pytest.raises(InputError, match=f"format '{name}': has no use for --{option.replace('_', '-')}; it takes"):
             export(dataset, name, tmp_path / "out", ExportOptions(**{option: VALUES[option]}))
         return
-    asked = {"validation": 0.3} if "validation" in FORMATS[name].options else {}
+    asked = {"validation": 0.3} if "validation" in export_format(name).options else {}
     export(dataset, name, tmp_path / "out", ExportOptions(**{**asked, option: VALUES[option]}))
     assert _contents(tmp_path / "out") != _contents(exported[name])
 

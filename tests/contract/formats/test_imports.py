@@ -16,9 +16,10 @@ from PIL import Image
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.formats.export import FORMATS, export
+from flcav.dataset.formats.export import export
 from flcav.dataset.formats.exporter import ExportOptions, split_scenes
-from flcav.dataset.formats.importing import READABLE, import_dataset
+from flcav.dataset.formats.formats import EXPORTS, IMPORTS
+from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.formats.kitti.read import KittiSource
 from flcav.dataset.formats.nuscenes.rows import COLUMNS
 from flcav.dataset.formats.opv2v.read import read_cloud
@@ -37,7 +38,7 @@ from flcav.pipeline.steps.graph import Graph
 from flcav.sensors.frame import Frame
 
 SCENES = 2
-ROUND = [name for name in READABLE if name in FORMATS]
+ROUND = [name for name in IMPORTS if name in EXPORTS]
 SENSORS = {  # of cav0: name in the format -> name in the source
     "kitti": {"velodyne": "lidar", "image_2": "front"},
     "nuscenes": {"LIDAR_TOP": "lidar", "CAM_FRONT": "front", "CAM_BACK": "back", "RADAR_FRONT": "radar"},
@@ -524,7 +525,7 @@ def test_beams_and_range_are_known_of_kitti_itself(exported: dict[str, Path], tm
     assert (described["beams"], described["range_m"]) == (64, 120)
 
 
-@pytest.mark.parametrize("name", READABLE)
+@pytest.mark.parametrize("name", IMPORTS)
 def test_a_folder_of_another_format_is_one_sentence(name: str, exported: dict[str, Path], tmp_path: Path):
     other = "nuscenes" if name == "kitti" else "kitti"
     with pytest.raises(InputError, match=f"is no folder of '{name}' but of '{other}'"):

@@ -10,9 +10,8 @@ import pytest
 import typer
 
 from flcav.cli.main import app, run
-from flcav.cli.options import Device, Engine, Format, ImportFormat, Method
-from flcav.dataset.formats.export import FORMATS
-from flcav.dataset.formats.importing import READABLE
+from flcav.cli.options import Device, EngineName, Method
+from flcav.dataset.formats.formats import EXPORTS, IMPORTS
 from flcav.dataset.recording.recorder import ENGINES
 from flcav.perception.device import select_device
 from flcav.perception.tasks import TASKS, task_named
@@ -83,11 +82,16 @@ def test_what_can_be_chosen_is_listed(path, shown):
 
 
 def test_choices_are_those_that_there_are():
-    for listed, known in ((Format, FORMATS), (ImportFormat, READABLE), (Engine, ENGINES)):
-        assert [*listed] == [*known]
+    assert [*EngineName] == [*ENGINES]
     for device in Device:
         if device != Device.cuda:
             select_device(device)
+
+
+def test_formats_are_named(shown):
+    for command, known in (("export", EXPORTS), ("import", IMPORTS)):
+        *others, last = known
+        assert f"{', '.join(others)} or {last}, or one of your own as module:NAME" in words(shown((command,), WIDE))
 
 
 def test_tasks_and_networks_are_named(shown):
@@ -106,12 +110,12 @@ def test_tasks_and_networks_are_named(shown):
         (("evaluate", "poetry", "--data", "d"), "task 'poetry'", TASKS),
         (("infer", "poetry", "d"), "task 'poetry'", TASKS),
         (("errors", "poetry", "--data", "d", "--out", "o.csv"), "task 'poetry'", TASKS),
-        (("export", "poetry", "d", "--out", "o"), "'FORMAT'", Format),
-        (("record", "r", "--out", "o", "--engine", "steam"), "'--engine'", Engine),
+        (("export", "poetry", "d", "--out", "o"), "export format 'poetry'", EXPORTS),
+        (("record", "r", "--out", "o", "--engine", "steam"), "'--engine'", EngineName),
         (("infer", "weather", "d", "--device", "steam"), "'--device'", Device),
         (("place", "--method", "steam"), "'--method'", Method),
-        (("export",), "'FORMAT'", Format),
-        (("import", "poetry", "d", "--out", "o"), "'FORMAT'", ImportFormat),
+        (("export",), "'FORMAT'", ()),
+        (("import", "poetry", "d", "--out", "o"), "import format 'poetry'", IMPORTS),
     ],
 )
 def test_a_wrong_choice_is_one_sentence(arguments, wrong, choices: Collection[str], capsys):

@@ -189,7 +189,7 @@ def test_the_command_line_exports(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert flcav("--out", out, "opv2v") == 2
     assert "holds other files" in capsys.readouterr().err
     assert flcav("--out", str(tmp_path / "b"), "kitty") == 2
-    assert "'kitty' is not one of 'kitti', 'yolo'" in capsys.readouterr().err
+    assert "export format 'kitty': choose one of kitti, yolo" in capsys.readouterr().err
     assert flcav("--out", str(tmp_path / "b"), "--labels", "cats", "yolo") == 2
     assert "'labels' = 'cats'" in capsys.readouterr().err
     assert flcav("--out", str(tmp_path / "b"), "--labels", "actors", "kitti") == 2

@@ -12,7 +12,7 @@ from PIL import Image
 from flcav.config import InputError
 from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.formats.kitti import (
-    Calibration,
+    KittiCalibration,
     KittiFolder,
     read_calibration,
     read_objects,
@@ -30,7 +30,7 @@ REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[4] / "share
 
 
 @pytest.fixture
-def calibration(tmp_path: Path) -> Calibration:
+def calibration(tmp_path: Path) -> KittiCalibration:
     (tmp_path / "calib.txt").write_text(CALIBRATION)
     return read_calibration(tmp_path / "calib.txt")
 
@@ -66,7 +66,7 @@ def test_a_missing_point_cloud(tmp_path: Path):
         read_points(tmp_path)
 
 
-def test_calibration_maps_camera_axes_to_lidar_axes(calibration: Calibration):
+def test_calibration_maps_camera_axes_to_lidar_axes(calibration: KittiCalibration):
     ahead_in_camera = calibration.camera_from_lidar @ [10.0, 2.0, -1.0, 1.0]
     np.testing.assert_allclose(ahead_in_camera[:3], [-2.0 + 0.1, 1.0 - 0.2, 10.0 - 0.3])
 
@@ -100,7 +100,7 @@ def test_boxes_match_the_devkit_corners(
     lidar = np.linalg.solve(camera_from_lidar, np.column_stack((camera, np.ones(8))).T).T[:, :3]
     path = tmp_path_factory.getbasetemp() / "label.txt"
     path.write_text(line)
-    box = read_objects(path, Calibration(camera_from_lidar, np.zeros((3, 4)))).boxes
+    box = read_objects(path, KittiCalibration(camera_from_lidar, np.zeros((3, 4)))).boxes
     distance = np.linalg.norm(box.corners()[0][:, None] - lidar[None], axis=2)
     assert distance.min(axis=1).max() < 1e-9
     front = lidar[:4].mean(axis=0) - lidar.mean(axis=0)
@@ -108,7 +108,7 @@ def test_boxes_match_the_devkit_corners(
     np.testing.assert_allclose(front / np.linalg.norm(front), heading, atol=1e-9)
 
 
-def test_dont_care_is_left_out_and_scores_kept(tmp_path: Path, calibration: Calibration):
+def test_dont_care_is_left_out_and_scores_kept(tmp_path: Path, calibration: KittiCalibration):
     path = tmp_path / "label.txt"
     row = "0 0 0 0 0 0 0 1.5 1.7 4 1 2 20 0.5"
     path.write_text(f"Van {row} 0.75\nDontCare -1 -1 -10 0 0 0 0 -1 -1 -1 -1000 -1000 -1000 -10\n")
@@ -123,7 +123,7 @@ def test_dont_care_is_left_out_and_scores_kept(tmp_path: Path, calibration: Cali
 
 
 @pytest.mark.parametrize("text", ["Car 1 2 3", "Car " + "x " * 14, "Car " + "nan " * 14, "1 " * 30])
-def test_what_is_no_label(tmp_path: Path, calibration: Calibration, text: str):
+def test_what_is_no_label(tmp_path: Path, calibration: KittiCalibration, text: str):
     (tmp_path / "label.txt").write_text(text)
     with pytest.raises(InputError, match=r"label\.txt: line 1 is no KITTI label"):
         read_objects(tmp_path / "label.txt", calibration)
@@ -191,7 +191,7 @@ def test_what_is_wrong_in_a_folder_is_one_sentence(folder: Path, damage: Callabl
         KittiFolder.open(folder, "val").frame(0)
 
 
-def test_regions_nobody_cares_about_are_in_no_column(tmp_path: Path, calibration: Calibration):
+def test_regions_nobody_cares_about_are_in_no_column(tmp_path: Path, calibration: KittiCalibration):
     (tmp_path / "label.txt").write_text(LABEL + LABEL.replace("Car", "DontCare"))
     objects = read_objects(tmp_path / "label.txt", calibration)
     assert objects.boxes.label.tolist() == ["Car"]

@@ -32,7 +32,7 @@ from flcav.federation.upload import name_like
 from flcav.network.ledger import Budget, Ledger, LedgerEntry
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import RadioLinks
-from flcav.network.radio.propagation import State
+from flcav.network.radio.propagation import PathState
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.weights import to_arrays
@@ -108,7 +108,7 @@ def test_a_region_has_its_own_model_where_it_keeps_one() -> None:
 
 def links_of(*present: bool) -> RadioLinks:
     """Return two vehicles' links to one unit, near enough for the highest rate, that do not change for 100 s."""
-    state = np.where(present, State.LOS, -1).astype(np.int8)[None, :, None].repeat(101, axis=0)
+    state = np.where(present, PathState.LOS, -1).astype(np.int8)[None, :, None].repeat(101, axis=0)
     distance, loss = np.where(state < 0, np.nan, 50.0), np.where(state < 0, np.inf, 69.0)
     return RadioLinks(Radio(), np.arange(0.0, 101.0), ("cav0", "cav1"), ("pole1",), distance, state, loss)
 

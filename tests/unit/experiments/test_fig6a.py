@@ -13,10 +13,11 @@ from flcav.experiments.fig6a.results import (
     AllocationSeed,
     AtBudgets,
     Planned,
-    Reached,
+    StageAP,
 )
 from flcav.experiments.fig6a.run import BUDGETS, PLANS, STAGES, _collect, budget_recipes, draw_allocation, summarise
 from flcav.experiments.fig6a.tables import tables
+from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import load_run_recipe
 from flcav.pipeline.results.plans import Placed, Pole
 from flcav.pipeline.results.run import LinkUse
@@ -32,7 +33,7 @@ HISTORY = {"samples": (80.0, 320.0), "edge_rounds": (0.0, 6.0), "cloud_rounds": 
 def seed_of(number: int, equal: tuple[float, ...], joint: tuple[float, ...]) -> AllocationSeed:
     """Return what one seed reached: AP50 after each stage with either plan."""
     reached = {EQUAL: equal, JOINT: joint}
-    realised = {name: {str(s): Reached(ap) for s, ap in zip(STAGES, aps)} for name, aps in reached.items()}
+    realised = {name: {str(s): StageAP(ap) for s, ap in zip(STAGES, aps)} for name, aps in reached.items()}
     differences = {s: Estimate(b - a, b - a - 0.05, b - a + 0.05) for s, a, b in zip(STAGES, equal, joint)}
     plan = Planned(118, 6, 6, 175.0, 70.0, predicted_error=0.38)
     book = {"wireless": LinkUse(180.0, 175.0, 176.0), "wireline": LinkUse(110.0, 70.0, 69.5)}
@@ -174,7 +175,7 @@ def test_budgets_are_multiples_of_the_recipe_s() -> None:
 
 
 def test_tables_hold_a_row_per_run() -> None:
-    found = tables(AllocationResult(HISTORY, (replace(WRONG, factor=0.25), RIGHT)))
+    found = tables(AllocationResult(HISTORY, (replace(WRONG, factor=0.25), RIGHT), {}, provenance()))
     assert found["plans"].count("\n") == 1 + 12
     assert "| x 1 | 1 | joint | 118 | 12 | 1 | 0.620 | 3 / 5 |" in found["plans"]
     assert "| x 1 | cloud FL | joint | 0.660 | 0.667 (" in found["accuracy"]
@@ -184,7 +185,7 @@ def test_tables_hold_a_row_per_run() -> None:
 
 
 def test_the_picture_has_a_row_per_budgets() -> None:
-    results = AllocationResult(HISTORY, (replace(WRONG, factor=0.25), RIGHT))
+    results = AllocationResult(HISTORY, (replace(WRONG, factor=0.25), RIGHT), {}, provenance())
     assert draw_allocation(results).startswith(b"\x89PNG")
     collected = {each.name: _collect(each) for each in results.budgets}
     titles = [axes.get_title(loc="left") for axes in predicted_and_realised(collected, MEAN).axes]

@@ -7,11 +7,12 @@ from flcav.experiments.sim_to_real.clouds import CloudNumbers, SeenCar, Street
 from flcav.experiments.sim_to_real.run import FrameResult, LabelledCar, RealScore, SimToReal, draw_clouds
 from flcav.experiments.studies import objects as objects_tables
 from flcav.experiments.studies.objects import STUDY
-from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
+from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResult
 from flcav.geometry import Boxes
 from flcav.perception.card import Card
 from flcav.perception.images import CameraView
 from flcav.perception.objects.evaluate import ObjectsEvaluation
+from flcav.pipeline.provenance import provenance
 from flcav.report.pictures.clouds import real_frame
 from flcav.statistics.seeds import mean_over_seeds
 
@@ -63,8 +64,8 @@ def study(aps):
     for test in ("suburb", "tracks"):
         rows = [seed.tests[test].numbers() for seed in seeds]
         summary[test] = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
-    recipes = Recorded(({"town": "suburb"},), {}, {})
-    return StudyResult("objects", "small", "full", 8, 8, recipes, seeds, summary)
+    recipes = StudyRecordings(({"town": "suburb"},), {}, {})
+    return StudyResult("objects", "small", "full", 8, 8, recipes, seeds, summary, provenance())
 
 
 def test_what_is_reached_is_said_with_its_interval():
@@ -102,14 +103,16 @@ def cloud():
 def test_clouds_and_real_cars_stand_beside_each_other():
     score = RealScore("Car", "3d", 0.5, targets=1, found=1, false_positives=0, ap=1.0)
     story = FrameResult("000008", (), (LabelledCar(5.0, (0.5,)),))
-    tables = sim_to_real_tables.tables(SimToReal({"KITTI": cloud(), "simulated": cloud()}, (score,), (story,)))
+    tables = sim_to_real_tables.tables(
+        SimToReal({"KITTI": cloud(), "simulated": cloud()}, (score,), (story,), provenance())
+    )
     assert "| 000008 | 5.0 | 0.5 |" in tables["cars"]
     assert "| Car | 3d at 0.5 | 1 | 1 | 0 | 1.000 |" in tables["detections"]
     assert "| returns without intensity | 25% | 25% |" in tables["clouds"]
 
 
 def test_clouds_and_frames_are_drawn():
-    assert draw_clouds(SimToReal({"KITTI": cloud(), "simulated": cloud()}, (), ())).startswith(b"\x89PNG")
+    assert draw_clouds(SimToReal({"KITTI": cloud(), "simulated": cloud()}, (), (), provenance())).startswith(b"\x89PNG")
     cars = Boxes.from_array([[12, 0, -1, 4, 1.7, 1.5, 0.1]], "Car")
     camera_from_lidar = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=float)
     intrinsics = np.array([[700, 0, 600], [0, 700, 180], [0, 0, 1]], dtype=float)

@@ -6,6 +6,7 @@ from flcav.experiments.roadside.detector import RoadDetectorResult
 from flcav.experiments.roadside.labels import RoadLabels, grade_labels
 from flcav.experiments.roadside.tables import detector_tables
 from flcav.geometry import Boxes
+from flcav.pipeline.provenance import provenance
 
 
 def cars(*rows: tuple[float, float, float]) -> Boxes:
@@ -27,10 +28,9 @@ def test_one_box_finds_one_label() -> None:
 
 def test_the_table_of_labels_has_all_their_fates() -> None:
     score = RoadDetectorResult(
-        0.7, 0.7, (), RoadLabels(sweeps=10, beyond=5, missed=2, coarse=3, exact=10, other=3, false=1)
+        0.7, 0.7, (), RoadLabels(sweeps=10, beyond=5, missed=2, coarse=3, exact=10, other=3, false=1), provenance()
     )
     rows = detector_tables(score)["labels"].splitlines()
     assert rows[2] == "| all | 20 | 2.00 | 100% |"
     assert rows[3] == "| beyond the field of the trained detector | 5 | 0.50 | 25% |"
     assert RoadDetectorResult.from_json(score.as_json(), "x") == score
-    assert "labels" not in detector_tables(RoadDetectorResult(0.7, 0.7, ()))

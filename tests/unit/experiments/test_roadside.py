@@ -13,9 +13,10 @@ from flcav.experiments.roadside.detector import _Frames, fit_threshold, score_to
 from flcav.experiments.roadside.errors import Errors, apply_errors
 from flcav.experiments.roadside.fig4 import EDGES_M, find_range
 from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
-from flcav.experiments.roadside.ranges import SHARED, Model, SensorRanges
+from flcav.experiments.roadside.ranges import SHARED, LidarModel, SensorRanges
 from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of
+from flcav.pipeline.provenance import provenance
 from flcav.sensors.rig import RIGS, Rig
 from flcav.sources.recipe import Recipe
 from flcav.world.map.town import load_town
@@ -129,11 +130,11 @@ def test_the_sensors_of_a_range_are_read_by_the_placement(tmp_path: Path) -> Non
     intervals = len(SENSOR_EDGES_M) - 1
     cars, all_to_20 = (10,) * intervals, (10,) * 4 + (0,) * (intervals - 4)
     models = (
-        Model("few", 16, (0,) * intervals, 0.0),
-        Model("many", 64, all_to_20, find_range(SENSOR_EDGES_M, cars, all_to_20)),
+        LidarModel("few", 16, (0,) * intervals, 0.0),
+        LidarModel("many", 64, all_to_20, find_range(SENSOR_EDGES_M, cars, all_to_20)),
     )
     assert models[1].range_m == 20.0
-    results = SensorRanges(8, cars, models)
+    results = SensorRanges(8, cars, models, provenance())
     files = {name: tmp_path / f"{name}.csv" for name in ("errors", "poles", "sensors")}
     files["errors"].write_text("x,y,z\n1,2,0\n")
     files["poles"].write_text("id,x,y,z\n1,0,0,6\n")

@@ -17,9 +17,10 @@ from flcav.experiments.roadside.cameras import (
 )
 from flcav.experiments.roadside.fig4 import Fig4
 from flcav.experiments.roadside.tables import fig4_tables
-from flcav.fusion.association import Pairs, Shot
+from flcav.fusion.association import PairedShot, Pairs
 from flcav.fusion.registration import Offset
 from flcav.geometry import Boxes
+from flcav.pipeline.provenance import provenance
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
 
 NONE = np.zeros(0, np.int64)
@@ -52,7 +53,7 @@ def found(*places: tuple[float, float]) -> Boxes:
 def test_actors_are_those_that_overlap_by_half() -> None:
     cars = found((20.3, 0.0), (30.0, 5.0), (40.0, 0.0), (10.0, 30.0), (60.0, 0.0))
     boxes = np.array([(102, 100, 141, 131), (300, 100, 395, 160), (130, 100, 170, 130)], dtype=float)
-    _, known = name_actors(frame(), "lidar", "left", Shot(cars, boxes))
+    _, known = name_actors(frame(), "lidar", "left", PairedShot(cars, boxes))
     assert known.cars.tolist() == [0, 1, -1, 3, -1]  # a bus is no car, and at 60 m there is nothing
     assert known.boxes.tolist() == [0, 2, -1]
     assert known.visible.tolist() == [True, False, False, False, False]
@@ -64,7 +65,7 @@ def test_without_annotated_actors_nobody_is_known() -> None:
     views = {"left": Views(none, none, NONE, np.zeros(0), np.zeros(0))}
     boxes = whole.annotations.boxes[:0]
     empty = Annotations(np.zeros(0, str), boxes, np.zeros((0, 3)), np.zeros((0, 3)), NONE, np.zeros(0), views=views)
-    shot = Shot(found((20.0, 0.0)), np.array([(100.0, 100.0, 140.0, 130.0)]))
+    shot = PairedShot(found((20.0, 0.0)), np.array([(100.0, 100.0, 140.0, 130.0)]))
     _, known = name_actors(replace(whole, annotations=empty), "lidar", "left", shot)
     assert (known.cars.tolist(), known.boxes.tolist(), known.visible.tolist()) == ([-1], [-1], [False])
 
@@ -86,7 +87,8 @@ def test_a_camera_has_a_row_for_each_choice_of_extrinsics() -> None:
     camera = CameraResult("left", 20, 10, 9, dict.fromkeys((CALIBRATED, CORRECTED, EXACT), told), True)
     intervals = 9
     arms = ("first suite alone", "three suites as calibrated", "three suites registered")
-    result = Fig4((), (0,) * intervals, dict.fromkeys(arms, (0,) * intervals), dict.fromkeys(arms, 0.0), (camera,))
+    found, ranges = dict.fromkeys(arms, (0,) * intervals), dict.fromkeys(arms, 0.0)
+    result = Fig4((), (0,) * intervals, found, ranges, (camera,), provenance())
     rows = fig4_tables(result)["cameras"].splitlines()
     assert len(rows) == 2 + 3
     assert rows[2] == "| left | as calibrated | 30 cm, 2.50° | 4.2 | 10 | 9 | 5 (0.50) | 8 | 6 (0.75) | 2 | 1 | 12.3 |"
@@ -94,13 +96,3 @@ def test_a_camera_has_a_row_for_each_choice_of_extrinsics() -> None:
     assert Fig4.from_json(result.as_json(), "x") == result
     moving = replace(result, cameras=(replace(camera, settled=False),))
     assert [each.sentences()[-1].endswith("; the pairs had not settled") for each in (result, moving)] == [False, True]
-
-
-def test_a_result_of_before_the_cameras_is_read() -> None:
-    arms = dict.fromkeys(("first suite alone", "three suites as calibrated", "three suites registered"), (0,) * 9)
-    old = {"suites": [], "cars": [0] * 9, "found": arms, "range_m": dict.fromkeys(arms, 0.0)}
-    result = Fig4.from_json(old, "x")
-    assert result.cameras is None
-    assert "cameras" not in result.as_json()
-    assert len(fig4_tables(result)["cameras"].splitlines()) == 2
-    assert len(result.sentences()) == 3

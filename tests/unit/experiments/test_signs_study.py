@@ -4,10 +4,11 @@ import pytest
 
 from flcav.config import parse_config
 from flcav.dataset.rectangles import SIGNS
-from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
+from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResult
 from flcav.experiments.studies.signs import STUDY, tables
 from flcav.perception.card import Card
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
+from flcav.pipeline.provenance import provenance
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.seeds import mean_over_seeds
@@ -41,7 +42,7 @@ def results(*scores: float) -> StudyResult[SignsEvaluation]:
         name: {key: mean_over_seeds([row[key] for row in of_seeds]) for key in of_seeds[0]}
         for name, of_seeds in rows.items()
     }
-    return StudyResult("signs", "n", "full", 15, 15, Recorded((), {}, {}), seeds, summary)
+    return StudyResult("signs", "n", "full", 15, 15, StudyRecordings((), {}, {}), seeds, summary, provenance())
 
 
 @pytest.mark.slow

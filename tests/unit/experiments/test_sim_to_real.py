@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flcav.dataset.formats.kitti.files import Calibration, KittiFrame, Objects
+from flcav.dataset.formats.kitti.files import KittiCalibration, KittiFrame, Objects
 from flcav.experiments.sim_to_real import run as sim_to_real
 from flcav.experiments.sim_to_real.clouds import summarise_clouds
 from flcav.geometry import Boxes
@@ -21,7 +21,7 @@ def boxes(*places, label="Car", score=None):
 def frame(objects: Boxes) -> KittiFrame:
     count = len(objects)
     labelled = Objects(objects, np.zeros(count), np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros((count, 4)))
-    calibration = Calibration(LIDAR_TO_CAMERA, PROJECTION)
+    calibration = KittiCalibration(LIDAR_TO_CAMERA, PROJECTION)
     image = np.zeros((375, 1242, 3), np.uint8)
     return KittiFrame("000001", np.ones((5, 4), np.float32), calibration, labelled, image, (375, 1242))
 

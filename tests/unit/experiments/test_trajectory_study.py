@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from flcav.experiments.studies import study_named
-from flcav.experiments.studies.run import Recorded, SeedResult, StudyResult
+from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResult
 from flcav.experiments.studies.trajectory import CAMERAS, STUDY, tables
 from flcav.perception.card import Card
 from flcav.perception.trajectory.config import FUTURE, PAST
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
+from flcav.pipeline.provenance import provenance
 from flcav.statistics.seeds import mean_over_seeds
 
 
@@ -41,8 +42,10 @@ def results(*off_m: float) -> StudyResult[TrajectoryEvaluation]:
         runs.append(SeedResult(seed, card, {"held-out scenes": found}, {"held-out scenes": seed}))
     rows = [evaluated(off).numbers() for off in off_m]
     means = {name: mean_over_seeds([row[name] for row in rows]) for name in rows[0]}
-    nothing = Recorded((), {}, {})
-    return StudyResult("trajectory", "tiny", "full", 3, 3, nothing, tuple(runs), {"held-out scenes": means})
+    nothing = StudyRecordings((), {}, {})
+    return StudyResult(
+        "trajectory", "tiny", "full", 3, 3, nothing, tuple(runs), {"held-out scenes": means}, provenance()
+    )
 
 
 @pytest.mark.parametrize(

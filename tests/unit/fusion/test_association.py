@@ -10,15 +10,15 @@ from flcav.fusion import association
 from flcav.fusion.association import (
     GATE,
     SIDE_PX,
-    Shot,
-    View,
+    AssociatedCamera,
+    PairedShot,
+    _sides,
     apply_error,
     correct_extrinsics,
     fit_extrinsics,
     measure_error,
     outline,
     pair,
-    project_cars,
     spread_of_calibration,
 )
 from flcav.fusion.registration import measure_offset
@@ -31,7 +31,7 @@ EXACT = np.eye(4)
 EXACT[:3, :3] = np.array([[0, -1, 0], [-np.sin(DOWN), 0, -np.cos(DOWN)], [np.cos(DOWN), 0, -np.sin(DOWN)]])
 EXACT[:3, 3] = (0.1, 0.2, -0.1)
 SPREAD = spread_of_calibration(1.0, 0.2)
-TRUE = View(EXACT, SPREAD, INTRINSICS, np.zeros(5), (WIDTH, HEIGHT))
+TRUE = AssociatedCamera(EXACT, SPREAD, INTRINSICS, np.zeros(5), (WIDTH, HEIGHT))
 OFF = np.array((*np.radians((0.6, 0.7, -0.4)), 0.15, -0.1, 0.1))  # 1 degree about a slanting axis, 21 cm
 
 
@@ -58,7 +58,7 @@ def street(seed: int, count: int = 6) -> Boxes:
     return Boxes(center, size, rng.choice((0.0, np.pi), count), np.full(count, "car"))
 
 
-def shots(number: int = 8) -> tuple[list[Shot], list[np.ndarray]]:
+def shots(number: int = 8) -> tuple[list[PairedShot], list[np.ndarray]]:
     """Return shots whose pictures lack a car and have a false box, and the car of each box (-1: none)."""
     made, truth = [], []
     for seed in range(number):
@@ -66,7 +66,7 @@ def shots(number: int = 8) -> tuple[list[Shot], list[np.ndarray]]:
         rng = np.random.default_rng(100 + seed)
         boxes = pinhole(cars, EXACT) + rng.normal(0, 1.0, (len(cars), 4))
         order = rng.permutation(len(cars))[1:]
-        made.append(Shot(cars, np.vstack((boxes[order], (5, 300, 60, 340)))))
+        made.append(PairedShot(cars, np.vstack((boxes[order], (5, 300, 60, 340)))))
         truth.append(np.append(order, -1))
     return made, truth
 
@@ -79,9 +79,9 @@ def share_right(found, truth) -> tuple[float, float]:
 
 def test_cars_are_projected_as_by_a_pinhole():
     cars = street(3)
-    np.testing.assert_allclose(project_cars(cars, TRUE), pinhole(cars, EXACT), atol=1e-9)
+    np.testing.assert_allclose(_sides(outline(cars), TRUE), pinhole(cars, EXACT), atol=1e-9)
     behind = replace(cars, center=cars.center * (-1, 1, 1))
-    assert np.isnan(project_cars(behind, TRUE)).all()
+    assert np.isnan(_sides(outline(behind), TRUE)).all()
 
 
 def test_an_error_turns_and_shifts_the_extrinsics():
@@ -123,16 +123,16 @@ def test_without_the_correction_cars_get_the_boxes_of_others():
 def test_beyond_the_gate_nothing_is_paired(monkeypatch):
     cars = street(0)[:1]
     boxes = pinhole(cars, EXACT)
-    shot, sure = Shot(cars, boxes + np.array((60, 0, 60, 0))), replace(TRUE, covariance=1e-4 * SPREAD)
+    shot, sure = PairedShot(cars, boxes + np.array((60, 0, 60, 0))), replace(TRUE, covariance=1e-4 * SPREAD)
     alone = pair(shot, sure)
     assert (len(alone), alone.lone_cars.tolist(), alone.lone_boxes.tolist()) == (0, [0], [0])
-    assert len(pair(Shot(cars, boxes + np.array((2, 0, 2, 0))), sure)) == 1
+    assert len(pair(PairedShot(cars, boxes + np.array((2, 0, 2, 0))), sure)) == 1
     monkeypatch.setattr(association, "GATE", 100 * GATE)  # of any number of sides
     assert len(pair(shot, sure)) == 1
 
 
 def test_without_a_pair_the_calibration_stays():
-    found = correct_extrinsics([Shot(street(0), np.zeros((0, 4)))], TRUE)
+    found = correct_extrinsics([PairedShot(street(0), np.zeros((0, 4)))], TRUE)
     assert found.view is TRUE
     assert len(found.pairs[0]) == 0
     assert found.settled
@@ -155,7 +155,7 @@ def test_the_gate_is_that_of_the_sides_that_count(sides, square, monkeypatch):
     monkeypatch.setattr(association, "sides_inside", lambda boxes, view: np.arange(4) < sides)
     for share, paired in ((0.99, 1), (1.01, 0)):
         box = pinhole(car, EXACT) + SIDE_PX * np.sqrt(share * square / sides)
-        assert len(pair(Shot(car, box), sure)) == paired
+        assert len(pair(PairedShot(car, box), sure)) == paired
 
 
 def alike() -> Boxes:
@@ -170,7 +170,7 @@ def test_a_wide_covariance_does_not_win_a_box():
     cars, shifted = alike(), replace(TRUE, covariance=spread_of_calibration(0.01, 0.5))
     boxes = pinhole(cars, EXACT)
     np.testing.assert_allclose(boxes[0], boxes[1], atol=1e-9)
-    shot = Shot(
+    shot = PairedShot(
         cars, boxes[:1] + np.array((2.0, 0.0, 2.0, 0.0))
     )  # a shift of the camera moves the near one twice as far
     for order in ([0, 1], [1, 0]):
@@ -192,8 +192,8 @@ def neighbours() -> tuple[Boxes, np.ndarray]:
 def test_a_lone_car_and_a_false_box_do_not_draw_a_right_pair_apart():
     cars, boxes = neighbours()
     for car, box in ((0, 1), (1, 0)):  # within the gate, both
-        assert len(pair(Shot(cars[[car]], boxes[[box]]), LARGE)) == 1
-    found = correct_extrinsics([Shot(cars, boxes)], LARGE)
+        assert len(pair(PairedShot(cars[[car]], boxes[[box]]), LARGE)) == 1
+    found = correct_extrinsics([PairedShot(cars, boxes)], LARGE)
     (pairs,) = found.pairs
     assert (pairs.car.tolist(), pairs.box.tolist()) == ([0], [0])
     assert (pairs.lone_cars.tolist(), pairs.lone_boxes.tolist()) == ([1], [1])
@@ -203,8 +203,8 @@ def test_a_lone_car_and_a_false_box_do_not_draw_a_right_pair_apart():
 def test_a_pair_less_likely_than_staying_alone_is_made_of_what_stays_alone():
     cars, boxes = neighbours()
     aside = boxes[:1] + np.array((45.0, 0.0, 45.0, 0.0))
-    assert len(pair(Shot(cars[:1], aside), LARGE)) == 1
-    assert pair(Shot(cars[:1], np.concatenate((aside, boxes[:1]))), LARGE).box.tolist() == [1]
+    assert len(pair(PairedShot(cars[:1], aside), LARGE)) == 1
+    assert pair(PairedShot(cars[:1], np.concatenate((aside, boxes[:1]))), LARGE).box.tolist() == [1]
 
 
 @pytest.mark.parametrize("together", [False, True], ids=["each by itself", "all four of a car together"])
@@ -217,7 +217,7 @@ def test_extrinsics_are_as_sure_as_they_are_right_however_sides_err(together: bo
         drawn = rng.normal(0, 1, (len(cars), 1)) * (1, 1, 1, 1) if together else rng.normal(0, 1, (len(cars), 4))
         off = np.linalg.cholesky(SPREAD) @ rng.normal(0, 1, 6)
         calibrated = replace(TRUE, camera_from_lidar=apply_error(EXACT, off))
-        shot = Shot(cars, boxes + whole * drawn)
+        shot = PairedShot(cars, boxes + whole * drawn)
         pairs = replace(pair(shot, TRUE), car=np.arange(len(cars)), box=np.arange(len(cars)))
         squared.append(measure_error(EXACT, fit_extrinsics([shot], [pairs], calibrated)))
     assert 2 < np.mean(squared) < 7.5
@@ -225,7 +225,7 @@ def test_extrinsics_are_as_sure_as_they_are_right_however_sides_err(together: bo
 
 def test_a_car_that_stands_counts_as_often_as_one_that_is_seen_once():
     def deviations(cars: list[Boxes]) -> np.ndarray:
-        made = [Shot(each, pinhole(each, EXACT)) for each in cars]
+        made = [PairedShot(each, pinhole(each, EXACT)) for each in cars]
         return np.sqrt(np.diag(fit_extrinsics(made, [pair(each, TRUE) for each in made], TRUE).covariance))
 
     car = street(0)[:1]

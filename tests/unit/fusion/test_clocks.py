@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flcav.fusion.clocks import LEAST_SPEED_MPS, Trace, set_clocks, trace_objects
+from flcav.fusion.clocks import LEAST_SPEED_MPS, ObjectPath, set_clocks, trace_objects
 from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose
 
@@ -78,6 +78,6 @@ def test_a_vehicle_that_is_not_sure_of_its_place_is_not_set_by_its_way() -> None
 
 
 def test_a_trace_is_straight_between_instants_and_ends_soon_after_them() -> None:
-    trace = Trace(np.array([0.0, 1.0]), np.array([[0.0, 0.0], [10.0, 4.0]]))
+    trace = ObjectPath(np.array([0.0, 1.0]), np.array([[0.0, 0.0], [10.0, 4.0]]))
     np.testing.assert_allclose(trace.place_at(np.array([0.25, 1.5])), [[2.5, 1.0], [15.0, 6.0]])
     assert np.isinf(trace.place_at(np.array([-0.7, 1.7]))).all()

@@ -9,7 +9,7 @@ import pytest
 from flcav.network.clock import rounds
 from flcav.network.clock.rounds import RoundRules
 from flcav.network.radio.budget import Radio, lone_rate_bps, received_dbm
-from flcav.network.radio.propagation import LAWS, State, path_loss_db
+from flcav.network.radio.propagation import LAWS, PathState, path_loss_db
 from flcav.network.radio.wireline import Wireline
 
 PAGE = (Path(__file__).parents[3] / "docs" / "network.md").read_text(encoding="utf-8")
@@ -17,7 +17,9 @@ PAGE = (Path(__file__).parents[3] / "docs" / "network.md").read_text(encoding="u
 
 def test_laws_are_those_of_the_table():
     rows = re.findall(r"^\| (urban|highway) \| (\w+) \| (.*?) \| (\d+) \| (\d+) \|$", PAGE, re.M)
-    said = {(place, State[state.upper()]): (law, float(sigma), float(far)) for place, state, law, sigma, far in rows}
+    said = {
+        (place, PathState[state.upper()]): (law, float(sigma), float(far)) for place, state, law, sigma, far in rows
+    }
     assert {*said} == {(place, state) for place, laws in LAWS.items() for state in laws}
     for (place, state), (law, sigma, far) in said.items():
         known = LAWS[place][state]
@@ -56,7 +58,7 @@ def test_reach_behind_buildings_is_as_the_page_says():
     said = re.search(r"falls below that at (\d+) m, to half at (\d+) m, and to 0 at (\d+) m", PAGE)
     assert said is not None
     distance = np.arange(1.0, 700.0)
-    rate = lone_rate_bps(received_dbm(path_loss_db(distance, State.NLOS, 5.9), Radio()), Radio())
+    rate = lone_rate_bps(received_dbm(path_loss_db(distance, PathState.NLOS, 5.9), Radio()), Radio())
     found = [distance[(rate < limit).argmax()] for limit in (rate[0], rate[0] / 2, 1.0)]
     assert found == pytest.approx([float(said[1]), float(said[2]), float(said[3])], abs=1)
-    assert lone_rate_bps(received_dbm(path_loss_db(500.0, State.LOS, 5.9), Radio()), Radio()) == 20e6
+    assert lone_rate_bps(received_dbm(path_loss_db(500.0, PathState.LOS, 5.9), Radio()), Radio()) == 20e6

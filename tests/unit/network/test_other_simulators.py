@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 
 from flcav.network.radio.budget import Radio, spectral_efficiency
-from flcav.network.radio.propagation import LAWS, State, blockage_moments_db, path_loss_db
+from flcav.network.radio.propagation import LAWS, PathState, blockage_moments_db, path_loss_db
 
 # ns-3: loss at 1 m and 1 GHz, factors of lg distance and lg frequency, standard deviation of the shadowing [dB]
 NS3 = {
-    ("urban", State.LOS): (38.77, 16.7, 18.2, 3.0),
-    ("urban", State.NLOSV): (38.77, 16.7, 18.2, 3.0),
-    ("urban", State.NLOS): (36.85, 30.0, 18.9, 4.0),
-    ("highway", State.LOS): (32.4, 20.0, 20.0, 3.0),
-    ("highway", State.NLOSV): (32.4, 20.0, 20.0, 3.0),
+    ("urban", PathState.LOS): (38.77, 16.7, 18.2, 3.0),
+    ("urban", PathState.NLOSV): (38.77, 16.7, 18.2, 3.0),
+    ("urban", PathState.NLOS): (36.85, 30.0, 18.9, 4.0),
+    ("highway", PathState.LOS): (32.4, 20.0, 20.0, 3.0),
+    ("highway", PathState.NLOSV): (32.4, 20.0, 20.0, 3.0),
 }
-NS3_CORRELATION_M = {State.LOS: 10.0, State.NLOSV: 13.0, State.NLOS: 13.0}
+NS3_CORRELATION_M = {PathState.LOS: 10.0, PathState.NLOSV: 13.0, PathState.NLOS: 13.0}
 WILAB = {"power_dbm": 23.0, "antenna_gain_dbi": 3.0, "noise_figure_db": 9.0}  # Ptx_dBm, Gt_dB and Gr_dB, F_dB
 WILAB_HIGHWAY_CORRELATION_M, WILAB_URBAN_CORRELATION_M = 25.0, 10.0  # D_corr
 SHARC_ATTENUATION, SHARC_LEAST_DB = 0.4, -10.0
@@ -58,7 +58,7 @@ def test_the_link_budget_and_a_highway_s_correlation_are_those_of_wilab():
     radio = Radio()
     assert {name: getattr(radio, name) for name in WILAB} == WILAB
     assert {law.correlation_m for law in LAWS["highway"].values()} == {WILAB_HIGHWAY_CORRELATION_M}
-    assert LAWS["urban"][State.LOS].correlation_m == WILAB_URBAN_CORRELATION_M
+    assert LAWS["urban"][PathState.LOS].correlation_m == WILAB_URBAN_CORRELATION_M
 
 
 def test_the_rate_is_that_of_sharc_up_to_the_highest():

@@ -7,15 +7,15 @@ import pytest
 from scipy import integrate, stats
 
 from flcav.network.radio import propagation
-from flcav.network.radio.propagation import State
+from flcav.network.radio.propagation import PathState
 
 # Table 6.2.1-1 in linear units: loss = C * d^n * f^m, with C, n, m worked out from the decibels of the table.
 CLAUSE = {
-    ("urban", State.LOS): (10**3.877, 1.67, 1.82),
-    ("urban", State.NLOSV): (10**3.877, 1.67, 1.82),
-    ("urban", State.NLOS): (10**3.685, 3.0, 1.89),
-    ("highway", State.LOS): (10**3.24, 2.0, 2.0),
-    ("highway", State.NLOSV): (10**3.24, 2.0, 2.0),
+    ("urban", PathState.LOS): (10**3.877, 1.67, 1.82),
+    ("urban", PathState.NLOSV): (10**3.877, 1.67, 1.82),
+    ("urban", PathState.NLOS): (10**3.685, 3.0, 1.89),
+    ("highway", PathState.LOS): (10**3.24, 2.0, 2.0),
+    ("highway", PathState.NLOSV): (10**3.24, 2.0, 2.0),
 }
 
 
@@ -31,32 +31,32 @@ def test_path_loss_is_that_of_the_table(environment, state):
 
 def test_path_loss_by_hand():
     """At 100 m and 6 GHz: lg 100 = 2, lg 6 = 0.778151."""
-    states = [State.LOS, State.NLOSV, State.NLOS]
+    states = [PathState.LOS, PathState.NLOSV, PathState.NLOS]
     assert propagation.path_loss_db(100, states, 6.0) == pytest.approx([86.33235, 86.33235, 111.55706], abs=1e-5)
-    assert propagation.path_loss_db(100, State.LOS, 6.0, "highway") == pytest.approx(87.96303, abs=1e-5)
+    assert propagation.path_loss_db(100, PathState.LOS, 6.0, "highway") == pytest.approx(87.96303, abs=1e-5)
 
 
 def test_a_highway_is_free_space_within_a_twentieth_of_a_decibel():
     wavelength = 299_792_458 / 5.9e9
     free_db = 20 * math.log10(4 * math.pi * 200 / wavelength)
-    assert propagation.path_loss_db(200, State.LOS, 5.9, "highway") == pytest.approx(free_db, abs=0.05)
+    assert propagation.path_loss_db(200, PathState.LOS, 5.9, "highway") == pytest.approx(free_db, abs=0.05)
 
 
 def test_links_below_three_metres_lose_what_they_lose_at_three():
     assert (
-        propagation.path_loss_db([0.0, 1.0], State.NLOS, 5.9).tolist()
-        == [float(propagation.path_loss_db(3.0, State.NLOS, 5.9))] * 2
+        propagation.path_loss_db([0.0, 1.0], PathState.NLOS, 5.9).tolist()
+        == [float(propagation.path_loss_db(3.0, PathState.NLOS, 5.9))] * 2
     )
     assert (propagation.blockage_moments_db(0.0, 1.5, 1.6, 3.0)[0]) == 9
 
 
 def test_a_highway_has_no_state_behind_buildings():
     with pytest.raises(ValueError, match="the highway environment has no state NLOS"):
-        propagation.path_loss_db([10.0, 20.0], [State.LOS, State.NLOS], 5.9, "highway")
+        propagation.path_loss_db([10.0, 20.0], [PathState.LOS, PathState.NLOS], 5.9, "highway")
 
 
 def test_shadowing_by_state():
-    states = [State.LOS, State.NLOSV, State.NLOS]
+    states = [PathState.LOS, PathState.NLOSV, PathState.NLOS]
     assert propagation.shadowing_sigma_db(states).tolist() == [3, 3, 4]
     assert propagation.correlation_distance_m(states).tolist() == [10, 13, 13]
     assert propagation.shadowing_sigma_db(states[:2], "highway").tolist() == [3, 3]

@@ -17,7 +17,7 @@ from flcav.optimization.placement import cheapest, solve
 from flcav.optimization.placement.solve import Candidates
 from flcav.optimization.problem import Problem
 from flcav.optimization.verification.allocation import verify_allocation
-from flcav.optimization.verification.placement import Asked, verify_placement
+from flcav.optimization.verification.placement import PlacementProblem, verify_placement
 
 
 def check_plan(problem: Problem, plan: Allocation, optimal: float) -> None:
@@ -48,7 +48,7 @@ def _verified_fleet(solve: Callable[..., Any]) -> Callable[..., Any]:
     return solve_and_verify
 
 
-ASKED: dict[int, Asked] = {}  # by the candidates' coverage
+ASKED: dict[int, PlacementProblem] = {}  # by the candidates' coverage
 KEPT: list[Any] = []  # which are not collected, so that no other has the same id
 
 
@@ -59,7 +59,7 @@ def _remembered(find: Callable[..., Candidates]) -> Callable[..., Candidates]:
         arrays = (np.asarray(each, np.float64) for each in (errors, poles, ranges_m))
         places, sites, ranges = arrays
         visible = None if given.get("visible") is None else given["visible"].toarray() > 0
-        ASKED[id(found.covers)] = Asked(places, found.weight, sites, ranges, np.zeros(0), visible=visible)
+        ASKED[id(found.covers)] = PlacementProblem(places, found.weight, sites, ranges, np.zeros(0), visible=visible)
         KEPT.append(found.covers)
         return found
 

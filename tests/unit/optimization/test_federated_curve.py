@@ -13,7 +13,7 @@ from flcav.config import InputError
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.budget_sweep import compute_savings
 from flcav.optimization.allocation.fleet import allocate_fleet
-from flcav.optimization.allocation.replanning import PlanState, condition_problem, replan
+from flcav.optimization.allocation.replanning import PlanState, condition_problem
 from flcav.optimization.curves.bands import bootstrap_bands, fit_upper_curve
 from flcav.optimization.curves.curves import Federated
 from flcav.optimization.curves.fitting import fit, fit_federated
@@ -193,7 +193,7 @@ def test_replanning_goes_through_what_was_observed() -> None:
     assert float(left.tasks[0].curve.error(4, 3, 2)) == pytest.approx(
         ratio * float(asked.tasks[0].curve.error(4, 3, 2))
     )
-    assert replan(asked, state).tasks[0].samples == 4
+    assert allocate(condition_problem(asked, state)).tasks[0].samples == 4
 
 
 def test_more_pairs_of_rounds_than_can_be_tried_are_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

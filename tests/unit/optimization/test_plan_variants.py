@@ -16,7 +16,7 @@ from flcav.optimization.allocation.allocate import (
     weighted_error,
 )
 from flcav.optimization.allocation.baselines import BASELINES, baseline
-from flcav.optimization.allocation.replanning import PlanState, condition_problem, replan
+from flcav.optimization.allocation.replanning import PlanState, condition_problem
 from flcav.optimization.solvers.area import area
 from flcav.optimization.solvers.instance import Infeasible, stage_plan
 
@@ -162,7 +162,7 @@ def test_replanning_keeps_within_the_budgets_whatever_is_observed():
                 | {"accuracy": 1 - min(1.0, float(task.curve.error(*done[task.name])) * rng.uniform(0.5, 1.5))}
                 for task in problem.tasks
             }
-            plan = replan(problem, parse_config(PlanState, {"tasks": observed}, "progress"))
+            plan = allocate(condition_problem(problem, parse_config(PlanState, {"tasks": observed}, "progress")))
     for planned in plan.tasks:
         assert [getattr(planned, field) for field in stages] == done[planned.name]
     assert ledger.used_mb("wireless") <= problem.budgets_mb.wireless
@@ -185,7 +185,7 @@ def test_curves_pass_through_what_was_observed_and_stages_that_are_over_stay():
     task = problem.tasks[0]
     cost = price(stage_plan(problem, task, (300, 2, 0)), MessageSizes(task.sample_mb, task.model_mb))
     assert left.budgets_mb.wireless == pytest.approx(problem.budgets_mb.wireless - 900 + cost.wireless_mb)
-    plan = replan(problem, progress)
+    plan = allocate(condition_problem(problem, progress))
     assert (plan.tasks[0].samples, plan.tasks[0].edge_rounds >= 2) == (300, True)
 
 
@@ -198,7 +198,7 @@ def test_progress_that_cannot_be_is_refused():
         with pytest.raises(InputError, match=said):
             condition_problem(problem, PlanState.model_validate(values))
     with pytest.raises(Infeasible, match="wireless"):
-        replan(problem, PlanState.model_validate({"tasks": {"t0": {"samples": 10**6}}}))
+        allocate(condition_problem(problem, PlanState.model_validate({"tasks": {"t0": {"samples": 10**6}}})))
 
 
 def test_the_weighted_error_of_a_cluster_is_the_mean_of_its_members_by_weight():

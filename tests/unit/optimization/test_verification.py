@@ -15,7 +15,7 @@ from flcav.optimization.placement.cheapest import cover_share
 from flcav.optimization.placement.solve import find_candidates, place_budget
 from flcav.optimization.verification.allocation import verify_allocation
 from flcav.optimization.verification.dual_bounds import bound_largest, bound_weighted
-from flcav.optimization.verification.placement import Asked, verify_placement
+from flcav.optimization.verification.placement import PlacementProblem, verify_placement
 from flcav.optimization.verification.record import Verification, exact
 from flcav.optimization.verification.tasks import least_cost, list_branches, read_tasks
 
@@ -148,12 +148,12 @@ def test_what_rests_on_a_search_is_said() -> None:
     assert any("search above the dual" in each for each in found.trusted)
 
 
-def made_placement(**limit: float) -> tuple[Asked, Data, float | None]:
+def made_placement(**limit: float) -> tuple[PlacementProblem, Data, float | None]:
     rng = np.random.default_rng(3)
     errors, poles = rng.uniform(0, 100, (60, 3)) * [1, 1, 0.1], rng.uniform(0, 100, (9, 3)) * [1, 1, 0.1]
     weight, of_pole, of_sensor = rng.uniform(0.1, 2, 60), rng.uniform(0.5, 1.5, 9), np.array([4.0, 1.0])
     ranges = np.array([45.0, 18.0])
-    asked = Asked(errors, weight, poles, ranges, of_pole[:, None] + of_sensor, **limit)  # pyright: ignore[reportArgumentType]
+    asked = PlacementProblem(errors, weight, poles, ranges, of_pole[:, None] + of_sensor, **limit)  # pyright: ignore[reportArgumentType]
     given = find_candidates(errors, poles, ranges, weight=weight, pole_cost=of_pole, sensor_cost=of_sensor)
     if "budget" in limit:
         return asked, asdict(place_budget(given, limit["budget"])), None
@@ -222,5 +222,5 @@ def test_errors_on_the_sphere_of_a_range_are_covered_and_those_beyond_are_not() 
     placed = place_budget(given, 1.0)
     assert placed.covered == 2
     assert not verify_placement(
-        Asked(errors, np.ones(3), poles, ranges, np.ones((1, 1)), budget=1.0), json.dumps(asdict(placed))
+        PlacementProblem(errors, np.ones(3), poles, ranges, np.ones((1, 1)), budget=1.0), json.dumps(asdict(placed))
     ).faults

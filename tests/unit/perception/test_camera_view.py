@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.dataset.formats.kitti import Calibration
+from flcav.dataset.formats.kitti import KittiCalibration
 from flcav.dataset.formats.kitti.write import format_calibration
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.images import CameraView, kitti_view, recorded_view, view_beside
@@ -73,14 +73,14 @@ def test_where_no_camera_looks_ahead_there_is_no_view(mounts, seen, recorded, tm
     assert recorded_view(recorded(seen(mounts), tmp_path), 0, "top") is None
 
 
-def real_like() -> Calibration:
+def real_like() -> KittiCalibration:
     """Return KITTI's: a projection that also shifts, a camera that is tilted against the LiDAR."""
     turned = OPTICAL.copy()
     turned[:3, :3] = (
         np.array([[1, 0, 0], [0, np.cos(0.02), -np.sin(0.02)], [0, np.sin(0.02), np.cos(0.02)]]) @ turned[:3, :3]
     )
     turned[:3, 3] = (-0.004, -0.08, -0.27)
-    return Calibration(turned, np.array([[721.5, 0, 609.6, 44.9], [0, 721.5, 172.9, 0.2], [0, 0, 1, 0.003]]))
+    return KittiCalibration(turned, np.array([[721.5, 0, 609.6, 44.9], [0, 721.5, 172.9, 0.2], [0, 0, 1, 0.003]]))
 
 
 def test_kitti_s_projection_is_its_formula():

@@ -25,7 +25,7 @@ from flcav.perception.errors import (
 from flcav.perception.signs import errors as sign_errors
 from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
 from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.predict import Detections
+from flcav.perception.signs.predict import SignDetections
 from flcav.perception.signs.samples import sample_from_frame
 from flcav.perception.trajectory import errors as path_errors
 from flcav.perception.trajectory.config import CONFIGURATIONS as PATHS
@@ -52,17 +52,17 @@ def network() -> SignDetector:
     return SignDetector(CONFIGURATIONS["n"])
 
 
-def seen(data: Dataset, config: SignsConfig) -> list[Detections]:
+def seen(data: Dataset, config: SignsConfig) -> list[SignDetections]:
     """Return what a perfect detector finds in each frame's picture."""
     out = []
     for number in range(len(data)):
         frame = data.frame(number)
         sample = sample_from_frame(frame, "front", data.plane(number, "front", "rgb"), config)
-        out.append(Detections(sample.boxes, sample.label, np.ones(len(sample.label))))
+        out.append(SignDetections(sample.boxes, sample.label, np.ones(len(sample.label))))
     return out
 
 
-def registered(data: Dataset, network: SignDetector, found: list[Detections], monkeypatch: pytest.MonkeyPatch):
+def registered(data: Dataset, network: SignDetector, found: list[SignDetections], monkeypatch: pytest.MonkeyPatch):
     answers = iter(found)
     monkeypatch.setattr(sign_errors, "detect", lambda *_, **__: next(answers))
     return sign_errors.register_errors(network, data, range(len(data)), 0.3)
@@ -75,7 +75,7 @@ def test_a_perfect_sign_detector_makes_no_mistakes(drive, network, monkeypatch):
 
 
 def test_signs_that_were_missed_stand_where_they_stand_in_town_and_count_once(drive, network, monkeypatch):
-    nothing = Detections(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0))
+    nothing = SignDetections(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0))
     result = registered(drive, network, [nothing] * len(drive), monkeypatch)
     town = drive.town()
     assert town is not None
@@ -96,8 +96,8 @@ def test_an_invented_sign_is_where_its_ray_meets_the_town_or_is_dropped(drive, n
     middles[1] = np.clip(middles[1], 9, None)
     assert np.isinf(image.depth_m[int(middles[1, 1]), int(middles[1, 0])])
     boxes = np.concatenate((middles - 8, middles + 8), axis=1)
-    nothing = Detections(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0))
-    invented = Detections(boxes, np.zeros(2, np.int64), np.ones(2))
+    nothing = SignDetections(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0))
+    invented = SignDetections(boxes, np.zeros(2, np.int64), np.ones(2))
     found = [invented, *[nothing] * (len(drive) - 1)]
     result = registered(drive, network, found, monkeypatch)
     (error,) = (error for error in result.errors if error.kind == FALSE_POSITIVE)

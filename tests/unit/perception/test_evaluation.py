@@ -1,15 +1,16 @@
 """The rules of evaluation, of training samples, and of the error registry, on frames made by hand."""
 
 import math
+from itertools import chain
 
 import numpy as np
 import pytest
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
-from flcav.perception.errors import load_errors, save_errors
+from flcav.perception.errors import keep_first, load_errors, save_errors
 from flcav.perception.objects import sample_from_frame, second_paper, second_tiny
-from flcav.perception.objects.errors import register_errors
+from flcav.perception.objects.errors import find_errors
 from flcav.perception.objects.evaluate import ObjectsEvaluation, Score, score_detections
 from flcav.perception.objects.samples import validate_points
 from flcav.perception.objects.truth import asked_of, ground_truth
@@ -27,6 +28,11 @@ MIXED = [
     ("behind", "car", -10, 0, 99),
     ("far", "car", 49, 0, 9),
 ]
+
+
+def register(*found, **limits):
+    """Return the mistakes of `find_errors`, each once."""
+    return keep_first(chain.from_iterable(find_errors(*found, **limits)))
 
 
 def xs(boxes):
@@ -87,7 +93,7 @@ def test_evaluating_nothing_is_said():
 def test_misses_are_registered_once_per_track():
     first = frame(MIXED, at=(100, 0), index=0)
     second = frame(MIXED, at=(105, 0), index=1)
-    errors = register_errors([first, second], [detections((10, 0, 0.9)), detections((20, 0, 0.9))], CONFIG)
+    errors = register([first, second], [detections((10, 0, 0.9)), detections((20, 0, 0.9))], CONFIG)
     assert [(e.kind, e.track) for e in errors] == [("miss", "van"), ("miss", "faint"), ("miss", "seen")]
     assert math.isclose(errors[0].x, 120)  # where it was first missed
     assert math.isclose(errors[0].z, 0.8)
@@ -95,7 +101,7 @@ def test_misses_are_registered_once_per_track():
 
 
 def test_low_scores_do_not_find():
-    errors = register_errors([frame(MIXED[:1])], [detections((10, 0, 0.2))], CONFIG, threshold=0.3)
+    errors = register([frame(MIXED[:1])], [detections((10, 0, 0.2))], CONFIG, threshold=0.3)
     assert [e.track for e in errors] == ["seen"]
 
 
@@ -104,7 +110,7 @@ def test_false_positives_need_a_return_and_are_one_per_place():
     with_points = cloud_in(found[:3])
     frames = [frame([], points=with_points, index=i) for i in range(2)]
     frames.append(frame([], points=with_points, scene="s1"))
-    errors = register_errors(frames, [found] * 3, CONFIG)
+    errors = register(frames, [found] * 3, CONFIG)
     assert [(e.kind, e.scene) for e in errors] == [("false_positive", "s0")] * 2 + [("false_positive", "s1")] * 2
     assert {round(e.x) for e in errors} == {10, 30}
     assert all(e.returns >= 6 for e in errors)
@@ -112,12 +118,12 @@ def test_false_positives_need_a_return_and_are_one_per_place():
 
 def test_detections_on_a_bus_or_a_hidden_car_are_no_mistakes():
     found = detections((40, 0, 0.9), (20, 12, 0.9))
-    assert register_errors([frame(MIXED[3:5], points=cloud_in(found))], [found], CONFIG) == ()
+    assert register([frame(MIXED[3:5], points=cloud_in(found))], [found], CONFIG) == ()
 
 
 def test_the_registry_is_a_parquet_table(tmp_path):
     found = detections((30, 5, 0.9))
-    errors = register_errors([frame(MIXED[:1], points=cloud_in(found))], [found], CONFIG)
+    errors = register([frame(MIXED[:1], points=cloud_in(found))], [found], CONFIG)
     save_errors(errors, tmp_path / "errors.parquet")
     assert repr(load_errors(tmp_path / "errors.parquet")) == repr(errors)
     save_errors([], tmp_path / "none.parquet")

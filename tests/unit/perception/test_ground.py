@@ -20,7 +20,7 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.pseudo_labels import road_views
 from flcav.report import style
 from flcav.report.pictures import birdseye
-from flcav.report.pictures.birdseye import View
+from flcav.report.pictures.birdseye import BirdseyeView
 from flcav.report.pictures.clouds import read_sweep
 from flcav.sensors.frame import Calibration, Frame
 from flcav.world.map.town import load_town
@@ -94,7 +94,7 @@ def test_a_network_for_poles_fits_them_by_their_height_above_the_ground(data: Da
 def test_a_birdseye_view_colours_points_by_height_above_the_ground(
     data: Dataset, agent: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shown: list[View] = []
+    shown: list[BirdseyeView] = []
     monkeypatch.setattr(birdseye, "birdseye", lambda view: shown.append(view) or style.canvas(1, 1))
     with pytest.raises(SystemExit) as ended:
         run(["birdseye", str(data.folder), "--frame", data.name(agent), "--out", str(tmp_path / "a.png")])

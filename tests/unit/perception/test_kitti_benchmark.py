@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError
-from flcav.dataset.formats.kitti import Calibration
+from flcav.dataset.formats.kitti import KittiCalibration
 from flcav.geometry import Boxes
 from flcav.perception import networks
 from flcav.perception.kitti_benchmark import BenchmarkEvaluation, compare_kitti_rig, project_boxes
@@ -132,7 +132,7 @@ def test_thresholds_are_forty_steps_of_recall():
 
 
 def test_boxes_are_projected_into_the_image():
-    camera = Calibration(
+    camera = KittiCalibration(
         np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]),
         np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
     )

@@ -10,7 +10,7 @@ from flcav.perception.objects import detect, detect_all, second, second_paper, s
 from flcav.perception.objects.model import head_shape
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.weights import from_arrays, load_network, load_weights, save_network, to_arrays
+from flcav.perception.weights import from_arrays, load_network, save_network, to_arrays
 
 from .toy import spin, toy_sample
 
@@ -73,14 +73,6 @@ def test_weights_return_as_they_were_saved(tiny, cloud, tmp_path):
     back = load_network(OBJECTS, path)
     assert back.config == tiny.config
     assert np.array_equal(detect(back, cloud).array(), detect(tiny, cloud).array())
-
-
-@pytest.mark.parametrize("other", [second_paper, lambda: second_tiny(ground_z_m=-2.5)])
-def test_weights_of_another_network_are_refused(tiny, tmp_path, other):
-    path = tmp_path / "weights.safetensors"
-    save_network(OBJECTS, tiny, path)
-    with pytest.raises(InputError, match="weights of another network"):
-        load_weights(OBJECTS, other(), path)
 
 
 def test_files_that_are_no_weights_are_refused(tmp_path):

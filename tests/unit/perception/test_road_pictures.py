@@ -16,7 +16,7 @@ from flcav.perception.signs.background import compare_with_background, learn_pic
 from flcav.perception.signs.config import CONFIGURATIONS
 from flcav.perception.signs.infer import detect_signs
 from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.predict import Detections
+from flcav.perception.signs.predict import SignDetections
 from flcav.perception.signs.samples import RecordedPictures, sample_from_frame
 from flcav.perception.signs.task import SIGNS
 from flcav.sensors.frame import Annotations, Frame, Views
@@ -24,7 +24,7 @@ from perception.frames import frame
 
 ROAD = CONFIGURATIONS["road"]
 GREY, RED = 100, (200, 20, 30)
-NOTHING = Detections(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0))
+NOTHING = SignDetections(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0))
 
 
 class Street:

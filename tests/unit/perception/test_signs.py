@@ -10,10 +10,10 @@ import torch
 from flcav.perception.ops.rectangles import complete_iou
 from flcav.perception.signs.augment import GREY, crop_sample, draw, draw_window, join_mosaic
 from flcav.perception.signs.config import CONFIGURATIONS, STRIDES, SignsConfig
-from flcav.perception.signs.evaluate import ClassPrecision, GroundTruth, mean_average_precision
+from flcav.perception.signs.evaluate import ClassPrecision, SignTruth, mean_average_precision
 from flcav.perception.signs.loss import BOX, CLASS, LEVELS, OBJECT, detection_loss
 from flcav.perception.signs.model import SignDetector, decode, decode_boxes
-from flcav.perception.signs.predict import Detections, detect
+from flcav.perception.signs.predict import SignDetections, detect
 from flcav.perception.signs.samples import Sample
 from flcav.perception.signs.targets import MOST_TIMES, assign_anchors
 from flcav.perception.signs.task import SIGNS, SignsTask
@@ -200,16 +200,16 @@ def test_mosaics_look_for_rare_classes():
     assert (seen == 2).sum() > 0.15 * (seen == 0).sum()  # though it is in a tenth of the pictures
 
 
-def found(*rows) -> Detections:
+def found(*rows) -> SignDetections:
     """Return detections of rows (x, y, side, class, score)."""
     array = np.array(rows, dtype=float).reshape(-1, 5)
     box = np.concatenate((array[:, :2], array[:, :2] + array[:, 2:3]), 1)
-    return Detections(box, array[:, 3].astype(np.int64), array[:, 4])
+    return SignDetections(box, array[:, 3].astype(np.int64), array[:, 4])
 
 
-def truth(*rows, neutral=NO_BOXES) -> GroundTruth:
+def truth(*rows, neutral=NO_BOXES) -> SignTruth:
     one = found(*((*row, 1.0) for row in rows))
-    return GroundTruth(one.box, one.label, neutral)
+    return SignTruth(one.box, one.label, neutral)
 
 
 def test_map_of_cases_by_hand():
@@ -270,7 +270,7 @@ def test_it_learns_eight_pictures():
 
     def map50() -> float:
         seen = [detect(network, sample.picture, threshold=0.01) for sample in samples]
-        truths = [GroundTruth(s.boxes, s.label, s.ignore) for s in samples]
+        truths = [SignTruth(s.boxes, s.label, s.ignore) for s in samples]
         return mean_average_precision(seen, truths, TINY.classes, 6).score
 
     assert map50() < 0.1

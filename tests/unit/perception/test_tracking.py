@@ -15,7 +15,7 @@ from flcav.perception.metrics.tracks import TrackingFrame, amota, count_clear_mo
 from flcav.perception.objects import second_tiny
 from flcav.perception.tracking import Tracker, evaluate_tracks
 from flcav.perception.tracking import evaluate as tracking_evaluation
-from flcav.perception.tracking.tracker import State, predict_state, start_state, update_state
+from flcav.perception.tracking.tracker import TrackState, predict_state, start_state, update_state
 
 from .frames import detections, frame
 
@@ -53,7 +53,7 @@ def test_a_filter_keeps_a_covariance_that_is_one():
 
 
 def test_a_heading_seen_the_wrong_way_round_does_not_turn_the_track():
-    state = State(np.zeros(9), np.eye(9))
+    state = TrackState(np.zeros(9), np.eye(9))
     box = np.zeros(7)
     box[6] = np.pi - 0.1
     assert abs(update_state(state, box, np.full(7, 0.1)).mean[6]) < 0.2

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flcav.perception.tracking.tracker import LEAST_VARIANCE, State, assign_detections, innovation
+from flcav.perception.tracking.tracker import LEAST_VARIANCE, TrackState, assign_detections, innovation
 
 WIDE = 1e6  # variance [m^2] with which every place is likely
 
 
-def state(variance: tuple[float, float]) -> State:
-    return State(np.zeros(9), np.diag([*variance, *[1.0] * 7]))
+def state(variance: tuple[float, float]) -> TrackState:
+    return TrackState(np.zeros(9), np.diag([*variance, *[1.0] * 7]))
 
 
-def pairs(own: State, place: tuple[float, float], after_s: float, yaw: float = 0.0) -> list[tuple[int, int]]:
+def pairs(own: TrackState, place: tuple[float, float], after_s: float, yaw: float = 0.0) -> list[tuple[int, int]]:
     return assign_detections([own], np.array([[*place, 0, 0, 0, 0, yaw]]), np.zeros((1, 7)), after_s)
 
 

@@ -11,7 +11,7 @@ from flcav.pipeline.results.plans import Placed, Plan, Pole, TaskPlan
 from flcav.pipeline.results.run import ArmResult, LinkUse, Run, Spent
 from flcav.pipeline.results.tests import Difference, Finding, Test, Tested
 from flcav.pipeline.results.training import Pretrained, Validated
-from flcav.report.pictures.clouds import Detections, Sweep
+from flcav.report.pictures.clouds import ComparedSweep, MatchedDetections
 from flcav.report.pictures.maps import DENSEST, ErrorMap, poles_of
 from flcav.statistics.estimates import Estimate, Spread
 from flcav.world.map.town import load_town
@@ -126,7 +126,7 @@ def error_map(town: str = "grid", errors: int = 61) -> ErrorMap:
     return ErrorMap(place, xyz, kind, poles_of(place), chosen={"2": 40.0}, conventional={DENSEST: ("8",)})
 
 
-def sweep() -> Sweep:
+def sweep() -> ComparedSweep:
     rng = np.random.default_rng(2)
     rows = [[12, 3, -1, 4.5, 1.8, 1.5, 0.0], [24, -3, -1, 4.5, 1.8, 1.5, 3.1], [33, 4, -1, 5.4, 2, 2.3, 0.1],
             [40, -12, -1, 4.2, 1.8, 1.5, 1.5], [19, 12, -1, 4.6, 1.8, 1.5, 1.6]]  # fmt: skip
@@ -141,10 +141,14 @@ def sweep() -> Sweep:
     ]
     before = Boxes.from_array(np.r_[near[:2], false], "Car", [0.9, 0.8, 0.4])
     after = Boxes.from_array(near[[0, 1, 2, 4]], "Car", [0.9, 0.9, 0.6, 0.5])
-    return Sweep(
+    return ComparedSweep(
         points=np.concatenate((ground, *on_boxes)).astype(np.float32),
         ground_m=-1.7,
         targets=targets,
-        before=Detections("Pretrained", before, np.array([True, True, False]), np.array([1, 1, 0, 0, 0], dtype=bool)),
-        after=Detections("Edge + cloud FL", after, np.ones(4, dtype=bool), np.array([1, 1, 1, 0, 1], dtype=bool)),
+        before=MatchedDetections(
+            "Pretrained", before, np.array([True, True, False]), np.array([1, 1, 0, 0, 0], dtype=bool)
+        ),
+        after=MatchedDetections(
+            "Edge + cloud FL", after, np.ones(4, dtype=bool), np.array([1, 1, 1, 0, 1], dtype=bool)
+        ),
     )

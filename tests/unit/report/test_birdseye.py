@@ -12,7 +12,7 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
 from flcav.report import style
-from flcav.report.pictures.birdseye import View, birdseye, view_frame
+from flcav.report.pictures.birdseye import BirdseyeView, birdseye, view_frame
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
@@ -20,14 +20,14 @@ UP = {"mount": {"z": 1.8}}
 RIG = {"lidars": {"lidar": UP}, "radars": {"radar": UP}}
 
 
-def view(**fields: object) -> View:
+def view(**fields: object) -> BirdseyeView:
     points = np.random.default_rng(0).uniform((-40, -40, 0), (40, 40, 6), (3000, 3))
     truth = Boxes.from_array([[20, 10, 1, 4, 2, 1.5, 0.3], [-20, 10, 1, 4, 2, 1.5, 0]], "car")
-    base = View(points=points, truth=truth, returns=np.array([30, 0]), title="a frame", agent_size=(4.5, 1.8))
+    base = BirdseyeView(points=points, truth=truth, returns=np.array([30, 0]), title="a frame", agent_size=(4.5, 1.8))
     return replace(base, **fields)
 
 
-def pixels(seen: View) -> np.ndarray:
+def pixels(seen: BirdseyeView) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(style.png(birdseye(seen), dpi=60))).convert("RGB")).astype(int)
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 from flcav.cli.main import run
 from flcav.dataset.store import Dataset
 from flcav.report import style
-from flcav.report.pictures.camera import Shot, arrange_cameras, camera_sheet, make_shot, thermal_grey
+from flcav.report.pictures.camera import CameraShot, arrange_cameras, camera_sheet, make_shot, thermal_grey
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import RIGS, Rig
@@ -57,7 +57,7 @@ def data(frame: Frame, recorded: Callable[[Frame, Path], Dataset], tmp_path_fact
     return recorded(frame, tmp_path_factory.mktemp("camera") / "data")
 
 
-def pixels(rows: list[list[Shot]], *, boxes: bool) -> np.ndarray:
+def pixels(rows: list[list[CameraShot]], *, boxes: bool) -> np.ndarray:
     png = style.png(camera_sheet("a frame", rows, boxes=boxes), dpi=60)
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
 

@@ -7,7 +7,7 @@ from flcav.world.map.relief import Relief
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import HILLS, KERB_M, TOWNS, load_town
 from flcav.world.rays.embree import Solid
-from flcav.world.static import GROUND_M, Part, build_static_world
+from flcav.world.static import GROUND_M, TownPart, build_static_world
 
 STEEPEST, CAMBER = 0.12, 0.025
 
@@ -51,7 +51,7 @@ def test_ground_roads_and_sidewalks_close_a_hilly_towns_surface() -> None:
     town = load_town("hilly_suburb")
     world, relief = build_static_world(town), town.relief
     assert relief is not None
-    low = np.isin(world.part, [Part.GROUND, Part.ROAD, Part.SIDEWALK])
+    low = np.isin(world.part, [TownPart.GROUND, TownPart.ROAD, TownPart.SIDEWALK])
     x0, y0, x1, y1 = town.bounds
     places = np.random.default_rng(3).uniform((x0, y0), (x1, y1), (20_000, 2))
     eye = np.eye(4)
@@ -64,5 +64,5 @@ def test_ground_roads_and_sidewalks_close_a_hilly_towns_surface() -> None:
     above = at[:, 2] - relief.heights(*at[:, :2].T)
     assert (above > GROUND_M - 0.005).all()
     assert (above < KERB_M + 0.015).all()
-    on_road = world.part[low][hits.face] == Part.ROAD
+    on_road = world.part[low][hits.face] == TownPart.ROAD
     assert np.abs(above[on_road]).max() < 0.005

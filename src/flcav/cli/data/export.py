@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import Format, join_choices
+from flcav.cli.options import OWN, join_choices
+from flcav.dataset.formats.formats import EXPORTS, export_format
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ def register(app: typer.Typer) -> None:
 
 
 def export(
-    format: Format = typer.Argument(metavar="FORMAT", help=f"What to write: {join_choices(Format)}."),
+    format: str = typer.Argument(metavar="FORMAT", help=f"What to write: {join_choices(EXPORTS)}, {OWN}."),
     folder: Path = typer.Argument(metavar="DIR", help="A dataset."),
     out: Path = typer.Option(..., "--out", help="New or empty folder."),
     labels: str | None = typer.Option(
@@ -54,6 +55,7 @@ def export(
     }
     asked = {name: value for name, value in every.items() if value is not None}
     options = parse_config(ExportOptions, asked, "export")
+    export_format(format)  # a wrong name is told before a wrong folder
     dataset = Dataset.open(folder)
     with progress.show_progress(f"export {out}") as report:
         exported = write(dataset, format, out, options, progress=report)

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.options import ImportFormat, join_choices
+from flcav.cli.options import OWN, join_choices
+from flcav.dataset.formats.formats import IMPORTS
 from flcav.interface.wording import plural
 
 
@@ -14,7 +15,7 @@ def register(app: typer.Typer) -> None:
 
 
 def import_(
-    format: ImportFormat = typer.Argument(metavar="FORMAT", help=f"What to read: {join_choices(ImportFormat)}."),
+    format: str = typer.Argument(metavar="FORMAT", help=f"What to read: {join_choices(IMPORTS)}, {OWN}."),
     folder: Path = typer.Argument(metavar="DIR", help="A folder of that format, as it is distributed."),
     out: Path = typer.Option(..., "--out", help="New or empty folder for the dataset."),
     split: str | None = typer.Option(None, "--split", help="One split of it alone, such as val; by default all."),

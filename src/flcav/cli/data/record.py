@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.options import ENGINE, Engine
+from flcav.cli.options import ENGINE, EngineName
 from flcav.cli.terminal import when_interrupted
 from flcav.interface.wording import plural
 
@@ -21,7 +21,7 @@ def record(
     frames: int | None = typer.Option(None, "--frames", help="Record exactly this many frames instead."),
     seed: int | None = typer.Option(None, "--seed", help="Seed instead of the recipe's."),
     jobs: int = typer.Option(1, "--jobs", help="Workers; the dataset is the same whatever their number."),
-    engine: Engine = ENGINE,
+    engine: EngineName = ENGINE,
 ) -> None:
     """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
     from flcav.config import parse_config

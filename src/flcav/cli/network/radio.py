@@ -46,7 +46,7 @@ def radio(
     from flcav.dataset.store import Dataset
     from flcav.network.clock.rounds import NetworkSettings
     from flcav.network.radio.coverage import cover_town
-    from flcav.network.radio.propagation import State
+    from flcav.network.radio.propagation import PathState
     from flcav.network.radio.recorded import link_scene, summarise_links
     from flcav.storage.files import check_writable, write_bytes
 
@@ -63,7 +63,7 @@ def radio(
         write_bytes(map_, style.png(coverage_map(recorded.town, covered, recorded.paths, links)))
     if as_json:
         rates = links.rate_bps / 1e6
-        states = {-1: None, **{int(state): state.name for state in State}}
+        states = {-1: None, **{int(state): state.name for state in PathState}}
         rows = []
         for row in found:
             at = (slice(None), links.vehicle.index(row.vehicle), links.unit.index(row.unit))

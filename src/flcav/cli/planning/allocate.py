@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 SHOWN = "#.2g"  # predictions: trainings on the same frames differ in the second digit
 
 
-class Compared(StrEnum):
+class BaselineName(StrEnum):
     """Baseline plans."""
 
     equal_stages = "equal-stages"
@@ -45,7 +45,7 @@ PROBLEM = typer.Argument(
 )
 AS_JSON = typer.Option(False, "--json", help="Print one JSON object.")
 BASELINE = typer.Option(
-    None, "--baseline", metavar="PLAN", help=f"A plan to compare with, in the same call: {join_choices(Compared)}."
+    None, "--baseline", metavar="PLAN", help=f"A plan to compare with, in the same call: {join_choices(BaselineName)}."
 )
 PROGRESS = "YAML: what is spent and observed so far; the plan goes on from there."
 VERIFY = typer.Option(
@@ -57,7 +57,7 @@ OUT = typer.Option(None, "--out", help="Write a page about the plan (HTML): wher
 def allocate(
     problem: Path = PROBLEM,
     as_json: bool = AS_JSON,
-    baseline: Compared | None = BASELINE,
+    baseline: BaselineName | None = BASELINE,
     progress: Path | None = typer.Option(None, "--progress", help=f"{PROGRESS} As `flcav replan`."),
     out: Path | None = OUT,
     verify: bool = VERIFY,
@@ -70,7 +70,7 @@ def replan(
     problem: Path = PROBLEM,
     progress: Path = typer.Argument(..., help=PROGRESS),
     as_json: bool = AS_JSON,
-    baseline: Compared | None = BASELINE,
+    baseline: BaselineName | None = BASELINE,
     out: Path | None = OUT,
     verify: bool = VERIFY,
 ) -> None:
@@ -83,7 +83,7 @@ def replan(
 
 
 def _plan(
-    problem: Path, progress: Path | None, as_json: bool, baseline: Compared | None, out: Path | None, verify: bool
+    problem: Path, progress: Path | None, as_json: bool, baseline: BaselineName | None, out: Path | None, verify: bool
 ) -> None:
     from flcav.config import read_config
     from flcav.optimization.allocation.baselines import baseline as compared

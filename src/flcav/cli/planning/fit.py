@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from flcav.optimization.curves.history import History
 
 
-class Model(StrEnum):
+class CurveForm(StrEnum):
     """Form of the learning curve: how the stages add up."""
 
     additive = "additive"
@@ -53,7 +53,7 @@ def fit(
         "file, write one with the rest to fill in."
     ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
-    model: Model = typer.Option(Model.additive, "--model", help="How the stages add up; best: additive or "
+    model: CurveForm = typer.Option(CurveForm.additive, "--model", help="How the stages add up; best: additive or "
         "federated, whichever has the smaller AICc, as runs are planned."),
     at: list[str] = typer.Option(
         [], "--at", metavar="SAMPLES[,EDGE_ROUNDS[,CLOUD_ROUNDS]]", help="Where to predict the error; may be given "
@@ -94,7 +94,7 @@ def fit(
     from flcav.optimization.curves.held_out import hold_out_runs
     from flcav.optimization.curves.history import parse_histories
 
-    if model is Model.additive:
+    if model is CurveForm.additive:
         refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")
 
     asked = [_counts(text) for text in at]

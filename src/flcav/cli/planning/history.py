@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.options import ENGINE, JOBS, STALE, Engine, Stale
+from flcav.cli.options import ENGINE, JOBS, STALE, EngineName, Stale
 from flcav.cli.terminal import only_writer_of, when_interrupted
 from flcav.config import InputError
 from flcav.interface.wording import plural
@@ -30,7 +30,7 @@ def history(
     ),
     out: Path = typer.Option(..., "--out", help="Folder of the runs; the same command goes on after a stop."),
     jobs: int = JOBS,
-    engine: Engine = ENGINE,
+    engine: EngineName = ENGINE,
     stale: Stale = STALE,
 ) -> None:
     """Measure the learning history of a task; write history.csv, and its origin to history.json.

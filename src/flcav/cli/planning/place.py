@@ -181,14 +181,16 @@ def _verify(
 ) -> "Verification":
     import numpy as np
 
-    from flcav.optimization.verification.placement import Asked, verify_placement
+    from flcav.optimization.verification.placement import PlacementProblem, verify_placement
 
     cost = given.pole_cost[:, None] + given.sensor_cost
     if count is not None or not given.priced:
         cost = np.ones_like(cost)
     visible = None if seen is None else seen.toarray() > 0
     places = (given.errors, given.weight, given.poles, given.ranges_m)
-    return verify_placement(Asked(*places, cost, count, budget, cover, visible), json.dumps(asdict(result)), least)
+    return verify_placement(
+        PlacementProblem(*places, cost, count, budget, cover, visible), json.dumps(asdict(result)), least
+    )
 
 
 def _place_conventionally(

@@ -16,7 +16,7 @@ from flcav.dataset.payloads import POINTS
 from flcav.dataset.tables import read_table
 
 
-class Cloud(NamedTuple):
+class CloudPlace(NamedTuple):
     """A point cloud's place: its dataset, the scene and the split of that; the split is empty where it has none."""
 
     folder: Path
@@ -29,7 +29,7 @@ def find_copies(folders: Sequence[Path]) -> list[str]:
 
     Folders that hold no whole dataset are left out: `validate` says what they lack.
     """
-    first: dict[str, Cloud] = {}  # by checksum
+    first: dict[str, CloudPlace] = {}  # by checksum
     shared: dict[tuple[tuple[Path, str], tuple[Path, str]], list[tuple[str, str]]] = defaultdict(list)
     for folder in folders:
         with contextlib.suppress(InputError):
@@ -44,7 +44,7 @@ def find_copies(folders: Sequence[Path]) -> list[str]:
     ]
 
 
-def _list_clouds(folder: Path) -> Iterator[tuple[str, Cloud]]:
+def _list_clouds(folder: Path) -> Iterator[tuple[str, CloudPlace]]:
     """Yield checksum and place of the point clouds of a dataset, without the empty ones."""
     manifest = read_manifest(folder)
     split_of, own = manifest.split_of, str(manifest.recipe.get("split", ""))
@@ -54,4 +54,4 @@ def _list_clouds(folder: Path) -> Iterator[tuple[str, Cloud]]:
     for row in frames:
         for lidar in row["lidar"]:
             if digest := digests.get(payload_path(lidar, row["key"], POINTS)):
-                yield digest, Cloud(folder, split_of.get(row["scene"], own), row["scene"])
+                yield digest, CloudPlace(folder, split_of.get(row["scene"], own), row["scene"])

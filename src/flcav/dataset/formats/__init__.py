@@ -1,1 +1,1 @@
-"""Dataset formats of the field: export to each of `export.FORMATS`, and reading of KITTI."""
+"""Dataset formats of the field, written and read: `formats.EXPORTS`, `formats.IMPORTS`."""

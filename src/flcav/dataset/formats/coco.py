@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from flcav.config import Json
 from flcav.dataset.formats.exporter import (
     Exported,
+    ExportFormat,
     ExportOptions,
     count_unlabelled,
     count_unwritten,
@@ -30,7 +31,7 @@ from flcav.sensors.frame import Frame
 
 
 def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write every image of `dataset` with its bounding boxes and masks: see `Exporter`."""
+    """Write every image of `dataset` with its bounding boxes and masks: see `ExportFormat`."""
     if dataset.manifest.imported:
         raise missing_data_error(dataset, "COCO", "the visible pixels of objects")
     split_of = split_scenes(dataset, options)
@@ -62,6 +63,9 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps(table, allow_nan=False), encoding="utf-8")
     return exported
+
+
+EXPORT = ExportFormat(export_coco, ("validation", "min_pixels"))
 
 
 class Table(TypedDict):

@@ -2,18 +2,12 @@
 
 import contextlib
 import shutil
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 
 from flcav.config import InputError
-from flcav.dataset.formats.coco import export_coco
-from flcav.dataset.formats.exporter import Exported, Exporter, ExportOptions
-from flcav.dataset.formats.kitti.write import export_kitti
-from flcav.dataset.formats.mcap import export_mcap
-from flcav.dataset.formats.nuscenes import export_nuscenes
-from flcav.dataset.formats.opv2v.write import export_opv2v
-from flcav.dataset.formats.yolo import export_yolo
+from flcav.dataset.formats.exporter import Exported, ExportOptions
+from flcav.dataset.formats.formats import export_format
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.locks import LOCK, only_writer
@@ -22,40 +16,27 @@ from flcav.storage.files import flush_tree
 DEFAULTS = ExportOptions()
 
 
-@dataclass(frozen=True)
-class Format:
-    """An export format: its exporter, and the options that apply to it."""
-
-    write: Exporter
-    options: tuple[str, ...]  # fields of `ExportOptions` that apply
-
-
-FORMATS: Mapping[str, Format] = {
-    "kitti": Format(export_kitti, ("validation", "min_points", "calibration")),
-    "yolo": Format(export_yolo, ("labels", "validation", "min_pixels")),
-    "coco": Format(export_coco, ("validation", "min_pixels")),
-    "nuscenes": Format(export_nuscenes, ("validation", "calibration")),
-    "opv2v": Format(export_opv2v, ("validation", "min_points", "calibration")),
-    "mcap": Format(export_mcap, ("calibration",)),
-}
-
-
 def export(
     dataset: Dataset, name: str, out: Path, options: ExportOptions = DEFAULTS, *, progress: Report = ignore_progress
 ) -> Exported:
-    """Write `dataset` in the format `name`, one of FORMATS, to the new or empty folder `out`; return counts.
+    """Write `dataset` in the format `name` to the new or empty folder `out`; return counts.
 
     Raises `InputError` for an unknown format, an option that is set but does not apply to the format, a folder that is
     not empty, and a dataset that lacks what the format needs. After any failure no partial output is left.
+
+    Args:
+        dataset: the dataset.
+        name: a name of `EXPORTS`, or a user's own format as `module:NAME`.
+        out: new or empty folder.
+        options: options that the format takes.
+        progress: callback for the frames written so far and in total.
     """
-    if name not in FORMATS:
-        raise InputError(f"format '{name}': unknown; known formats: {', '.join(FORMATS)}")
-    taken = FORMATS[name].options
-    if refused := options.model_fields_set.difference(taken):
-        flags = [f"--{option.replace('_', '-')}" for option in (min(refused), *taken)]
-        raise InputError(f"format '{name}': has no use for {flags[0]}; it takes {', '.join(flags[1:])}")
+    chosen = export_format(name)
+    if refused := options.model_fields_set.difference(chosen.options):
+        flag, *taken = (f"--{option.replace('_', '-')}" for option in (min(refused), *chosen.options))
+        raise InputError(f"format '{name}': has no use for {flag}; it takes {', '.join(taken) or 'no options'}")
     with only_writer(out), _new_folder(out) as folder:
-        return FORMATS[name].write(dataset, folder, options, progress)
+        return chosen.write(dataset, folder, options, progress)
 
 
 @contextlib.contextmanager

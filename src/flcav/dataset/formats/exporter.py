@@ -1,4 +1,4 @@
-"""Protocol, options and results of exporters, and the split of scenes into train, val and test."""
+"""Formats to write, the options and results of exports, and the split of scenes into train, val and test."""
 
 import math
 from collections import Counter
@@ -23,7 +23,7 @@ SPLITS = ("train", "val", "test")
 
 
 class ExportOptions(Config):
-    """Options of an export; `export.FORMATS` lists those that apply to each format."""
+    """Options of an export; `ExportFormat.options` has those that apply to a format."""
 
     labels: Literal["signs", "actors"] = "signs"  # classes of a YOLO export, which has one list of classes
     validation: float = Field(default=0.2, ge=0, lt=1)  # fraction of the scenes in the validation split
@@ -56,8 +56,13 @@ class Exported:
         self.left_out.update({LeftOut("frames", why, which): 1, LeftOut("objects", why, which): len(frame.annotations)})
 
 
-# Writes a dataset in one format into an empty folder; raises `InputError` where the dataset lacks what that needs.
-Exporter = Callable[[Dataset, Path, ExportOptions, Report], Exported]
+class ExportFormat(NamedTuple):
+    """A format to write: how a dataset is written into an empty folder, and the options that apply."""
+
+    write: Callable[[Dataset, Path, ExportOptions, Report], Exported]
+    # dataset, folder, options, and whom to tell frames done and in total; raises `InputError` where the dataset lacks
+    # what the format needs
+    options: tuple[str, ...] = ()  # fields of `ExportOptions`
 
 
 def read_frame(dataset: Dataset, i: int, options: ExportOptions) -> Frame:

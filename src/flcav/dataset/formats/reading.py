@@ -7,10 +7,10 @@ from tracks, and the rectangles that boxes fill in images.
 import os
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Hashable, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from flcav.dataset.payloads import open_image, read_image
 from flcav.dataset.store import LazyMapping
 from flcav.dataset.upright import measure_upright
 from flcav.geometry import Boxes, angles_of, count_points_in_boxes, inverse, transform_points
-from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, LinkedFrame, SignViews, Views
+from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, Frame, SignViews, Views
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front, compute_truncation
 from flcav.sensors.lens import Lens, project
 
@@ -41,32 +41,32 @@ class LogSource(ABC):
 
     FORMAT: ClassVar[str]
     notes: tuple[str, ...] = ()  # sentences on what is not in the files, for whoever imports them
-    _folder: Path
-    _split: str | None  # that was asked for
-    _split_of: Mapping[str, str | None]  # scene -> its split
-    _folders: Mapping[str, Path] = {}  # scene -> its folder, where a format has one for each
-    _labelled: bool = True  # whether all frames have boxes
-    _beams: int | None = None  # of the LiDAR, where the format settles them
-    _range_m: float | None = None  # of the LiDAR, the largest
+    folder: Path
+    split: str | None  # that was asked for
+    split_of: Mapping[str, str | None]  # scene -> its split
+    folders: Mapping[str, Path] = {}  # scene -> its folder, where a format has one for each
+    labelled: bool = True  # whether all frames have boxes
+    beams: int | None = None  # of the LiDAR, where the format settles them
+    range_m: float | None = None  # of the LiDAR, the largest
 
     def describe(self) -> Mapping[str, Json]:
         """Return folder, splits and what is labelled; of scenes that are not called as their folders, these."""
-        folders = {scene: name_place(self._folders[scene])[1] for scene in self._split_of if scene in self._folders}
+        folders = {scene: name_place(self.folders[scene])[1] for scene in self.split_of if scene in self.folders}
         renamed = {scene: name for scene, name in folders.items() if scene != name}
         return {
             "imported": self.FORMAT,
-            "from": str(self._folder.resolve()),
-            "split": self._split or "",
-            "labels": ["objects"] if self._labelled else [],
-            "splits": name_splits(self._split_of),
+            "from": str(self.folder.resolve()),
+            "split": self.split or "",
+            "labels": ["objects"] if self.labelled else [],
+            "splits": name_splits(self.split_of),
             **({"folders": renamed} if renamed else {}),
-            **({} if self._beams is None else {"beams": self._beams}),
-            **({} if self._range_m is None else {"range_m": self._range_m}),
+            **({} if self.beams is None else {"beams": self.beams}),
+            **({} if self.range_m is None else {"range_m": self.range_m}),
         }
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes."""
-        return list(self._split_of)
+        return list(self.split_of)
 
     def trace(self, scene: str) -> None:
         """Return None: the traffic between frames is not known."""
@@ -77,12 +77,19 @@ class LogSource(ABC):
         """Return the number of frames of a scene."""
 
     @abstractmethod
-    def frames(self, scene: str) -> Iterator[LinkedFrame]:
+    def frames(self, scene: str) -> Iterator[Frame]:
         """Yield the frames of a scene; raises `InputError` where a file is missing, truncated or malformed."""
 
 
+class ImportFormat(NamedTuple):
+    """A format to read: how a folder of it is opened, and the files by which it is told from others."""
+
+    read: Callable[[Path, str | None], LogSource]  # folder, split (None: all)
+    signs: tuple[str, ...] = ()  # patterns of paths, of which a folder of this format has one
+
+
 @dataclass(frozen=True)
-class Picture:
+class LogPicture:
     """A camera's image file with what projects into it."""
 
     path: Path
@@ -106,10 +113,15 @@ def annotate(
     velocity: Array | None = None,
     occlusion: Array | None = None,
 ) -> Annotations:
-    """Return annotations of M objects from their `boxes`, world frame.
+    """Return annotations of M objects from their boxes; the points in an object's box are its returns.
 
-    `clouds` maps each LiDAR to its (N, 4) points and its (4, 4) pose in the world; the points in an object's box are
-    its returns. `velocity` (M, 3) and `occlusion` (M,) are NaN where they are None.
+    Args:
+        track: M track ids.
+        boxes: (M,) boxes, world frame.
+        clouds: LiDAR -> its (N, 4) points, sensor frame, and its (4, 4) pose in the world.
+        views: camera -> image annotations of the objects.
+        velocity: (M, 3) world [m/s]; None: NaN, unknown.
+        occlusion: (M,) for the LiDARs, 0 to 1; None: NaN, unknown.
     """
     count = len(boxes)
     points = {
@@ -152,7 +164,7 @@ def difference_tracks(track: NDArray[np.str_], time_s: Array, center: Array) -> 
     return velocity
 
 
-def view_boxes(boxes: Boxes, pictures: Mapping[str, Picture]) -> dict[str, Views]:
+def view_boxes(boxes: Boxes, pictures: Mapping[str, LogPicture]) -> dict[str, Views]:
     """Return the rectangles that `boxes` (world frame) fill in each image, with the share outside it.
 
     They are those of the boxes and not of what is in them, so somewhat larger than of a simulated actor. Which pixels
@@ -162,7 +174,7 @@ def view_boxes(boxes: Boxes, pictures: Mapping[str, Picture]) -> dict[str, Views
     return {name: _view_corners(corners, picture) for name, picture in pictures.items()}
 
 
-def _view_corners(corners: Array, picture: Picture) -> Views:
+def _view_corners(corners: Array, picture: LogPicture) -> Views:
     amodal = np.full((len(corners), 4), np.nan)
     corners = transform_points(inverse(picture.world_from_camera), corners.reshape(-1, 3)).reshape(-1, 8, 3)
     ahead = (corners[:, :, 2] >= NEAR_M).sum(axis=1)

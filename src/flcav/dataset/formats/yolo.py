@@ -11,6 +11,7 @@ import yaml
 
 from flcav.dataset.formats.exporter import (
     Exported,
+    ExportFormat,
     ExportOptions,
     LeftOut,
     count_unlabelled,
@@ -34,7 +35,7 @@ OTHERS = {  # what is labelled -> what is not, and how to have it
 
 
 def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write every image of `dataset` with its signs and lights, or its actors: see `Exporter`."""
+    """Write every image of `dataset` with its signs and lights, or its actors: see `ExportFormat`."""
     if dataset.manifest.imported:
         raise missing_data_error(dataset, "YOLO", "the visible pixels of objects")
     split_of = split_with_validation(dataset, options, "YOLO")
@@ -61,6 +62,9 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     names = dict(enumerate(CLASSES[options.labels]))
     (out / "data.yaml").write_text(yaml.safe_dump({**folders, "names": names}, sort_keys=False), encoding="utf-8")
     return exported
+
+
+EXPORT = ExportFormat(export_yolo, ("labels", "validation", "min_pixels"))
 
 
 def format_label_file(found: Rectangles, width: int, height: int) -> str:

@@ -66,12 +66,18 @@ def record(
 ) -> bool:
     """Record a source, or the built-in simulator with a recipe or that in a YAML file, into the folder `out`.
 
-    `jobs` workers of the `engine`, one of ENGINES, do the work. Returns True if anything was recorded, False if `out`
-    already held this very dataset. An interrupted recording of the same source is resumed. A dataset is mended, see
-    `flcav.dataset.recording.mending`, where files are missing or have another size, or tables another hash. Raises
-    `InputError` where `out` holds anything else, is written by another process or cannot be mended, or `jobs`, `engine`
-    or the recipe is wrong; ValueError where scenes have names that no folder may have, before anything is touched;
-    OSError where `out` cannot be written.
+    Returns True if anything was recorded, False if `out` already held this very dataset. An interrupted recording of
+    the same source is resumed. A dataset is mended, see `flcav.dataset.recording.mending`, where files are missing or
+    have another size, or tables another hash. Raises `InputError` where `out` holds anything else, is written by
+    another process or cannot be mended, or `jobs`, `engine` or the recipe is wrong; ValueError where scenes have names
+    that no folder may have, before anything is touched; OSError where `out` cannot be written.
+
+    Args:
+        source: source of frames, recipe of the built-in simulator, or its YAML file.
+        out: folder of the dataset; new, empty, or with a recording of the same source.
+        jobs: number of workers.
+        engine: kind of workers, one of `ENGINES`: processes of this machine, or actors of a Ray cluster.
+        progress: callback for the frames recorded so far and in total.
 
     >>> from flcav import Recipe, record
     >>> recipe = Recipe(town="ring", cavs=1, spins_per_scene=1, warmup_s=5.0)

@@ -8,7 +8,6 @@ traffic too. The verdicts on all differences are corrected together.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 from flcav.config import Json
 from flcav.pipeline.analysis.findings import name_stage
@@ -22,7 +21,7 @@ from flcav.report.charts import figures
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import Claim, Judged, judge
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 TASK = "objects"
 FURTHER = "edge FL, as many more rounds"  # instead of those of cloud FL
@@ -60,7 +59,7 @@ COMPARED = (  # (after, before): claims of the article and controls
 
 
 @dataclass(frozen=True)
-class Reached:
+class ReachedAP:
     """AP of a network at IoU 0.5, with its interval over test scenes, and at IoU 0.7."""
 
     ap50: float
@@ -70,7 +69,7 @@ class Reached:
 
 
 @dataclass(frozen=True)
-class Counts:
+class PlannedCounts:
     """The plan's samples and rounds."""
 
     samples: int
@@ -88,7 +87,7 @@ class Pretraining:
 
 
 @dataclass(frozen=True)
-class Placement:
+class PlacedSensor:
     """Placement of a region's roadside sensor, and the errors it covers."""
 
     chosen: int
@@ -104,10 +103,10 @@ class ArmsSeed:
     """Results of one seed; arms are named as in `ARMS`."""
 
     seed: int
-    plan: Counts
+    plan: PlannedCounts
     pretraining: Pretraining
-    placement: Mapping[str, Placement]  # by town
-    ap: Mapping[str, Mapping[str, Reached]]  # by town and arm
+    placement: Mapping[str, PlacedSensor]  # by town
+    ap: Mapping[str, Mapping[str, ReachedAP]]  # by town and arm
     differences: Mapping[str, Estimate]  # "town: after - before", over test scenes
     gap_closed: Mapping[str, float]  # by arm
     used_mb: Mapping[str, Mapping[str, float]]  # by arm and link
@@ -121,7 +120,7 @@ class ArmsSummary:
     ap70: Mapping[str, Mapping[str, MeanOverSeeds]]
     differences: Mapping[str, MeanOverSeeds]
     gap_closed: Mapping[str, MeanOverSeeds]
-    road_share: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # of the ideal detector's gain; None: older results
+    road_share: MeanOverSeeds  # of the ideal detector's gain
 
 
 @dataclass(frozen=True)
@@ -130,9 +129,8 @@ class ArmsResult(Record):
 
     seeds: tuple[ArmsSeed, ...]
     summary: ArmsSummary
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
-    note: Annotated[str | None, LEFT_OUT] = None  # of older results
+    recipe: Mapping[str, Json]
+    provenance: Provenance
 
 
 def compare_arms(recipe: RunRecipe, runs: Sequence[Run]) -> ArmsResult:
@@ -167,7 +165,7 @@ def one_seed(run: Run) -> ArmsSeed:
     curve = tuple(vars(each) for each in pretrained.validated)
     return ArmsSeed(
         seed=run.recipe.seed,
-        plan=Counts(plan.samples, plan.edge_rounds, plan.cloud_rounds),
+        plan=PlannedCounts(plan.samples, plan.edge_rounds, plan.cloud_rounds),
         pretraining=Pretraining(pretrained.steps, pretrained.threshold, curve),
         placement={placed.region: _placed(run, placed.region) for placed in main.placed},
         ap=ap,
@@ -177,20 +175,20 @@ def one_seed(run: Run) -> ArmsSeed:
     )
 
 
-def _tested(run: Run, town: str, arm: str, stage: str) -> Reached:
+def _tested(run: Run, town: str, arm: str, stage: str) -> ReachedAP:
     test = run.test(arm=arm, stage=stage, region=town, task=TASK)
-    return Reached(test.estimate.mean, test.estimate.low, test.estimate.high, test.numbers["AP70"])
+    return ReachedAP(test.estimate.mean, test.estimate.low, test.estimate.high, test.numbers["AP70"])
 
 
-def _placed(run: Run, town: str) -> Placement:
+def _placed(run: Run, town: str) -> PlacedSensor:
     placed = next(each for each in run.arms[MAIN].placed if each.region == town)
-    return Placement(placed.first, placed.densest, placed.poles, placed.errors, placed.covered, placed.range_m)
+    return PlacedSensor(placed.first, placed.densest, placed.poles, placed.errors, placed.covered, placed.range_m)
 
 
 def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:
     """Return means over seeds with their 95 % intervals."""
 
-    def means(number: Callable[[Reached], float | None]) -> dict[str, dict[str, MeanOverSeeds]]:
+    def means(number: Callable[[ReachedAP], float | None]) -> dict[str, dict[str, MeanOverSeeds]]:
         return {
             town: {
                 arm: mean_over_seeds([_known(number(seed.ap[town][arm])) for seed in seeds], share=True) for arm in arms
@@ -209,7 +207,7 @@ def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:
     )
 
 
-def _road_share(reached: Mapping[str, Reached]) -> float:
+def _road_share(reached: Mapping[str, ReachedAP]) -> float:
     """Return the share of edge FL's gain with an ideal road detector that the trained one brings."""
     return gap_closed(*(reached[arm].ap50 for arm in ("pretrained", "edge FL, VRCSP pole", IDEAL)))
 

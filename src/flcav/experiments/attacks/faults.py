@@ -10,7 +10,6 @@ import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +38,7 @@ from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 BYZANTINE, ROUNDS, STEPS, LEARNING_RATE = 3, 10, 5, 0.05
 HONEST, LABELS = "none", "label flip"
@@ -88,7 +87,7 @@ class FaultsResult(Record):
     seeds: tuple[FaultsSeed, ...]
     accuracy: Mapping[str, Mapping[str, MeanOverSeeds]]  # by lie and strategy
     gained: Mapping[str, Mapping[str, MeanOverSeeds]]  # over FedAvg, by lie and strategy
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return the accuracies in words, a sentence per lie."""

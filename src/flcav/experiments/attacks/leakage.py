@@ -7,7 +7,6 @@ and their sum alone.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +43,7 @@ from flcav.report import style
 from flcav.report.charts.leakage import draw_leakage
 from flcav.statistics.seeds import OWN_SCENES, MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 NOISES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # standard deviation as a multiple of the clipping norm
 CLIP, DELTA = 1.0, 1e-5
@@ -73,7 +72,7 @@ class Attacked:
 
 
 @dataclass(frozen=True)
-class Level:
+class NoiseLevel:
     """One amount of noise, or secure aggregation."""
 
     name: str
@@ -90,10 +89,10 @@ class LeakageResult(Record):
     clip: float
     delta: float
     rounds: int
-    levels: tuple[Level, ...]  # ascending noise
-    masked: Level  # a single masked update
-    summed: Level  # the sum of all updates, which secure aggregation shows
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    levels: tuple[NoiseLevel, ...]  # ascending noise
+    masked: NoiseLevel  # a single masked update
+    summed: NoiseLevel  # the sum of all updates, which secure aggregation shows
+    provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return a sentence per level, and one on what epsilon rests on."""
@@ -182,7 +181,7 @@ def share_recognised(start: Weights, sent: Mapping[str, Weights], own: Mapping[s
 
 def make_level(
     test: Pictures, name: str, epsilon: float | None, seeds: Sequence[Attacked], *, by_sum: bool = False
-) -> Level:
+) -> NoiseLevel:
     """Return a level with the means over its seeds: of the accuracy over the scenes of `test`, too."""
     leaked = tuple(each.by_sum if by_sum else each.by_update for each in seeds)
     spread = {"accuracy": spread_over_scenes(test, [each.right.astype(float) for each in seeds])}
@@ -191,4 +190,4 @@ def make_level(
         values = [getattr(each, key) for each in leaked]
         share = key != "membership_advantage"
         means[key] = mean_over_seeds(values, share=share, shared=spread.get(key, OWN_SCENES))
-    return Level(name, epsilon, leaked, means)
+    return NoiseLevel(name, epsilon, leaked, means)

@@ -1,7 +1,7 @@
 """Markdown tables of the attacks."""
 
 from flcav.experiments.attacks.faults import LIES, STRATEGIES, FaultsResult
-from flcav.experiments.attacks.leakage import LeakageResult, Level
+from flcav.experiments.attacks.leakage import LeakageResult, NoiseLevel
 from flcav.statistics.verdicts import Claim, judge
 from flcav.storage.markdown import format_table
 
@@ -32,7 +32,7 @@ def leakage_tables(results: LeakageResult) -> dict[str, str]:
         "recognised_round": "of an update",
     }
 
-    def row(level: Level) -> list[str]:
+    def row(level: NoiseLevel) -> list[str]:
         return [level.mean[name].describe() for name in names]
 
     levels = [

@@ -7,7 +7,6 @@ intervals cover training and traffic. The verdicts on all differences are correc
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 from flcav.config import Json
 from flcav.pipeline.analysis.histories import gap_closed
@@ -19,7 +18,7 @@ from flcav.report import style
 from flcav.report.charts import figures
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import Claim, Judged, judge
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 TASK, TOWN = "objects", "grid"
 PRETRAINED, NO_ROAD, PLAIN, IDEAL, BOTH, GRAPH = (
@@ -70,8 +69,8 @@ class DistillationResult(Record):
     ap50: Mapping[str, MeanOverSeeds]  # by arm
     differences: Mapping[str, MeanOverSeeds]  # "after - before", in AP50
     closed: MeanOverSeeds  # share of the gain with ideal labels that the trained road detector's bring
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    recipe: Mapping[str, Json]
+    provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return AP50 by arm, the verdicts on differences, and what the trained road detector costs, in words."""

@@ -87,9 +87,9 @@ class ExchangeResult(Record):
     seeds: Mapping[str, Mapping[str, ExchangeArm]]  # by seed and arm
     accuracy: Mapping[str, Mapping[str, MeanOverSeeds]]  # by arm and place
     differences: Mapping[str, Mapping[str, MeanOverSeeds]]  # to whole weights, by arm and place
+    recipe: Mapping[str, Json]
+    provenance: Provenance
     divergence: Annotated[Mapping[str, RoundDivergence] | None, LEFT_OUT] = None  # by seed, of whole weights
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
 
     @property
     def measure(self) -> str:

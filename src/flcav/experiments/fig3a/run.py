@@ -6,7 +6,6 @@ of this package's runs, in the additive form that plans use.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
 
 import networkx as nx
 import numpy as np
@@ -23,7 +22,7 @@ from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.tables import load_history
 from flcav.report import style
 from flcav.report.charts import curves as curve_charts
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 Array = NDArray[np.float64]
 
@@ -83,15 +82,15 @@ class Fig3a(Record):
     article: Mapping[str, ArticleCurve]  # by task
     own: OwnCurves
     findings: tuple[str, ...]
-    level: float = LEVEL  # confidence level of the bands
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # None in older results
+    level: float  # confidence level of the bands
+    provenance: Provenance
 
 
 def fig3a() -> Fig3a:
     """Fit both sets of curves and return the numbers of the figure."""
     article = {task: _article_curve(points, PRINTED[task]) for task, points in article_histories().items()}
     own = _own_curves()
-    return Fig3a(article, own, _findings(article, own), provenance=provenance())
+    return Fig3a(article, own, _findings(article, own), LEVEL, provenance())
 
 
 def _article_curve(points: History, printed: tuple[float, float]) -> ArticleCurve:

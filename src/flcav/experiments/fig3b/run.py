@@ -8,7 +8,7 @@ As many drives in other towns show how many sensors each takes.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from flcav.report.charts.placement import draw_cover
 from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE, ErrorMap, poles_of
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 from flcav.world.line_of_sight import count_visible_actors
 from flcav.world.map.census import measure_traffic_density
 from flcav.world.map.town import Town
@@ -64,7 +64,7 @@ class Zone:
 
 
 @dataclass(frozen=True)
-class Placed:
+class ChosenPoles:
     """The poles that one rule chooses, and the errors they cover."""
 
     rule: str
@@ -80,9 +80,9 @@ class Fig3b(Record):
     frames: int
     errors: int
     zones: tuple[Zone, ...]  # densest in errors first
-    placed: tuple[Placed, ...]
-    towns: Annotated[tuple[TownCover, ...] | None, LEFT_OUT] = None  # None in older results
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    placed: tuple[ChosenPoles, ...]
+    towns: tuple[TownCover, ...]
+    provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return zones and placements in words."""
@@ -98,7 +98,7 @@ class Fig3b(Record):
                 if each.count == count
             ]
             told.append(f"{count} sensor{'s' if count > 1 else ''}, errors covered by the poles of {'; '.join(rules)}")
-        for town in self.towns or ():
+        for town in self.towns:
             first = f"{town.town}: {town.errors} errors; one sensor covers {town.shares[0]:.0%}"
             told.append(f"{first}, {town.poles} cover {town.shares[-1]:.0%}")
         return told
@@ -158,9 +158,9 @@ def _count_zones(
     return tuple(sorted(zones, key=lambda zone: (-zone.errors, zone.pole)))
 
 
-def _place(candidates: Candidates, town: Town, scores: Mapping[str, NDArray[np.float64]]) -> Sequence[Placed]:
-    def tell(rule: str, count: int, placed: Placement) -> Placed:
-        return Placed(rule, count, tuple(int(town.poles.id[pole]) for pole in placed.chosen), placed.covered)
+def _place(candidates: Candidates, town: Town, scores: Mapping[str, NDArray[np.float64]]) -> Sequence[ChosenPoles]:
+    def tell(rule: str, count: int, placed: Placement) -> ChosenPoles:
+        return ChosenPoles(rule, count, tuple(int(town.poles.id[pole]) for pole in placed.chosen), placed.covered)
 
     rows = []
     for count in COUNTS:

@@ -30,7 +30,7 @@ def tables(results: Fig3b) -> dict[str, str]:
             *("" if wanted is None else wanted for wanted in each.wanted),
             *(each.count_for_reached(share) for share in REACHED),
         ]
-        for each in results.towns or ()
+        for each in results.towns
     ]
     covered = (*(f"covered by {count}" for count in COUNTS), "by all poles")
     asked = (

@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
 
 from flcav.config import Json
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.results.run import LinkUse
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 EQUAL, JOINT = "equal-stages", "joint"  # the plans
 MEAN = "mean of towns"  # place of what the planner's history measures: the mean of the federating towns
@@ -34,7 +33,7 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Reached:
+class StageAP:
     """AP50 after a stage."""
 
     ap50: float
@@ -47,7 +46,7 @@ class AllocationSeed:
     seed: int
     plans: Mapping[str, Planned]
     predicted: Mapping[str, Mapping[str, float]]  # AP50 by plan and stage
-    realised: Mapping[str, Mapping[str, Mapping[str, Reached]]]  # by `MEAN` or town, plan and stage
+    realised: Mapping[str, Mapping[str, Mapping[str, StageAP]]]  # by `MEAN` or town, plan and stage
     differences: Mapping[str, Mapping[str, Estimate]]  # joint - equal by `MEAN` or town, and stage, over test scenes
     poles: Mapping[str, Mapping[str, int]]  # by plan and town
     ledger: Mapping[str, Mapping[str, LinkUse]]  # by plan and link
@@ -103,6 +102,5 @@ class AllocationResult(Record):
 
     history: Mapping[str, tuple[float, float]]  # least and most of each count in the planner's history
     budgets: tuple[AtBudgets, ...]
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None  # this and the next: None in older results
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
-    note: Annotated[str | None, LEFT_OUT] = None  # of older results
+    recipe: Mapping[str, Json]
+    provenance: Provenance

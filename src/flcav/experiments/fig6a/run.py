@@ -24,7 +24,7 @@ from flcav.experiments.fig6a.results import (
     AllocationSummary,
     AtBudgets,
     Planned,
-    Reached,
+    StageAP,
 )
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Budgets, RunRecipe
@@ -97,7 +97,7 @@ def one_seed(run: Run) -> AllocationSeed:
     }
     predicted = {name: dict(arm.plans[0].tasks[TASK].predicted or {}) for name, arm in arms.items()}
     realised = {
-        town: {name: {stage: Reached(_ap50(run, arm, stage, town)) for stage in STAGES} for name, arm in ARM_OF.items()}
+        town: {name: {stage: StageAP(_ap50(run, arm, stage, town)) for stage in STAGES} for name, arm in ARM_OF.items()}
         for town in towns
     }
     differences = {town: {stage: _difference(found.get((town, stage))) for stage in STAGES} for town in towns}
@@ -125,10 +125,10 @@ def one_seed(run: Run) -> AllocationSeed:
     )
 
 
-def _average_reached(towns: Mapping[str, Mapping[str, Mapping[str, Reached]]]) -> dict[str, dict[str, Reached]]:
+def _average_reached(towns: Mapping[str, Mapping[str, Mapping[str, StageAP]]]) -> dict[str, dict[str, StageAP]]:
     """Return AP50 by plan and stage in the mean of the towns."""
     return {
-        name: {stage: Reached(float(np.mean([own[name][stage].ap50 for own in towns.values()]))) for stage in STAGES}
+        name: {stage: StageAP(float(np.mean([own[name][stage].ap50 for own in towns.values()]))) for stage in STAGES}
         for name in PLANS
     }
 

@@ -120,8 +120,8 @@ class PlacementProof(Record):
     range_m: float
     regions: Mapping[str, RegionProof]
     pooled: Means  # over seeds, of the mean over regions; only what all regions have
-    recipe: Annotated[Mapping[str, Json] | None, LEFT_OUT] = None
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    recipe: Mapping[str, Json]
+    provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return what was found in each region and, of several, over all of them."""

@@ -7,7 +7,6 @@ all scenes and spins together.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.roadside.errors import Errors, apply_errors
-from flcav.experiments.roadside.sightings import Scene, read_scenes
+from flcav.experiments.roadside.sightings import SightedScene, read_scenes
 from flcav.fusion.average import RoadAverage, average_boxes
 from flcav.fusion.map_context import MapContext, build_context, snap_to_map
 from flcav.fusion.pose_graph import correct_poses
@@ -31,7 +30,7 @@ from flcav.report.charts.roadside import draw_errors
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import stream
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 from flcav.world.map.lanes import map_layers
 
 RECIPE = {
@@ -109,10 +108,8 @@ class RoadAverageResult(Record):
     joint: Mapping[str, Point]  # at `JOINT`, by arm
     clean: Mapping[str, float]  # without errors, by arm
     snapped: Snapped
-    residuals: Annotated[Mapping[str, tuple[Residual, Residual]] | None, LEFT_OUT] = (
-        None  # of `CORRECTED` as stated and after the pose graph; None in older results
-    )
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    residuals: Mapping[str, tuple[Residual, Residual]]  # of `CORRECTED` as stated and after the pose graph
+    provenance: Provenance
 
     @property
     def won_back(self) -> float:
@@ -174,14 +171,14 @@ def fuse(sightings: list[Sighting], posts: np.ndarray, at_s: float, arm: str) ->
 
 
 def _point(
-    scenes: Mapping[str, Scene], size: float, errors: Errors, arm: str, posts: np.ndarray, clean: float
+    scenes: Mapping[str, SightedScene], size: float, errors: Errors, arm: str, posts: np.ndarray, clean: float
 ) -> Point:
     if errors == Errors():
         return Point(size, (clean,) * SEEDS)
     return Point(size, tuple(_precision(scenes, errors, arm, posts, seed) for seed in range(SEEDS)))
 
 
-def _precision(scenes: Mapping[str, Scene], errors: Errors, arm: str, posts: np.ndarray, seed: int) -> float:
+def _precision(scenes: Mapping[str, SightedScene], errors: Errors, arm: str, posts: np.ndarray, seed: int) -> float:
     found, targets, neutral = [], [], []
     for name, scene in scenes.items():
         arrived = apply_errors(scene.sightings, errors, stream(seed, "road average", name))
@@ -196,7 +193,7 @@ def _precision(scenes: Mapping[str, Scene], errors: Errors, arm: str, posts: np.
     return average_precision(match(found, targets, neutral, 0.5, "bev"))
 
 
-def _correct(scenes: Mapping[str, Scene], errors: Errors, posts: np.ndarray) -> tuple[Residual, Residual]:
+def _correct(scenes: Mapping[str, SightedScene], errors: Errors, posts: np.ndarray) -> tuple[Residual, Residual]:
     """Return the errors of vehicles, of which none is a loss, as stated and after the pose graph."""
     true: list[Sighting] = []
     stated: list[Sighting] = []
@@ -222,7 +219,7 @@ def measure_residual(true: Sequence[Sighting], told: Sequence[Sighting]) -> Resi
     return Residual(100 * float(np.mean(off_m)), float(np.degrees(np.mean(turned))), 1000 * float(np.mean(late_s)))
 
 
-def _snap(scenes: Mapping[str, Scene], context: MapContext) -> Snapped:
+def _snap(scenes: Mapping[str, SightedScene], context: MapContext) -> Snapped:
     labels: tuple[list[Boxes], list[Boxes]] = ([], [])
     targets, neutral, off = [], [], []
     for scene in scenes.values():

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from flcav.dataset.rectangles import HALF_PX
 from flcav.dataset.store import Dataset
 from flcav.fusion.association import (
+    AssociatedCamera,
+    PairedShot,
     Pairs,
-    Shot,
-    View,
     correct_extrinsics,
     measure_error,
     pair,
@@ -88,7 +88,7 @@ def associate_camera(
     made = []
     for number in numbers:
         boxes = detect(network, read(number, camera), threshold=PICTURE_THRESHOLD).box
-        made.append(name_actors(data.frame(number), lidar, camera, Shot(find(number), boxes)))
+        made.append(name_actors(data.frame(number), lidar, camera, PairedShot(find(number), boxes)))
     shots, known = [shot for shot, _ in made], [actors for _, actors in made]
     height, width = data.plane(numbers[0], camera, "rgb").shape[:2]
     both, size = data.calibrations[agent], (width, height)
@@ -98,7 +98,7 @@ def associate_camera(
     calibrated = make_view(both.assumed, lidar, camera, size, prior)
     corrected = correct_extrinsics(shots, calibrated)
 
-    def judge(pairs: Sequence[Pairs], view: View) -> Associated:
+    def judge(pairs: Sequence[Pairs], view: AssociatedCamera) -> Associated:
         off = measure_offset(true.camera_from_lidar, view.camera_from_lidar)
         return judge_pairs(pairs, known, off, None if view is true else measure_error(true.camera_from_lidar, view))
 
@@ -118,10 +118,10 @@ def associate_camera(
 
 def make_view(
     calibration: Calibration, lidar: str, camera: str, size: tuple[int, int], covariance: NDArray[np.float64]
-) -> View:
+) -> AssociatedCamera:
     """Return the view of a camera beside a LiDAR by an agent's calibration; size: width, height of its picture [px]."""
     mounts = calibration.agent_from_sensor
-    return View(
+    return AssociatedCamera(
         inverse(mounts[camera]) @ mounts[lidar],
         covariance,
         calibration.intrinsics[camera],
@@ -152,7 +152,7 @@ def judge_pairs(
     )
 
 
-def name_actors(frame: Frame, lidar: str, camera: str, shot: Shot) -> tuple[Shot, Known]:
+def name_actors(frame: Frame, lidar: str, camera: str, shot: PairedShot) -> tuple[PairedShot, Known]:
     """Return what LiDAR and camera found in a frame, and which actors that is."""
     truth, views = frame.annotations, frame.annotations.views[camera]
     rows = _actors_of_cars(shot.cars.transform(frame.world_from_sensor(lidar)), truth)

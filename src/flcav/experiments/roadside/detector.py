@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from flcav.sources.recipe import Recipe
 from flcav.statistics.bootstrap import bootstrap_over_scenes
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.streams import stream
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 OVERLAP = 0.5  # bird's-eye IoU of a car that was found
 WITHIN_M = 30.0  # horizontal distance of a car from the pole
@@ -72,8 +72,8 @@ class RoadDetectorResult(Record):
     threshold: float  # lowest score of a label, see `flcav.fusion.detector`
     fitted: float  # lowest threshold with `LEAST_PRECISION` on the validation towns, as computed here
     towns: tuple[TownScore, ...]
-    labels: Annotated[RoadLabels | None, LEFT_OUT] = None  # that vehicles get; None in older results
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    labels: RoadLabels  # that vehicles get
+    provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return the scores in words, a sentence per town."""

@@ -9,7 +9,7 @@ beside the third, off as well: their cars are associated with those of the LiDAR
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 CROSSING, STREET = "pole4", "pole2"
 ACROSS_M = 24.0  # from the first suite over the crossing to the second
@@ -91,8 +91,8 @@ class Fig4(Record):
     cars: tuple[int, ...]  # seen by any suite, in each interval of `EDGES_M`
     found: dict[str, tuple[int, ...]]  # of these, by arm
     range_m: dict[str, float]  # to which an arm finds the share `REACHED` of the cars; 0 where nowhere
-    cameras: Annotated[tuple[CameraResult, ...] | None, LEFT_OUT] = None  # None: of before they were measured
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    cameras: tuple[CameraResult, ...]
+    provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return residuals and ranges in words."""
@@ -103,7 +103,7 @@ class Fig4(Record):
             for each in self.suites
         ]
         told += [f"{arm}: {REACHED:.0%} of the cars are found up to {self.range_m[arm]:.0f} m" for arm in ARMS]
-        for each in self.cameras or ():
+        for each in self.cameras:
             before, after = (each.by_extrinsics[name] for name in (CALIBRATED, CORRECTED))
             told.append(
                 f"{each.name}: of {each.cars} cars {before.found} are rightly associated as calibrated, off by "

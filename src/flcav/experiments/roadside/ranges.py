@@ -10,7 +10,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from flcav.report.charts.roadside import draw_ranges
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import Record
 
 MODELS: Mapping[str, Mapping[str, Any]] = {  # settings of `Lidar`
     **{f"pole_{channels}": {**LIDAR["settings"], "channels": channels} for channels in (16, 32, 64, 128)},
@@ -50,7 +50,7 @@ CHEAPEST = 16  # channels of a sensor of cost 1
 
 
 @dataclass(frozen=True)
-class Model:
+class LidarModel:
     """A LiDAR model on the poles."""
 
     name: str
@@ -70,8 +70,8 @@ class SensorRanges(Record):
 
     sweeps: int  # of each model
     cars: tuple[int, ...]  # that some model has returns of, in each interval of `EDGES_M`
-    models: tuple[Model, ...]
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None
+    models: tuple[LidarModel, ...]
+    provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return the ranges in words."""
@@ -119,7 +119,7 @@ def measure_ranges(out: Path, progress: Report = ignore_progress) -> tuple[Senso
             sweeps += 1
             progress(number + 1, len(data), town)
     models = tuple(
-        Model(
+        LidarModel(
             name,
             Lidar.model_validate(dict(settings)).channels,
             tuple(found[name].tolist()),

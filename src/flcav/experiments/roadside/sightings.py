@@ -33,7 +33,7 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SightedScene:
     """The sightings of all agents in one scene, in the order of their spins, and the truth at each spin."""
 
     sightings: tuple[Sighting, ...]
@@ -42,7 +42,7 @@ class Scene:
     time_s: Mapping[int, float]
 
 
-def read_scenes(data: Dataset, progress: Report = ignore_progress) -> dict[str, Scene]:
+def read_scenes(data: Dataset, progress: Report = ignore_progress) -> dict[str, SightedScene]:
     """Return the scenes of a dataset by name: detections by the package's networks, posts segmented from sweeps.
 
     Cars count as targets where one of the sensors has them in its network's range with five returns or more.
@@ -72,7 +72,7 @@ def read_scenes(data: Dataset, progress: Report = ignore_progress) -> dict[str, 
         _add_truth(seen, frame, road if kind_of(key.agent) == POLE else vehicles.config)
         progress(number + 1, len(data), "")
     return {
-        scene: Scene(
+        scene: SightedScene(
             tuple(told for _, told in own),
             tuple(spin for spin, _ in own),
             {spin: _truth(seen) for (name, spin), seen in there.items() if name == scene},

@@ -17,7 +17,7 @@ WHEN = ("as stated", "after the pose graph")
 
 
 def detector_tables(results: RoadDetectorResult) -> dict[str, str]:
-    """Return Markdown by name: towns, distances, and labels where they were counted."""
+    """Return Markdown by name: towns, distances, labels."""
     towns = [
         [
             f"{each.town}{' (trained there)' if each.seen else ''}",
@@ -41,7 +41,7 @@ def detector_tables(results: RoadDetectorResult) -> dict[str, str]:
     return {
         "towns": format_table(header, towns),
         "distances": format_table(("recall", *(f"{low} to {high} m" for low, high in near)), rows),
-        **({"labels": _labels(results.labels)} if results.labels is not None else {}),
+        "labels": _labels(results.labels),
     }
 
 
@@ -62,7 +62,7 @@ def _labels(labels: RoadLabels) -> str:
 
 
 def average_tables(results: RoadAverageResult) -> dict[str, str]:
-    """Return Markdown by name: joint, knobs, map, and residuals where they were measured."""
+    """Return Markdown by name: joint, knobs, map, residuals."""
     joint = [[arm, f"{results.clean[arm]:.3f}", _describe(results.joint[arm])] for arm in ARMS]
     rows = [
         [knob, f"{point.size:g}", *(_describe(results.knobs[knob][arm][row]) for arm in ARMS)]
@@ -78,7 +78,7 @@ def average_tables(results: RoadAverageResult) -> dict[str, str]:
         "joint": format_table(("AP50", "no errors", f"{BOTH}: mean (range over seeds)"), joint),
         "knobs": format_table(("error: AP50, mean (range over seeds)", "size", *ARMS), rows),
         "map": format_table(("labels", "mean heading error [°]", f"reversed of {snapped.matched}", "AP50"), context),
-        **({"residuals": _residuals(results.residuals)} if results.residuals is not None else {}),
+        "residuals": _residuals(results.residuals),
     }
 
 
@@ -126,7 +126,7 @@ def fig4_tables(results: Fig4) -> dict[str, str]:
     return {
         "residuals": format_table(("suite", "from the first [m]", "off as calibrated", "off as registered"), rows),
         "range": format_table(header, [["cars", *results.cars, ""], *found]),
-        "cameras": _tabulate_cameras(results.cameras or ()),
+        "cameras": _tabulate_cameras(results.cameras),
     }
 
 

@@ -7,7 +7,7 @@ with one that has only its beams, on Lambertian surfaces. The detector is the pa
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.clouds import CloudSeries, cloud_statistics
 from flcav.report.pictures.clouds import real_frame
-from flcav.storage.records import LEFT_OUT, Class, Record
+from flcav.storage.records import Class, Record
 
 RECIPE: dict[str, Any] = {  # of the simulated scenes
     "town": "suburb",
@@ -87,7 +87,7 @@ class SimToReal(Record):
     clouds: Mapping[str, CloudNumbers]  # by origin: `REAL`, or a name in `RIGS`
     scores: tuple[RealScore, ...]
     frames: tuple[FrameResult, ...]
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # None in older results
+    provenance: Provenance
 
 
 def run_sim_to_real(

@@ -8,7 +8,7 @@ but not the choice of the training scenes.
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar, cast, get_type_hints
+from typing import Any, Generic, TypeVar, cast, get_type_hints
 
 from flcav.config import InputError, Json
 from flcav.dataset.store import Dataset
@@ -23,7 +23,7 @@ from flcav.pipeline.provenance import Provenance, provenance
 from flcav.statistics.power import MOST_SEEDS, plan_seeds
 from flcav.statistics.seeds import LEVEL, MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import Claim
-from flcav.storage.records import LEFT_OUT, from_json, to_json
+from flcav.storage.records import from_json, to_json
 
 EvaluationT = TypeVar("EvaluationT", bound=Evaluated)
 VALIDATION = "validation"
@@ -40,7 +40,7 @@ class SeedResult(Generic[EvaluationT]):
 
 
 @dataclass(frozen=True)
-class Recorded:
+class StudyRecordings:
     """The recording recipes of all splits."""
 
     train: tuple[RecipeFields, ...]
@@ -57,10 +57,10 @@ class StudyResult(Generic[EvaluationT]):
     scale: str
     epochs: int
     patience: int
-    recipes: Recorded
+    recipes: StudyRecordings
     seeds: tuple[SeedResult[EvaluationT], ...]
     summary: Mapping[str, Mapping[str, MeanOverSeeds]]  # by test and name of the number
-    provenance: Annotated[Provenance | None, LEFT_OUT] = None  # None in older results
+    provenance: Provenance
 
     def tested(self, test: str) -> list[EvaluationT]:
         """Return the evaluations of a test, one per seed."""
@@ -141,7 +141,7 @@ def run_study(
         scale,
         recipe.epochs,
         recipe.patience,
-        Recorded(recipe.train, recipe.validation, recipe.tests),
+        StudyRecordings(recipe.train, recipe.validation, recipe.tests),
         runs,
         summarise(study, runs),
         provenance(),

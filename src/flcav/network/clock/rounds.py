@@ -181,12 +181,19 @@ def simulate_rounds(
     edge_rounds_per_cloud_round: int | None = None,
     model_bytes: int = 0,
 ) -> tuple[RoundRecord, ...]:
-    """Return the rounds of `works`, one after another from `start_s`, by default the trace's start.
+    """Return the timed rounds of a federation over radio links, one after another.
 
-    Every vehicle of a round's work, by name, that is in the town when the round begins takes part. With
-    `edge_rounds_per_cloud_round` = k the cloud's model of `model_bytes` reaches the edge servers before each group of k
-    rounds, and theirs the cloud after it, over `settings.wireline`. Raises `InputError` as `time_clients`, and where
-    there is no round, or no multiple of k.
+    Every vehicle of a round's work that is in the town when the round begins takes part. Before each group of edge
+    rounds of a cloud round the cloud's model reaches the edge servers, and after it theirs the cloud, over
+    `settings.wireline`. Raises `InputError` as `time_clients`, and where there is no round, or no multiple of k.
+
+    Args:
+        links: radio links of the vehicles.
+        works: work of each round, by name of vehicle.
+        settings: settings of the network and its clock.
+        start_s: time at which the first round begins [s]; None: the start of the links' trace.
+        edge_rounds_per_cloud_round: k, number of edge rounds in a cloud round; None: there is no cloud.
+        model_bytes: size of the cloud's model [bytes].
     """
     k = edge_rounds_per_cloud_round
     if not works or (k is not None and (k < 1 or len(works) % k)):

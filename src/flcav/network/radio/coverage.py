@@ -10,7 +10,7 @@ from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.network.radio.budget import Radio, lone_rate_bps, received_dbm
 from flcav.network.radio.links import check_units, walls_of
-from flcav.network.radio.propagation import State, path_loss_db
+from flcav.network.radio.propagation import path_loss_db
 from flcav.network.radio.sight import find_sight
 from flcav.world.map.town import Town
 
@@ -33,10 +33,16 @@ class Coverage:
 
 
 def cover_town(town: Town, units: Mapping[str, Array], radio: Radio, step_m: float = 2.0) -> Coverage:
-    """Return the coverage of a town by `units`, name -> mount (3,) [m, world], on a grid of `step_m`.
+    """Return the radio coverage of a town by roadside units, on a grid.
 
     Rates are those of a vehicle alone in the band, without shadowing: medians over it. Raises `InputError` as
     `links.check_units`, and for a step below `FINEST_M`.
+
+    Args:
+        town: the town.
+        units: name -> (3,) position of the unit's antenna [m, world].
+        radio: settings of the links.
+        step_m: distance of the grid's points [m].
     """
     check_units(town, units, radio)
     if not step_m >= FINEST_M:
@@ -55,8 +61,3 @@ def cover_town(town: Town, units: Mapping[str, Array], radio: Radio, step_m: flo
         rate[row] = lone_rate_bps(received_dbm(np.take_along_axis(loss, best, 1)[:, 0], radio), radio)
         state[row] = np.take_along_axis(seen, best, 1)[:, 0]
     return Coverage(tuple(units), sites, x, y, rate, state)
-
-
-def share_in_state(coverage: Coverage, state: State) -> float:
-    """Return the fraction of the places that are in `state`."""
-    return float((coverage.state == state).mean())

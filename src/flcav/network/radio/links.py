@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.network.radio import propagation as laws
 from flcav.network.radio.budget import Radio, lone_rate_bps, received_dbm
-from flcav.network.radio.propagation import State
+from flcav.network.radio.propagation import PathState
 from flcav.network.radio.sight import find_sight, raise_walls, vehicle_boxes
 from flcav.statistics.streams import stream
 from flcav.world.map.town import Town
@@ -77,11 +77,19 @@ def walls_of(town: Town, radio: Radio) -> Assembly | None:
 def link_vehicles(
     town: Town, trace: Trace, vehicles: Sequence[str], units: Mapping[str, Array], radio: Radio, seed: int = 0
 ) -> RadioLinks:
-    """Return the links of `vehicles`, track ids of the trace, to `units`, name -> mount (3,) [m, world].
+    """Return the radio links of vehicles to roadside units.
 
     A vehicle's antenna is in the middle of its roof. Draws are named by seed, vehicle, unit and blocking vehicle, so
     that another unit changes no other link; the loss by a vehicle in the path keeps its draw as long as that vehicle is
     there. Raises `InputError` for an unknown vehicle, and as `check_units`.
+
+    Args:
+        town: the town, whose buildings are in the way.
+        trace: its traffic.
+        vehicles: track ids of the trace.
+        units: name -> (3,) position of the unit's antenna [m, world].
+        radio: settings of the links.
+        seed: seed of shadowing and losses.
     """
     check_units(town, units, radio)
     actors = trace.actor.tolist()
@@ -147,4 +155,4 @@ def _losses(
         moved, correlation, shadow
     )
     path_loss = laws.path_loss_db(distance, state, radio.frequency_ghz, radio.environment)
-    return path_loss + np.where(paths.state == State.NLOSV, blocked, 0.0) + shadowing
+    return path_loss + np.where(paths.state == PathState.NLOSV, blocked, 0.0) + shadowing

@@ -18,7 +18,7 @@ Environment = Literal["urban", "highway"]
 NEAREST_M = 3.0  # nearer links lose what they lose here: TR 36.885, Table A.1.4-1
 
 
-class State(IntEnum):
+class PathState(IntEnum):
     """State of the direct path between two antennas (TR 37.885, clause 6.2)."""
 
     LOS = 0  # free
@@ -38,15 +38,15 @@ class Law:
 
 
 # Path loss and sigma: TR 37.885, Table 6.2.1-1; correlation: Table 6.2.3-1 (urban), TR 36.885, Table A.1.4-1 (highway)
-LAWS: Mapping[Environment, Mapping[State, Law]] = {
+LAWS: Mapping[Environment, Mapping[PathState, Law]] = {
     "urban": {
-        State.LOS: Law(38.77, 16.7, 18.2, 3.0, 10.0),
-        State.NLOSV: Law(38.77, 16.7, 18.2, 3.0, 13.0),
-        State.NLOS: Law(36.85, 30.0, 18.9, 4.0, 13.0),
+        PathState.LOS: Law(38.77, 16.7, 18.2, 3.0, 10.0),
+        PathState.NLOSV: Law(38.77, 16.7, 18.2, 3.0, 13.0),
+        PathState.NLOS: Law(36.85, 30.0, 18.9, 4.0, 13.0),
     },
     "highway": {  # has no buildings, and so no NLOS
-        State.LOS: Law(32.4, 20.0, 20.0, 3.0, 25.0),
-        State.NLOSV: Law(32.4, 20.0, 20.0, 3.0, 25.0),
+        PathState.LOS: Law(32.4, 20.0, 20.0, 3.0, 25.0),
+        PathState.NLOSV: Law(32.4, 20.0, 20.0, 3.0, 25.0),
     },
 }
 
@@ -124,5 +124,5 @@ def _by_state(state: ArrayLike, environment: Environment, field: str) -> Array:
     laws = LAWS[environment]
     states = np.asarray(state, dtype=np.int64)
     if unknown := set(np.unique(states).tolist()) - set(laws):
-        raise ValueError(f"the {environment} environment has no state {State(min(unknown)).name}")
-    return np.array([getattr(laws[each], field) if each in laws else np.nan for each in State])[states]
+        raise ValueError(f"the {environment} environment has no state {PathState(min(unknown)).name}")
+    return np.array([getattr(laws[each], field) if each in laws else np.nan for each in PathState])[states]

@@ -11,7 +11,7 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import RadioLinks, link_vehicles, unit_positions
-from flcav.network.radio.propagation import State
+from flcav.network.radio.propagation import PathState
 from flcav.world.map.town import Town
 
 POLE = re.compile(r"pole([0-9]{1,9})")  # what agents on poles are called
@@ -31,10 +31,17 @@ class RecordedScene:
 def link_scene(
     data: Dataset, radio: Radio, poles: Sequence[int] = (), scene: str | None = None, seed: int = 0
 ) -> RecordedScene:
-    """Return the links of a scene, by default the first, to units on `poles`, by default those recorded from.
+    """Return the radio links of a recorded scene's vehicles to roadside units on poles.
 
     Raises `InputError` where the dataset has no such scene, no traffic, town, connected vehicles or poles, and as
     `links.link_vehicles`.
+
+    Args:
+        data: the dataset.
+        radio: settings of the links.
+        poles: numbers of the town's poles; empty: those recorded from.
+        scene: name of the scene; None: the first.
+        seed: seed of shadowing and losses.
     """
     scenes = list(dict.fromkeys(key.scene for key in data.keys))
     name = scenes[0] if scene is None else scene
@@ -83,6 +90,6 @@ def summarise_links(links: RadioLinks) -> tuple[LinkSummary, ...]:
         for u, unit in enumerate(links.unit):
             rate, distance, state = rates[here, v, u], links.distance_m[here, v, u], links.state[here, v, u]
             numbers = (rate.mean(), rate.min(), rate.max(), distance.min(), distance.max())
-            shares = ((state == each).mean() for each in (State.LOS, State.NLOSV, State.NLOS))
+            shares = ((state == each).mean() for each in (PathState.LOS, PathState.NLOSV, PathState.NLOS))
             found.append(LinkSummary(vehicle, unit, *map(float, (*numbers, *shares))))
     return tuple(found)

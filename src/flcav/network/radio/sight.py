@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, segments_meet_boxes
-from flcav.network.radio.propagation import State
+from flcav.network.radio.propagation import PathState
 from flcav.world.map.town import Town
 from flcav.world.rays.embree import Assembly, Embree
 from flcav.world.static import build_buildings_mesh
@@ -66,7 +66,7 @@ def find_sight(
     tops = np.where(crossed, vehicles.corners()[..., 2].max(axis=1), -np.inf)
     hidden = crossed.any(axis=1)
     blocker = np.where(hidden, tops.argmax(axis=1) if len(vehicles) else 0, -1)
-    state = np.where(walled, State.NLOS, np.where(hidden, State.NLOSV, State.LOS)).astype(np.int8)
+    state = np.where(walled, PathState.NLOS, np.where(hidden, PathState.NLOSV, PathState.LOS)).astype(np.int8)
     shape = (len(antennas), len(sites))
     return Sight(state.reshape(shape), blocker.reshape(shape))
 

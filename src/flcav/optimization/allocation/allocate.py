@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.network.plan import Price
-from flcav.optimization.curves.curves import Curve, Shared
+from flcav.optimization.curves.curves import Curve, SharedCurve
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.area import area, maximise_area
 from flcav.optimization.solvers.branches import solve_branches
@@ -179,7 +179,7 @@ def _task_plan(problem: Problem, task: AllocationTask, row: Array) -> TaskPlan:
     return TaskPlan(
         *(task.name, samples, edge_rounds, cloud_rounds, error(task.curve), cost.wireless_mb, cost.wireline_mb),
         upper_error=error(task.upper) if problem.robust and task.upper is not None else None,
-        members=tuple(members) if isinstance(task.curve, Shared) else (),
+        members=tuple(members) if isinstance(task.curve, SharedCurve) else (),
     )
 
 

@@ -9,7 +9,6 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from flcav.config import Config, InputError
-from flcav.optimization.allocation.allocate import Allocation, allocate
 from flcav.optimization.curves.curves import STAGES, Additive, Curve, Decay, Effective, Federated, NonNegative
 from flcav.optimization.problem import AllocationTask, Budgets, Count, Fraction, Problem
 from flcav.optimization.solvers.instance import price_counts
@@ -50,14 +49,6 @@ class PlanState(Config):
 
     tasks: Annotated[Mapping[str, TaskState], Field(min_length=1)]  # resources spent, by task
     used_mb: Sent | None = None  # megabytes sent; None: the counts times the problem's message sizes
-
-
-def replan(problem: Problem, progress: PlanState, *, gap: float = 1e-4) -> Allocation:
-    """Return the best plan that continues from `progress`; its counts are totals, including what is spent.
-
-    Raises `InputError` as `condition_problem` does, and `Infeasible` where the rest of the budgets allows no plan.
-    """
-    return allocate(condition_problem(problem, progress), gap=gap)
 
 
 def condition_problem(problem: Problem, progress: PlanState) -> Problem:

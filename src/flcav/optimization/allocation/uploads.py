@@ -12,7 +12,7 @@ LEAST_MBPS = 1e-3  # rate of a vehicle that is never in coverage: it uploads las
 
 
 @dataclass(frozen=True)
-class Asked:
+class UploadDemand:
     """The samples of stage I of a task, and who holds how many."""
 
     samples: int
@@ -20,7 +20,7 @@ class Asked:
     held: Mapping[str, int]  # by vehicle
 
 
-def share_by_held(asked: Asked) -> dict[str, int]:
+def share_by_held(asked: UploadDemand) -> dict[str, int]:
     """Return each vehicle's number of samples, in proportion to what it holds, by the method of largest remainders.
 
     Equal remainders go to the vehicle that is named first.
@@ -33,7 +33,7 @@ def share_by_held(asked: Asked) -> dict[str, int]:
     return shares
 
 
-def share_by_links(tasks: Mapping[str, Asked], mbps: Mapping[str, float]) -> dict[str, dict[str, int]]:
+def share_by_links(tasks: Mapping[str, UploadDemand], mbps: Mapping[str, float]) -> dict[str, dict[str, int]]:
     """Return each vehicle's number of samples by task, by which the last sample arrives earliest: see `split_plan`.
 
     mbps: rate of the wireless uplink of every vehicle [Mbit/s]. A vehicle sends the samples of all tasks one after

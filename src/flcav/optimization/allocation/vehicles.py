@@ -56,7 +56,7 @@ Shares = dict[str, tuple[VehicleShare, ...]]  # by task
 
 
 @dataclass(frozen=True)
-class _Part:
+class _TaskOnVehicle:
     """One task on one vehicle: two consecutive variables of the program, samples and rounds."""
 
     task: AllocationTask
@@ -124,11 +124,11 @@ def _held(task: AllocationTask, plan: TaskPlan, vehicle: str) -> int:
     return min(task.samples_held.get(vehicle, plan.samples), plan.samples)
 
 
-def _parts(problem: Problem, task: AllocationTask, plan: TaskPlan) -> list[_Part]:
+def _parts(problem: Problem, task: AllocationTask, plan: TaskPlan) -> list[_TaskOnVehicle]:
     groups = np.repeat(np.arange(len(task.edge_groups)), task.edge_groups)
     rounds = plan.edge_rounds + problem.edge_rounds_per_cloud_round * plan.cloud_rounds
     return [
-        _Part(
+        _TaskOnVehicle(
             *(task, int(group), name, None if task.uplink_mbps is None else task.uplink_mbps[name].wireline),
             *(task.sample_s(name), task.round_s(name)),
             *(_held(task, plan, name), rounds, float(task.data_quality.get(name, 1.0))),
@@ -137,7 +137,7 @@ def _parts(problem: Problem, task: AllocationTask, plan: TaskPlan) -> list[_Part
     ]
 
 
-def _split(parts: Sequence[_Part], plans: Sequence[TaskPlan], horizon_s: float | None, subject: str) -> Array:
+def _split(parts: Sequence[_TaskOnVehicle], plans: Sequence[TaskPlan], horizon_s: float | None, subject: str) -> Array:
     """Return the samples and rounds (P, 2) of every part; raises `TooSlow` of `subject` where none fits the horizon."""
     size = 2 * len(parts) + 1  # the last variable is a time [s]: the end of stage I, or of the plan
     needs, least = _needs(parts, plans)
@@ -164,7 +164,7 @@ def _split(parts: Sequence[_Part], plans: Sequence[TaskPlan], horizon_s: float |
     return np.round(found[:-1]).reshape(-1, 2)
 
 
-def _needs(parts: Sequence[_Part], plans: Sequence[TaskPlan]) -> tuple[csr_array, Array]:
+def _needs(parts: Sequence[_TaskOnVehicle], plans: Sequence[TaskPlan]) -> tuple[csr_array, Array]:
     """Return constraint rows and their bounds (rows, 2) for the samples of each task and the rounds of each group.
 
     All planned samples are uploaded; the rounds that the vehicles of a group join are together at least the task's.
@@ -186,7 +186,7 @@ def _needs(parts: Sequence[_Part], plans: Sequence[TaskPlan]) -> tuple[csr_array
     return csr_array(coo_array((np.ones(len(rows)), (rows, columns)), shape=shape)), np.array(bounds, dtype=np.float64)
 
 
-def _busy(parts: Sequence[_Part], *, with_rounds: bool, less_last: bool = False) -> csr_array:
+def _busy(parts: Sequence[_TaskOnVehicle], *, with_rounds: bool, less_last: bool = False) -> csr_array:
     """Return the time of each vehicle and its wireline [s], a row each; with `less_last`, minus the last variable."""
     lines: dict[tuple[str, str], Array] = {}
     for number, part in enumerate(parts):

@@ -2,7 +2,7 @@
 
 `Additive` sums an inverse power law per stage, and what the first cloud round costs; `Effective` is one inverse power
 law of effective samples; `Federated` is one, too, in which cloud rounds bring the samples of the other regions and may
-cost accuracy; `Shared` is the weighted mean of the curves of tasks with the same network.
+cost accuracy; `SharedCurve` is the weighted mean of the curves of tasks with the same network.
 """
 
 from collections.abc import Sequence
@@ -205,7 +205,7 @@ class Member(Config):
     curve: OwnCurve  # the task's learning curve
 
 
-class Shared(Config):
+class SharedCurve(Config):
     """Learning curve of a cluster: the weighted mean error of its members, which all learn from each sample and round.
 
     Construction raises pydantic's ValidationError where one of several members has a curve that is not `Additive`.
@@ -228,4 +228,4 @@ class Shared(Config):
         return np.asarray(np.average(errors, axis=0, weights=weights), dtype=np.float64)
 
 
-Curve = Annotated[Additive | Effective | Federated | Shared, Field(discriminator="model")]
+Curve = Annotated[Additive | Effective | Federated | SharedCurve, Field(discriminator="model")]

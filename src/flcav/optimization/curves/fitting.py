@@ -142,12 +142,18 @@ def fit(
 
     It is the error by samples, edge rounds and cloud rounds.
 
-    `model` is `Additive`, `Effective` or `Federated`; the other settings belong to the last two, see `fit_effective`
-    and `fit_federated`. The best one is the additive or, where there are several regions and cloud rounds vary, the
-    federated one, whichever has the smaller AICc; runs are planned by it. `group_samples` are those of all regions, or
-    of each. Where runs of several seeds are in the history, the curve is that of a mean seed (`level_seeds`). Raises
-    `InputError` where there are too few points, where the effective model lacks `group_samples` for a history with
-    rounds, and as `fit_federated` does.
+    The best model is the additive or, where there are several regions and cloud rounds vary, the federated one,
+    whichever has the smaller AICc; runs are planned by it. Where runs of several seeds are in the history, the curve is
+    that of a mean seed (`level_seeds`). The data determine beta / alpha alone. Raises `InputError` where there are too
+    few points, where the effective model lacks `group_samples` for a history with rounds, and as `fit_federated` does.
+
+    Args:
+        history: accuracies at samples, edge rounds and cloud rounds, or their CSV file.
+        model: `Additive`, `Effective`, `Federated`, or the best one; the settings below are of the latter ones.
+        group_samples: number of samples that the vehicles hold, of all regions, or of each.
+        k: number of edge rounds per cloud round.
+        alpha: worth of an uploaded sample.
+        beta: worth of a sample that vehicles hold; None: fitted, or 0.5 where the rounds never vary.
 
     >>> from flcav import fit
     >>> from flcav.optimization import article_histories  # the points of Wang et al., Fig. 3a

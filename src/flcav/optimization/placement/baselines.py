@@ -13,7 +13,7 @@ DRAWS = 200
 
 
 @dataclass(frozen=True)
-class Expected:
+class ExpectedCoverage:
     """Mean coverage of random placements."""
 
     covered: float  # errors
@@ -31,7 +31,7 @@ def place_by_score(candidates: Candidates, score: Array, budget: float) -> Place
     return describe(candidates, chosen, bound=0.0, optimal=False)
 
 
-def place_at_random(candidates: Candidates, budget: float, draws: int = DRAWS, seed: int = 0) -> Expected:
+def place_at_random(candidates: Candidates, budget: float, draws: int = DRAWS, seed: int = 0) -> ExpectedCoverage:
     """Return the mean coverage of `draws` random placements: candidates in random order, as long as they fit."""
     random = stream(seed, "random-placements")
     errors, weight = np.zeros(draws), np.zeros(draws)
@@ -39,7 +39,7 @@ def place_at_random(candidates: Candidates, budget: float, draws: int = DRAWS, s
         chosen = _fill(candidates, random.permutation(len(candidates.cost)), budget)
         covered = np.bincount(candidates.covers[chosen].indices, minlength=len(candidates.weight)) > 0
         errors[draw], weight[draw] = covered.sum(), candidates.weight[covered].sum()
-    return Expected(float(errors.mean()), float(weight.mean()))
+    return ExpectedCoverage(float(errors.mean()), float(weight.mean()))
 
 
 def _fill(candidates: Candidates, order: NDArray[np.int64], budget: float) -> list[int]:

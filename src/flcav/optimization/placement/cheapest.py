@@ -12,7 +12,7 @@ import numpy as np
 from flcav.config import InputError
 from flcav.interface.wording import hint_share
 from flcav.optimization.placement.greedy import extend_greedily
-from flcav.optimization.placement.instance import TIE, Instance
+from flcav.optimization.placement.instance import TIE, CoverageInstance
 from flcav.optimization.placement.program import bound_by_highs, minimise_cost
 from flcav.optimization.placement.relaxation import Relaxation, bound_by, relax
 from flcav.optimization.placement.solve import (
@@ -57,7 +57,7 @@ def cover_share(candidates: Candidates, share: float, *, method: Method = "exact
     return describe(candidates, found.chosen, bound, certificate, optimal), least
 
 
-def minimise(instance: Instance, target: float, method: Method) -> Found:
+def minimise(instance: CoverageInstance, target: float, method: Method) -> Found:
     """Return the cheapest candidates that cover `target` of the weight, with a proven lower bound on their cost."""
     chosen = _drop(instance, target, extend_greedily(instance, np.inf, (), target))
     cost = float(instance.cost[chosen].sum())
@@ -98,7 +98,7 @@ def _least_cost(root: Relaxation, target: float) -> float:
     return (target - root.spare) / max(root.price, NOTHING)
 
 
-def _drop(instance: Instance, target: float, chosen: Sequence[int]) -> list[int]:
+def _drop(instance: CoverageInstance, target: float, chosen: Sequence[int]) -> list[int]:
     """Return the choice without those, the dearest first, that `target` does not need."""
     kept = list(chosen)
     for candidate in sorted(chosen, key=lambda each: -instance.cost[each]):

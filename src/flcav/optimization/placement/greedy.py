@@ -13,13 +13,13 @@ from itertools import combinations
 
 import numpy as np
 
-from flcav.optimization.placement.instance import TIE, Instance, reach
+from flcav.optimization.placement.instance import TIE, CoverageInstance, reach
 
 NOTHING = 1e-12  # the least cost that a gain is divided by
 TRIALS = 1000  # exchanges tried at most
 
 
-def choose_greedily(instance: Instance, budget: float) -> list[int]:
+def choose_greedily(instance: CoverageInstance, budget: float) -> list[int]:
     """Return the candidates of greatest gain over cost within `budget`, or the best single one and what fits beside.
 
     Ascending; among equals the earliest candidate.
@@ -32,7 +32,9 @@ def choose_greedily(instance: Instance, budget: float) -> list[int]:
     return chosen
 
 
-def extend_greedily(instance: Instance, budget: float, chosen: Iterable[int], target: float = np.inf) -> list[int]:
+def extend_greedily(
+    instance: CoverageInstance, budget: float, chosen: Iterable[int], target: float = np.inf
+) -> list[int]:
     """Return `chosen` with candidates of greatest gain over cost added while they fit into `budget`, ascending.
 
     Ends where nothing gains, or where `target` of the weight is covered.
@@ -85,7 +87,7 @@ def extend_greedily(instance: Instance, budget: float, chosen: Iterable[int], ta
     return sorted(on.values())
 
 
-def exchange(instance: Instance, budget: float, chosen: Sequence[int]) -> list[int]:
+def exchange(instance: CoverageInstance, budget: float, chosen: Sequence[int]) -> list[int]:
     """Return `chosen` improved: one or two are taken out and the rest extended, while more weight is covered."""
     best, value, trials = list(chosen), instance.value(chosen), 0
     improves = True

@@ -16,7 +16,7 @@ TIE = 1e-9  # relative difference below which covered weights and costs are equa
 
 
 @dataclass(frozen=True)
-class Instance:
+class CoverageInstance:
     """Budgeted maximum coverage over N candidates and K groups of errors that the same candidates cover.
 
     Candidate k is the sensor k % `sensors` on the pole k // `sensors`.
@@ -65,7 +65,7 @@ def find_covered(errors: Array, poles: Array, ranges_m: ArrayLike) -> csr_array:
     return csr_array((np.ones(ends[-1]), np.concatenate(found).astype(np.int32), ends.astype(np.int32)), shape=shape)
 
 
-def merge_errors(covers: csr_array, weights: Array, cost: Array, sensors: int = 1) -> Instance:
+def merge_errors(covers: csr_array, weights: Array, cost: Array, sensors: int = 1) -> CoverageInstance:
     """Return the instance in which errors that the same candidates cover are one group.
 
     `covers` (N, E), `weights` (E,) and `cost` (N,) are of single errors. Errors that nobody covers are left out. Groups
@@ -84,4 +84,4 @@ def merge_errors(covers: csr_array, weights: Array, cost: Array, sensors: int = 
     kept.sort_indices()
     group_of = np.full(count, -1, np.int64)
     group_of[seen] = group.ravel()
-    return Instance(kept, total, cost, sensors, group_of)
+    return CoverageInstance(kept, total, cost, sensors, group_of)

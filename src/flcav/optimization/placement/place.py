@@ -36,12 +36,23 @@ def place(
 ) -> Placement:
     """Return the sensors on poles (P, 3), at most one each, that cover most of the weight (E,) of the errors (E, 3).
 
-    Positions are in the world frame [m]; without `weight` each error weighs 1. Sensors are of one range, or of several
-    kinds, each with its `range_m` and `sensor_cost` (S,); a pole may have a cost (P,) of its own. One of these is
-    given: `count`, the number of sensors; `budget`, the most that they cost; `cover`, the share of the weight that they
-    cover for the least cost. With a `town`, or its name, a pole has to see an error past buildings and the traffic
-    of `traces`. Among equal choices of a number earlier poles are preferred. Raises `InputError` where positions,
-    weights, ranges, costs, limits or method are invalid, or not one limit is given.
+    One limit is given: `count`, `budget` or `cover`. Among equal choices of a number earlier poles are preferred.
+    Raises `InputError` where positions, weights, ranges, costs, limits or method are invalid, or not one limit is
+    given.
+
+    Args:
+        errors: (E, 3) positions of errors [m, world].
+        poles: (P, 3) positions where a sensor may stand [m, world].
+        range_m: range of the sensors [m], or of each of S kinds of sensors.
+        count: number of sensors.
+        budget: largest cost of the sensors and their poles.
+        cover: share of the weight, 0 to 1, that is covered for the least cost.
+        sensor_cost: (S,) cost of a sensor of each kind; None: 0.
+        pole_cost: (P,) cost of a sensor's place; None: 0.
+        town: town, or its name, past whose buildings a pole has to see an error; None: nothing is in the way.
+        traces: traffic of the town that is in the way, too.
+        weight: (E,) weight of each error; None: 1.
+        method: "exact", a mixed-integer program, or "greedy".
 
     >>> from flcav import place
     >>> placed = place([[0, 0, 1], [5, 0, 1], [90, 0, 1]], poles=[[0, 9, 3], [90, 9, 3]], range_m=40, count=1)

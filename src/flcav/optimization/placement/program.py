@@ -4,12 +4,12 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from scipy.sparse import csr_array, eye_array, hstack, vstack
 
-from flcav.optimization.placement.instance import Array, Instance
+from flcav.optimization.placement.instance import Array, CoverageInstance
 
 NODES = 2000  # of the search tree at most, where a limit is asked for
 
 
-def bound_by_highs(instance: Instance, budget: float) -> tuple[float, Array]:
+def bound_by_highs(instance: CoverageInstance, budget: float) -> tuple[float, Array]:
     """Return the bound of the linear relaxation on the weight covered within `budget`, and its dual (K,) by group."""
     groups = len(instance.weight)
     if not groups:
@@ -19,7 +19,9 @@ def bound_by_highs(instance: Instance, budget: float) -> tuple[float, Array]:
     return -float(result.fun), np.clip(-result.ineqlin.marginals[:groups], 0.0, instance.weight)
 
 
-def maximise_coverage(instance: Instance, budget: float, *, limited: bool = False) -> tuple[list[int] | None, float]:
+def maximise_coverage(
+    instance: CoverageInstance, budget: float, *, limited: bool = False
+) -> tuple[list[int] | None, float]:
     """Return the candidates within `budget` that cover most weight, and a proven bound on it.
 
     `limited`: search NODES nodes at most; None where no choice was found by then.
@@ -28,7 +30,9 @@ def maximise_coverage(instance: Instance, budget: float, *, limited: bool = Fals
     return _solve(instance, objective, rows, limits, limited, sign=-1.0)
 
 
-def minimise_cost(instance: Instance, target: float, *, limited: bool = False) -> tuple[list[int] | None, float]:
+def minimise_cost(
+    instance: CoverageInstance, target: float, *, limited: bool = False
+) -> tuple[list[int] | None, float]:
     """Return the cheapest candidates that cover `target` of the weight, and a proven lower bound on the cost.
 
     `limited` as in `maximise_coverage`.
@@ -41,7 +45,7 @@ def minimise_cost(instance: Instance, target: float, *, limited: bool = False) -
     return _solve(instance, cost, rows, limits, limited, sign=1.0)
 
 
-def _program(instance: Instance, budget: float) -> tuple[Array, csr_array, Array]:
+def _program(instance: CoverageInstance, budget: float) -> tuple[Array, csr_array, Array]:
     """Return objective, constraint rows and upper limits of the program over the variables (candidates, groups).
 
     A group is covered only where one of its candidates is chosen; the chosen cost at most `budget`, and a pole has one.
@@ -61,7 +65,7 @@ def _program(instance: Instance, budget: float) -> tuple[Array, csr_array, Array
 
 
 def _solve(
-    instance: Instance, objective: Array, rows: csr_array, limits: Array, limited: bool, sign: float
+    instance: CoverageInstance, objective: Array, rows: csr_array, limits: Array, limited: bool, sign: float
 ) -> tuple[list[int] | None, float]:
     """Return the choice that minimises `objective`, and `sign` times its bound."""
     candidates, groups = instance.covers.shape  # pyright: ignore[reportGeneralTypeIssues]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flcav.optimization.placement.instance import TIE, Array, Instance
+from flcav.optimization.placement.instance import TIE, Array, CoverageInstance
 
 STEPS = 1600
 RESTARTS = (200, 400, 800)  # steps after which the average is the new start
@@ -35,7 +35,7 @@ class Relaxation:
     dual: Array  # (K,) of each group, in [0, weight]
 
 
-def relax(instance: Instance, budget: float, enough: float = 0.0) -> Relaxation:
+def relax(instance: CoverageInstance, budget: float, enough: float = 0.0) -> Relaxation:
     """Return the best bound found; ends early where it has converged, or is `enough` (a covered weight)."""
     covers, weight, cost, kinds = instance.covers, instance.weight, instance.cost, instance.sensors
     by_group = covers.T.tocsr()
@@ -74,7 +74,7 @@ def relax(instance: Instance, budget: float, enough: float = 0.0) -> Relaxation:
     return best
 
 
-def bound_by(instance: Instance, budget: float, u: Array, share: Array) -> Relaxation:
+def bound_by(instance: CoverageInstance, budget: float, u: Array, share: Array) -> Relaxation:
     """Return the proven bound of the dual values `u` (K,) in [0, weight], with the price that is best for it."""
     kinds = instance.sensors
     gain, cost = (instance.covers @ u).reshape(-1, kinds), instance.cost.reshape(-1, kinds)

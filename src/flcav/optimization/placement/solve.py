@@ -17,7 +17,7 @@ from scipy.sparse import csr_array, diags_array
 
 from flcav.config import InputError
 from flcav.optimization.placement.greedy import choose_greedily, exchange, extend_greedily
-from flcav.optimization.placement.instance import TIE, Array, Instance, find_covered, merge_errors, reach
+from flcav.optimization.placement.instance import TIE, Array, CoverageInstance, find_covered, merge_errors, reach
 from flcav.optimization.placement.program import bound_by_highs, maximise_coverage
 from flcav.optimization.placement.relaxation import Relaxation, bound_by, relax
 
@@ -90,10 +90,10 @@ class Candidates:
         """Return the same candidates, each of which costs 1."""
         return replace(self, cost=np.ones(len(self.cost)))
 
-    def instance(self, method: Method = "exact") -> Instance:
+    def instance(self, method: Method = "exact") -> CoverageInstance:
         """Return the instance with errors merged that the same candidates cover; greedy, not where it takes longest."""
         if method == "greedy" and self.covers.nnz > SEARCHED:
-            return Instance(self.covers, self.weight, self.cost, self.sensors)
+            return CoverageInstance(self.covers, self.weight, self.cost, self.sensors)
         return merge_errors(self.covers, self.weight, self.cost, self.sensors)
 
 
@@ -184,7 +184,7 @@ class Found:
     search: float | None = None  # bound that a search states above it; None: none was made
 
 
-def maximise(instance: Instance, budget: float, method: Method) -> Found:
+def maximise(instance: CoverageInstance, budget: float, method: Method) -> Found:
     """Return the candidates that cover most weight within `budget`, with a proven bound on that weight."""
     chosen = choose_greedily(instance, budget)
     value = instance.value(chosen)
@@ -214,7 +214,7 @@ def maximise(instance: Instance, budget: float, method: Method) -> Found:
 
 
 def certify(
-    candidates: Candidates, instance: Instance, root: Relaxation, bound: float, search: float | None
+    candidates: Candidates, instance: CoverageInstance, root: Relaxation, bound: float, search: float | None
 ) -> Certificate:
     """Return the certificate of the `root` relaxation of `instance`; a group's dual is divided over its errors."""
     values = root.dual
@@ -224,13 +224,13 @@ def certify(
     return Certificate(tuple(values.tolist()), root.price, bound, search)
 
 
-def bound_of_choice(instance: Instance, budget: float, chosen: Sequence[int]) -> Relaxation:
+def bound_of_choice(instance: CoverageInstance, budget: float, chosen: Sequence[int]) -> Relaxation:
     """Return the bound that a choice proves: what is covered counts in full, and of the rest what could be afforded."""
     left = np.where(reach(instance.covers, chosen), 0.0, instance.weight)
     return bound_by(instance, budget, left, np.zeros(len(instance.cost)))
 
 
-def improve(instance: Instance, budget: float, chosen: Sequence[int], relaxed: Relaxation) -> list[int]:
+def improve(instance: CoverageInstance, budget: float, chosen: Sequence[int], relaxed: Relaxation) -> list[int]:
     """Return the better of `chosen` and the rounded relaxation, improved by exchanges."""
     kinds, spent, taken = instance.sensors, 0.0, {}
     for candidate in np.argsort(-relaxed.share, kind="stable").tolist():
@@ -245,7 +245,7 @@ def improve(instance: Instance, budget: float, chosen: Sequence[int], relaxed: R
     return exchange(instance, budget, best)
 
 
-def keep_candidates(instance: Instance, kept: NDArray[np.bool_]) -> Instance:
+def keep_candidates(instance: CoverageInstance, kept: NDArray[np.bool_]) -> CoverageInstance:
     """Return the instance in which only the candidates `kept` (N,) cover anything, its groups merged anew."""
     covers = csr_array(diags_array(kept.astype(np.float64)) @ instance.covers)
     covers.eliminate_zeros()
@@ -294,7 +294,7 @@ def _points(values: ArrayLike, name: str) -> Array:
     return points
 
 
-def _prefer_earlier(instance: Instance, chosen: Sequence[int]) -> list[int]:
+def _prefer_earlier(instance: CoverageInstance, chosen: Sequence[int]) -> list[int]:
     """Return the choice with each candidate replaced by the earliest one, of a free pole, that loses no weight."""
     best, kinds = instance.value(chosen), instance.sensors
     chosen = list(chosen)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.optimization.curves.curves import Shared
+from flcav.optimization.curves.curves import SharedCurve
 from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import Clock, build_instance
 from flcav.optimization.solvers.weighted import minimise_weighted_error
@@ -85,7 +85,7 @@ def _weighed(problem: Problem, weights: Array) -> Problem:
     for task in problem.tasks:
         own = [next(left) for _ in task.learners]
         update: dict[str, object] = {"weight": sum(own)}
-        if isinstance(task.curve, Shared):
+        if isinstance(task.curve, SharedCurve):
             members = (member.model_copy(update={"weight": w}) for member, w in zip(task.curve.members, own))
             update["curve"] = task.curve.model_copy(update={"members": tuple(members)})
         tasks.append(task.model_copy(update=update))

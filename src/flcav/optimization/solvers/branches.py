@@ -11,7 +11,7 @@ from itertools import product
 from typing import TypeVar
 
 from flcav.config import InputError
-from flcav.optimization.curves.curves import Additive, Curve, Shared
+from flcav.optimization.curves.curves import Additive, Curve, SharedCurve
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible
 
@@ -63,7 +63,7 @@ def _branch(task: AllocationTask) -> list[AllocationTask]:
 
 
 def _list_own(curve: Curve) -> list[Additive]:
-    members = [member.curve for member in curve.members] if isinstance(curve, Shared) else [curve]
+    members = [member.curve for member in curve.members] if isinstance(curve, SharedCurve) else [curve]
     return [each for each in members if isinstance(each, Additive)]
 
 
@@ -76,7 +76,7 @@ def _limit(task: AllocationTask, cloud_rounds: tuple[int, int], *, merged: bool)
 def _settle(curve: Curve, merged: bool) -> Curve:
     if isinstance(curve, Additive):
         return curve.model_copy(update={"floor": curve.floor + curve.merge * merged, "merge": 0.0})
-    if isinstance(curve, Shared):
+    if isinstance(curve, SharedCurve):
         members = (member.model_copy(update={"curve": _settle(member.curve, merged)}) for member in curve.members)
         return curve.model_copy(update={"members": tuple(members)})
     return curve

@@ -104,7 +104,7 @@ class EffectiveTasks:
 
 
 @dataclass(frozen=True)
-class Alone:
+class EffectiveTask:
     """A task whose curve is over effective samples."""
 
     number: int  # index of the task in the problem
@@ -113,7 +113,9 @@ class Alone:
     curve: Effective | Federated
 
 
-def build_effective_tasks(tasks: Sequence[Alone], k: int, low: Array, high: Array, cost: Array) -> EffectiveTasks:
+def build_effective_tasks(
+    tasks: Sequence[EffectiveTask], k: int, low: Array, high: Array, cost: Array
+) -> EffectiveTasks:
     """Return the `tasks` in arrays, with their choices of rounds.
 
     The problem has N tasks with bounds `low` and `high` (3N,) and `cost` (3N, L), and `k` edge rounds per cloud round.
@@ -135,7 +137,7 @@ def build_effective_tasks(tasks: Sequence[Alone], k: int, low: Array, high: Arra
     return EffectiveTasks(quantity, *worth, k, least, most, sample_cost, rounds, rounds_cost)
 
 
-def _held(task: Alone) -> tuple[float, float, float]:
+def _held(task: EffectiveTask) -> tuple[float, float, float]:
     """Return the worth of the samples held in the own region and in the others, and the weighted drift."""
     curve = task.curve
     if isinstance(curve, Federated):
@@ -143,7 +145,7 @@ def _held(task: Alone) -> tuple[float, float, float]:
     return curve.beta * curve.group_samples, 0.0, 0.0
 
 
-def _choices(task: Alone, low: Array, high: Array, k: int, cost: Array) -> Array:
+def _choices(task: EffectiveTask, low: Array, high: Array, k: int, cost: Array) -> Array:
     if isinstance(task.curve, Federated) and (task.curve.others > 0 or task.curve.drift < 0):
         return pair_rounds(low, high, "a federated curve", task.name)
     if np.any(k * cost[1] > cost[2] * (1 + BUDGET_SLACK)):

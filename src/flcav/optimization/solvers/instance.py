@@ -11,7 +11,7 @@ from flcav.config import InputError, shorten
 from flcav.network.plan import Price, StagePlan, price
 from flcav.optimization.curves.curves import Additive
 from flcav.optimization.problem import AllocationTask, Problem
-from flcav.optimization.solvers.effective import Alone, EffectiveTasks, build_effective_tasks
+from flcav.optimization.solvers.effective import EffectiveTask, EffectiveTasks, build_effective_tasks
 from flcav.optimization.solvers.rounding import outermost
 from flcav.optimization.solvers.separable import BUDGET_SLACK, Separable, room
 
@@ -141,11 +141,11 @@ def build_instance(problem: Problem, clocks: Sequence[Clock] = ()) -> Instance:
     """
     low, high = (np.concatenate(edge) for edge in zip(*(_range(problem, task) for task in problem.tasks)))
     rows: list[tuple[float, float, float, int]] = []
-    alone: list[Alone] = []
+    alone: list[EffectiveTask] = []
     for number, task in enumerate(problem.tasks):
         for learner in task.learners:
             if not isinstance(learner.curve, Additive):
-                alone.append(Alone(number, task.name, learner.weight, learner.curve))
+                alone.append(EffectiveTask(number, task.name, learner.weight, learner.curve))
                 continue
             for stage, decay in enumerate(learner.curve.decays()):
                 if decay.a > 0:

@@ -17,7 +17,7 @@ from flcav.optimization.verification.tasks import (
     QUANTITIES,
     Array,
     Data,
-    Task,
+    VerifiedTask,
     error,
     least_cost,
     list_branches,
@@ -72,7 +72,7 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
     return judge(value, spent, bound, claims, trusted)
 
 
-def _prove(kind: str, tasks: Sequence[Task], dual: Data, budgets: Array, k: int) -> float:
+def _prove(kind: str, tasks: Sequence[VerifiedTask], dual: Data, budgets: Array, k: int) -> float:
     multipliers = np.array([exact(each) for each in dual["multipliers"]])
     if len(multipliers) != len(budgets) or np.any(multipliers < 0):
         return 0.0

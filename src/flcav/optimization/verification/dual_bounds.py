@@ -19,7 +19,7 @@ from flcav.optimization.verification.tasks import (
     STAGES,
     Array,
     Data,
-    Task,
+    VerifiedTask,
     drift_part,
     error,
     held_samples,
@@ -32,7 +32,7 @@ SUMS = 1 - 2.0**-45  # of a sum of few terms, none negative: less than its round
 BELOW = 1 - 1e-9  # of a level: choices whose error just reaches it, or rounds to it, are not below this
 
 
-def bound_weighted(tasks: Sequence[Task], multipliers: Array, budgets: Array, k: int) -> float:
+def bound_weighted(tasks: Sequence[VerifiedTask], multipliers: Array, budgets: Array, k: int) -> float:
     """Return the least Lagrangian at the `multipliers` (L,): no plan within the `budgets` (L,) has less error."""
     least, left = [], budgets - least_cost(tasks)
     for task in tasks:
@@ -53,7 +53,7 @@ def bound_weighted(tasks: Sequence[Task], multipliers: Array, budgets: Array, k:
     return nextafter(fsum((*least, -nextafter(float(multipliers @ budgets), inf))), -inf)
 
 
-def bound_largest(tasks: Sequence[Task], prices: Array, level: float, budgets: Array, k: int) -> float:
+def bound_largest(tasks: Sequence[VerifiedTask], prices: Array, level: float, budgets: Array, k: int) -> float:
     """Return `level` times `BELOW` if keeping to that costs more than the `budgets` (L,) at `prices` (L,), else 0."""
     least, left = [], budgets - least_cost(tasks)
     for task in tasks:
@@ -70,7 +70,7 @@ def bound_largest(tasks: Sequence[Task], prices: Array, level: float, budgets: A
     return level * BELOW if fsum(least) * SUMS > nextafter(float(prices @ budgets), inf) else 0.0
 
 
-def _afford(task: Task, left: Array) -> list[tuple[int, int]]:
+def _afford(task: VerifiedTask, left: Array) -> list[tuple[int, int]]:
     """Return the limits, with the most at what is `left` (L,) when all else is at its least."""
     rooms = [min((floor(a / c) for a, c in zip(left, unit) if c > 0), default=inf) for unit in task.unit]
     return [(low, int(min(high, low + room))) for (low, high), room in zip(task.limits, rooms)]

@@ -29,7 +29,7 @@ UPPER = "the linear program's word that this cost covers at most {:.9g}"
 
 
 @dataclass(frozen=True)
-class Asked:
+class PlacementProblem:
     """A placement problem: one of `count`, `budget` and `cover` is given."""
 
     errors: Array  # (E, 3) [m]
@@ -43,7 +43,7 @@ class Asked:
     visible: NDArray[np.bool_] | None = None  # (P, E) whether a pole sees an error; None: all do
 
 
-def find_reached(asked: Asked) -> list[list[NDArray[np.intp]]]:
+def find_reached(asked: PlacementProblem) -> list[list[NDArray[np.intp]]]:
     """Return the numbers of the errors that each sensor on each pole covers, by pole and sensor."""
     found: list[list[NDArray[np.intp]]] = []
     for number, pole in enumerate(asked.poles):
@@ -58,7 +58,7 @@ def find_reached(asked: Asked) -> list[list[NDArray[np.intp]]]:
     return found
 
 
-def verify_placement(asked: Asked, placed_json: str, least: float | None = None) -> Verification:
+def verify_placement(asked: PlacementProblem, placed_json: str, least: float | None = None) -> Verification:
     """Return the verification of a `Placement` as JSON text, with `cover` also of the bound `least` on its cost."""
     placed = json.loads(placed_json)
     reached, proof, weight, upper = find_reached(asked), placed["certificate"], asked.weight, placed["upper_bound"]

@@ -20,7 +20,7 @@ QUANTITIES, STAGES = ("samples", "edge_rounds", "cloud_rounds"), ("pretrain", "e
 SLACK = 1 + Fraction(1, 10**12)  # of a budget: the rounding of a sum that is within it
 
 
-class Task(NamedTuple):
+class VerifiedTask(NamedTuple):
     """A task under L budgets."""
 
     curves: list[tuple[float, Data]]  # weight and curve of each member
@@ -33,12 +33,12 @@ class Task(NamedTuple):
         return np.array(counts, dtype=object) @ self.unit + self.once * (counts[2] > 0)
 
 
-def least_cost(tasks: Sequence[Task]) -> Array:
+def least_cost(tasks: Sequence[VerifiedTask]) -> Array:
     """Return the cost (L,) of the least that the limits allow."""
     return sum((task.cost([low for low, _ in task.limits]) for task in tasks), np.zeros(1, dtype=object))
 
 
-def read_tasks(problem: Data, k: int) -> tuple[list[Task], Array]:
+def read_tasks(problem: Data, k: int) -> tuple[list[VerifiedTask], Array]:
     """Return the tasks, and the budgets (L,) with the rounding that the sums of a plan within them may have."""
     tasks, budgets, horizon_s = [], list(problem["budgets_mb"].values()), problem["horizon_s"]
     gains = [max((problem["performance"] or 0) - (each["performance_without"] or 0), 0) for each in problem["tasks"]]
@@ -60,14 +60,14 @@ def read_tasks(problem: Data, k: int) -> tuple[list[Task], Array]:
         cars, servers = sum(task["edge_groups"]), len(task["edge_groups"])
         rounds = [[cars * (sent + labels), 0, train_s], [k * cars * sent, servers * model, k * train_s]]
         costs = np.array([[sample, sample, 0], *rounds, [cars * labels, 0, 0]], dtype=object)
-        tasks.append(Task(curves, limits, costs[:3], costs[3]))
+        tasks.append(VerifiedTask(curves, limits, costs[:3], costs[3]))
     budgets += [horizon_s] * (horizon_s is not None and any(task.unit[1, 2] for task in tasks))
     kept = slice(len(budgets))
     tasks = [task._replace(unit=task.unit[:, kept], once=task.once[kept]) for task in tasks]
     return tasks, np.array([exact(budget) * SLACK for budget in budgets])
 
 
-def list_branches(tasks: Sequence[Task]) -> Iterator[tuple[Task, ...]]:
+def list_branches(tasks: Sequence[VerifiedTask]) -> Iterator[tuple[VerifiedTask, ...]]:
     """Yield the tasks with limits without and with cloud rounds, where the first of these is paid for once."""
     options = []
     for task in tasks:

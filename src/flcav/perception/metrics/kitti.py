@@ -25,7 +25,7 @@ RECALLS = 41  # positions of recall, of which the first, 0, is left out of the m
 SIMILAR = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 
-class Level(NamedTuple):
+class Difficulty(NamedTuple):
     """Criteria of a level of difficulty: the objects that count at it."""
 
     height_px: float  # of the rectangle in the image: higher ones count
@@ -33,10 +33,10 @@ class Level(NamedTuple):
     truncation: float  # at most
 
 
-LEVELS: Mapping[str, Level] = {
-    "easy": Level(40, 0, 0.15),
-    "moderate": Level(25, 1, 0.3),
-    "hard": Level(25, 2, 0.5),
+LEVELS: Mapping[str, Difficulty] = {
+    "easy": Difficulty(40, 0, 0.15),
+    "moderate": Difficulty(25, 1, 0.3),
+    "hard": Difficulty(25, 2, 0.5),
 }
 
 
@@ -52,7 +52,7 @@ class ClassFrame:
 
 
 def label_states(
-    name: str, labels: NDArray[np.str_], height_px: Array, occlusion: States, truncation: Array, level: Level
+    name: str, labels: NDArray[np.str_], height_px: Array, occlusion: States, truncation: Array, level: Difficulty
 ) -> States:
     """Return (G,) whether each of a frame's objects counts for the class `name` at a level."""
     hard = (occlusion > level.occlusion) | (truncation > level.truncation) | (height_px <= level.height_px)
@@ -60,7 +60,7 @@ def label_states(
     return np.where(own & ~hard, COUNTS, np.where(own | similar, IGNORED, OTHER)).astype(np.int64)
 
 
-def detection_states(name: str, labels: NDArray[np.str_], height_px: Array, level: Level) -> States:
+def detection_states(name: str, labels: NDArray[np.str_], height_px: Array, level: Difficulty) -> States:
     """Return (D,) whether each of a frame's detections counts for the class `name` at a level."""
     return np.where(height_px < level.height_px, IGNORED, np.where(labels == name, COUNTS, OTHER)).astype(np.int64)
 

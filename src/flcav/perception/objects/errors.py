@@ -5,12 +5,11 @@ detection on no annotated object with at least one LiDAR return in its box. Both
 """
 
 from collections.abc import Iterable, Iterator
-from itertools import chain
 
 import numpy as np
 
 from flcav.geometry import Boxes, points_in_boxes, transform_points
-from flcav.perception.errors import FALSE_POSITIVE, MISS, THRESHOLD, PerceptionError, keep_first
+from flcav.perception.errors import FALSE_POSITIVE, MISS, THRESHOLD, PerceptionError
 from flcav.perception.metrics.matching import assign_targets, on_neutral
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
@@ -19,22 +18,14 @@ from flcav.sensors.frame import Frame
 OVERLAP = 0.5  # 3D IoU from which an object is detected
 
 
-def register_errors(
-    frames: Iterable[Frame], detections: Iterable[Boxes], config: SecondConfig, threshold: float = THRESHOLD
-) -> tuple[PerceptionError, ...]:
-    """Return the misses and false positives of the detections of score `threshold` or more, at world coordinates.
-
-    detections: one `Boxes` per frame, LiDAR frame. An error that repeats over frames is registered once, as it was in
-    the first of them, see `flcav.perception.errors`. Raises ValueError where `detections` and `frames` differ in
-    length.
-    """
-    return keep_first(chain.from_iterable(find_errors(frames, detections, config, threshold)))
-
-
 def find_errors(
     frames: Iterable[Frame], detections: Iterable[Boxes], config: SecondConfig, threshold: float = THRESHOLD
 ) -> Iterator[list[PerceptionError]]:
-    """Yield the mistakes of each frame, with those that repeat over frames, see `register_errors`."""
+    """Yield the misses and false positives of each frame, of detections of score `threshold` or more.
+
+    They are at world coordinates; those that repeat over frames are among them, see `flcav.perception.errors`.
+    detections: one `Boxes` per frame, LiDAR frame. Raises ValueError where these and `frames` differ in length.
+    """
     for frame, found in zip(frames, detections, strict=True):
         found = found[np.flatnonzero(found.score >= threshold)] if found.score is not None else found
         matched = np.zeros(len(found), dtype=bool)

@@ -23,7 +23,7 @@ from flcav.perception.objects.truth import choose_lidar, network_from_lidar
 from flcav.perception.task import Finding
 
 
-class Cloud(NamedTuple):
+class InputCloud(NamedTuple):
     """A point cloud to detect objects in, LiDAR frame."""
 
     path: Path  # of the file; of a dataset, folder / key of the frame
@@ -45,7 +45,7 @@ def detect_objects(
         yield Finding(cloud.path, cloud.points, ObjectsFound(boxes_to_rows(found)), (CloudBoxes(found),), cloud.view)
 
 
-def read_point_clouds(path: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[Cloud]:
+def read_point_clouds(path: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[InputCloud]:
     """Yield the point clouds of a file, of a folder of them, or of `frames` (None: all) of a dataset folder.
 
     Those of a dataset are as a network of `config` sees them. Raises `InputError` where `path` is none of these, a
@@ -65,11 +65,11 @@ def read_point_clouds(path: Path, frames: Sequence[int] | None, config: SecondCo
     return clouds
 
 
-def _of_file(path: Path) -> Cloud:
-    return Cloud(path, validate_points(read_sweep(path), path), None, partial(view_beside, path))
+def _of_file(path: Path) -> InputCloud:
+    return InputCloud(path, validate_points(read_sweep(path), path), None, partial(view_beside, path))
 
 
-def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[Cloud]:
+def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[InputCloud]:
     dataset = Dataset.open(folder)
     read = frame_reader(dataset, config.foreground)
     for i in dataset.numbers(frames):
@@ -78,4 +78,4 @@ def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) 
         points = frame.lidar[lidar]
         if not config.foreground:  # a street may be empty before its background
             validate_points(points, origin)
-        yield Cloud(origin, points, network_from_lidar(frame, config), partial(recorded_view, dataset, i, lidar))
+        yield InputCloud(origin, points, network_from_lidar(frame, config), partial(recorded_view, dataset, i, lidar))

@@ -15,7 +15,7 @@ from flcav.perception.images import check_picture
 from flcav.perception.ops.rectangles import iou
 from flcav.perception.signs.config import SignsConfig
 from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.predict import Detections, detect
+from flcav.perception.signs.predict import SignDetections, detect
 from flcav.perception.signs.samples import find_targets, size_px
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import unproject_pixels
@@ -64,7 +64,7 @@ def register_errors(
 
 
 def _mistakes(
-    frame: Frame, camera: str, found: Detections, size: tuple[int, int], config: SignsConfig
+    frame: Frame, camera: str, found: SignDetections, size: tuple[int, int], config: SignsConfig
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the annotation rows of the missed signs of an image, and the indices of the false positives."""
     shown = select_rectangles(frame, camera, "signs", min_pixels=1)
@@ -101,7 +101,7 @@ def _misses(frame: Frame, camera: str, rows: NDArray[np.int64], things: SignsAnd
 
 
 def _meets(
-    frame: Frame, camera: str, found: Detections, numbers: NDArray[np.int64], solid: Solid, config: SignsConfig
+    frame: Frame, camera: str, found: SignDetections, numbers: NDArray[np.int64], solid: Solid, config: SignsConfig
 ) -> Iterator[PerceptionError | None]:
     """Yield each false positive at the hit of its ray with the town, None for a ray without a hit."""
     if not len(numbers):

@@ -11,7 +11,7 @@ from faster_coco_eval import COCO, COCOeval_faster
 from numpy.typing import NDArray
 
 from flcav.interface.wording import plural
-from flcav.perception.signs.predict import Detections
+from flcav.perception.signs.predict import SignDetections
 from flcav.perception.signs.samples import size_px
 from flcav.perception.task import Evaluated
 from flcav.storage.records import Class
@@ -22,7 +22,7 @@ ALL, FIFTY = 0, 0  # index of the area range of all sizes; index of the IoU thre
 
 
 @dataclass(frozen=True)
-class GroundTruth:
+class SignTruth:
     """Ground truth of one image."""
 
     box: NDArray[np.float64]  # (N, 4) x1 y1 x2 y2 [px] of the targets
@@ -97,7 +97,7 @@ class SignsEvaluation(Evaluated):
 
 
 def mean_average_precision(
-    found: Sequence[Detections], truths: Sequence[GroundTruth], classes: Sequence[str], smallest_px: float
+    found: Sequence[SignDetections], truths: Sequence[SignTruth], classes: Sequence[str], smallest_px: float
 ) -> SignsEvaluation:
     """Return mAP at IoU 0.5 and averaged over IoU 0.5 to 0.95, by class and by size of the true box.
 
@@ -137,8 +137,8 @@ def mean_average_precision(
 
 
 def _evaluated(
-    found: Sequence[Detections],
-    truths: Sequence[GroundTruth],
+    found: Sequence[SignDetections],
+    truths: Sequence[SignTruth],
     classes: Sequence[str],
     ranges: Sequence[tuple[float, float]],
 ) -> COCOeval_faster:

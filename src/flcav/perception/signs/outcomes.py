@@ -9,9 +9,9 @@ from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.outcomes import Outcomes, Times, Values
 from flcav.perception.signs.config import SignsConfig
-from flcav.perception.signs.evaluate import GroundTruth, mean_average_precision
+from flcav.perception.signs.evaluate import SignTruth, mean_average_precision
 from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.predict import Detections, detect
+from flcav.perception.signs.predict import SignDetections, detect
 from flcav.perception.signs.samples import RecordedPictures
 
 LOWEST_SCORE = 0.01  # score threshold; detections below it hardly change the average precision
@@ -32,7 +32,7 @@ class SignsOutcomes:
         recorded = _last_asked_for(data, network.config, tuple(frames))
         found, truths = [], []
         for done, sample in enumerate(recorded, start=1):
-            truths.append(GroundTruth(sample.boxes, sample.label, sample.ignore))
+            truths.append(SignTruth(sample.boxes, sample.label, sample.ignore))
             found.append(detect(network, sample.picture, threshold=LOWEST_SCORE))
             progress(done, len(recorded), "")
         arrays = {
@@ -69,15 +69,15 @@ class SignsOutcomes:
         return {"mAP50-95": result.map50_95, "targets": float(len(outcomes.arrays[f"{WANTED}/label"]))}
 
 
-def by_picture(outcomes: Outcomes) -> tuple[list[Detections], list[GroundTruth]]:
+def by_picture(outcomes: Outcomes) -> tuple[list[SignDetections], list[SignTruth]]:
     """Return the detections and the ground truth of each image."""
 
     def parts(name: str, field: str) -> list[np.ndarray]:
         ends = np.cumsum(outcomes.arrays[f"{name}/count"])[:-1]
         return np.split(outcomes.arrays[f"{name}/{field}"], ends)
 
-    found = [Detections(*one) for one in zip(*(parts(FOUND, field) for field in ("box", "label", "score")))]
-    truths = [GroundTruth(*one) for one in zip(parts(WANTED, "box"), parts(WANTED, "label"), parts(NEUTRAL, "box"))]
+    found = [SignDetections(*one) for one in zip(*(parts(FOUND, field) for field in ("box", "label", "score")))]
+    truths = [SignTruth(*one) for one in zip(parts(WANTED, "box"), parts(WANTED, "label"), parts(NEUTRAL, "box"))]
     return found, truths
 
 

@@ -24,7 +24,7 @@ MOST_FOUND = 100  # largest number of detections of an image
 
 
 @dataclass(frozen=True)
-class Detections:
+class SignDetections:
     """Detections in one image as arrays, by falling score."""
 
     box: NDArray[np.float64]  # (N, 4) x1 y1 x2 y2 [px] from the upper left corner
@@ -62,13 +62,13 @@ class BoxesFound(Result):
         return lines
 
 
-def boxes_found(found: Detections, classes: Sequence[str]) -> BoxesFound:
+def boxes_found(found: SignDetections, classes: Sequence[str]) -> BoxesFound:
     """Return detections as a record with the names of their classes."""
     rows = zip(found.box.tolist(), map(int, found.label), map(float, found.score), strict=True)
     return BoxesFound(tuple(BoxFound(classes[label], score, *box) for box, label, score in rows))
 
 
-def detect(network: SignDetector, picture: Picture, *, threshold: float) -> Detections:
+def detect(network: SignDetector, picture: Picture, *, threshold: float) -> SignDetections:
     """Return the detections in an image of any size with a score of at least `threshold`.
 
     The network's training mode is left as it was.
@@ -131,7 +131,7 @@ def predict(network: SignDetector, pictures: Sequence[Picture]) -> list[torch.Te
     return [maps.float() for maps in raw]
 
 
-def _chosen(cells: torch.Tensor, threshold: float, picture: Picture) -> Detections:
+def _chosen(cells: torch.Tensor, threshold: float, picture: Picture) -> SignDetections:
     share, label = cells[:, 5:].max(1)
     score = share * cells[:, 4]
     likely = score.topk(min(CANDIDATES, len(score))).indices
@@ -140,6 +140,6 @@ def _chosen(cells: torch.Tensor, threshold: float, picture: Picture) -> Detectio
     box = cells[likely, :4].clamp(min=0).minimum(cells.new_tensor([width, height, width, height]))
     kept = nms(box, score[likely], MOST_OVERLAP)[:MOST_FOUND]
     chosen = likely[kept]
-    return Detections(
+    return SignDetections(
         box[kept].double().cpu().numpy(), label[chosen].cpu().numpy(), score[chosen].double().cpu().numpy()
     )

@@ -34,20 +34,20 @@ SLACK_M = 2.0
 UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of detections without a predicted one
 
 
-class State(NamedTuple):
+class TrackState(NamedTuple):
     """Gaussian state estimate of one object: x, y, z, length, width, height [m], yaw [rad], velocity x, y [m/s]."""
 
     mean: Array  # (9,)
     covariance: Array  # (9, 9)
 
 
-def start_state(box: Array, variance: Array) -> State:
+def start_state(box: Array, variance: Array) -> TrackState:
     """Return the state of a new track from its first detection: box (7,) with `variance` (7,), mean velocity zero."""
     spread = np.concatenate((np.maximum(variance, LEAST_VARIANCE), np.full(2, FIRST_SPEED**2)))
-    return State(np.concatenate((box, np.zeros(2))), np.diag(spread))
+    return TrackState(np.concatenate((box, np.zeros(2))), np.diag(spread))
 
 
-def predict_state(state: State, after_s: float) -> State:
+def predict_state(state: TrackState, after_s: float) -> TrackState:
     """Return the Kalman prediction of the state `after_s` [s] later, at constant velocity."""
     step = np.eye(STATES)
     step[0, 7] = step[1, 8] = after_s
@@ -59,10 +59,10 @@ def predict_state(state: State, after_s: float) -> State:
         noise[place, speed] = noise[speed, place] = after_s**3 / 2
     both = np.ix_((0, 1, 7, 8), (0, 1, 7, 8))
     noise[both] *= ACCELERATION**2
-    return State(step @ state.mean, step @ state.covariance @ step.T + noise)
+    return TrackState(step @ state.mean, step @ state.covariance @ step.T + noise)
 
 
-def innovation(state: State, box: Array, variance: Array) -> tuple[Array, Array]:
+def innovation(state: TrackState, box: Array, variance: Array) -> tuple[Array, Array]:
     """Return the innovation (7,) of box (7,) with `variance` (7,), and its covariance (7, 7).
 
     The innovation is detection less prediction. A heading more than 90 degrees off the predicted one is taken for
@@ -74,7 +74,7 @@ def innovation(state: State, box: Array, variance: Array) -> tuple[Array, Array]
     return off, state.covariance[:MEASURED, :MEASURED] + np.diag(np.maximum(variance, LEAST_VARIANCE))
 
 
-def update_state(state: State, box: Array, variance: Array) -> State:
+def update_state(state: TrackState, box: Array, variance: Array) -> TrackState:
     """Return the Kalman update of the state by the detection box (7,) with `variance` (7,)."""
     off, spread = innovation(state, box, variance)
     gain = np.linalg.solve(spread, state.covariance[:MEASURED]).T
@@ -83,7 +83,7 @@ def update_state(state: State, box: Array, variance: Array) -> State:
     rest = np.eye(STATES)
     rest[:, :MEASURED] -= gain
     noise = np.diag(np.maximum(variance, LEAST_VARIANCE))
-    return State(mean, rest @ state.covariance @ rest.T + gain @ noise @ gain.T)  # Joseph form: stays symmetric
+    return TrackState(mean, rest @ state.covariance @ rest.T + gain @ noise @ gain.T)  # Joseph form: stays symmetric
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Tracked:
 class _Track:
     number: int
     label: str
-    state: State
+    state: TrackState
     scores: list[float]  # of its detections
     missed: int = 0  # frames since its last detection
 
@@ -166,7 +166,7 @@ class Tracker:
         return Tracked(boxes, np.array([track.number for track in told], dtype=np.int64), mean[:, 7:])
 
 
-def assign_detections(states: list[State], boxes: Array, variance: Array, after_s: float) -> list[tuple[int, int]]:
+def assign_detections(states: list[TrackState], boxes: Array, variance: Array, after_s: float) -> list[tuple[int, int]]:
     """Return the pairs (index of a state, index of a box) of least total cost: the Hungarian method within the gate.
 
     The cost is twice the negative log-likelihood of the detection's x, y under the prediction, up to a constant.

@@ -67,7 +67,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Part:
+class DatasetPart:
     """A dataset with the frames selected from it."""
 
     data: Dataset
@@ -84,8 +84,8 @@ class Prepared:
     out: Path
     config: Any  # configuration of the network
     settings: Settings
-    parts: tuple[Part, ...]  # training data
-    held: Part | None  # validation data
+    parts: tuple[DatasetPart, ...]  # training data
+    held: DatasetPart | None  # validation data
     finished: Card | None  # card of the weights in `out`, if the training was finished before
     samples: Sequence[Any]  # training samples; empty if finished before
 
@@ -208,9 +208,9 @@ def _find_finished(out: Path, settings: Settings) -> Card | None:
         raise
 
 
-def _part(task: Task, config: Any, data: Dataset, agents: str | None) -> Part:
+def _part(task: Task, config: Any, data: Dataset, agents: str | None) -> DatasetPart:
     chosen = choose_frames(task, config, data, agents)
-    return Part(data, chosen, data_entry(data, chosen))
+    return DatasetPart(data, chosen, data_entry(data, chosen))
 
 
 def _rounded(scores: NDArray[np.float64]) -> list[float]:

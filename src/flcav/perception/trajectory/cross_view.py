@@ -47,7 +47,7 @@ class GroundFeatures(NamedTuple):
     map_logits: Tensor | None = None  # (B, LEARNED, h, w) of the map's segmentation; None with rasters
 
 
-class Summary(nn.Module):
+class PatchPooling(nn.Module):
     """Pooling of the patch's feature maps to one vector, over a coarse grid so that places stay distinguishable."""
 
     def __init__(self, maps: int, out: int, size: int) -> None:
@@ -69,7 +69,7 @@ class RasterEncoder(nn.Module):
         fine, ground, coarse = config.maps
         self.summary = 2 * config.hidden
         self.layers = nn.Sequential(conv(len(LAYERS), fine, 2), conv(fine, ground, 2))
-        self.sum_up = Summary(ground, coarse, self.summary)
+        self.sum_up = PatchPooling(ground, coarse, self.summary)
 
     def forward(self, inputs: Inputs) -> GroundFeatures:
         """Return the features of rasters (B, LAYERS, cells, cells); a place of `ground` is 4 x 4 cells."""
@@ -103,7 +103,7 @@ class CrossViewEncoder(nn.Module):
             conv(width, width), nn.Upsample(scale_factor=2, mode="bilinear"), conv(width, config.maps[1])
         )
         self.map = nn.Conv2d(config.maps[1], len(LEARNED), 1)
-        self.sum_up = Summary(config.maps[1], config.maps[2], self.summary)
+        self.sum_up = PatchPooling(config.maps[1], config.maps[2], self.summary)
 
     pixels: Tensor  # (P, 3) homogeneous coordinates of the image features
     places: Tensor  # (Q, 2) x, y of the queries [SCALE_M]

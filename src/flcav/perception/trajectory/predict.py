@@ -40,7 +40,7 @@ class ForecastMode:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Forecast:
+class RoadUserForecast:
     """The forecast of one road user: the JSON record of a `RoadUser`."""
 
     track: str
@@ -63,7 +63,7 @@ class Forecasts(Result):
     time_s: tuple[float, ...]  # times of the points of every path, after the present
     observer: Pose2D
     lights: tuple[Light, ...]
-    agents: tuple[Forecast, ...]
+    agents: tuple[RoadUserForecast, ...]
 
     def lines(self) -> list[str]:
         """Return one line per road user: its position now and at the end of its single path."""
@@ -145,8 +145,8 @@ def forecasts(paths: Paths) -> Forecasts:
     return Forecasts(paths.times_s, Pose2D(x, y, yaw), paths.lights, tuple(map(_forecast, paths.users)))
 
 
-def _forecast(user: RoadUser) -> Forecast:
-    return Forecast(
+def _forecast(user: RoadUser) -> RoadUserForecast:
+    return RoadUserForecast(
         track=user.track,
         label=user.label,
         x=user.x,

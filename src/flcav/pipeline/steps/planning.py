@@ -12,7 +12,7 @@ from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import BYTES_PER_MB, LINKS, Link
 from flcav.network.plan import MessageSizes, Price
 from flcav.network.radio.links import RadioLinks
-from flcav.optimization.allocation.uploads import Asked, share_by_held, share_by_links
+from flcav.optimization.allocation.uploads import UploadDemand, share_by_held, share_by_links
 from flcav.optimization.problem import Problem
 from flcav.perception.client import as_shared
 from flcav.perception.objects.config import SecondConfig
@@ -230,7 +230,7 @@ def plan_uploads(work: Work, plan: Plan, pools: Mapping[str, Sequence[str]], how
     asked = {}
     for task, splits in opened.items():
         held = {name: len(frames) for region, split in splits.items() for name, frames in list_frames(region, split)}
-        asked[task] = Asked(plan.tasks[task].samples, plan.tasks[task].sample_mb, held)
+        asked[task] = UploadDemand(plan.tasks[task].samples, plan.tasks[task].sample_mb, held)
     if how.network is None:
         shares = {task: share_by_held(own) for task, own in asked.items()}
     else:

@@ -28,7 +28,7 @@ def town_map(scene: maps.ErrorMap, width_in: float = WIDTH) -> Figure:
 
 
 @style.styled
-def before_after(sweep: clouds.Sweep, extent: clouds.Extent = EXTENT) -> Figure:
+def before_after(sweep: clouds.ComparedSweep, extent: clouds.Extent = EXTENT) -> Figure:
     """Return one sweep twice, one above the other, with the detections of each of two networks."""
     figure = style.canvas(WIDTH, 2 * WIDTH)
     for axes, found in zip(figure.subplots(2), (sweep.before, sweep.after), strict=True):
@@ -85,7 +85,7 @@ def arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> Figure:
 
 @style.styled
 def overview(
-    scene: maps.ErrorMap, sweep: clouds.Sweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
+    scene: maps.ErrorMap, sweep: clouds.ComparedSweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
 ) -> Figure:
     """Return the overview of a run: map of errors, a sweep before and after, a measure by round and by stage."""
     figure = style.canvas(9.6, 4.4)

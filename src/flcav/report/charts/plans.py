@@ -23,7 +23,7 @@ STAGES = {"pretrain": "pretrained", "edge": "edge FL", "cloud": "edge +\ncloud F
 ASIDE = 0.07  # offset that keeps intervals of two plans apart
 
 
-class Part(TypedDict):
+class StageTraffic(TypedDict):
     """Traffic of a task on a link in one stage."""
 
     link: str
@@ -33,7 +33,7 @@ class Part(TypedDict):
 
 
 @style.styled
-def megabytes(parts: Sequence[Part], links: Mapping[str, Mapping[str, float]]) -> Figure:
+def megabytes(parts: Sequence[StageTraffic], links: Mapping[str, Mapping[str, float]]) -> Figure:
     """Return a stacked bar per link, a part per task (colour) and stage (shade), against the budget [MB]."""
     tasks = list(dict.fromkeys(row["task"] for row in parts))
     colours = dict(zip(tasks, TASKS, strict=False))

@@ -94,7 +94,7 @@ def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
     return terms | {name: TERMS[name] for name in used}
 
 
-def _parts(problem: Problem, plan: Allocation) -> list[plans.Part]:
+def _parts(problem: Problem, plan: Allocation) -> list[plans.StageTraffic]:
     """Return megabytes by link, task and stage; tasks beyond the `SHOWN` largest are one part."""
     ordered = sorted(plan.tasks, key=lambda row: -(row.wireless_mb + row.wireline_mb))
     shown = {row.name for row in ordered[: SHOWN if len(ordered) > SHOWN + 1 else len(ordered)]}

@@ -268,18 +268,18 @@ def _sent(run: Run) -> Sequence[Row]:
     ]
 
 
-def _sweep(work: Path, names: Names, run: Run) -> clouds.Sweep:
+def _sweep(work: Path, names: Names, run: Run) -> clouds.ComparedSweep:
     looked = SweepComparison.load(work / LOOK)
     region = run.recipe.with_role("federate")[0]
     data: Dataset = Frames.open(work / names.recording(region, "test", OBJECTS)).data
     frame = data.frame(looked.frame)
     points, ground_m = clouds.read_sweep(frame, choose_lidar(frame), Ground(data).relief)
     before, after = _detections("pretrained", looked.before), _detections("after the last stage", looked.after)
-    return clouds.Sweep(points, ground_m, _boxes(looked.targets), before, after)
+    return clouds.ComparedSweep(points, ground_m, _boxes(looked.targets), before, after)
 
 
-def _detections(title: str, seen: SweepDetections) -> clouds.Detections:
-    return clouds.Detections(
+def _detections(title: str, seen: SweepDetections) -> clouds.MatchedDetections:
+    return clouds.MatchedDetections(
         title, _boxes(seen.boxes), np.array(seen.hit, dtype=bool), np.array(seen.found, dtype=bool)
     )
 

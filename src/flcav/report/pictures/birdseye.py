@@ -31,7 +31,7 @@ HEIGHT_COLOURS = ListedColormap(colormaps["turbo"](np.linspace(0.08, 0.92, 64)))
 
 
 @dataclass(frozen=True)
-class View:
+class BirdseyeView:
     """Content of the view: everything in the agent's frame, heights above ground."""
 
     points: NDArray  # (N, 3) x, y, height [m]
@@ -45,7 +45,7 @@ class View:
     tracks: Sequence[NDArray] = ()  # (T, 2) x, y of an actor over the scene, for each actor that moved
 
 
-def view_frame(dataset: Dataset, frame: Frame, *, range_m: float, tracks: bool = False) -> View:
+def view_frame(dataset: Dataset, frame: Frame, *, range_m: float, tracks: bool = False) -> BirdseyeView:
     """Return the view of a frame of `dataset`, `range_m` [m] to each side; with `tracks` its actors' paths as well."""
     agent_from_world = inverse(frame.world_from_agent)
     clouds = [transform_points(frame.agent_from_sensor[name], cloud[:, :3]) for name, cloud in frame.lidar.items()]
@@ -54,7 +54,7 @@ def view_frame(dataset: Dataset, frame: Frame, *, range_m: float, tracks: bool =
         points[:, 2] += ground.height_of(dataset.number(frame.key))
     else:
         points[:, 2] = ground.relief.above(transform_points(frame.world_from_agent, points))
-    return View(
+    return BirdseyeView(
         points=points,
         truth=frame.annotations.boxes.transform(agent_from_world),
         returns=frame.annotations.returns,
@@ -89,7 +89,7 @@ def _collect_paths(dataset: Dataset, frame: Frame, agent_from_world: NDArray) ->
 
 
 @style.styled
-def birdseye(view: View) -> Figure:
+def birdseye(view: BirdseyeView) -> Figure:
     """Return the view as a figure with its legend and height scale."""
     figure = style.canvas(7.2, 8.25)
     axes = figure.add_subplot()
@@ -104,7 +104,7 @@ def birdseye(view: View) -> Figure:
     return figure
 
 
-def draw_view(axes: Axes, view: View) -> None:
+def draw_view(axes: Axes, view: BirdseyeView) -> None:
     """Draw the view into axes."""
     axes.set(xlim=(-view.range_m, view.range_m), ylim=(-view.range_m, view.range_m), aspect="equal")
     style.hide_axes(axes)
@@ -169,7 +169,7 @@ def _draw_agent(axes: Axes, size: tuple[float, float] | None) -> None:
     axes.add_patch(Polygon(on_page(outline), facecolor=style.INK, edgecolor="white", linewidth=0.6, zorder=5))
 
 
-def _legend(view: View) -> list[Line2D]:
+def _legend(view: BirdseyeView) -> list[Line2D]:
     entries = [
         Line2D([], [], color=style.INK, linewidth=0.8, label="annotated, with returns"),
         Line2D([], [], color=style.MUTED, linewidth=0.8, linestyle=(0, (3, 2)), label="annotated, no return"),

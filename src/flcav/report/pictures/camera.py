@@ -76,7 +76,7 @@ def boxes_on_picture(axes: Axes, boxes: Boxes, view: CameraView, colour: str, *,
 
 
 @dataclass(frozen=True)
-class Shot:
+class CameraShot:
     """The picture of one camera with the annotations that it shows."""
 
     name: str
@@ -86,7 +86,7 @@ class Shot:
     signs: SignViews | None  # None for an infrared camera
 
 
-def make_shot(frame: Frame, camera: str) -> Shot:
+def make_shot(frame: Frame, camera: str) -> CameraShot:
     """Return the picture and the visible annotations of a frame's camera, by its true calibration.
 
     Boxes are moved from the LiDAR spin to the time of the picture where their velocity is known. A thermal image
@@ -97,7 +97,7 @@ def make_shot(frame: Frame, camera: str) -> Shot:
     late_s = calibration.offset_ms.get(camera, 0.0) / 1000  # after the LiDAR spin, which boxes are of
     boxes = replace(seen.boxes, center=seen.boxes.center + late_s * np.nan_to_num(seen.velocity))
     camera_from_world, shows = inverse(frame.world_from_sensor(camera)), seen.views[camera].pixels != 0
-    return Shot(
+    return CameraShot(
         name=camera,
         view=CameraView(picture, camera_from_world, calibration.intrinsics[camera], calibration.distortion[camera]),
         boxes=boxes[shows],
@@ -121,7 +121,7 @@ def arrange_cameras(frame: Frame, cameras: Sequence[str]) -> list[list[str]]:
 
 
 @style.styled
-def camera_sheet(title: str, rows: Sequence[Sequence[Shot]], *, boxes: bool) -> Figure:
+def camera_sheet(title: str, rows: Sequence[Sequence[CameraShot]], *, boxes: bool) -> Figure:
     """Return the pictures in rows as one figure; `boxes`: also boxes of actors and rectangles of signs."""
     shots = [shot for row in rows for shot in row]
     width = ONE_IN if len(shots) == 1 else SHEET_IN
@@ -144,7 +144,7 @@ def camera_sheet(title: str, rows: Sequence[Sequence[Shot]], *, boxes: bool) -> 
     return figure
 
 
-def _draw_truth(axes: Axes, shot: Shot) -> None:
+def _draw_truth(axes: Axes, shot: CameraShot) -> None:
     for colour, categories in KINDS.values():
         boxes_on_picture(axes, shot.boxes[np.isin(shot.boxes.label, categories)], shot.view, colour, width=0.8)
     if shot.signs is not None:
@@ -152,7 +152,7 @@ def _draw_truth(axes: Axes, shot: Shot) -> None:
             axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=SIGNS[1], linewidth=1.0))
 
 
-def _key(shots: Sequence[Shot]) -> list[Patch]:
+def _key(shots: Sequence[CameraShot]) -> list[Patch]:
     """Return the legend: colours with numbers of objects; an object in two pictures counts once."""
     label = np.concatenate([shot.boxes.label for shot in shots])
     track = np.concatenate([shot.track for shot in shots])

@@ -23,7 +23,7 @@ EXTENT = (0.0, 60.0, 22.0)  # of a real frame
 
 
 @dataclass(frozen=True)
-class Detections:
+class MatchedDetections:
     """Detections of one network in a sweep, matched with the sweep's targets by the caller."""
 
     title: str
@@ -33,18 +33,18 @@ class Detections:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class ComparedSweep:
     """A sweep with detections of two networks, all in one frame: x forward, y left, at the sensor or its vehicle."""
 
     points: NDArray[np.float32]  # (P, >=3) x, y, z [m]; on slopes z is the height above the ground
     ground_m: float  # z of the ground in that frame
     targets: Boxes  # (M,)
-    before: Detections
-    after: Detections
+    before: MatchedDetections
+    after: MatchedDetections
 
 
 def read_sweep(frame: Frame, lidar: str, relief: Relief | None) -> tuple[NDArray[np.float32], float]:
-    """Return the points of a vehicle's sweep and the z of the ground among them, as `Sweep` has them."""
+    """Return the points of a vehicle's sweep and the z of the ground among them, as `ComparedSweep` has them."""
     points = frame.lidar[lidar]
     if relief is None:
         return points, -float(frame.agent_from_sensor[lidar][2, 3])
@@ -81,7 +81,7 @@ def draw_boxes(
     axes.add_collection(LineCollection(list(ticks), **look))
 
 
-def draw_detections(axes: Axes, sweep: Sweep, found: Detections, extent: Extent) -> None:
+def draw_detections(axes: Axes, sweep: ComparedSweep, found: MatchedDetections, extent: Extent) -> None:
     """Draw a sweep with hits, misses and false positives of one network's detections in different colours."""
     draw_points(axes, sweep.points, sweep.ground_m, extent)
     draw_boxes(axes, sweep.targets, style.INK)
@@ -91,7 +91,7 @@ def draw_detections(axes: Axes, sweep: Sweep, found: Detections, extent: Extent)
     axes.plot(0, 0, "^", color=style.INK, markersize=7, clip_on=False, zorder=5)
 
 
-def key(found: Detections | None = None) -> list[Patch]:
+def key(found: MatchedDetections | None = None) -> list[Patch]:
     """Return the legend of `draw_detections`, with counts where `found` is given."""
     entries = (("found", style.HIT, 0.35), ("missed", style.MISSED, 0.6), ("false", style.FALSE, 0.2))
     counts = ("", "", "") if found is None else (found.found.sum(), (~found.found).sum(), (~found.hit).sum())

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flcav.geometry import Boxes
 from flcav.network.radio.coverage import Coverage
 from flcav.network.radio.links import RadioLinks
-from flcav.network.radio.propagation import State
+from flcav.network.radio.propagation import PathState
 from flcav.report import style
 from flcav.report.pictures.maps import HALO
 from flcav.world.map.town import Town
@@ -25,10 +25,10 @@ from flcav.world.map.town import Town
 Array = NDArray[np.float64]
 
 STEPS = 8  # of the rate's colours
-MARKS: dict[State, tuple[str, dict[str, Any]]] = {
-    State.LOS: ("line of sight", {"color": "white", "markeredgecolor": style.INK}),
-    State.NLOSV: ("behind a vehicle", {"color": style.ORANGE, "markeredgecolor": style.INK}),
-    State.NLOS: ("behind buildings", {"color": style.INK, "markeredgecolor": "white"}),
+MARKS: dict[PathState, tuple[str, dict[str, Any]]] = {
+    PathState.LOS: ("line of sight", {"color": "white", "markeredgecolor": style.INK}),
+    PathState.NLOSV: ("behind a vehicle", {"color": style.ORANGE, "markeredgecolor": style.INK}),
+    PathState.NLOS: ("behind buildings", {"color": style.INK, "markeredgecolor": "white"}),
 }
 HATCH = "////"
 EVERY_S = 2.0  # between two marks of a drive
@@ -74,7 +74,7 @@ def _draw_rates(axes: Axes, coverage: Coverage) -> tuple[ListedColormap, Boundar
     colours = ListedColormap(colormaps["YlGnBu"](np.linspace(0.05, 0.85, STEPS)))
     norm = BoundaryNorm(levels.tolist(), STEPS)
     axes.pcolormesh(coverage.x, coverage.y, rate, cmap=colours, norm=norm, shading="nearest", rasterized=True)
-    hidden = (coverage.state == State.NLOS).astype(np.float64)
+    hidden = (coverage.state == PathState.NLOS).astype(np.float64)
     if hidden.any():
         area = axes.contourf(coverage.x, coverage.y, hidden, levels=[0.5, 1.5], colors="none", hatches=[HATCH])
         area.set(edgecolor="#ffffff90", linewidth=0.0, hatch_linewidth=0.6)

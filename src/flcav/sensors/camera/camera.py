@@ -11,7 +11,7 @@ from flcav.sensors.camera.tone import GRAINS, develop, grain
 from flcav.sensors.frame import SEMANTICS
 from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.rendering.rain import add_drops
-from flcav.sensors.rendering.render import Picture, render
+from flcav.sensors.rendering.render import RadianceImage, render
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 
@@ -60,7 +60,7 @@ def photograph(
     return Exposure(rgb, depth.reshape(shape), semantic.reshape(shape), instance.reshape(shape))
 
 
-def _labels(picture: Picture) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+def _labels(picture: RadianceImage) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
     semantic, instance = np.empty(len(picture.seen), np.uint8), np.empty(len(picture.seen), np.int32)
     sky, line = SEMANTICS["sky"], SEMANTICS["road_line"]
     _label(picture.seen, picture.appearance, picture.painted, sky, line, semantic, instance)

@@ -28,7 +28,7 @@ from flcav.sensors.rendering.light import compute_light, compute_sun_visibility,
 from flcav.sensors.rendering.noise import sample_noise
 from flcav.world.materials import Material
 from flcav.world.scene import Scene
-from flcav.world.static import Part
+from flcav.world.static import TownPart
 from flcav.world.weather import Weather
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ LAMP_K = 14.0  # how much warmer a lit lamp is
 BLUR_PX = 0.6  # standard deviation of the lens' point spread function
 PATCHES_K = 1.6  # range of the noise of one surface's temperature
 PANE_EMISSIVITY = 0.85
-WALL, BUILDING = int(Material.WALL), int(Part.BUILDING)
+WALL, BUILDING = int(Material.WALL), int(TownPart.BUILDING)
 
 
 class Warmth(NamedTuple):

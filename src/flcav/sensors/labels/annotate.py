@@ -28,7 +28,7 @@ class Sweep(NamedTuple):
     visible: NDArray[np.int64]  # (A,) rays that return from each, detected or not
 
 
-class Sight(NamedTuple):
+class InstanceImage(NamedTuple):
     """The instance image of one colour or thermal camera, and its pose."""
 
     lens: Lens
@@ -43,7 +43,7 @@ def annotate(
     *,
     within: NDArray[np.bool_],
     sweeps: Mapping[str, Sweep],
-    sights: Mapping[str, Sight],
+    sights: Mapping[str, InstanceImage],
     echoes: Mapping[str, NDArray[np.int64]],
 ) -> tuple[Annotations, NDArray[np.int64]]:
     """Return the annotations of M actors, and their indices (M,) in the trace.

@@ -30,22 +30,22 @@ from flcav.world.materials import (
 )
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
-from flcav.world.static import Part, build_static_world
+from flcav.world.static import TownPart, build_static_world
 
 _OF_PART = {
-    Part.GROUND: "terrain",
-    Part.ROAD: "road",
-    Part.SIDEWALK: "sidewalk",
-    Part.BUILDING: "building",
-    Part.TREE: "vegetation",
-    Part.CLUTTER: "static",
-    Part.LAMP: "pole",
-    Part.POST: "pole",
-    Part.MAST: "pole",
-    Part.SIGN: "traffic_sign",
-    Part.SIGNAL: "traffic_light",
-    Part.POLE: "pole",
-    Part.DECK: "road",
+    TownPart.GROUND: "terrain",
+    TownPart.ROAD: "road",
+    TownPart.SIDEWALK: "sidewalk",
+    TownPart.BUILDING: "building",
+    TownPart.TREE: "vegetation",
+    TownPart.CLUTTER: "static",
+    TownPart.LAMP: "pole",
+    TownPart.POST: "pole",
+    TownPart.MAST: "pole",
+    TownPart.SIGN: "traffic_sign",
+    TownPart.SIGNAL: "traffic_light",
+    TownPart.POLE: "pole",
+    TownPart.DECK: "road",
 }
 _RIDER = (Material.SKIN, Material.CLOTH, Material.TROUSERS)
 
@@ -94,8 +94,8 @@ def _appearance(scene: Scene) -> Appearance:
     rows, actors = len(surfaces.material), len(world.part)
     semantic = np.zeros(rows, np.uint8)
     part, part_row, thing = np.zeros(rows, np.uint8), np.zeros(rows, np.int32), np.zeros(rows, np.int32)
-    numbers = np.array([SEMANTICS[_OF_PART[Part(value)]] for value in range(len(Part))], np.uint8)
-    leafy = (world.part == Part.CLUTTER) & (world.mesh.material == Material.LEAF)
+    numbers = np.array([SEMANTICS[_OF_PART[TownPart(value)]] for value in range(len(TownPart))], np.uint8)
+    leafy = (world.part == TownPart.CLUTTER) & (world.mesh.material == Material.LEAF)
     semantic[:actors] = np.where(leafy, SEMANTICS["vegetation"], numbers[world.part])
     part[:actors], part_row[:actors] = world.part, world.row
     thing[:actors] = -(scene.things.face + 1)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from flcav.geometry import heading_vectors, inverse, transform_points
 from flcav.machine.compiled import compiled
 from flcav.sensors.lens import Lens, project
-from flcav.sensors.rendering.light import DARK, Light
+from flcav.sensors.rendering.light import DARK, Illumination
 from flcav.sensors.rendering.state import AMBER, GREEN, RED, LampState, lamp_places
 from flcav.world.materials import Material
 from flcav.world.meshes.furniture import LENS_PITCH_M, SIGNAL_LENSES
@@ -30,7 +30,7 @@ def add_glare(
     image: NDArray[np.float32],
     scene: Scene,
     state: LampState,
-    light: Light,
+    light: Illumination,
     world_from_camera: NDArray[np.float64],
     lens: Lens,
     hidden: int | None,
@@ -65,7 +65,7 @@ def add_glare(
 def add_sun_glare(
     image: NDArray[np.float32],
     scene: Scene,
-    light: Light,
+    light: Illumination,
     world_from_camera: NDArray[np.float64],
     lens: Lens,
     hidden: int | None,
@@ -94,7 +94,7 @@ def add_sun_glare(
 
 
 def _glowing(
-    scene: Scene, state: LampState, light: Light, eye: NDArray[np.float64], hidden: int | None
+    scene: Scene, state: LampState, light: Illumination, eye: NDArray[np.float64], hidden: int | None
 ) -> list[Glowing]:
     trace, out = scene.trace, []
     for actor in np.flatnonzero((state.head[1:] > 0) | (state.tail[1:] > 0)):

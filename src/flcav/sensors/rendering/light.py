@@ -57,7 +57,7 @@ DARK = 1e-3  # irradiance of the sun below which it casts no shadow
 SAME = 0.04  # relative difference of distance up to which two pixels lie on one surface
 
 
-class Light(NamedTuple):
+class Illumination(NamedTuple):
     """The light of the sun and the sky, and the air, under one weather."""
 
     to_sun: Colour  # unit, world
@@ -75,7 +75,7 @@ class Light(NamedTuple):
     lamps: np.float32  # 0 off, 1 on
 
 
-def compute_light(weather: Weather) -> Light:
+def compute_light(weather: Weather) -> Illumination:
     """Return the sun, sky and air of `weather`: tables by the sun's elevation, changed by clouds, fog and rain."""
     elevation, azimuth = np.radians(weather.sun_elevation_deg), np.radians(weather.sun_azimuth_deg)
     level = np.cos(elevation)
@@ -101,7 +101,7 @@ def compute_light(weather: Weather) -> Light:
     sky = 0.55 * sky + 0.45 * sky.mean()  # houses and ground reflect light of the sky, which makes it less blue
     bounce = 0.16 * (sun * max(to_sun[2], 0.0) + sky)
     ambient = float((0.5 * sun * max(to_sun[2], 0.15) + 0.6 * zenith + 0.4 * horizon).mean())
-    return Light(
+    return Illumination(
         to_sun=_three(to_sun),
         sun=_three(sun),
         zenith=_three(zenith),
@@ -140,7 +140,7 @@ def compute_lamplight(scene: Scene, seen: GBuffer, lamps: Lamps, hidden: int | N
     return light
 
 
-def compute_sun_visibility(scene: Scene, seen: GBuffer, light: Light, hidden: int | None) -> NDArray[np.float32]:
+def compute_sun_visibility(scene: Scene, seen: GBuffer, light: Illumination, hidden: int | None) -> NDArray[np.float32]:
     """Return for each hit (N,) 0 where it is in the sun's shadow, else 1; also 1 where it faces away from the sun."""
     far = np.empty(len(seen), np.float32)
     _facing(seen, light.to_sun, max(light.sun) > DARK, far)

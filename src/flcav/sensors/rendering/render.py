@@ -15,7 +15,7 @@ from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion
 from flcav.sensors.rendering.appearance import Appearance, build_appearance
 from flcav.sensors.rendering.gbuffer import GBuffer, fill_gbuffer
 from flcav.sensors.rendering.glare import add_glare, add_sun_glare
-from flcav.sensors.rendering.light import Light, compute_lamplight, compute_light, compute_sun_visibility, soften
+from flcav.sensors.rendering.light import Illumination, compute_lamplight, compute_light, compute_sun_visibility, soften
 from flcav.sensors.rendering.state import Lamps, LampState, collect_lamps, compute_lamp_state, no_lamps
 from flcav.sensors.rendering.surface import shade
 from flcav.world.rays.hits import Hits
@@ -28,7 +28,7 @@ MIRRORS = 0.2  # wetness above which roads reflect
 NO_LAMPS = np.zeros((0, 3), np.float32)
 
 
-class Picture(NamedTuple):
+class RadianceImage(NamedTuple):
     """An image as radiance, with its exposure, G-buffer and appearance tables."""
 
     radiance: NDArray[np.float32]  # (N, 3) of each pixel, row after row
@@ -41,7 +41,7 @@ class Picture(NamedTuple):
 class _World(NamedTuple):
     scene: Scene
     appearance: Appearance
-    light: Light
+    light: Illumination
     state: LampState
     lamps: Lamps
     pixel_angle: np.float32
@@ -56,7 +56,7 @@ def render(
     rng: np.random.Generator,
     *,
     hidden: int | None,
-) -> Picture:
+) -> RadianceImage:
     """Return the radiance of every pixel of `lens` at the scene's instant: see `camera.photograph`.
 
     `world_from_camera` (4, 4) is the pose of the optical frame, `hidden` the actor left out (the carrier); `rng` draws
@@ -86,7 +86,7 @@ def render(
     if state.head.any() or light.lamps > 0:
         add_glare(image, scene, state, light, world_from_camera, lens, hidden)
     add_sun_glare(image, scene, light, world_from_camera, lens, hidden)
-    return Picture(radiance, light.exposure, seen, painted, appearance)
+    return RadianceImage(radiance, light.exposure, seen, painted, appearance)
 
 
 def _meet(

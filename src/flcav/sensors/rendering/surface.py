@@ -14,14 +14,14 @@ from flcav.sensors.rendering.signs import sample_sign
 from flcav.sensors.rendering.sky import compute_environment, compute_sky
 from flcav.sensors.rendering.state import AMBER, GREEN, RED
 from flcav.world.materials import Material
-from flcav.world.static import Part
+from flcav.world.static import TownPart
 
 GROUND, ROAD, SIDEWALK, WALL, ROOF = (int(Material[name]) for name in ("GROUND", "ROAD", "SIDEWALK", "WALL", "ROOF"))
 BARK, LEAF, SIGN, HEADLAMP, TAILLAMP, PLATE, LAMP = (
     int(Material[name]) for name in ("BARK", "LEAF", "SIGN", "HEADLAMP", "TAILLAMP", "PLATE", "LAMP")
 )
 LENS_RED, LENS_GREEN = int(Material.LENS_RED), int(Material.LENS_GREEN)
-BUILDING, CLUTTER = int(Part.BUILDING), int(Part.CLUTTER)
+BUILDING, CLUTTER = int(TownPart.BUILDING), int(TownPart.CLUTTER)
 
 LENS_RADIANCE = 2.2  # of a lit signal lens
 LOW_SUN = 0.4  # sine of the sun's elevation below which dry roads have a sheen towards the sun

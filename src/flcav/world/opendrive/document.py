@@ -16,7 +16,7 @@ OPEN_ROADS = ("rural", "motorway", "highway")  # types of roads outside towns
 
 
 @dataclass(frozen=True)
-class Road:
+class RoadType:
     """Type and speed limit of one road of the map."""
 
     kind: str  # of the first <type>: town, rural, motorway, ...; "unknown" where there is none
@@ -47,7 +47,7 @@ class Document:
 
     geo_reference: str  # a PROJ string or an EPSG code; empty where there is none
     offset: MapOffset  # NaN where the map writes no number
-    roads: dict[str, Road]  # by the road's id
+    roads: dict[str, RoadType]  # by the road's id
     stops: frozenset[str]  # ids of the junctions with a stop sign
     left_hand: bool  # whether most of its roads have left-hand traffic
 
@@ -102,18 +102,18 @@ def _offset(row: ElementTree.Element | None) -> MapOffset:
         return MapOffset(math.nan)
 
 
-def _road(row: ElementTree.Element) -> Road:
+def _road(row: ElementTree.Element) -> RoadType:
     limits = [limit for signal in row.iterfind("signals/signal") if (limit := read_limit(signal)) is not None]
     signed = limits[0] if limits else None
     first = row.find("type")
     if first is None:
-        return Road("unknown", signed)
+        return RoadType("unknown", signed)
     limit = first.find("speed")
     try:
         speed = float(limit.get("max", "")) * TO_METRES_PER_SECOND[limit.get("unit", "m/s")] if limit is not None else 0
     except (ValueError, KeyError):
         speed = 0.0  # "no limit", "undefined"
-    return Road(first.get("type", "unknown"), speed if 0 < speed <= FASTEST else signed)
+    return RoadType(first.get("type", "unknown"), speed if 0 < speed <= FASTEST else signed)
 
 
 def _stops(row: ElementTree.Element) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from flcav.config import InputError
 from flcav.world.map.roads import RoadNet, read_net
-from flcav.world.opendrive.document import OPEN_ROADS, Document, Road
+from flcav.world.opendrive.document import OPEN_ROADS, Document, RoadType
 
 FAR_M = 5000.0  # a map that reaches farther than this from its origin is moved there
 SIDEWALK_M = 2.0  # width of an added sidewalk
@@ -103,7 +103,7 @@ def _write_widths(rows: list[ElementTree.Element], net: RoadNet) -> None:
             ElementTree.SubElement(row, "lane", {**lane, "index": str(i), "width": f"{exact:.2f}"})
 
 
-def _road(edge: str, document: Document) -> Road:
+def _road(edge: str, document: Document) -> RoadType:
     """Return the road of an edge, which netconvert names by the road's id with a sign before and a section behind.
 
     A road that ends where it begins is cut: "1#0", "1#1".
@@ -111,10 +111,10 @@ def _road(edge: str, document: Document) -> Road:
     name = edge.removeprefix("-").partition("#")[0]
     while name not in document.roads and "." in name:
         name = name.rpartition(".")[0]
-    return document.roads.get(name, Road("unknown", None))
+    return document.roads.get(name, RoadType("unknown", None))
 
 
-def _lanes(row: ElementTree.Element, road: Road, add_sidewalk: bool) -> list[_Lane]:
+def _lanes(row: ElementTree.Element, road: RoadType, add_sidewalk: bool) -> list[_Lane]:
     """Return the lanes of an edge in the town, from the kerb to the middle; those beyond the sidewalk are left out."""
     found = _plain_lanes(row)
     kinds = [_kind(lane) for lane in found]
@@ -156,7 +156,7 @@ def _kind(lane: dict[str, str]) -> str:
     return "shoulder" if closed else "driving"
 
 
-def _write_edge(row: ElementTree.Element, lanes: list[_Lane], road: Road) -> None:
+def _write_edge(row: ElementTree.Element, lanes: list[_Lane], road: RoadType) -> None:
     """Rewrite an edge in place: street type, priority, speed limit, and its lanes with their permissions."""
     old = _plain_lanes(row)
     driven = [lane.before for lane in lanes if lane.kind == "driving" and lane.before is not None]

@@ -109,7 +109,7 @@ def _park_in_spaces(parameters: TownParameters, random: np.random.Generator) -> 
             yield Parked(category, shape, space.x, space.y, float(wrap_angle(yaw)))
 
 
-class Follower(NamedTuple):
+class Successor(NamedTuple):
     """A vehicle that enters when another has left."""
 
     name: str
@@ -122,7 +122,7 @@ class Demand:
     """The road users of a run."""
 
     routes: str  # SUMO's route file (XML)
-    followers: dict[str, Follower]  # by the name of the vehicle before; none where all tours are long enough
+    followers: dict[str, Successor]  # by the name of the vehicle before; none where all tours are long enough
 
 
 def write_demand(
@@ -166,7 +166,7 @@ def write_demand(
         trips.append((depart, _vehicle(f"cav{i}", CAV_TYPE, depart, edges, entering=depart > 0)))
     categories = list(parameters.mix)
     shares = np.array([parameters.mix[category] for category in categories])
-    followers: dict[str, Follower] = {}
+    followers: dict[str, Successor] = {}
     for i in range(parameters.vehicles):
         random = stream(seed, "vehicle", i)
         kind = draw_type(categories[int(random.choice(len(categories), p=shares / shares.sum()))], parameters, random)
@@ -180,7 +180,7 @@ def write_demand(
         trips.append((depart, _vehicle(name, kind, depart, [driven[row].id for row in rows])))
         while (rest := rest - max(float(passages.time_s[rows].sum()), HEADWAY_S)) > 0:
             rows = passages.draw(traffic * passages.entries, random, least_s=0.0, most_s=rest)
-            followers[name] = Follower(
+            followers[name] = Successor(
                 f"veh{parameters.vehicles + len(followers)}", kind, [driven[row].id for row in rows]
             )
             name = followers[name].name

@@ -19,7 +19,7 @@ from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.importing import import_town
 from flcav.world.opendrive.streets import SIDEWALK_M
 from flcav.world.scene import Scene
-from flcav.world.static import DECK_M, ROOM_M, Part, build_static_world
+from flcav.world.static import DECK_M, ROOM_M, TownPart, build_static_world
 from flcav.world.trace import Trace
 from flcav.world.traffic.bridges import find_footing
 from flcav.world.traffic.traffic import simulate
@@ -157,7 +157,7 @@ def test_rays_meet_the_deck_from_above_and_from_below(town: Town, trace: Trace) 
     assert 20.0 - fall == pytest.approx(top, abs=0.05) or fall < 20.0 - top  # or what drives there
     assert 2.5 + rise == pytest.approx(top - DECK_M[1], abs=0.05)
     world = build_static_world(town)
-    assert set(world.mesh.material[world.part == Part.DECK]) == {Material.ROAD, Material.WALL}
+    assert set(world.mesh.material[world.part == TownPart.DECK]) == {Material.ROAD, Material.WALL}
 
 
 def test_a_low_deck_is_thinner(town: Town) -> None:
@@ -167,7 +167,7 @@ def test_a_low_deck_is_thinner(town: Town) -> None:
         low = replace(town, relief=Relief(town.relief.points, [Deck(sections)]))
         world = build_static_world(low)
         under = world.mesh.vertices[
-            world.mesh.faces[(world.part == Part.DECK) & (world.mesh.material == Material.WALL)]
+            world.mesh.faces[(world.part == TownPart.DECK) & (world.mesh.material == Material.WALL)]
         ]
         middle = under[np.abs(under[..., 1]) < 0.3]
         assert middle[:, 2].min() == pytest.approx(RISE * HALF_M - lowered - thickness, abs=0.05)

@@ -21,7 +21,7 @@ from flcav.world.opendrive.importing import ImportedTown, import_town
 from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map
 from flcav.world.opendrive.objects.signs import find_signs
-from flcav.world.static import Part, build_static_world
+from flcav.world.static import TownPart, build_static_world
 from flcav.world.traffic.demand import draw_tour
 from flcav.world.traffic.reach import find_driven, find_walked
 from flcav.world.traffic.traffic import simulate
@@ -420,5 +420,5 @@ def test_signs_and_poles_of_the_map_stand_where_it_says(tmp_path: Path) -> None:
     np.testing.assert_allclose(town.signs.position[stop], (30.0, -5.0, 2.3), atol=1e-3)  # the road begins at (10, 0)
     np.testing.assert_allclose(np.cos(town.signs.yaw[[stop, 1 - stop]]), (1, -1), atol=1e-6)
     np.testing.assert_allclose(town.posts, ((20, 6, 3), (30, 7, 3), (40, 8, 3)), atol=1e-3)
-    poles = build_static_world(town).part == Part.POLE
+    poles = build_static_world(town).part == TownPart.POLE
     assert poles.any()

@@ -22,8 +22,9 @@ from flcav.dataset.checks.frames import LONGEST_SPIN_S
 from flcav.dataset.formats.reading import (
     FARTHEST,
     AgentNames,
+    ImportFormat,
+    LogPicture,
     LogSource,
-    Picture,
     annotate,
     check_sizes,
     choose_split,
@@ -93,13 +94,13 @@ class Argoverse2Source(LogSource):
     """The logs of a folder of Argoverse 2's sensor dataset: one log, a folder of logs, or folders of SPLITS of them."""
 
     FORMAT = "argoverse2"
-    _beams = BEAMS
-    _range_m = RANGE_M
+    beams = BEAMS
+    range_m = RANGE_M
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where there is no log in `folder`, none of `split`, or a file of a log is missing."""
-        self._folder, self._split = folder, split
-        self._folders = found = _find_logs(folder)
+        self.folder, self.split = folder, split
+        self.folders = found = _find_logs(folder)
         names = AgentNames()
         self._logs = {
             scene: _open_log(found[scene], names)
@@ -112,8 +113,8 @@ class Argoverse2Source(LogSource):
             *((f"no sweep at {lost} annotated times, so no frames there",) if lost else ()),
             *((f"no picture within {LATE_NS // 10**6} ms of a sweep, of cameras with others: {dark}",) if dark else ()),
         )
-        self._labelled = not bare
-        self._split_of = {scene: log.split for scene, log in self._logs.items()}
+        self.labelled = not bare
+        self.split_of = {scene: log.split for scene, log in self._logs.items()}
 
     def frame_count(self, scene: str) -> int:
         """Return the number of sweeps of a log."""
@@ -138,7 +139,7 @@ class Argoverse2Source(LogSource):
             taken = {name: t for name in seen if (t := _nearest(cameras[name], sweep)) is not None}
             then = {name: poses.at(t) for name, t in taken.items()}
             pictures = {
-                name: Picture(
+                name: LogPicture(
                     log.folder / "sensors" / "cameras" / name / f"{t}.jpg", lenses[name], then[name] @ mounts[name]
                 )
                 for name, t in taken.items()
@@ -169,6 +170,9 @@ class Argoverse2Source(LogSource):
                 agent_at_trigger={name: city_from_then @ EGO_FROM_AGENT for name, city_from_then in then.items()},
                 files=files,
             )
+
+
+IMPORT = ImportFormat(Argoverse2Source, ("sensors/lidar", "*/sensors/lidar", "*/*/sensors/lidar"))
 
 
 class Poses:

@@ -4,7 +4,7 @@ Geiger et al., "Are we ready for autonomous driving?", CVPR 2012, and the benchm
 """
 
 from flcav.dataset.formats.kitti.files import (
-    Calibration,
+    KittiCalibration,
     KittiFolder,
     KittiFrame,
     Objects,
@@ -14,7 +14,7 @@ from flcav.dataset.formats.kitti.files import (
 )
 
 __all__ = [
-    "Calibration",
+    "KittiCalibration",
     "KittiFolder",
     "KittiFrame",
     "Objects",

@@ -33,7 +33,7 @@ MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
 
 
 @dataclass(frozen=True)
-class Calibration:
+class KittiCalibration:
     """Extrinsics and projection of the left colour camera (camera 2)."""
 
     camera_from_lidar: NDArray[np.float64]  # (4, 4), rectified camera frame
@@ -69,7 +69,7 @@ def _refuse_points(data: bytes, path: Path) -> Never:
     raise InputError(f"{path}: no point cloud by its numbers; wanted are {LAYOUT}: {POINT}")
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: Path) -> KittiCalibration:
     """Return the calibration of a frame from its file; raises `InputError` for a missing, malformed or singular matrix.
 
     Needs the matrices in MATRICES.
@@ -86,7 +86,7 @@ def read_calibration(path: Path) -> Calibration:
     rectified, camera = np.eye(4), np.eye(4)
     rectified[:3, :3] = matrices["R0_rect"]
     camera[:3] = matrices["Tr_velo_to_cam"]
-    return Calibration(camera_from_lidar=rectified @ camera, image_from_camera=matrices["P2"])
+    return KittiCalibration(camera_from_lidar=rectified @ camera, image_from_camera=matrices["P2"])
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Objects:
         return cls(Boxes.empty(), np.zeros(0), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 4)))
 
 
-def read_objects(path: Path, calibration: Calibration) -> Objects:
+def read_objects(path: Path, calibration: KittiCalibration) -> Objects:
     """Return the labelled objects of a frame from its label file.
 
     Boxes are upright in the LiDAR frame: the tilt of about a degree between camera and LiDAR is neglected in their
@@ -162,7 +162,7 @@ class KittiFrame:
 
     name: str  # "000008"
     points: NDArray[np.float32]  # (N, 4) x, y, z [m], reflectance; LiDAR frame
-    calibration: Calibration
+    calibration: KittiCalibration
     objects: Objects
     image: NDArray[np.uint8]  # (H, W, 3) red, green, blue; (0, 0, 3) where there is none
     size: tuple[int, int]  # height, width of the image [px]; `ASSUMED_SIZE` where there is none

@@ -18,6 +18,7 @@ from flcav.config import InputError
 from flcav.dataset.formats.kitti.files import (
     PICTURES,
     SUFFIXES,
+    KittiCalibration,
     Objects,
     check_objects,
     read_calibration,
@@ -25,10 +26,10 @@ from flcav.dataset.formats.kitti.files import (
     read_points,
     read_split,
 )
-from flcav.dataset.formats.kitti.files import Calibration as KittiCalibration
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import (
     AgentNames,
+    ImportFormat,
     LogSource,
     annotate,
     assign_split,
@@ -55,7 +56,7 @@ FOLDERS = ("training", "testing")
 LISTS = ("train", "val", "test")
 
 
-class Shot(NamedTuple):
+class KittiShot(NamedTuple):
     """A frame of the benchmark, and where it belongs in a dataset."""
 
     folder: Path  # "training" or "testing"
@@ -75,15 +76,15 @@ class KittiSource(LogSource):
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where `folder` has no frames, none of `split`, or a file of a frame is missing."""
-        self._folder, self._split = folder, split
+        self.folder, self.split = folder, split
         shots = _find_shots(folder)
         split_of: dict[str, str | None] = {}
         for shot in shots:
             assign_split(split_of, shot.scene, shot.split, folder)
         chosen = set(choose_split(folder, split_of, split))
-        self._split_of = {scene: own for scene, own in split_of.items() if scene in chosen}
-        self._shots: dict[str, list[Shot]] = defaultdict(list)
-        self._agent: dict[Shot, str] = {}
+        self.split_of = {scene: own for scene, own in split_of.items() if scene in chosen}
+        self._shots: dict[str, list[KittiShot]] = defaultdict(list)
+        self._agent: dict[KittiShot, str] = {}
         self._calibration: dict[str, Calibration] = {}
         every = [shot for shot in shots if shot.scene in chosen]
         _check_complete(every)
@@ -96,9 +97,9 @@ class KittiSource(LogSource):
             agent = self._agent[shot] = names.of(shot.vehicle, text)
             self._calibration.setdefault(agent, mounted)
         if not any(shot.exported for shot in every):
-            self._beams, self._range_m = BEAMS, RANGE_M
+            self.beams, self.range_m = BEAMS, RANGE_M
         bare = sum(not _path(shot, "label_2").is_file() for shot in every)
-        self._labelled = not bare
+        self.labelled = not bare
         self.notes = (f"no label_2 of {bare} of {plural(len(every), 'frame')}, so no boxes there",) if bare else ()
         if blind := sum(not _path(shot, CAMERA).is_file() for shot in every):
             self.notes += (f"no {CAMERA} of {blind} of {plural(len(every), 'frame')}, so LiDAR alone there",)
@@ -114,6 +115,9 @@ class KittiSource(LogSource):
             yield _read_frame(shot, agent, self._calibration[agent])
 
 
+IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne"))
+
+
 def _calibrate(calibrated: KittiCalibration) -> Calibration:
     agent_from_lidar, projection = pose(0.0, 0.0, HEIGHT_M), calibrated.image_from_camera
     shifted = np.eye(4)  # the projection's fourth column as a translation
@@ -125,7 +129,7 @@ def _calibrate(calibrated: KittiCalibration) -> Calibration:
     )
 
 
-def _read_frame(shot: Shot, agent: str, calibration: Calibration) -> LinkedFrame:
+def _read_frame(shot: KittiShot, agent: str, calibration: Calibration) -> LinkedFrame:
     pictures = {CAMERA: path} if (path := _path(shot, CAMERA)).is_file() else {}
     files = {LIDAR: _path(shot, "velodyne"), **pictures}
     points, calibrated = read_points(files[LIDAR]), read_calibration(_path(shot, "calib"))
@@ -161,7 +165,7 @@ def _read_frame(shot: Shot, agent: str, calibration: Calibration) -> LinkedFrame
     )
 
 
-def _find_shots(folder: Path) -> list[Shot]:
+def _find_shots(folder: Path) -> list[KittiShot]:
     """Return the frames of `training` and `testing` in the order of their numbers, in folders with a point cloud.
 
     A frame is one that is listed, or that any of its files is there of.
@@ -181,13 +185,13 @@ def _find_shots(folder: Path) -> list[Shot]:
         for number in sorted(numbers) if found["velodyne"] else ():
             split = listed.get((part, number), "test" if part == "testing" else None)
             where = origin.get(number, (f"kitti-{part}-{number}", 0, "ego", 0.0))
-            shots.append(Shot(folder / part, number, split, *where, number in origin))
+            shots.append(KittiShot(folder / part, number, split, *where, number in origin))
     if not shots:
         raise InputError(f"{folder}: no KITTI folder; it holds no 'training/velodyne' with point clouds")
     return shots
 
 
-def _check_complete(shots: list[Shot]) -> None:
+def _check_complete(shots: list[KittiShot]) -> None:
     """Raise `InputError` where a file of a frame is missing: images may be, and all labels of a folder."""
     labelled = {shot.folder for shot in shots if _path(shot, "label_2").is_file()}
     for shot in shots:
@@ -215,5 +219,5 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
     return found
 
 
-def _path(shot: Shot, part: str) -> Path:
+def _path(shot: KittiShot, part: str) -> Path:
     return shot.folder / part / f"{shot.number}.{SUFFIXES[part]}"

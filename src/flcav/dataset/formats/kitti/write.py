@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from flcav.dataset.formats.exporter import (
     SPLITS,
     Exported,
+    ExportFormat,
     ExportOptions,
     LeftOut,
     check_rectified,
@@ -49,7 +50,7 @@ FRAMES = "frames.csv"  # maps each number to a frame of the dataset
 
 
 def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write `dataset` as `training` and `ImageSets`, a dataset recorded for testing as `testing`: see `Exporter`.
+    """Write `dataset` as `training` and `ImageSets`, a dataset recorded for testing as `testing`: see `ExportFormat`.
 
     Frames without a LiDAR or a level camera that looks ahead are left out.
     """
@@ -80,6 +81,9 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
     with (out / FRAMES).open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([("number", "split", "frame", "agent", "time_s", "camera"), *rows])
     return exported
+
+
+EXPORT = ExportFormat(export_kitti, ("validation", "min_points", "calibration"))
 
 
 def _write_frame(

@@ -11,14 +11,14 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
 from flcav.config import Json
-from flcav.dataset.formats.exporter import Exported, ExportOptions, read_frame
+from flcav.dataset.formats.exporter import Exported, ExportFormat, ExportOptions, read_frame
 from flcav.dataset.formats.mcap.messages import JsonMessage, make_messages
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report
 
 
 def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write `<scene>.mcap` for each scene of `dataset`: see `Exporter`."""
+    """Write `<scene>.mcap` for each scene of `dataset`: see `ExportFormat`."""
     counts: Counter[str] = Counter(files=0, messages=0, objects=0)
     done = 0
     for scene in dict.fromkeys(key.scene for key in dataset.keys):
@@ -35,6 +35,9 @@ def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: R
             log.writer.finish()
         counts["files"] += 1
     return Exported(counts)
+
+
+EXPORT = ExportFormat(export_mcap, ("calibration",))
 
 
 class _Log:

@@ -1,5 +1,4 @@
-"""Export to nuScenes' tables and files, as nuscenes-devkit reads them. Caesar et al., "nuScenes", CVPR 2020."""
+"""nuScenes' tables and files, as nuscenes-devkit reads them: written (`write`) and read (`read`).
 
-from flcav.dataset.formats.nuscenes.write import export_nuscenes
-
-__all__ = ["export_nuscenes"]
+Caesar et al., "nuScenes", CVPR 2020.
+"""

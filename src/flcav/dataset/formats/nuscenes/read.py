@@ -21,8 +21,9 @@ from flcav.dataset.formats.nuscenes.tables import VERSION
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
     AgentNames,
+    ImportFormat,
+    LogPicture,
     LogSource,
-    Picture,
     annotate,
     assign_split,
     check_sizes,
@@ -82,7 +83,7 @@ class NuscenesSource(LogSource):
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where tables are missing or malformed, or there is nothing of `split`."""
-        self._folder, self._split = folder, split
+        self.folder, self.split = folder, split
         self._tables = _find_tables(folder)
         self._root = self._tables.parent
         table = {name: read_table(self._tables, name) for name in SMALL}
@@ -106,12 +107,12 @@ class NuscenesSource(LogSource):
         self._spins, split_of = self._order(table["scene"], table["log"], table["sample"])
         if first_lost is not None and not self._spins:
             raise InputError(f"{first_lost}: no such file, nor is that of any other sweep of {TOP}")
-        self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
+        self.split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._read_notes(table)
         if self._tables.name in VERSIONS:
-            self._beams, self._range_m = BEAMS, RANGE_M
-        self._labelled = bool(self._notes)
-        self.notes = () if self._labelled else ("no annotations in its tables, so no boxes",)
+            self.beams, self.range_m = BEAMS, RANGE_M
+        self.labelled = bool(self._notes)
+        self.notes = () if self.labelled else ("no annotations in its tables, so no boxes",)
         if lost := sum(map(len, self._lost.values())):
             whole = sum(TOP not in own for own in self._lost.values())
             self.notes += (
@@ -250,7 +251,7 @@ class NuscenesSource(LogSource):
         own = self._notes[spin.sample]
         boxes = self._boxes[own]
         pictures = {
-            name: Picture(
+            name: LogPicture(
                 path[name],
                 pinhole(calibration.intrinsics[name], *self._pixels(data[name]), self._tables / MOUNTED),
                 poses[name] @ mounts[name],
@@ -280,6 +281,9 @@ class NuscenesSource(LogSource):
             agent_at_trigger={name: then for name, then in poses.items() if not np.array_equal(then, poses[TOP])},
             files=files,
         )
+
+
+IMPORT = ImportFormat(NuscenesSource, ("v1.0-*/sample.json", "sample.json", "samples/LIDAR_TOP"))
 
 
 def _find_tables(folder: Path) -> Path:

@@ -12,7 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import Exported, ExportOptions, missing_data_error, read_frame, split_scenes
+from flcav.dataset.formats.exporter import (
+    Exported,
+    ExportFormat,
+    ExportOptions,
+    missing_data_error,
+    read_frame,
+    split_scenes,
+)
 from flcav.dataset.formats.mounts import agent_velocities
 from flcav.dataset.formats.nuscenes.drive import Drive
 from flcav.dataset.formats.nuscenes.files import RESOLUTION_M, map_mask
@@ -30,7 +37,7 @@ UNKNOWN_MARGIN_M = 120.0  # margin of the map around the agents where the town i
 
 
 def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write one nuScenes scene for each agent and scene of `dataset`: see `Exporter`."""
+    """Write one nuScenes scene for each agent and scene of `dataset`: see `ExportFormat`."""
     split_of = split_scenes(dataset, options)
     tables = constant_rows()
     global_from_world = _write_map(dataset, out / MAP)
@@ -72,6 +79,9 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
         path.write_text(json.dumps(rows, indent=0, allow_nan=False), encoding="utf-8")
     (out / "sweeps").mkdir()
     return exported
+
+
+EXPORT = ExportFormat(export_nuscenes, ("validation", "calibration"))
 
 
 def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:

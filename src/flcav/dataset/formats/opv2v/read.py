@@ -22,8 +22,9 @@ from flcav.dataset.formats.opv2v.write import FOLDERS, KMH, from_carla
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
     AgentNames,
+    ImportFormat,
+    LogPicture,
     LogSource,
-    Picture,
     annotate,
     check_cloud,
     check_sizes,
@@ -52,7 +53,7 @@ DIGITS = 9  # of mounts, which are computed of poses
 PROTOCOL = "data_protocol.yaml"
 
 
-class Shot(NamedTuple):
+class Opv2vShot(NamedTuple):
     """A frame of an agent: the files without their ending, and where it belongs in a dataset."""
 
     stem: Path
@@ -68,16 +69,16 @@ class Opv2vSource(LogSource):
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
         """Raises `InputError` where there is no scenario, none of `split`, or a file of a frame is missing."""
-        self._folder, self._split = folder, split
-        self._folders = found = _find_scenarios(folder)
+        self.folder, self.split = folder, split
+        self.folders = found = _find_scenarios(folder)
         split_of = {scene: _split_of(path) for scene, path in found.items()}
-        self._split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
+        self.split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._calibration: dict[str, Calibration] = {}
         self._track: dict[str, dict[str, str]] = {}
         names = AgentNames()
         self._blind: set[str] = set()  # agents with a camera of which there is no picture
         self._frames = self._lost = self._unseen = 0  # frames in the folder, without a file, without a picture
-        self._shots = {scene: self._open(scene, found[scene], names) for scene in self._split_of}
+        self._shots = {scene: self._open(scene, found[scene], names) for scene in self.split_of}
         blind, agents, frames = len(self._blind), len(self._calibration), plural(self._frames, "frame")
         if not agents:
             raise InputError(f"{folder}: none of {frames} has both a YAML file and a point cloud")
@@ -88,7 +89,7 @@ class Opv2vSource(LogSource):
         }
         self.notes = tuple(note for note, count in told.items() if count)
 
-    def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Shot]:
+    def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Opv2vShot]:
         known = self._track[scene] = _read_names(folder / PROTOCOL)
         found = {path: self._list_stamps(path) for path in sorted(folder.iterdir()) if path.is_dir()}
         rank = {stamp: number for number, stamp in enumerate(sorted({s for own, _ in found.values() for s in own}))}
@@ -103,7 +104,7 @@ class Opv2vSource(LogSource):
                 self._calibration.setdefault(agent, calibration)
                 if not cameras.keys() <= pictured:
                     self._blind.add(agent)
-                shots += [Shot(path / stamp, agent, int(stamp), rank[stamp] * PERIOD_S) for stamp in own]
+                shots += [Opv2vShot(path / stamp, agent, int(stamp), rank[stamp] * PERIOD_S) for stamp in own]
         return sorted(shots, key=lambda shot: (shot.spin, shot.agent))
 
     def _list_stamps(self, folder: Path) -> tuple[list[str], set[str]]:
@@ -133,7 +134,7 @@ class Opv2vSource(LogSource):
         for shot in self._shots[scene]:
             yield self._frame(scene, shot)
 
-    def _frame(self, scene: str, shot: Shot) -> LinkedFrame:
+    def _frame(self, scene: str, shot: Opv2vShot) -> LinkedFrame:
         calibration, about = self._calibration[shot.agent], read_about(shot.stem)
         mounts = calibration.agent_from_sensor
         world_from_lidar = from_carla(about["lidar_pose"])
@@ -144,7 +145,7 @@ class Opv2vSource(LogSource):
         files = {name: file for name in mounts if name in about and (file := _picture(shot.stem, name)) is not None}
         placed = {name: from_carla(about[name]["cords"]) @ BODY_FROM_OPTICAL for name in files}
         pictures = {
-            name: Picture(
+            name: LogPicture(
                 file,
                 pinhole(calibration.intrinsics[name], *measure_picture(file), shot.stem.with_suffix(".yaml")),
                 placed[name],
@@ -172,6 +173,9 @@ class Opv2vSource(LogSource):
             agent_at_trigger={name: world @ inverse(mounts[name]) for name, world in placed.items()},
             files=files,
         )
+
+
+IMPORT = ImportFormat(Opv2vSource, ("data_protocol.yaml", "*/data_protocol.yaml", "*/*/data_protocol.yaml"))
 
 
 def _read_points(stem: Path) -> NDArray[np.float32]:

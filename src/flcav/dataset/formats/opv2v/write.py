@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flcav.dataset.formats.exporter import (
     Exported,
+    ExportFormat,
     ExportOptions,
     LeftOut,
     check_rectified,
@@ -50,7 +51,7 @@ KMH = 3.6
 FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built without libyaml has only the slow one
 
 
-class Vehicle(TypedDict):
+class Opv2vVehicle(TypedDict):
     """A vehicle in OPV2V's file of a frame."""
 
     angle: list[float]  # roll, yaw, pitch [degrees]
@@ -61,7 +62,7 @@ class Vehicle(TypedDict):
 
 
 def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write one scenario for each scene of `dataset`: see `Exporter`.
+    """Write one scenario for each scene of `dataset`: see `ExportFormat`.
 
     Spins that not every agent of a scene has are left out.
     """
@@ -97,6 +98,9 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
         (folder / "data_protocol.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False), encoding="utf-8")
         counts["scenarios"] += 1
     return exported
+
+
+EXPORT = ExportFormat(export_opv2v, ("validation", "min_points", "calibration"))
 
 
 def _shared_spins(dataset: Dataset, scene: str) -> set[int]:
@@ -152,7 +156,7 @@ def from_carla(values: Sequence[float]) -> Array:
     return MIRROR @ matrix @ MIRROR
 
 
-def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed_m_s: float) -> set[str]:
+def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], speed_m_s: float) -> set[str]:
     """Write the files of a frame; return the sensors whose measurements they hold."""
     lidar, points = next(iter(frame.lidar.items()))
     folder.mkdir(parents=True, exist_ok=True)
@@ -184,7 +188,9 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Vehicle], speed
     return {lidar, *cameras}
 
 
-def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> tuple[dict[int, Vehicle], Counter[LeftOut]]:
+def _vehicles(
+    frame: Frame, numbers: dict[str, int], min_points: int
+) -> tuple[dict[int, Opv2vVehicle], Counter[LeftOut]]:
     """Return number -> OPV2V's box of each vehicle with at least `min_points` points of the first LiDAR in its box.
 
     Other actors are counted by reason.
@@ -192,7 +198,7 @@ def _vehicles(frame: Frame, numbers: dict[str, int], min_points: int) -> tuple[d
     truth, boxes = frame.annotations, frame.annotations.boxes
     few = count_points_in_boxes(frame, *next(iter(frame.lidar.items()))) < min_points
     labelled, left_out = select_objects("OPV2V", boxes.label, VEHICLES, {lacks_points(min_points): few})
-    vehicles: dict[int, Vehicle] = {}
+    vehicles: dict[int, Opv2vVehicle] = {}
     for i in np.flatnonzero(labelled):
         tall = boxes.size[i, 2]
         placed = boxes.pose(int(i))

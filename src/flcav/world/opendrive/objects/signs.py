@@ -23,7 +23,7 @@ PAINTED = (crosswalks.MARKING, stop_lines.MARKING)  # types of signals that are 
 
 
 @dataclass(frozen=True)
-class Signs:
+class MappedSigns:
     """The signs that a map describes, and how many were left out, by the reason."""
 
     found: tuple[SignParameters, ...]
@@ -39,7 +39,7 @@ class Posts:
     left: Counter[str]
 
 
-def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> Signs:
+def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> MappedSigns:
     """Return the stop, give-way and speed-limit signs of a map, in town coordinates: map + `offset_m` [m].
 
     A sign faces the traffic that it is for, by its orientation. Left out are signs of other types, limits that say no
@@ -74,7 +74,7 @@ def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> Sign
                     height_m=round(up, 2) if PLATE_M[0] <= up <= PLATE_M[1] else SIGN_HEIGHT_M,
                 )
             )
-    return Signs(tuple(found), left, limits)
+    return MappedSigns(tuple(found), left, limits)
 
 
 def find_posts(root: ElementTree.Element, offset_m: tuple[float, float]) -> Posts:

@@ -1,0 +1,45 @@
+"""Registry of the dataset formats: `EXPORTS` and `IMPORTS` list those of the package, a user's own is `module:NAME`."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from flcav.plugins import load_named
+
+if TYPE_CHECKING:
+    from flcav.dataset.formats.exporter import ExportFormat
+    from flcav.dataset.formats.reading import ImportFormat
+
+EXPORTS: Mapping[str, str] = {  # name -> module:NAME, so that listing the formats imports none
+    "kitti": "flcav.dataset.formats.kitti.write:EXPORT",
+    "yolo": "flcav.dataset.formats.yolo:EXPORT",
+    "coco": "flcav.dataset.formats.coco:EXPORT",
+    "nuscenes": "flcav.dataset.formats.nuscenes.write:EXPORT",
+    "opv2v": "flcav.dataset.formats.opv2v.write:EXPORT",
+    "mcap": "flcav.dataset.formats.mcap.write:EXPORT",
+}
+IMPORTS: Mapping[str, str] = {
+    "kitti": "flcav.dataset.formats.kitti.read:IMPORT",
+    "nuscenes": "flcav.dataset.formats.nuscenes.read:IMPORT",
+    "argoverse2": "flcav.dataset.formats.argoverse2.read:IMPORT",
+    "opv2v": "flcav.dataset.formats.opv2v.read:IMPORT",
+}
+
+
+def export_format(name: str) -> "ExportFormat":
+    """Return the format of that name to write: one of `EXPORTS`, or a user's own as `module:NAME`.
+
+    Raises `InputError` for an unknown name, and if the user's module is missing or has no format of that name.
+    """
+    from flcav.dataset.formats.exporter import ExportFormat
+
+    return load_named("export format", name, EXPORTS, ExportFormat)
+
+
+def import_format(name: str) -> "ImportFormat":
+    """Return the format of that name to read: one of `IMPORTS`, or a user's own as `module:NAME`.
+
+    Raises `InputError` for an unknown name, and if the user's module is missing or has no format of that name.
+    """
+    from flcav.dataset.formats.reading import ImportFormat
+
+    return load_named("import format", name, IMPORTS, ImportFormat)
