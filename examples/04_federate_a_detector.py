@@ -6,36 +6,26 @@ They learn from ground truth here, to keep it short; the demo's vehicles have no
 import sys
 from pathlib import Path
 
-import torch
-
-from flcav.config import parse_config
-from flcav.dataset.recording.recorder import record
-from flcav.dataset.store import Dataset
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
-from flcav.network.ledger import Budget, Ledger
-from flcav.perception.client import TaskClient
-from flcav.perception.objects.model import second_tiny
-from flcav.perception.objects.samples import sample_from_frame
-from flcav.perception.objects.task import OBJECTS
-from flcav.perception.weights import from_arrays, save_network, to_arrays
-from flcav.sources.embedded import EmbeddedSource
-from flcav.sources.recipe import Recipe
+from flcav import Dataset, Ledger, Recipe, federate, record, task_named
+from flcav.federation import Account, Schedule
+from flcav.network import Budget
+from flcav.perception import TaskClient, build_network, from_arrays, save_network, to_arrays
 
 RECIPE = {"town": "grid", "seed": 3, "cavs": 2, "warmup_s": 40.0, "spins_per_scene": 2, "every_s": 2.0}
 SCHEDULE = Schedule(rounds=2, steps=2, learning_rate=1e-3, final_learning_rate=2e-4, seed=1)
 VEHICLES = ("cav0", "cav1")
+OBJECTS = task_named("objects")
+TINY = OBJECTS.configurations["tiny"]
 
 
 def main(out: Path) -> None:
-    record(EmbeddedSource(parse_config(Recipe, RECIPE, "this example")), out / "data")
+    record(Recipe.model_validate(RECIPE), out / "data")
     data = Dataset.open(out / "data")
-    torch.manual_seed(0)
-    network = second_tiny()
-    clients = {}
-    for vehicle in VEHICLES:
-        frames = (data.frame(i) for i in data.select(agents=[vehicle]))
-        clients[vehicle] = TaskClient(OBJECTS, network.config, [sample_from_frame(f, network.config) for f in frames])
+    network = build_network(OBJECTS, TINY, seed=0)
+    clients = {
+        vehicle: TaskClient(OBJECTS, TINY, OBJECTS.samples(data, TINY, data.select(agents=[vehicle])))
+        for vehicle in VEHICLES
+    }
 
     ledger = Ledger(Budget(wireless_mb=6.0, wireline_mb=0.0))
     account = Account(ledger, stage="edge", task="objects", link="wireless")

@@ -6,25 +6,15 @@ q-fair federated learning (Li et al., ICLR 2020).
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from flcav.dataset.recording.recorder import record
-from flcav.dataset.store import Dataset
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.strategies.fedavg import FedAvg, average
-from flcav.federation.trainable import Update, Weights
-from flcav.network.ledger import Budget, Ledger
-from flcav.perception.client import TaskClient
-from flcav.perception.task import build_network
-from flcav.perception.weather.config import LeNetConfig
-from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import from_arrays, to_arrays
-from flcav.sources.embedded import EmbeddedSource
-from flcav.sources.recipe import Recipe
+from flcav import Dataset, Recipe, federate, record, task_named
+from flcav.federation import FedAvg, Schedule, Update, Weights, average
+from flcav.perception import TaskClient, build_network, from_arrays, to_arrays
 
-CONFIG = LeNetConfig(classes=("clear", "fog", "night"))
+WEATHER = task_named("weather")
+CONFIG = replace(next(iter(WEATHER.configurations.values())), classes=("clear", "fog", "night"))
 RIG = {"cameras": {"front": {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 160, "height": 96}}}}
 SKY = {"classes": CONFIG.classes * 2, "turn_s": 2.0}
 RECIPE = {"town": "grid", "cavs": 3, "spins_per_scene": 6, "every_s": 2.0, "vehicle_rig": RIG, "weather": SKY}
@@ -40,7 +30,7 @@ class LossWeighted:
 
 
 def main(out: Path) -> None:
-    record(EmbeddedSource(Recipe.model_validate(RECIPE)), out)
+    record(Recipe.model_validate(RECIPE), out)
     data, clients = Dataset.open(out), {}
     for vehicle, weathers in (("cav0", ("clear", "fog")), ("cav1", ("night",))):
         samples = WEATHER.samples(data, CONFIG, data.select(agents=[vehicle]))
@@ -48,8 +38,7 @@ def main(out: Path) -> None:
         clients[vehicle] = TaskClient(WEATHER, CONFIG, seen)
     for strategy in (FedAvg(), LossWeighted()):
         network = build_network(WEATHER, CONFIG, seed=1)
-        account = Account(Ledger(Budget(wireless_mb=10.0, wireline_mb=0.0)), "edge", WEATHER.name, "wireless")
-        update = federate(clients, to_arrays(network), SCHEDULE, account, strategy=strategy)
+        update = federate(clients, to_arrays(network), SCHEDULE, strategy=strategy)
         from_arrays(network, update.weights)
         recall = WEATHER.evaluate(network, data, data.select(agents=["cav2"])).recall
         print(f"{strategy}: a third vehicle's pictures, recall", ", ".join(f"{k} {v:.2f}" for k, v in recall.items()))

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from flcav.federation.selection import Selection
     from flcav.federation.state import FederationState, RoundRecord
     from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy, strategy_named
-    from flcav.federation.trainable import LocalUpdate, Trainable, Update
+    from flcav.federation.strategies.fedavg import average
+    from flcav.federation.trainable import LocalUpdate, Trainable, Update, Weights
     from flcav.federation.upload import Upload
 
 PLACES = {
@@ -31,10 +32,12 @@ PLACES = {
     "STRATEGIES": "flcav.federation.strategies",
     "FedAvg": "flcav.federation.strategies",
     "Strategy": "flcav.federation.strategies",
+    "average": "flcav.federation.strategies.fedavg",
     "strategy_named": "flcav.federation.strategies",
     "LocalUpdate": "flcav.federation.trainable",
     "Trainable": "flcav.federation.trainable",
     "Update": "flcav.federation.trainable",
+    "Weights": "flcav.federation.trainable",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, PLACES)
