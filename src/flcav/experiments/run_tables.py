@@ -11,7 +11,7 @@ from flcav.network.ledger import LINKS
 from flcav.pipeline.analysis.costs import list_home_costs
 from flcav.pipeline.analysis.findings import findings, name_stage
 from flcav.pipeline.arms import resolve_settings
-from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
+from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Finding
@@ -45,9 +45,8 @@ def tables(run: Run) -> dict[str, str]:
 
 def judge_anew(run: Run) -> tuple[Finding, ...]:
     """Return the findings of a run's results by the present rules; those that it was saved with may be older."""
-    labels = {task: choose_labels(task, own.labels) for task, own in run.recipe.tasks.items()}
-    settings = resolve_settings(run.recipe, labels)
-    caveats = {task: LABEL_SOURCES[kind].caveat for task, kind in labels.items()}
+    settings = resolve_settings(run.recipe)
+    caveats = {task: LABEL_SOURCES[kind].caveat for task, kind in settings[MAIN].labels.items()}
     return findings(run.differences, run.tested, run.arms, settings, run.recipe, caveats)
 
 

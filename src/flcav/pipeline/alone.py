@@ -15,7 +15,7 @@ from flcav.interface.progress import DAMAGED
 from flcav.pipeline.arms import check_federations
 from flcav.pipeline.engine import Notify, Stale, Step, print_steps, run_steps
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
 from flcav.pipeline.results.saved import WEIGHTS, Saved

@@ -17,7 +17,7 @@ from flcav.perception.distillation import Imitates
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.label_sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.recipe import (
     CENTRAL,
     CLOUD,
@@ -85,11 +85,14 @@ class Setting:
         return self.federation.model_copy(update={name: Federation.model_fields[name].default for name in of_cloud})
 
 
-def resolve_settings(recipe: RunRecipe, labels: Mapping[str, str]) -> dict[str, Setting]:
-    """Return the settings of the run itself and of its arms by name, the run first; `labels`: the run's, by task.
+def resolve_settings(recipe: RunRecipe, labels: Mapping[str, str] | None = None) -> dict[str, Setting]:
+    """Return the settings of the run itself and of its arms by name, the run first.
 
-    After them come those of every arm's retrainings, by `name_repeat`.
+    After them come those of every arm's retrainings, by `name_repeat`. `labels`: the run's kinds of labels by task;
+    None: those of the recipe, or each task's first. Raises `InputError` for labels that a task does not have.
     """
+    if labels is None:
+        labels = {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()}
     arms = {MAIN: Arm(), **recipe.arms}
     return {
         name_repeat(name, repeat): _setting(recipe, labels, name_repeat(name, repeat), repeat, arm)
@@ -340,3 +343,8 @@ class Names:
         if task is not None:
             values["labels"] = setting.labels[task]
         return list(values.values())
+
+
+def name_steps(recipe: RunRecipe) -> Names:
+    """Return the names of a recipe's steps, whose folders lie in the folder `work` of its run."""
+    return Names(resolve_settings(recipe))

@@ -13,9 +13,9 @@ from flcav.perception.objects.truth import FrameTruth
 from flcav.pipeline.analysis.caveats import PLACED_BARE, list_caveats
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.label_sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.labels import pseudo_labels
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold, select_frames_near
-from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.plan import exchanges
 from flcav.pipeline.plan.exchanges import Held, Sensors, measure_labels
 from flcav.pipeline.recipe import RunRecipe

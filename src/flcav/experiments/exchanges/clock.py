@@ -14,9 +14,8 @@ from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
 from flcav.network.clock.work import ClientWork, work_of_messages
 from flcav.network.ledger import LedgerEntry
 from flcav.network.radio.links import RadioLinks
-from flcav.pipeline.arms import Names, resolve_settings
+from flcav.pipeline.arms import name_steps
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.radio.driving import link_scenes
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, RunRecipe
 from flcav.pipeline.results.plans import Placed
@@ -27,9 +26,7 @@ def link_regions(recipe: RunRecipe, task: str, work: Path, rounds: int) -> dict[
 
     `work`: the folder of the run's steps. Raises `InputError` as `link_scenes`.
     """
-    names = Names(
-        resolve_settings(recipe, {name: choose_labels(name, own.labels) for name, own in recipe.tasks.items()})
-    )
+    names = name_steps(recipe)
     found = {}
     for region in recipe.with_role("federate"):
         split = Frames.open(work / names.recording(region, EDGE, task))

@@ -44,10 +44,8 @@ from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import Outcomes
 from flcav.perception.weights import load_network
-from flcav.pipeline.arms import Names, resolve_settings
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.pseudo_labels import select_frames_near
-from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.poles import find_sites, read_traces
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
@@ -77,9 +75,7 @@ class _Folders:
 
     @classmethod
     def open(cls, run: Run, work: Path, region: str) -> "_Folders":
-        recipe = run.recipe
-        labels = {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()}
-        names = Names(resolve_settings(recipe, labels))
+        names = run.steps
         test, registry, edge = (
             Frames.open(work / names.recording(region, split, TASK)) for split in ("test", "registry", EDGE)
         )

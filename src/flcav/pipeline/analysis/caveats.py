@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 from flcav.fusion.detector import TRAINED_IN
 from flcav.pipeline.arms import Setting
-from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MORE_EDGE, RunRecipe
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.training import StageResult, diverges

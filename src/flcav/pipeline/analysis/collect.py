@@ -17,7 +17,7 @@ from flcav.pipeline.analysis.differences import (
 from flcav.pipeline.analysis.findings import findings
 from flcav.pipeline.analysis.histories import gaps_closed
 from flcav.pipeline.arms import Setting, name_repeat
-from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results.plans import Placed, Plan

@@ -22,7 +22,7 @@ from flcav.pipeline.results.run import ArmCost, ArmResult, Run
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import HomeCost, Test
 from flcav.pipeline.steps.graph import Graph
-from flcav.statistics.estimates import Estimate
+from flcav.statistics.estimates import Estimate, average_estimates
 from flcav.statistics.seeds import mean_over_seeds
 
 
@@ -55,7 +55,7 @@ def _row(name: str, arm: ArmResult, task: str, tests: Sequence[Test], before: fl
         stage: max((each.rounds for each in arm.stages if (each.task, each.stage) == (task, stage)), default=0)
         for stage in (EDGE, CLOUD)
     }
-    after = _mean_of([test.estimate for test in tests])
+    after = average_estimates([test.estimate for test in tests])
     gain, uplink_mb = after.mean - before, sum(sent.values())
     return ArmCost(
         arm=name,
@@ -73,20 +73,6 @@ def _row(name: str, arm: ArmResult, task: str, tests: Sequence[Test], before: fl
         gain=gain,
         gain_per_mb=gain / uplink_mb if uplink_mb else None,
     )
-
-
-def _mean_of(regions: Sequence[Estimate]) -> Estimate:
-    """Return the mean over regions, whose test scenes are independent; its interval by their half widths."""
-    mean = float(np.mean([each.mean for each in regions]))
-    ends = [
-        (each.mean - each.low, each.high - each.mean)
-        for each in regions
-        if each.low is not None and each.high is not None
-    ]
-    if len(ends) < len(regions):
-        return Estimate(mean, None, None)
-    below, above = np.sqrt(np.square(ends).sum(axis=0)) / len(regions)
-    return Estimate(mean, mean - float(below), mean + float(above))
 
 
 def collect_home_costs(graph: Graph, work: Path) -> tuple[HomeCost, ...]:

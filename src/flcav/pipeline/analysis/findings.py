@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from flcav.pipeline.arms import Setting
-from flcav.pipeline.labels.sources import LABEL_SOURCES
+from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, ELSEWHERE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference, Finding, Test

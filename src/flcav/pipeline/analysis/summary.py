@@ -7,7 +7,6 @@ from pathlib import Path
 from flcav.pipeline.analysis.differences import mean_of_tests
 from flcav.pipeline.analysis.findings import ask, judge_asked, name_stage
 from flcav.pipeline.arms import resolve_settings
-from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.recipe import MAIN
 from flcav.pipeline.results.run import Mean, Run, Summary
 from flcav.pipeline.results.tests import Difference, Test
@@ -30,7 +29,7 @@ def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
         for rows in zip(*(run.differences for run in runs), strict=True)
     ]
     recipe = runs[0].recipe
-    settings = resolve_settings(recipe, {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()})
+    settings = resolve_settings(recipe)
     own = [number for number, each in enumerate(runs[0].differences) if each.arm == MAIN]
     asked = [ask(runs[0].differences[number], recipe, settings) for number in own]
     judged = judge_asked(asked, [differences[number].estimate for number in own])

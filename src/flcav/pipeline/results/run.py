@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
+from flcav.pipeline.arms import Names, name_steps
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
 from flcav.pipeline.results.plans import Placed, Plan
@@ -99,6 +100,11 @@ class Run(Saved):
     elapsed_s: float = 0.0  # wall time of all starts together
     costs: Annotated[tuple[ArmCost, ...] | None, LEFT_OUT] = None  # of each arm and task
     home: Annotated[tuple[HomeCost, ...] | None, LEFT_OUT] = None  # of further measures than the tasks' own
+
+    @property
+    def steps(self) -> Names:
+        """Return the names of the run's steps, whose folders, in its folder `work`, hold all artefacts."""
+        return name_steps(self.recipe)
 
     def test(self, *, stage: str, region: str, task: str, arm: str = "main") -> Tested:
         """Return the result of a test; raises `KeyError` for one that was not made."""

@@ -18,8 +18,8 @@ from flcav.perception.weights import save_network
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold
-from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CENTRAL, PRETRAIN, Budgets, Role
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS

@@ -25,8 +25,8 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import Setting, find_strategies
 from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.labels.road_average import RoadAverageLabels
-from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.plan.updates import follow_plan
 from flcav.pipeline.radio.driving import DrivenRounds
 from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation

@@ -12,7 +12,7 @@ from flcav.perception.client import check_network
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import count_training_frames
-from flcav.pipeline.labels.sources import LABEL_SOURCES, choose_labels
+from flcav.pipeline.label_sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, Region, RunRecipe, SplitName, find_path
 from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.steps.settings import LearningSettings, RegionInputs
@@ -30,8 +30,7 @@ class Outline:
         self.recipe, self.beside = recipe, beside.absolute()
         for task, own in recipe.tasks.items():
             check_network(task_named(task), own.network)
-        labels = {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()}
-        self.settings = resolve_settings(recipe, labels)
+        self.settings = resolve_settings(recipe)
         for setting in self.settings.values():
             for task, kind in setting.labels.items():
                 choose_labels(task, kind)

@@ -16,10 +16,10 @@ from flcav.perception.objects.distillation.loss import DistillationTerms, Distil
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.labels.pseudo_labels import annotated_samples, pseudo_label_samples, select_frames_near
 from flcav.pipeline.labels.quality import measure_labels, read_history
 from flcav.pipeline.labels.road_average import RoadAverageLabels
-from flcav.pipeline.labels.sources import LABEL_SOURCES
 from flcav.pipeline.poles import find_sites
 from flcav.pipeline.radio.driving import CLOCK, DrivenRounds, Fleet, drive_rounds, link_scenes
 from flcav.pipeline.results.plans import Placed

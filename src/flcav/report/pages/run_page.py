@@ -17,9 +17,8 @@ from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.analysis.caveats import PLACED_BARE
 from flcav.pipeline.analysis.costs import list_arm_costs, list_home_costs
 from flcav.pipeline.analysis.findings import WORDS
-from flcav.pipeline.arms import Names, resolve_settings
+from flcav.pipeline.arms import Names
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels.sources import choose_labels
 from flcav.pipeline.radio.driving import CLOCK
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.plans import Placed
@@ -159,7 +158,7 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
     drawn["megabytes"] = figures.megabytes(_sent(run), {link: use.budget_mb for link, use in main.links.items()})
     if costs := [each for each in _list_costs(run) if each.gain_per_mb is not None]:
         drawn["gain"] = figures.gains({task: _list_gains(costs, task) for task in {each.task: None for each in costs}})
-    sweep = _sweep(work, _names(run), run) if (work / LOOK).is_dir() else None
+    sweep = _sweep(work, run.steps, run) if (work / LOOK).is_dir() else None
     if sweep is not None:
         drawn["before_after"] = figures.before_after(sweep)
         if scenes:
@@ -169,7 +168,7 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
 
 def _timelines(run: Run, work: Path) -> dict[str, Figure]:
     """Return the first rounds of stage II of each arm on a network, by `_list_timelines`."""
-    task, names, drawn = next(iter(run.recipe.tasks)), _names(run), {}
+    task, names, drawn = next(iter(run.recipe.tasks)), run.steps, {}
     for name, (arm, region) in _list_timelines(run).items():
         path = work / names.edge(arm, region, task) / f"{CLOCK}-{region}.parquet"
         records = load_rounds(path)[:SHOWN_ROUNDS] if path.exists() else ()
@@ -180,7 +179,7 @@ def _timelines(run: Run, work: Path) -> dict[str, Figure]:
 
 def _list_timelines(run: Run) -> dict[str, tuple[str, str]]:
     """Return arm and region of each federation of the first task, by the name of its picture; shared ones once."""
-    task, names, listed = next(iter(run.recipe.tasks)), _names(run), {}
+    task, names, listed = next(iter(run.recipe.tasks)), run.steps, {}
     for arm, result in run.arms.items():
         for stage in result.stages:
             if stage.stage == EDGE and stage.region:
@@ -193,14 +192,9 @@ def _file_name(task: str) -> str:
     return task.replace(":", "_")
 
 
-def _names(run: Run) -> Names:
-    labels = {task: choose_labels(task, own.labels) for task, own in run.recipe.tasks.items()}
-    return Names(resolve_settings(run.recipe, labels))
-
-
 def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
     """Return a region's errors and poles; None where its town, its poles or the tasks of the placement are missing."""
-    names, tasks = _names(run), run.recipe.placement.tasks
+    names, tasks = run.steps, run.recipe.placement.tasks
     if not tasks:
         return None
     drive = Frames.open(work / names.recording(placed.region, "registry", tasks[0])).data
