@@ -22,7 +22,7 @@ from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Update, Weights
 from flcav.machine.threads import use_threads
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.client import TaskClient
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import sample_from_frame
@@ -98,7 +98,7 @@ def spent(pids: list[int]) -> float:
 
 def compare(name: str, work: Work, rounds: int) -> None:
     """Time `rounds` rounds of each way in turns, and print medians and ratios."""
-    account = Account(Ledger(Budget(1e6, 1e6)), "edge", name, "wireless")
+    account = Account(Ledger(LinkMegabytes(1e6, 1e6)), "edge", name, "wireless")
     context, clients, weights = get_context("spawn"), work.clients, work.weights
     with ClientProcesses(clients, 2) as several, ProcessPoolExecutor(2, context, hold, (work,)) as pool:
         ways: dict[str, Callable[[], object]] = {

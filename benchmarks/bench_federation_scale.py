@@ -18,7 +18,7 @@ import numpy as np
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.task import build_network
 from flcav.perception.weather.config import LeNetConfig
 from flcav.perception.weather.task import WEATHER
@@ -54,7 +54,7 @@ class Fleet(Mapping[str, Trainable]):
 
 def measure(vehicles: int) -> None:
     weights = to_arrays(build_network(WEATHER, LeNetConfig(), 0))
-    account = Account(Ledger(Budget(1e6, 1e6)), "edge", "weather", "wireless")
+    account = Account(Ledger(LinkMegabytes(1e6, 1e6)), "edge", "weather", "wireless")
     start = time.process_time()
     federate(Fleet(vehicles), weights, Schedule(1, 1, 1e-3, 1e-3, 0), account)
     spent = time.process_time() - start

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flcav import Dataset, Ledger, Recipe, federate, record, task_named
 from flcav.federation import Account, Schedule
-from flcav.network import Budget
+from flcav.network import LinkMegabytes
 from flcav.perception import TaskClient, build_network, from_arrays, save_network, to_arrays
 
 RECIPE = {"town": "grid", "seed": 3, "cavs": 2, "warmup_s": 40.0, "spins_per_scene": 2, "every_s": 2.0}
@@ -27,7 +27,7 @@ def main(out: Path) -> None:
         for vehicle in VEHICLES
     }
 
-    ledger = Ledger(Budget(wireless_mb=6.0, wireline_mb=0.0))
+    ledger = Ledger(LinkMegabytes(wireless_mb=6.0, wireline_mb=0.0))
     account = Account(ledger, stage="edge", task="objects", link="wireless")
     result = federate(
         clients,

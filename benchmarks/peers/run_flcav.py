@@ -15,7 +15,7 @@ from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 
 @lru_cache
@@ -60,7 +60,7 @@ def main(rounds: int, processes: int) -> None:
             users,
             weights,
             Schedule(rounds, 5, RATE, RATE, 0),
-            Account(Ledger(Budget(1e6, 1e6)), "edge", "peers", "wireless"),
+            Account(Ledger(LinkMegabytes(1e6, 1e6)), "edge", "peers", "wireless"),
             rules=Rules(selection=Selection(rule="round-robin", clients=COHORT)),
             on_round=lambda round_, after, loss: turns.wait([*after.values()]),
             runtime=runtime,

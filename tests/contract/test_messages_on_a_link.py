@@ -28,7 +28,7 @@ from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes
 from flcav.network import messages
-from flcav.network.ledger import Budget, BudgetExceeded, Ledger
+from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.perception.errors import MISS, PerceptionError, Registry
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
@@ -123,7 +123,7 @@ def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
 def test_the_ledger_has_what_a_socket_carried_in_every_stage(wire: Wire, tmp_path: Path) -> None:
     record(Drives(spins=2), tmp_path / "data")
     data, config = Dataset.open(tmp_path / "data"), find_configuration(OBJECTS, "tiny")
-    split, book = Frames(data, tuple(range(len(data))), {}), Ledger(Budget(100.0, 100.0))
+    split, book = Frames(data, tuple(range(len(data))), {}), Ledger(LinkMegabytes(100.0, 100.0))
 
     received = upload_samples(book, OBJECTS, config, "suburb", split, [0, 3])
     assert all(
@@ -188,7 +188,7 @@ def test_the_ledger_has_what_a_socket_carried_by_every_rule(wire: Wire, rules: d
 
 def federate_twice(strategy: Strategy, rules: Rules) -> Ledger:
     """Return the ledger of two edge rounds of five vehicles, and of two cloud rounds with five regions."""
-    book, start = Ledger(Budget(100.0, 100.0)), {"w": np.zeros(300, np.float32), "v": np.zeros(30, np.float32)}
+    book, start = Ledger(LinkMegabytes(100.0, 100.0)), {"w": np.zeros(300, np.float32), "v": np.zeros(30, np.float32)}
     schedule, vehicles = Schedule(2, 1, 0.1, 0.1, 3), {f"grid/cav{i}": Walk() for i in range(5)}
     how: Any = {"strategy": strategy, "rules": rules}
     federate(vehicles, start, schedule, Account(book, "edge", "objects", "wireless"), **how)
@@ -203,10 +203,12 @@ def federate_twice(strategy: Strategy, rules: Rules) -> Ledger:
 def test_an_update_over_the_budget_is_not_sent(wire: Wire) -> None:
     start, schedule = {"w": np.zeros(300, np.float32)}, Schedule(2, 1, 0.1, 0.1, 3)
     vehicles: dict[str, Trainable] = {f"grid/cav{i}": Walk() for i in range(3)}
-    free = Ledger(Budget(1.0, 1.0))
+    free = Ledger(LinkMegabytes(1.0, 1.0))
     federate(vehicles, start, replace(schedule, rounds=1), Account(free, "edge", "objects", "wireless"))
     wire.arrived.clear()
-    tight = Ledger(Budget(1.4 * free.used_mb("wireless"), 1.0))  # of the second round, for one more update of three
+    tight = Ledger(
+        LinkMegabytes(1.4 * free.used_mb("wireless"), 1.0)
+    )  # of the second round, for one more update of three
     with pytest.raises(BudgetExceeded, match=r"grid/cav1 wants .* for round 2"):
         federate(vehicles, start, schedule, Account(tight, "edge", "objects", "wireless"))
     assert sorted(entry.bytes for entry in tight.entries) == sorted(wire.arrived)

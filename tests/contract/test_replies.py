@@ -20,7 +20,7 @@ from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.median import Median
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 START = {"w": np.zeros((4, 3), np.float32), "g": np.zeros((64, 1), np.float32), "count": np.array(2)}
 SCHEDULE = Schedule(2, 1, 0.1, 0.1, 1)
@@ -73,7 +73,7 @@ def run(
 
     monkeypatch.setattr(links, "BudgetedGrid", link)
     clients, state = {f"cav{i}": Vehicle() for i in range(5)}, FederationState()
-    account = Account(Ledger(Budget(999.0, 0.0)), "edge", "toy", "wireless")
+    account = Account(Ledger(LinkMegabytes(999.0, 0.0)), "edge", "toy", "wireless")
     return federate(clients, START, SCHEDULE, account, rules=rules, state=state, strategy=strategy).weights, state
 
 

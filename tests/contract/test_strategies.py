@@ -23,7 +23,7 @@ from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Stateful
 from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.pipeline.engine import Step
 from flcav.pipeline.recipe import Federation, load_run_recipe
 from flcav.pipeline.steps.graph import Graph
@@ -89,7 +89,7 @@ def strategy(request: pytest.FixtureRequest) -> Strategy:
 
 
 def federated(strategy: Strategy, start: Weights = START, **how: Any) -> Weights:
-    account = Account(Ledger(Budget(1.0, 1.0)), "edge", "walk", "wireless")
+    account = Account(Ledger(LinkMegabytes(1.0, 1.0)), "edge", "walk", "wireless")
     return federate(CLIENTS, start, SCHEDULE, account, strategy=strategy, **how).weights
 
 
@@ -185,7 +185,7 @@ def test_a_client_that_fails_is_named_and_the_others_go_on(strategy):
             return replace(update, weights=moved)
 
     clients = {f"cav{i}": Failing(samples) for i, samples in enumerate((3, 40, 1, 17, 8, 9, 5, 6))}
-    account, state = Account(Ledger(Budget(1.0, 1.0)), "edge", "walk", "wireless"), FederationState()
+    account, state = Account(Ledger(LinkMegabytes(1.0, 1.0)), "edge", "walk", "wireless"), FederationState()
     rules = Rules(least_clients=5)
     result = federate(clients, START, SCHEDULE, account, strategy=strategy, rules=rules, state=state)
     usable = {name: client for name, client in clients.items() if client.samples not in (8, 9, 17)}
@@ -195,7 +195,7 @@ def test_a_client_that_fails_is_named_and_the_others_go_on(strategy):
         "cav4": "'layer.weight' has values that are not finite",
         "cav5": "'layer.weight' is float32 ",
     }
-    account = replace(account, ledger=Ledger(Budget(1.0, 1.0)))
+    account = replace(account, ledger=Ledger(LinkMegabytes(1.0, 1.0)))
     alone = federate(usable, START, SCHEDULE, account, strategy=strategy)
     if type(strategy).__name__ != "Scaffold":  # whose server counts all clients
         assert same(result.weights, alone.weights)

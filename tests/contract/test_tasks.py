@@ -24,7 +24,7 @@ from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import Trainable
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.card import CARD_KEY
 from flcav.perception.client import TaskClient, as_shared
 from flcav.perception.device import select_device
@@ -210,7 +210,7 @@ def test_two_clients_federate(task, samples):
     learned = samples[task.name]
     clients = {f"cav{i}": TaskClient(task, small(task), learned[i::2], batch=2) for i in range(2)}
     weights = to_arrays(build_network(task, small(task), 1))
-    ledger = Ledger(Budget(wireless_mb=100.0, wireline_mb=0.0))
+    ledger = Ledger(LinkMegabytes(wireless_mb=100.0, wireline_mb=0.0))
     schedule = Schedule(rounds=1, steps=1, learning_rate=1e-3, final_learning_rate=1e-3, seed=1)
     result = federate(clients, weights, schedule, Account(ledger, "edge", task.name, "wireless"))
     assert list(result.weights) == list(weights)

@@ -16,7 +16,7 @@ from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import Upload
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 pytest.importorskip("ray", reason="the extra 'ray' is not installed")
 pytestmark = pytest.mark.slow
@@ -57,7 +57,7 @@ CLIENTS = {f"cav{i}": Walker(stride) for i, stride in enumerate((3, 40, 1, 17, 8
     ids=["fedavg", "krum", "scaffold", "seeded noise", "secret noise"],
 )
 def test_the_weights_on_ray_are_those_of_the_embedded_runtime(strategy: Strategy, rules: Rules, stopped: int):
-    account, state = Account(Ledger(Budget(1.0, 1.0)), "edge", "walk", "wireless"), FederationState()
+    account, state = Account(Ledger(LinkMegabytes(1.0, 1.0)), "edge", "walk", "wireless"), FederationState()
     kept: dict[int, tuple[Weights, dict, list]] = {}
 
     def keep(number: int, weights: Weights, loss: float | None) -> None:
@@ -70,7 +70,7 @@ def test_the_weights_on_ray_are_those_of_the_embedded_runtime(strategy: Strategy
         start, clients, again.records = kept[stopped]
         again.server = clients.pop("")
         again.clients = clients
-    book = Account(Ledger(Budget(1.0, 1.0)), "edge", "walk", "wireless")
+    book = Account(Ledger(LinkMegabytes(1.0, 1.0)), "edge", "walk", "wireless")
     how = {"strategy": strategy, "rules": rules, "state": again, "done": stopped, "runtime": RaySimulation(2)}
     found = federate(CLIENTS, start, SCHEDULE, book, **how)
     np.testing.assert_allclose(found.weights["layer.weight"], whole.weights["layer.weight"], rtol=1e-6)

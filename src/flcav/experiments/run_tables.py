@@ -14,7 +14,7 @@ from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.tests import Finding
+from flcav.pipeline.results.tests import RunFinding
 from flcav.pipeline.spread import read_spreads, widen_anew
 from flcav.storage.markdown import format_bullets, format_table
 
@@ -43,7 +43,7 @@ def tables(run: Run) -> dict[str, str]:
     return own | {"spread": _spread(run)} if run.recipe.retrainings else own
 
 
-def judge_anew(run: Run) -> tuple[Finding, ...]:
+def judge_anew(run: Run) -> tuple[RunFinding, ...]:
     """Return the findings of a run's results by the present rules; those that it was saved with may be older."""
     settings = resolve_settings(run.recipe)
     caveats = {task: LABEL_SOURCES[kind].caveat for task, kind in settings[MAIN].labels.items()}

@@ -27,7 +27,7 @@ class SecureAggregation(Config):
 MOST_SAMPLES, LARGEST = 10**12, 1e12  # of any limit
 
 
-class Limits(Config):
+class ReplyLimits(Config):
     """Limits of one client's reply and of its training; beyond them the round goes on without the client.
 
     The defaults refuse what no vehicle can mean, so that sums stay finite; they are no defence against clients that lie
@@ -64,7 +64,7 @@ class Rules(Config):
     privacy: Privacy | None = None  # clipping and noise; default: none
     secure: SecureAggregation | None = None  # default: the server sees every update
     personal: Patterns | RegionalModels = ()  # what edge servers keep for their regions: arrays, as in `head.*`, or all
-    limits: Limits = Limits()  # of what is taken from a client
+    limits: ReplyLimits = ReplyLimits()  # of what is taken from a client
     least_clients: LeastClients = None  # whose updates a round needs; default: half of those asked whom no network lost
 
     def of_servers(self) -> "Rules":

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 from flcav.interface.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from flcav.network.clock.records import ClientTiming, RoundRecord, load_rounds, save_rounds
+    from flcav.network.clock.records import ClientTiming, RoundTiming, load_rounds, save_rounds
     from flcav.network.clock.rounds import NetworkSettings, RoundRules, simulate_rounds
     from flcav.network.clock.work import ClientWork, work_of_messages
-    from flcav.network.ledger import Budget, BudgetExceeded, Ledger, LedgerEntry
-    from flcav.network.plan import MessageSizes, Price, StagePlan, price
+    from flcav.network.ledger import BudgetExceeded, Ledger, LedgerEntry, LinkMegabytes
+    from flcav.network.plan import MessageSizes, StagePlan, price
     from flcav.network.radio.budget import Radio
     from flcav.network.radio.coverage import Coverage, cover_town
     from flcav.network.radio.links import RadioLinks, link_vehicles
@@ -17,12 +17,11 @@ if TYPE_CHECKING:
     from flcav.network.radio.wireline import Wireline
 
 PLACES = {
-    "Budget": "flcav.network.ledger",
+    "LinkMegabytes": "flcav.network.ledger",
     "BudgetExceeded": "flcav.network.ledger",
     "Ledger": "flcav.network.ledger",
     "LedgerEntry": "flcav.network.ledger",
     "MessageSizes": "flcav.network.plan",
-    "Price": "flcav.network.plan",
     "StagePlan": "flcav.network.plan",
     "price": "flcav.network.plan",
     "Radio": "flcav.network.radio.budget",
@@ -39,7 +38,7 @@ PLACES = {
     "RoundRules": "flcav.network.clock.rounds",
     "simulate_rounds": "flcav.network.clock.rounds",
     "ClientTiming": "flcav.network.clock.records",
-    "RoundRecord": "flcav.network.clock.records",
+    "RoundTiming": "flcav.network.clock.records",
     "load_rounds": "flcav.network.clock.records",
     "save_rounds": "flcav.network.clock.records",
 }

@@ -34,14 +34,14 @@ class BudgetExceeded(InputError):
 
 
 @dataclass(frozen=True)
-class Budget:
-    """Uplink budget of a run on each link [MB; 1 MB = 10^6 bytes]."""
+class LinkMegabytes:
+    """Megabytes on each uplink: a budget, a price, or what was sent [MB; 1 MB = 10^6 bytes]."""
 
-    wireless_mb: float
-    wireline_mb: float
+    wireless_mb: float  # from vehicles to edge servers
+    wireline_mb: float  # from edge servers to the cloud
 
     def bytes_on(self, link: Link) -> int:
-        """Return the budget of `link` in bytes."""
+        """Return the bytes on `link`."""
         return round((self.wireless_mb if link == "wireless" else self.wireline_mb) * BYTES_PER_MB)
 
 
@@ -73,8 +73,8 @@ class Ledger:
     """The ledger of one run: its uplink budget and the messages entered so far.
 
     >>> from flcav import Ledger
-    >>> from flcav.network import Budget, LedgerEntry
-    >>> ledger = Ledger(Budget(wireless_mb=2.0, wireline_mb=0.0))
+    >>> from flcav.network import LinkMegabytes, LedgerEntry
+    >>> ledger = Ledger(LinkMegabytes(wireless_mb=2.0, wireline_mb=0.0))
     >>> update = LedgerEntry("edge", "objects", "wireless", "up", round=1, client="grid/cav0", bytes=1_300_000)
     >>> ledger.enter(update)
     >>> ledger.left_mb("wireless")
@@ -84,7 +84,7 @@ class Ledger:
     flcav.network.ledger.BudgetExceeded: wireless uplink budget exceeded: ...
     """
 
-    def __init__(self, budget: Budget, entries: Iterable[LedgerEntry] = ()) -> None:
+    def __init__(self, budget: LinkMegabytes, entries: Iterable[LedgerEntry] = ()) -> None:
         """Enter `entries` in order; raises `BudgetExceeded` at the first that does not fit."""
         self.budget = budget
         self._entries: list[LedgerEntry] = []
@@ -162,7 +162,7 @@ class Ledger:
         """Return the ledger that `save` wrote to `path`; raises `InputError` where the file is missing or not one."""
         table = read_parquet(Path(path))
         try:
-            budget = Budget(**json.loads((table.schema.metadata or {})[b"budget"]))
+            budget = LinkMegabytes(**json.loads((table.schema.metadata or {})[b"budget"]))
             return cls(budget, (LedgerEntry(**row) for row in table.to_pylist()))
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise InputError(f"{path}: not a ledger ({error})") from None

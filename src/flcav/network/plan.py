@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from flcav.network.ledger import LinkMegabytes
+
 
 @dataclass(frozen=True)
 class MessageSizes:
@@ -32,15 +34,7 @@ class StagePlan:
     edge_rounds_per_cloud_round: int = 1  # k: stage III
 
 
-@dataclass(frozen=True)
-class Price:
-    """Uplink traffic on each link [MB]."""
-
-    wireless_mb: float
-    wireline_mb: float
-
-
-def price(plan: StagePlan, sizes: MessageSizes) -> Price:
+def price(plan: StagePlan, sizes: MessageSizes) -> LinkMegabytes:
     """Return the uplink traffic of `plan` on each link [MB].
 
     wireless = samples * sample + vehicles * ((edge_rounds + k * cloud_rounds) * exchange + labellings * labels);
@@ -52,15 +46,15 @@ def price(plan: StagePlan, sizes: MessageSizes) -> Price:
     >>> from flcav.network import MessageSizes
     >>> plan = StagePlan(samples=200, edge_rounds=6, cloud_rounds=3, edge_groups=(4, 3))
     >>> price(plan, MessageSizes(sample_mb=0.5, model_mb=1.0))
-    Price(wireless_mb=163.0, wireline_mb=106.0)
+    LinkMegabytes(wireless_mb=163.0, wireline_mb=106.0)
     >>> price(plan, MessageSizes(sample_mb=0.5, model_mb=1.0, exchange_mb=0.01, labels_mb=0.02))
-    Price(wireless_mb=101.61, wireline_mb=106.0)
+    LinkMegabytes(wireless_mb=101.61, wireline_mb=106.0)
     """
     wireless_rounds = plan.edge_rounds + plan.edge_rounds_per_cloud_round * plan.cloud_rounds
     labellings = plan.edge_rounds + (plan.cloud_rounds > 0)
     uploaded, vehicles = plan.samples * sizes.sample_mb, sum(plan.edge_groups)
     exchange_mb = sizes.model_mb if sizes.exchange_mb is None else sizes.exchange_mb
-    return Price(
+    return LinkMegabytes(
         wireless_mb=uploaded
         + wireless_rounds * vehicles * exchange_mb
         + labellings * vehicles * (sizes.labels_mb or 0.0),

@@ -179,10 +179,10 @@ def _members(curve: Curve) -> list[tuple[str, float]]:
 
 
 class Budgets(Quantities):
-    """Uplink budgets [MB]."""
+    """Uplink budgets [MB; 1 MB = 10^6 bytes]."""
 
-    wireless: Positive
-    wireline: Positive
+    wireless: Positive  # from vehicles to edge servers
+    wireline: Positive  # from edge servers to the cloud
 
 
 class Problem(Quantities):

@@ -19,13 +19,13 @@ from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
 from flcav.pipeline.results.saved import WEIGHTS, Saved
-from flcav.pipeline.results.training import PrivacySpent, Round, StageResult, Watched
+from flcav.pipeline.results.training import PrivacySpent, ScoredRound, StageResult, Watched
 from flcav.pipeline.rigs import tell_rigs
 from flcav.pipeline.steps.edge import EdgeSettings, edge_step
 from flcav.pipeline.steps.graph import Graph
 from flcav.pipeline.steps.settings import make_step
 from flcav.pipeline.training.checkpoints import LAST, LOSS, Checkpoint
-from flcav.pipeline.training.private_rounds import Training, compose_trainings
+from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings
 from flcav.pipeline.training.timing import TrainTimes, read_times, summarise_times
 from flcav.storage.files import atomic_path
 from flcav.storage.records import LEFT_OUT
@@ -35,7 +35,7 @@ FEDERATE = "federate"  # in the names of the steps
 
 
 @dataclass(frozen=True)
-class Federation:
+class RegionFederation:
     """The federation of a region's vehicles: its result, and the scores of its network after each round."""
 
     result: StageResult
@@ -49,7 +49,7 @@ class Federations(Saved):
 
     recipe: RunRecipe
     arm: str
-    federations: tuple[Federation, ...]
+    federations: tuple[RegionFederation, ...]
     provenance: Provenance
     privacy: Annotated[PrivacySpent | None, LEFT_OUT] = None  # all tasks together; None: no noise
 
@@ -94,7 +94,7 @@ def federate_regions(
     run_steps([*before, *alone.values()], out / WORK, jobs=1, notify=tell, stale=stale)
     found = tuple(_collect(graph, out, name, about[1]) for name, about in asked.items())
     trained = [each.result for each in found]
-    trainings = [Training(own.region or "", own.clients, own.rounds, own.noise) for own in trained]
+    trainings = [PrivateTraining(own.region or "", own.clients, own.rounds, own.noise) for own in trained]
     spent = compose_trainings(graph.settings[arm].federation, trainings)
     results = Federations(recipe, arm, found, provenance(recipe.seed), spent)
     results.save(out, name_results(arm))
@@ -153,7 +153,7 @@ def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapp
     return replace(scored, means=means)
 
 
-def _collect(graph: Graph, out: Path, step: str, region: str) -> Federation:
+def _collect(graph: Graph, out: Path, step: str, region: str) -> RegionFederation:
     """Return the results of a finished federation, and copy its weights beside them."""
     folder = out / WORK / step
     result = StageResult.load(folder)
@@ -163,10 +163,12 @@ def _collect(graph: Graph, out: Path, step: str, region: str) -> Federation:
         for name in graph.recipe.regions
     }
     watched = tuple(
-        Watched(EDGE, result.task, name, count, tuple(Round(i, each[name]) for i, each in enumerate(scores, start=1)))
+        Watched(
+            EDGE, result.task, name, count, tuple(ScoredRound(i, each[name]) for i, each in enumerate(scores, start=1))
+        )
         for name, count in frames.items()
     )
     weights = f"{step}.safetensors"
     with atomic_path(out / weights) as temporary:
         shutil.copyfile(folder / WEIGHTS, temporary)
-    return Federation(result, watched, weights)
+    return RegionFederation(result, watched, weights)

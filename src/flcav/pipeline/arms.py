@@ -27,7 +27,7 @@ from flcav.pipeline.recipe import (
     PRETRAIN,
     Arm,
     Federation,
-    Placement,
+    PlacementSettings,
     RunRecipe,
     Training,
 )
@@ -62,7 +62,7 @@ class Setting:
     name: str
     repeat: int  # 0: the arm itself; n: its n-th retraining
     plan: PlanRule
-    placement: Placement
+    placement: PlacementSettings
     labels: Mapping[str, str]  # kind of labels, by task
     distillation: Distillation  # where the labels are the road average
     federation: Federation
@@ -112,7 +112,7 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         name,
         repeat,
         arm.plan,
-        Placement.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
+        PlacementSettings.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
         dict(labels) | dict(arm.labels),
         Distillation.model_validate((recipe.distillation or Distillation()).model_dump() | dict(arm.distillation)),
         Federation.model_validate(recipe.federation.model_dump() | dict(arm.federation)),

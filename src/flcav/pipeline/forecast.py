@@ -33,7 +33,12 @@ from flcav.pipeline.steps.graph import Graph
 from flcav.pipeline.steps.planning import FirstPlanSettings, frame_plan
 from flcav.pipeline.tables import parse_history
 from flcav.pipeline.training.learning import make_clients
-from flcav.pipeline.training.private_rounds import Training, compose_trainings, find_budget_noise, plan_private_rounds
+from flcav.pipeline.training.private_rounds import (
+    PrivateTraining,
+    compose_trainings,
+    find_budget_noise,
+    plan_private_rounds,
+)
 from flcav.storage.records import LEFT_OUT, Record
 
 STEPS = 3  # that are timed
@@ -210,7 +215,7 @@ def _forecast_arm(
         sent = price(StagePlan(own.samples, edge, cloud, groups, k), _size_messages(settings, task, measured[task]))
         uplink_mb += (sent.wireless_mb, sent.wireline_mb)
     trainings = [
-        Training(region, graph.vehicles[region], own.edge_rounds + own.cloud_rounds * k, own.noise)
+        PrivateTraining(region, graph.vehicles[region], own.edge_rounds + own.cloud_rounds * k, own.noise)
         for repeat in range(1 + graph.recipe.retrainings)
         for own in plans[arm.name].values()
         for region in arm.regions

@@ -12,7 +12,7 @@ from flcav.optimization.placement.place import place
 from flcav.optimization.placement.solve import coverage
 from flcav.perception.errors import PerceptionError
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import Placement
+from flcav.pipeline.recipe import PlacementSettings
 from flcav.pipeline.results.plans import Placed, Pole
 from flcav.statistics.streams import stream
 from flcav.world.map.census import measure_traffic_density
@@ -39,7 +39,7 @@ def find_sites(drive: Frames, edge: Frames | None) -> Sites:
 
 def place_sensors(
     region: str,
-    how: Placement,
+    how: PlacementSettings,
     sites: Sites,
     errors: Mapping[str, Sequence[PerceptionError]],
     weights: Mapping[str, float],

@@ -15,6 +15,7 @@ from flcav.federation.rules import Rules
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors
 from flcav.network.clock.rounds import NetworkSettings
+from flcav.optimization.problem import Budgets
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
 from flcav.statistics.streams import stream
@@ -186,14 +187,7 @@ class Region(Config):
         return self
 
 
-class Budgets(Config):
-    """Uplink budgets [MB; 1 MB = 10^6 bytes]."""
-
-    wireless: Positive  # from vehicles to edge servers
-    wireline: Positive  # from edge servers to the cloud
-
-
-class Limits(Config):
+class PlanLimits(Config):
     """Bounds (least, most) of a plan's decision variables."""
 
     samples: tuple[Count, Count | None] = (40, None)  # of pretraining; None: all that the pools hold
@@ -201,7 +195,7 @@ class Limits(Config):
     cloud_rounds: tuple[Count, Count | None] = (1, None)  # of cloud FL; None: as many as the history has
 
 
-class Placement(Config):
+class PlacementSettings(Config):
     """Settings of the choice of sites for roadside sensors."""
 
     rule: Literal["vrcsp", "densest", "random", "fixed", "none"] = (
@@ -257,7 +251,7 @@ class Arm(Config):
     plan: Literal["joint", "equal-stages", "equal-tasks", "max-throughput"] = (
         "joint"  # joint: optimal under both budgets; otherwise a baseline
     )
-    placement: Mapping[str, Any] = {}  # fields of `Placement` that differ from the run
+    placement: Mapping[str, Any] = {}  # fields of `PlacementSettings` that differ from the run
     federation: Mapping[str, Any] = {}  # fields of `Federation` that differ from the run
     labels: Mapping[str, str] = {}  # kinds of labels that differ from the run, by task
     distillation: Mapping[str, Any] = {}  # fields of `Distillation` that differ from the run
@@ -314,10 +308,10 @@ class RunRecipe(Config):
         "drawn"  # samples of stage I: drawn from all vehicles' frames; or the plan says how many each vehicle uploads
     )
     headroom: float = Field(default=0.02, ge=0, lt=0.5)  # fraction left unspent: samples differ in size
-    limits: Limits = Limits()  # bounds of the plan's quantities
+    limits: PlanLimits = PlanLimits()  # bounds of the plan's quantities
     horizon_s: Positive | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]
     stragglers: Stragglers | None = None  # vehicles that train slower, in every region that is simulated
-    placement: Placement = Placement()  # placement of roadside sensors
+    placement: PlacementSettings = PlacementSettings()  # placement of roadside sensors
     federation: Federation = Federation()  # settings of aggregation
     distillation: Distillation | None = None  # of labels "road-average"; None: the defaults
     navigation: NavigationErrors = NavigationErrors()  # errors of vehicles' poses and clocks, in labels of road sensors
@@ -381,7 +375,7 @@ class RunRecipe(Config):
                 if each not in known:
                     raise ValueError(f"arms.{name}.{field}: '{each}' is none of {', '.join(known)}")
         parts: list[tuple[type[Config], Config, str]] = [
-            (Placement, self.placement, "placement"),
+            (PlacementSettings, self.placement, "placement"),
             (Federation, self.federation, "federation"),
             (Distillation, self.distillation or Distillation(), "distillation"),
             *((Training, self.training_of(task), "training") for task in self.tasks),

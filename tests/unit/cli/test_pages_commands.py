@@ -20,7 +20,7 @@ from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 ROOT = Path(__file__).parents[3]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -92,7 +92,7 @@ def test_the_strategy_that_is_shown_runs_under_central_noise_and_one_that_fails_
     clients = {f"cav{i}": Fixed(float(i)) for i in range(1, 4)}
 
     def run(strategy: Strategy) -> Weights:
-        account = Account(Ledger(Budget(1.0, 1.0)), "edge", "walk", "wireless")
+        account = Account(Ledger(LinkMegabytes(1.0, 1.0)), "edge", "walk", "wireless")
         rules = Rules(privacy=privacy)
         return federate(clients, start, schedule, account, strategy=strategy, rules=rules).weights
 

@@ -29,7 +29,7 @@ from flcav.experiments.exchanges.tables import tables
 from flcav.experiments.scales import shrink_recipe
 from flcav.federation.divergence import Divergence, RoundDivergence
 from flcav.federation.upload import name_like
-from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.propagation import PathState
@@ -142,7 +142,7 @@ def test_edge_federation_alone_has_the_accuracy_the_messages_and_the_rounds_of_s
     monkeypatch.setattr(exchanges, "link_regions", lambda *_: {"grid": [links_of(True, True)]})
     sent = [entry("grid/cav0", "up", 2_000_000), entry("grid/cav0", "up", 1_000_000, CLOUD)]
     sent.append(LedgerEntry(PRETRAIN, "weather", "wireless", "up", 0, "suburb", 9_000_000))
-    Ledger(Budget(60, 30), sent).save(tmp_path / "ledgers" / "main.parquet")
+    Ledger(LinkMegabytes(60, 30), sent).save(tmp_path / "ledgers" / "main.parquet")
     clients = {EDGE: ("cav0", "cav1"), CLOUD: ("cav0",)}
     stages = [
         SimpleNamespace(stage=stage, records=[SimpleNamespace(server="grid", clients=names, epsilon=None)])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 
 @dataclass
@@ -46,4 +46,4 @@ def vehicles(region: str, number: int) -> dict[str, Regression]:
 
 
 def ledger(wireless_mb: float = 1.0, wireline_mb: float = 1.0) -> Ledger:
-    return Ledger(Budget(wireless_mb, wireline_mb))
+    return Ledger(LinkMegabytes(wireless_mb, wireline_mb))

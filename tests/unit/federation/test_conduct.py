@@ -23,7 +23,7 @@ from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 START = {"w": np.zeros(50, np.float32)}
 SCHEDULE = Schedule(9, 1, 0.1, 0.1, 1)
@@ -222,7 +222,10 @@ def test_a_query_plants_nothing_in_a_client():
 @pytest.mark.parametrize("name", ["local", "secure"])
 def test_what_was_answered_is_kept_with_the_state(name: str):
     clients = {f"cav{i}": Vehicle() for i in range(3)}
-    rules, account = Rules.model_validate(RULES[name]), Account(Ledger(Budget(9.0, 9.0)), "edge", "toy", "wireless")
+    rules, account = (
+        Rules.model_validate(RULES[name]),
+        Account(Ledger(LinkMegabytes(9.0, 9.0)), "edge", "toy", "wireless"),
+    )
     state = FederationState()
     federate(clients, START, replace(SCHEDULE, rounds=2), account, rules=rules, state=state)
     assert {client: kept[ANSWERED][ANSWERED][0] for client, kept in state.clients.items()} == dict.fromkeys(clients, 2)

@@ -9,13 +9,13 @@ import pytest
 
 from flcav.federation.edge_server import EdgeServer
 from flcav.federation.rounds import Schedule, federate
-from flcav.federation.rules import Limits, Rules
+from flcav.federation.rules import ReplyLimits, Rules
 from flcav.federation.runtimes.deadline import ClientLate, TimedClients
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 START = {"w": np.zeros(3)}
 SCHEDULE = Schedule(2, 1, 0.1, 0.1, 1)
@@ -35,8 +35,8 @@ def fleet(stalls_s: float) -> dict[str, Vehicle]:
 
 
 def run(clients: dict[str, Vehicle], limit_s: float | None, **how: Any) -> tuple[Weights, FederationState]:
-    state, account = FederationState(), Account(Ledger(Budget(9.0, 9.0)), "edge", "toy", "wireless")
-    rules = Rules(limits=Limits(train_s=limit_s))
+    state, account = FederationState(), Account(Ledger(LinkMegabytes(9.0, 9.0)), "edge", "toy", "wireless")
+    rules = Rules(limits=ReplyLimits(train_s=limit_s))
     return federate(clients, START, SCHEDULE, account, rules=rules, state=state, **how).weights, state
 
 
@@ -69,9 +69,9 @@ def test_a_limit_that_nobody_reaches_changes_nothing():
 
 
 def test_vehicles_of_an_edge_server_have_their_own_time_and_the_server_none():
-    rules = Rules(limits=Limits(train_s=0.3))
+    rules = Rules(limits=ReplyLimits(train_s=0.3))
     assert rules.of_servers().limits.train_s is None
-    account, state = Account(Ledger(Budget(9.0, 9.0)), "cloud", "toy", "wireless"), FederationState()
+    account, state = Account(Ledger(LinkMegabytes(9.0, 9.0)), "cloud", "toy", "wireless"), FederationState()
     server = EdgeServer(fleet(3600.0), 2, account, START, rules=rules, state=state)
     federate({"grid": server}, START, Schedule(1, 1, 0.1, 0.1, 1), account, rules=rules.of_servers())
     assert [{*record.failed} for record in state.records] == [{"cav2"}] * 2

@@ -11,7 +11,7 @@ from flcav.federation.divergence import measure_divergence
 from flcav.federation.rules import Rules
 from flcav.federation.strategies import FEDAVG
 from flcav.interface.progress import ignore_progress
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.recipe import CLOUD, Training
@@ -56,7 +56,7 @@ def test_a_cloud_round_records_how_far_regions_were_apart(tmp_path: Path, monkey
 
     def run(folder: Path) -> Any:
         folder.mkdir(exist_ok=True)
-        where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), folder, ignore_progress)
+        where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), folder, ignore_progress)
         federate_cloud(CloudFederation(learning, network, starts, 1, *where), 2, Rules())
         return Checkpoint.read(folder, LAST).records[CLOUD]
 

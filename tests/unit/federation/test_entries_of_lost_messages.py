@@ -12,7 +12,7 @@ from flcav.federation.messages.records import ARRAYS, CONFIG, LOST, LOST_BY_NETW
 from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account, MeteredGrid, Outage
 from flcav.federation.runtimes.outages import LossyGrid
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 NAMES = {1: "a", 2: "b", 3: "c"}
 
@@ -51,7 +51,7 @@ def messages(*nodes: int) -> list[Message]:
 
 
 def account(outages: Any = None) -> Account:
-    return Account(Ledger(Budget(1.0, 1.0)), "edge", "objects", "wireless", outages or {})
+    return Account(Ledger(LinkMegabytes(1.0, 1.0)), "edge", "objects", "wireless", outages or {})
 
 
 def entered(own: Account) -> list[tuple[str, int, str, int]]:

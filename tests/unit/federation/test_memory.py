@@ -14,7 +14,7 @@ from flcav.federation.strategies.fedavg import FedAvg
 from flcav.federation.strategies.median import Median
 from flcav.federation.strategies.strategy import find_weigher
 from flcav.federation.trainable import LocalUpdate, Trainable, Update, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 FEW, MANY = 10, 50
 START = {"w": np.zeros(100_000, np.float32)}
@@ -45,7 +45,7 @@ class Fleet(Mapping[str, Trainable]):
 
 
 def peak(count: int, strategy: Strategy) -> int:
-    fleet, account = Fleet(count), Account(Ledger(Budget(1e3, 1e3)), "edge", "toy", "wireless")
+    fleet, account = Fleet(count), Account(Ledger(LinkMegabytes(1e3, 1e3)), "edge", "toy", "wireless")
     tracemalloc.start()
     try:
         federate(fleet, START, Schedule(1, 1, 0.1, 0.1, 0), account, strategy=strategy)

@@ -12,7 +12,7 @@ from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 START = {
     "body.weight": np.zeros(400, np.float32),
@@ -50,7 +50,7 @@ def servers(book: Ledger, states: dict[str, FederationState], done: int = 0) -> 
 
 
 def run(rounds: int, done: int, start: Weights, states: dict[str, FederationState]) -> tuple[Weights, Ledger]:
-    book = Ledger(Budget(1.0, 1.0))
+    book = Ledger(LinkMegabytes(1.0, 1.0))
     account, schedule = Account(book, "cloud", "t", "wireline"), Schedule(rounds, 1, 0.1, 0.1, 3)
     how: Any = {"rules": RULES.of_servers(), "done": done}
     return federate(servers(book, states, done), start, schedule, account, **how).weights, book

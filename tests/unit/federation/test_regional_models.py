@@ -15,7 +15,7 @@ from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import strategy_named
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 START = {"w": np.zeros(500, np.float64)}
 GOALS = {"grid": 1.0, "ring": 5.0}
@@ -46,7 +46,7 @@ class Descent:
 
 
 def run(pull: float, rounds: int, done: int, start: Weights, states: dict[str, FederationState]) -> Any:
-    book, rules = Ledger(Budget(1.0, 1.0)), Rules.model_validate({"personal": {"pull": pull}})
+    book, rules = Ledger(LinkMegabytes(1.0, 1.0)), Rules.model_validate({"personal": {"pull": pull}})
     wireless, wireline = (Account(book, "cloud", "t", link) for link in ("wireless", "wireline"))
     servers: dict[str, Trainable] = {
         region: EdgeServer(
@@ -124,6 +124,6 @@ def test_what_cannot_be_combined_is_one_sentence() -> None:
         def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
             return LocalUpdate(weights, 1, 0.0)
 
-    account = Account(Ledger(Budget(1.0, 1.0)), "edge", "t", "wireless")
+    account = Account(Ledger(LinkMegabytes(1.0, 1.0)), "edge", "t", "wireless")
     with pytest.raises(InputError, match="personal: needs clients whose training takes 'proximal', and that of cav0"):
         federate({"cav0": Plain()}, START, Schedule(1, 1, 0.1, 0.1, 3), account, rules=rules)

@@ -25,7 +25,7 @@ from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.median import Median
 from flcav.federation.trainable import LocalUpdate
 from flcav.federation.upload import Upload
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 
 NAMES = [f"grid/cav{i}" for i in (3, 0, 4, 1, 2)]
 
@@ -165,7 +165,7 @@ SECURE = Rules(secure=SecureAggregation(), least_clients=3)
 
 
 def run(clients: dict[str, Walk], rules: Rules, **how: Any) -> tuple[Any, FederationState, Ledger]:
-    book, state = Ledger(Budget(10.0, 0.0)), FederationState()
+    book, state = Ledger(LinkMegabytes(10.0, 0.0)), FederationState()
     account = Account(book, "edge", "walk", "wireless")
     return federate(clients, START, SCHEDULE, account, rules=rules, state=state, **how).weights, state, book
 

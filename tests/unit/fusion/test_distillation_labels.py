@@ -25,7 +25,7 @@ from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, concatenate, inverse, pose
-from flcav.network.ledger import Budget, BudgetExceeded, Ledger
+from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import FrameTruth
@@ -292,7 +292,7 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     how, errors = Distillation(), NavigationErrors(position_m=0.05, heading_deg=0.1)
     split = Frames(cast(Any, data), (0, 1), {})
     book, weights, about = (
-        Ledger(Budget(1.0, 0.0)),
+        Ledger(LinkMegabytes(1.0, 0.0)),
         to_arrays(second_tiny()),
         (how, errors, CONFIG, 0.6, split, (0, 1), (3,)),
     )
@@ -323,15 +323,15 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     labels.renew(2, weights)  # as after a stop
     history = read_history(tmp_path).rounds
     assert [(each.round, each.precision, each.recall) for each in history] == [(1, 1.0, 1.0), (2, 1.0, 1.0)]
-    last = RoadAverageLabels(*about, "grid", later := Ledger(Budget(1.0, 0.0)), "cloud")
+    last = RoadAverageLabels(*about, "grid", later := Ledger(LinkMegabytes(1.0, 0.0)), "cloud")
     last.renew(1, weights)
     assert [replace(entry, stage="edge") for entry in later.entries] == list(sent)  # the same messages
     assert {entry.stage for entry in later.entries} == {"cloud"}
     np.testing.assert_array_equal(last["grid/cav0"][0].boxes.array(), own[0].boxes.array())
     assert read_history(tmp_path).rounds == history
     mapless = (how.model_copy(update={"map_context": False}), *about[1:])
-    as_told = RoadAverageLabels(*mapless, "grid", Ledger(Budget(1.0, 0.0)), "cloud")
+    as_told = RoadAverageLabels(*mapless, "grid", Ledger(LinkMegabytes(1.0, 0.0)), "cloud")
     as_told.renew(1, weights)
     assert as_told["grid/cav0"][0].boxes.yaw == pytest.approx(0, abs=0.05)
     with pytest.raises(BudgetExceeded, match="wireless uplink budget exceeded: grid/cav1"):
-        RoadAverageLabels(*about, "grid", Ledger(Budget(1e-4, 0.0))).renew(3, weights)
+        RoadAverageLabels(*about, "grid", Ledger(LinkMegabytes(1e-4, 0.0))).renew(3, weights)

@@ -13,7 +13,7 @@ from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, transform_points
 from flcav.interface.progress import ignore_progress
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.frames import Frames, list_window
@@ -149,7 +149,7 @@ def test_labels_are_of_windows_and_each_frame_is_sent_once(
     monkeypatch.setattr(road_average, "road_views", see)
     monkeypatch.setattr(sightings, "detect_in", lambda network, frames, **how: [car(*PLACE, z=-1.0)])
     how, errors = Distillation(window_s=window_s), NavigationErrors(position_m=0.05, heading_deg=0.1)
-    book, about = Ledger(Budget(1.0, 0.0)), (how, errors, CONFIG, 0.6, split, split.vehicles, (3,))
+    book, about = Ledger(LinkMegabytes(1.0, 0.0)), (how, errors, CONFIG, 0.6, split, split.vehicles, (3,))
     labels = RoadAverageLabels(*about, "grid", book)
     labels.renew(1, to_arrays(second_tiny()))
     sent = [(each.direction, each.client) for each in book.entries]

@@ -20,7 +20,7 @@ from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.clock.rounds import NetworkSettings, RoundRules
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.wireline import Wireline
 from flcav.pipeline.poles import Sites
@@ -145,7 +145,7 @@ OUTAGES = {(1, "grid/cav1"): Outage("out of coverage", 999), (2, "grid/cav2"): O
 @pytest.mark.parametrize("masked", [False, True])
 def test_a_round_goes_on_without_those_that_the_network_loses(masked: bool) -> None:
     clients = {name: Walk() for name in NAMES}
-    book, state = Ledger(Budget(1.0, 0.0)), FederationState()
+    book, state = Ledger(LinkMegabytes(1.0, 0.0)), FederationState()
     rules = Rules.model_validate({"secure": {}} if masked else {})
     account = Account(book, "edge", "t", "wireless", OUTAGES)
     federate({**clients}, START, Schedule(2, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
@@ -161,7 +161,7 @@ def test_a_round_goes_on_without_those_that_the_network_loses(masked: bool) -> N
 
 
 def test_a_round_that_loses_everybody_leaves_the_weights() -> None:
-    book, state = Ledger(Budget(1.0, 1.0)), FederationState()
+    book, state = Ledger(LinkMegabytes(1.0, 1.0)), FederationState()
     lost = {(1, name): Outage("not in the town") for name in NAMES}
     clients: dict[str, Trainable] = {name: Walk() for name in NAMES}
     server = EdgeServer(clients, 1, Account(book, CLOUD, "t", "wireless", lost), START, state=state)
@@ -190,7 +190,7 @@ def test_a_masked_round_that_the_network_leaves_too_few_for_has_no_update_and_th
     clients: dict[str, Trainable] = {name: Walk() for name in NAMES}
     plan = {name: (1, 2, 3) if name in joins else (1, 3) for name in NAMES}
     rules = Rules.model_validate({"secure": {}, "selection": {"rule": "planned", "joins": plan}})
-    book, state, after = Ledger(Budget(1.0, 0.0)), FederationState(), []
+    book, state, after = Ledger(LinkMegabytes(1.0, 0.0)), FederationState(), []
     account = Account(book, "edge", "t", "wireless", {(2, name): outage for name, outage in lost.items()})
     federate(
         clients,
@@ -225,7 +225,7 @@ def test_a_first_round_that_the_network_predicts_for_one_vehicle_has_no_update_a
 ) -> None:
     plan = {"rule": "planned", "joins": {name: (1, 2) if name == NAMES[0] else (2,) for name in NAMES}}
     clients = {name: Walk() for name in NAMES}
-    account, state, after = Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless"), FederationState(), []
+    account, state, after = Account(Ledger(LinkMegabytes(1.0, 0.0)), "edge", "t", "wireless"), FederationState(), []
     federate(
         {**clients},
         START,
@@ -267,7 +267,7 @@ def test_a_round_that_fewer_vehicles_are_there_for_than_are_wanted_has_no_update
     rules = Rules.model_validate({"selection": {"rule": rule, "joins": joins}, "least_clients": 2})
     clients, state = {name: Walk() for name in NAMES}, FederationState()
     lost = {(1, name): outage for name, outage in away.items()}
-    account = Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless", lost)
+    account = Account(Ledger(LinkMegabytes(1.0, 0.0)), "edge", "t", "wireless", lost)
     federate({**clients}, START, Schedule(2, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
     assert [record.clients for record in state.records] == [(), NAMES]
     assert [record.failed for record in state.records] == [failed, {}]
@@ -275,7 +275,7 @@ def test_a_round_that_fewer_vehicles_are_there_for_than_are_wanted_has_no_update
 
 
 def test_all_are_those_who_are_there() -> None:
-    state, book = FederationState(), Ledger(Budget(1.0, 0.0))
+    state, book = FederationState(), Ledger(LinkMegabytes(1.0, 0.0))
     account = Account(book, "edge", "t", "wireless", {(1, NAMES[1]): GONE, (2, NAMES[1]): LATE})
     schedule, rules = Schedule(2, 1, 0.1, 0.1, 3), Rules(least_clients="all")
     with pytest.raises(ClientFailed, match=r"round 2: 2 of 3 clients .*, 3 are wanted \(grid/cav1: past the deadline"):
@@ -284,7 +284,7 @@ def test_all_are_those_who_are_there() -> None:
 
 
 def test_a_round_that_chance_leaves_to_nobody_names_nobody() -> None:
-    state, account = FederationState(), Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless")
+    state, account = FederationState(), Account(Ledger(LinkMegabytes(1.0, 0.0)), "edge", "t", "wireless")
     rules = Rules.model_validate({"selection": {"rule": "poisson", "probability": 1e-9}, "least_clients": 1})
     federate({name: Walk() for name in NAMES}, START, Schedule(1, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
     assert [(record.clients, record.failed) for record in state.records] == [((), {})]
@@ -292,7 +292,7 @@ def test_a_round_that_chance_leaves_to_nobody_names_nobody() -> None:
 
 def test_a_round_with_fewer_than_were_to_take_part_by_chance_has_no_update() -> None:
     names = [f"grid/cav{i}" for i in range(6)]
-    state, account = FederationState(), Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless")
+    state, account = FederationState(), Account(Ledger(LinkMegabytes(1.0, 0.0)), "edge", "t", "wireless")
     rules = Rules.model_validate({"selection": {"rule": "poisson", "probability": 0.4}, "least_clients": 3})
     federate({name: Walk() for name in names}, START, Schedule(8, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
     chosen = [len(record.clients) or len(record.failed) for record in state.records]
@@ -318,7 +318,7 @@ def test_a_round_with_fewer_than_the_strategy_needs_has_no_update_and_the_next_g
         {name: Walk() for name in FIVE},
         START,
         Schedule(3, 1, 0.1, 0.1, 3),
-        Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless", lost),
+        Account(Ledger(LinkMegabytes(1.0, 0.0)), "edge", "t", "wireless", lost),
         strategy=strategy,
         state=state,
         on_round=lambda number, weights, loss: after.append((weights["w"][0], loss)),
@@ -339,7 +339,7 @@ def test_half_of_those_whom_the_network_leaves_are_enough() -> None:
 
     def run(fails: tuple[str, ...], rules: Rules) -> FederationState:
         clients: dict[str, Trainable] = {name: Fails() if name in fails else Walk() for name in NAMES}
-        state, account = FederationState(), Account(Ledger(Budget(1.0, 0.0)), "edge", "t", "wireless", OUTAGES)
+        state, account = FederationState(), Account(Ledger(LinkMegabytes(1.0, 0.0)), "edge", "t", "wireless", OUTAGES)
         federate(clients, START, Schedule(1, 1, 0.1, 0.1, 3), account, rules=rules, state=state)
         return state
 
@@ -354,7 +354,7 @@ def test_half_of_those_whom_the_network_leaves_are_enough() -> None:
 def test_the_network_knows_whom_an_edge_server_will_draw() -> None:
     names = [f"grid/cav{i}" for i in range(6)]
     rules, state = Rules.model_validate({"selection": {"rule": "uniform", "clients": 2}}), FederationState()
-    book, schedule = Ledger(Budget(1.0, 1.0)), Schedule(3, 1, 0.1, 0.1, 3)
+    book, schedule = Ledger(LinkMegabytes(1.0, 1.0)), Schedule(3, 1, 0.1, 0.1, 3)
     clients: dict[str, Trainable] = {name: Walk() for name in names}
     server = EdgeServer(clients, 2, Account(book, CLOUD, "t", "wireless"), START, rules=rules, state=state)
     federate({"grid": server}, START, schedule, Account(book, CLOUD, "t", "wireline"))

@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 
 from flcav.config import InputError
-from flcav.network.ledger import Budget, BudgetExceeded, Ledger, LedgerEntry
+from flcav.network.ledger import BudgetExceeded, Ledger, LedgerEntry, LinkMegabytes
 
 UP = LedgerEntry("edge", "objects", "wireless", "up", 1, "grid/cav0", 600_000)
 DOWN = replace(UP, direction="down")
 
 
 def test_an_uplink_message_over_its_budget_is_refused_and_not_recorded():
-    ledger = Ledger(Budget(wireless_mb=1.0, wireline_mb=5.0), [UP])
+    ledger = Ledger(LinkMegabytes(wireless_mb=1.0, wireline_mb=5.0), [UP])
     with pytest.raises(BudgetExceeded, match=r"wireless.*cav0 wants 0\.6 MB.*0\.6 of the 1 MB"):
         ledger.enter(replace(UP, round=2))
     assert ledger.entries == (UP,)
@@ -22,7 +22,7 @@ def test_an_uplink_message_over_its_budget_is_refused_and_not_recorded():
 
 
 def test_each_link_has_its_own_budget_and_downlink_has_none():
-    ledger = Ledger(Budget(wireless_mb=0.6, wireline_mb=0.1), [UP])
+    ledger = Ledger(LinkMegabytes(wireless_mb=0.6, wireline_mb=0.1), [UP])
     ledger.enter(replace(DOWN, bytes=10**9))
     with pytest.raises(BudgetExceeded, match="wireline"):
         ledger.enter(replace(UP, link="wireline"))
@@ -40,7 +40,7 @@ def test_usage_by_link_stage_and_task_is_exact():
             for k in ("wireless", "wireline")
         )
     ]
-    ledger = Ledger(Budget(1, 1), entries)
+    ledger = Ledger(LinkMegabytes(1, 1), entries)
     assert ledger.used_bytes() == sum(range(12))
     assert ledger.used_bytes(stage="edge") == 4 + 5 + 6 + 7
     assert ledger.used_bytes("wireline", task="signs") == 3 + 7 + 11
@@ -48,7 +48,7 @@ def test_usage_by_link_stage_and_task_is_exact():
 
 
 def test_a_saved_ledger_goes_on_where_it_stopped(tmp_path):
-    ledger = Ledger(Budget(1.0, 2.0), [UP, DOWN])
+    ledger = Ledger(LinkMegabytes(1.0, 2.0), [UP, DOWN])
     ledger.save(tmp_path / "ledger.parquet")
     loaded = Ledger.load(tmp_path / "ledger.parquet")
     assert (loaded.entries, loaded.budget) == (ledger.entries, ledger.budget)
@@ -58,7 +58,7 @@ def test_a_saved_ledger_goes_on_where_it_stopped(tmp_path):
 
 
 def test_an_empty_ledger_saves_and_loads(tmp_path):
-    Ledger(Budget(1.0, 2.0)).save(tmp_path / "ledger.parquet")
+    Ledger(LinkMegabytes(1.0, 2.0)).save(tmp_path / "ledger.parquet")
     assert Ledger.load(tmp_path / "ledger.parquet").entries == ()
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flcav.network import messages
-from flcav.network.ledger import Budget, BudgetExceeded, Ledger, LedgerEntry
+from flcav.network.ledger import BudgetExceeded, Ledger, LedgerEntry, LinkMegabytes
 from flcav.network.messages import from_names, pack, send, to_names, unpack
 
 
@@ -44,7 +44,7 @@ def test_a_message_is_booked_before_it_is_sent_in_the_bytes_that_a_socket_carrie
         return received
 
     monkeypatch.setattr(messages, "carry", through_a_socket)
-    book = Ledger(Budget(wireless_mb=0.5, wireline_mb=0.0))
+    book = Ledger(LinkMegabytes(wireless_mb=0.5, wireline_mb=0.0))
     sample = {"points": np.random.default_rng(0).normal(size=(10_000, 4)).astype(np.float32)}
     with near, far:
         at_edge = send(

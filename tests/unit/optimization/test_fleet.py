@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from flcav.config import parse_config
-from flcav.optimization.allocation.allocate import TaskPlan, allocate
+from flcav.optimization.allocation.allocate import TaskAllocation, allocate
 from flcav.optimization.allocation.fleet import allocate_fleet
 from flcav.optimization.allocation.vehicles import split_plan
 from flcav.optimization.problem import Problem
@@ -49,7 +49,7 @@ def best_carried(asked: Problem) -> float:
             continue
         error = float(task.curve.error(samples, edge_rounds, cloud_rounds, asked.edge_rounds_per_cloud_round))
         try:
-            split_plan(asked, [TaskPlan(task.name, samples, edge_rounds, cloud_rounds, error, 0.0, 0.0)])
+            split_plan(asked, [TaskAllocation(task.name, samples, edge_rounds, cloud_rounds, error, 0.0, 0.0)])
         except Infeasible:
             continue
         errors.append(error)

@@ -7,10 +7,10 @@ import pytest
 from made_problems import parsed, written
 
 from flcav.config import InputError, parse_config
-from flcav.network.ledger import LINKS, Budget, Ledger, LedgerEntry
+from flcav.network.ledger import LINKS, Ledger, LedgerEntry, LinkMegabytes
 from flcav.network.plan import MessageSizes, price
 from flcav.optimization.allocation.allocate import (
-    TaskPlan,
+    TaskAllocation,
     allocate,
     resolve_problem,
     weighted_error,
@@ -89,7 +89,7 @@ def test_equal_stages_spends_a_third_of_the_wireless_link_on_each_stage():
 def test_max_throughput_gets_most_messages_through():
     problem = parsed(written(3, 3, "additive", LIMITS))
 
-    def messages(plans: Sequence[TaskPlan]) -> int:
+    def messages(plans: Sequence[TaskAllocation]) -> int:
         groups = [task.edge_groups for task in problem.tasks]
         return sum(
             plan.samples + (plan.edge_rounds + plan.cloud_rounds) * sum(own) + plan.cloud_rounds * len(own)
@@ -138,7 +138,7 @@ def test_a_plan_beyond_the_measured_range_says_so():
 def test_replanning_keeps_within_the_budgets_whatever_is_observed():
     problem = parsed(written(7, 2, "additive", {"samples": [20, 900], "edge_rounds": [1, 12], "cloud_rounds": [1, 8]}))
     stages = ("samples", "edge_rounds", "cloud_rounds")
-    ledger = Ledger(Budget(problem.budgets_mb.wireless, problem.budgets_mb.wireline))
+    ledger = Ledger(LinkMegabytes(problem.budgets_mb.wireless, problem.budgets_mb.wireline))
     rng = np.random.default_rng(0)
     plan, done = allocate(problem), {task.name: [0, 0, 0] for task in problem.tasks}
 

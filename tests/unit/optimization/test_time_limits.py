@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from made_problems import SMALL, parsed, searched, written
 from test_fleet import best_carried, fleet, problem
 
-from flcav.optimization.allocation.allocate import TaskPlan, allocate
+from flcav.optimization.allocation.allocate import TaskAllocation, allocate
 from flcav.optimization.allocation.baselines import BASELINES, baseline
 from flcav.optimization.allocation.budget_sweep import compute_savings
 from flcav.optimization.allocation.fleet import allocate_fleet
@@ -144,7 +144,7 @@ def test_bounds_hold_for_fleets_that_train_one_task_fast_and_another_slowly(seed
     errors = []
     for counts in itertools.product(itertools.product((1, 2), range(4)), repeat=2):
         errors_of = [float(task.curve.error(*own, 0)) for task, own in zip(asked.tasks, counts)]
-        plans = [TaskPlan(task.name, *own, 0, 0.0, 0.0, 0.0) for task, own in zip(asked.tasks, counts)]
+        plans = [TaskAllocation(task.name, *own, 0, 0.0, 0.0, 0.0) for task, own in zip(asked.tasks, counts)]
         with contextlib.suppress(Infeasible):
             split_plan(asked, plans)
             errors.append(sum(errors_of))

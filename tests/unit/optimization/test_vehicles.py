@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flcav.config import parse_config
-from flcav.optimization.allocation.allocate import TaskPlan
+from flcav.optimization.allocation.allocate import TaskAllocation
 from flcav.optimization.allocation.vehicles import VehicleShare, split_plan
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible
@@ -34,8 +34,8 @@ def problem(tasks: list[dict[str, Any]], horizon_s: float | None = None, k: int 
     return parse_config(Problem, values, "test")
 
 
-def plan(samples: int, edge_rounds: int = 0, cloud_rounds: int = 0, name: str = "objects") -> TaskPlan:
-    return TaskPlan(name, samples, edge_rounds, cloud_rounds, 0.1, 0.0, 0.0)
+def plan(samples: int, edge_rounds: int = 0, cloud_rounds: int = 0, name: str = "objects") -> TaskAllocation:
+    return TaskAllocation(name, samples, edge_rounds, cloud_rounds, 0.1, 0.0, 0.0)
 
 
 def links(*mbps: float) -> dict[str, dict[str, float]]:
@@ -69,10 +69,10 @@ def values(asked: Problem, shares: dict[str, tuple[VehicleShare, ...]]) -> tuple
     return joined, worth, -max(busy_s(asked, shares, with_rounds=False).values())
 
 
-def every_split(asked: Problem, plans: list[TaskPlan]) -> Iterator[tuple[float, float, float]]:
+def every_split(asked: Problem, plans: list[TaskAllocation]) -> Iterator[tuple[float, float, float]]:
     """Yield the aims of every split that is allowed, by trying all numbers."""
 
-    def own(task: AllocationTask, each: TaskPlan) -> list[list[tuple[int, int]]]:
+    def own(task: AllocationTask, each: TaskAllocation) -> list[list[tuple[int, int]]]:
         names = list(task.uplink_mbps or {})
         rounds = each.edge_rounds + asked.edge_rounds_per_cloud_round * each.cloud_rounds
         groups = np.repeat(np.arange(len(task.edge_groups)), task.edge_groups)

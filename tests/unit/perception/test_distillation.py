@@ -15,7 +15,7 @@ from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Trainable, Weights
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.client import TaskClient
 from flcav.perception.distillation import PROBABILITIES, OutputClient, SharedSamples
 from flcav.perception.signs.config import SignsConfig
@@ -54,7 +54,7 @@ VEHICLES = {
 
 
 def run(rounds: int = 3, weights: Weights = START, **how: Any) -> tuple[Weights, Ledger]:
-    account = Account(Ledger(Budget(1.0, 0.0)), "edge", "weather", "wireless")
+    account = Account(Ledger(LinkMegabytes(1.0, 0.0)), "edge", "weather", "wireless")
     state = how.pop("state", None) or FederationState()
     schedule = replace(SCHEDULE, rounds=rounds)
     strategy = FedMD(steps=3)
@@ -126,7 +126,7 @@ def test_clients_of_another_process_a_restart_and_masks_end_with_the_same_networ
 
 
 def test_edge_servers_send_networks_to_the_cloud():
-    book, states = Ledger(Budget(1.0, 1.0)), {region: FederationState() for region in ("grid", "ring")}
+    book, states = Ledger(LinkMegabytes(1.0, 1.0)), {region: FederationState() for region in ("grid", "ring")}
     wireless, wireline = (Account(book, "cloud", "weather", link) for link in ("wireless", "wireline"))
     servers: dict[str, Trainable] = {
         region: EdgeServer(

@@ -19,7 +19,7 @@ from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavgm import FedAvgM
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 from flcav.interface.progress import ignore_progress
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.client import TaskClient
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
@@ -124,7 +124,7 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
     clients = make_clients(learning, Slope(), {f"a/cav{i}": [np.float32(i), np.float32(1)] for i in range(2)})
     ends = []
     for folder in (tmp_path / "timed", tmp_path / "plain"):
-        how = (FEDAVG, 0, Ledger(Budget(1.0, 1.0)), folder, ignore_progress)
+        how = (FEDAVG, 0, Ledger(LinkMegabytes(1.0, 1.0)), folder, ignore_progress)
         federation = EdgeFederation(learning, network, clients, learning.schedule(3, 2, "edge", "a"), *how)
         federate_edge(federation, Rules(), timed=folder.name == "timed")
         ends.append({path.name: path.read_bytes() for path in folder.iterdir() if path.name != TIMES})
@@ -132,7 +132,7 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
     assert {name: len(times) for name, times in read_times(tmp_path / "timed").items()} == {"a/cav0": 3, "a/cav1": 3}
     assert read_times(tmp_path / "plain") == {}
     secret = Rules.model_validate({"privacy": PRIVACY, "selection": {"rule": "uniform", "clients": 1}})
-    how = (FEDAVG, 0, Ledger(Budget(1.0, 1.0)), tmp_path / "secret", ignore_progress)
+    how = (FEDAVG, 0, Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / "secret", ignore_progress)
     schedule = learning.schedule(1, 2, "edge", "a")
     federate_edge(EdgeFederation(learning, network, clients, schedule, *how), secret, timed=True)
     assert not (tmp_path / "secret" / TIMES).exists()  # its lines would name who was drawn
@@ -141,7 +141,7 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
 def test_unbiased_federations_are_timed_too(tmp_path: Path) -> None:
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
     clients = make_clients(learning, Slope(), {f"a/cav{i}": [np.float32(i + 1)] for i in range(3)})
-    how = (FEDAVG, 0, Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
+    how = (FEDAVG, 0, Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
     schedule = learning.schedule(2, 1, "edge", "a")
     rules = Rules.model_validate({"selection": {"rule": "uniform", "clients": 2, "unbiased": True}})
     federate_edge(EdgeFederation(learning, learning.build_network(), clients, schedule, *how), rules, timed=True)
@@ -171,7 +171,7 @@ def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:
     for region, x in (("a", 1.0), ("b", 4.0)):
         clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
         starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
-    where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
+    where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
     federation = CloudFederation(learning, network, starts, 1, *where)
     federate_cloud(federation, 2, Rules(personal=("bias",)))
     found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
@@ -190,7 +190,7 @@ def test_regional_models_are_beside_that_of_all(tmp_path: Path) -> None:
     for region, x in (("a", 1.0), ("b", 4.0)):
         clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
         starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
-    where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), tmp_path, ignore_progress)
+    where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
     rules = Rules.model_validate({"personal": {"pull": 0.5}})
     federate_cloud(CloudFederation(learning, network, starts, 1, *where), 2, rules)
     found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
@@ -216,14 +216,14 @@ def test_the_note_of_a_round_names_who_failed_in_it(tmp_path: Path) -> None:
         notes.append(note.partition(", ")[2])
 
     for rounds in (2, 3):  # the third goes on from the checkpoint of the second
-        how = (FEDAVG, 0, Ledger(Budget(1.0, 1.0)), tmp_path / "edge", report)
+        how = (FEDAVG, 0, Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / "edge", report)
         schedule = learning.schedule(rounds, 1, "edge", "a")
         federate_edge(EdgeFederation(learning, network, clients, schedule, *how), Rules())
     names = [f"{name} (OSError('no power'))" for name in ("a/cav0", "a/cav2")]
     assert notes == ["failed or lost: " + ", ".join(names)] * 3
     notes.clear()
     start = {"a": RegionStart(clients, to_arrays(network), earlier=0)}
-    where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), tmp_path / "cloud", report)
+    where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / "cloud", report)
     federate_cloud(CloudFederation(learning, network, start, 2, *where), 2, Rules())
     assert notes == ["failed or lost: " + ", ".join(f"{name} in 2" for name in names)] * 2
 
@@ -242,11 +242,11 @@ def test_both_stages_in_two_processes_end_with_the_bytes_of_one_also_where_label
 
         regions = {name: {each: clients[each] for each in clients if each.startswith(name)} for name in ("a", "b")}
         folders = [tmp_path / f"{stage}-{processes}-{renewed}" for stage in ("edge", "cloud")]
-        how = (Ledger(Budget(1.0, 1.0)), folders[0], ignore_progress)
+        how = (Ledger(LinkMegabytes(1.0, 1.0)), folders[0], ignore_progress)
         edge = EdgeFederation(learning, network, regions["a"], schedule, FEDAVG, 0, *how)
         federate_edge(replace(edge, relabel=renew if renewed else None), Rules(), processes=processes)
         starts = {name: RegionStart(own, to_arrays(network), earlier=3) for name, own in regions.items()}
-        where = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), folders[1], ignore_progress)
+        where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), folders[1], ignore_progress)
         federate_cloud(CloudFederation(learning, network, starts, 2, *where), 2, Rules(), processes=processes)
         return tuple((folder / WEIGHTS).read_bytes() for folder in folders)
 
@@ -274,7 +274,7 @@ def test_cloud_rounds_begin_the_learning_rate_anew_where_that_is_asked_for_and_s
     clients = make_clients(learning, Slope(), {"a/cav0": [np.float32(1), np.float32(2)]})
     starts = {"a": RegionStart(clients, to_arrays(network), earlier=2)}
     for rate, expected in ((None, [0.1, 0.1]), (0.4, [0.4, 0.1])):
-        how = (Strategies(FEDAVG, FEDAVG), Ledger(Budget(1.0, 1.0)), tmp_path / str(rate), ignore_progress)
+        how = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / str(rate), ignore_progress)
         federate_cloud(CloudFederation(learning, network, starts, 1, *how, rate=rate), 2, Rules())
         assert rates == pytest.approx(expected)
         rates.clear()
@@ -298,7 +298,7 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
     def edge(rounds: int, earlier: int) -> int:
         folder = tmp_path / f"{rounds}-{earlier}"
         schedule = learning.schedule(rounds, 2, "edge", "a")
-        book = Ledger(Budget(1.0, 1.0))
+        book = Ledger(LinkMegabytes(1.0, 1.0))
         how, begun = (FEDAVG, earlier, book, folder, report), []
         federation = EdgeFederation(
             *(learning, network, clients["a"], schedule, *how),
@@ -316,7 +316,7 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
     starts = {region: RegionStart(own, to_arrays(network), earlier=2) for region, own in clients.items()}
 
     def cloud(edge_rounds: int) -> int:
-        book, folder = Ledger(Budget(1.0, 1.0)), tmp_path / f"cloud{edge_rounds}"
+        book, folder = Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / f"cloud{edge_rounds}"
         how = (Strategies(FEDAVG, FEDAVG), book, folder, report)
         return len(federate_cloud(CloudFederation(learning, network, starts, edge_rounds, *how), 9, rules))
 

@@ -15,7 +15,7 @@ from flcav.pipeline.analysis.caveats import list_unreached
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.poles import Sites, find_passed, place_sensors
-from flcav.pipeline.recipe import EDGE, MAIN, Placement, RunRecipe
+from flcav.pipeline.recipe import EDGE, MAIN, PlacementSettings, RunRecipe
 from flcav.pipeline.results.plans import Placed
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.training import StageResult
@@ -24,7 +24,7 @@ SITES = Sites(np.array([2, 5, 7, 9]), np.array([[0, 0, 6], [100, 0, 6], [200, 0,
 
 
 def place(seed: int = 1, passed: NDArray[np.bool_] | None = None, **how: object) -> tuple[int, ...]:
-    settings = parse_config(Placement, {"range_m": 40.0, **how}, "placement")
+    settings = parse_config(PlacementSettings, {"range_m": 40.0, **how}, "placement")
     return place_sensors("grid", settings, SITES, {}, {}, [], seed, passed).chosen
 
 
@@ -48,7 +48,7 @@ def test_sensors_stand_where_vehicles_pass() -> None:
     errors = [
         PerceptionError(x, 0.0, 0.0, 1.0, "miss", "Car", 3, 0.0, "a", f"car{x}") for x in (0, 1, 2, 100, 101, 200)
     ]
-    settings = Placement(rule="vrcsp", range_m=40, count=1, tasks=("objects",))
+    settings = PlacementSettings(rule="vrcsp", range_m=40, count=1, tasks=("objects",))
     rule = (settings, SITES, {"objects": errors}, {"objects": 1.0}, [], 1)
     assert place_sensors("grid", *rule).chosen == (2,)
     placed = place_sensors("grid", *rule, passed)
@@ -93,12 +93,12 @@ def test_regions_whose_sensors_nobody_passes_are_told() -> None:
 @pytest.mark.parametrize("how", [{"rule": "fixed"}, {"poles": [1]}, {"rule": "fixed", "poles": [1, 1]}])
 def test_poles_are_named_once_and_by_their_rule_alone(how: dict[str, object]) -> None:
     with pytest.raises(InputError, match="'poles'"):
-        parse_config(Placement, how, "placement")
+        parse_config(PlacementSettings, how, "placement")
 
 
 def test_errors_count_only_where_the_rule_is_theirs() -> None:
     error = PerceptionError(195.0, 0.0, 0.0, 1.0, "miss", "Car", 3, 0.0, "a", "car1")
-    how = Placement(rule="fixed", poles=(2,), tasks=("objects",))
+    how = PlacementSettings(rule="fixed", poles=(2,), tasks=("objects",))
     placed = place_sensors("grid", how, SITES, {"objects": [error]}, {"objects": 1.0}, [])
     assert (placed.chosen, placed.covered, placed.errors) == ((2,), 0, 1)
     assert [pole.covered for pole in placed.poles] == [0, 0, 1, 0]

@@ -18,8 +18,8 @@ from flcav.experiments.fig6a.run import BUDGETS
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.trainable import LocalUpdate
-from flcav.network.ledger import Budget, Ledger
-from flcav.network.plan import MessageSizes, Price, price
+from flcav.network.ledger import Ledger, LinkMegabytes
+from flcav.network.plan import MessageSizes, price
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.curves.curves import Additive, Federated
 from flcav.optimization.curves.fitting import CurveFit, fit
@@ -35,7 +35,7 @@ from flcav.pipeline.plan import allocation
 from flcav.pipeline.plan.allocation import PlanRequest, PlanSettings, make_plan
 from flcav.pipeline.plan.replanning import remake_plan
 from flcav.pipeline.plan.updates import model_mb
-from flcav.pipeline.recipe import FixedPlan, Limits, load_run_recipe
+from flcav.pipeline.recipe import FixedPlan, PlanLimits, load_run_recipe
 from flcav.pipeline.results.plans import TaskPlan
 from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.tables import HistoryPoint, append_records, load_history, parse_history
@@ -59,11 +59,11 @@ def _equal_histories_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 SIZES = MessageSizes(sample_mb=0.4, model_mb=1.4)
-LIMITS = Limits(edge_rounds=(1, 12), cloud_rounds=(1, 6))
+LIMITS = PlanLimits(edge_rounds=(1, 12), cloud_rounds=(1, 6))
 
 
 def frame(wireless: float = 90.0, wireline: float = 60.0) -> PlanSettings:
-    return PlanSettings(Price(wireless, wireline), 0.02, LIMITS, (4, 3), 1)
+    return PlanSettings(LinkMegabytes(wireless, wireline), 0.02, LIMITS, (4, 3), 1)
 
 
 def history() -> History:
@@ -164,7 +164,7 @@ def test_a_plan_made_anew_is_the_best_of_what_is_left() -> None:
     for stage, reached, saved_mb in cases:
         rounds = own.edge_rounds if stage == "edge" else 0
         sent = price(frame().stage_plan(own.samples, rounds, 0), SIZES)
-        used = Price(sent.wireless_mb - saved_mb, sent.wireline_mb)
+        used = LinkMegabytes(sent.wireless_mb - saved_mb, sent.wireline_mb)
         plan = remake_plan(first, problem, stage, {"objects": reached}, used)
         new = plan.tasks["objects"]
         factor = (1 - reached) / float(problem.tasks[0].curve.error(own.samples, rounds, 0))
@@ -181,7 +181,7 @@ def test_a_plan_made_anew_is_the_best_of_what_is_left() -> None:
         assert new.predicted["cloud"] == pytest.approx(1 - best[0], abs=1e-6)
         assert new.predicted["pretrain"] == own.predicted["pretrain"]
         assert (plan.after, plan.reached) == (stage, {"objects": reached})
-    more = remake_plan(first, problem, "pretrain", {"objects": 0.5}, Price(0.0, 0.0)).tasks["objects"]
+    more = remake_plan(first, problem, "pretrain", {"objects": 0.5}, LinkMegabytes(0.0, 0.0)).tasks["objects"]
     assert more.wireless_mb > own.wireless_mb  # what stage I did not send is free
 
 
@@ -190,7 +190,9 @@ def test_no_other_plan_fits_what_is_left() -> None:
     assert problem is not None
     counts = first.tasks["objects"]
     sent = price(frame().stage_plan(counts.samples, 0, 0), SIZES)
-    plan = remake_plan(first, problem, "pretrain", {"objects": 0.5}, Price(sent.wireless_mb + 60.0, sent.wireline_mb))
+    plan = remake_plan(
+        first, problem, "pretrain", {"objects": 0.5}, LinkMegabytes(sent.wireless_mb + 60.0, sent.wireline_mb)
+    )
     assert plan.tasks == first.tasks
 
 
@@ -211,7 +213,7 @@ def test_the_curve_of_least_aicc_is_planned_by() -> None:
 
 
 def test_rounds_without_limits_are_those_that_were_measured_and_there_is_time_for() -> None:
-    open_ended = replace(frame(9000.0, 9000.0), limits=Limits())
+    open_ended = replace(frame(9000.0, 9000.0), limits=PlanLimits())
     free = make_plan((asked(),), open_ended, "joint")[0].tasks["objects"]
     assert (free.edge_rounds, free.cloud_rounds) == (6, 3)
     timed = make_plan((replace(asked(), train_s=4.0),), replace(open_ended, horizon_s=25.0), "joint")[0].tasks[
@@ -223,7 +225,7 @@ def test_rounds_without_limits_are_those_that_were_measured_and_there_is_time_fo
 
 def test_slow_vehicles_are_planned_into_the_rounds_that_they_have_time_for() -> None:
     speeds = {f"a/cav{number}": 1.0 for number in range(4)} | {f"b/cav{number}": 0.5 for number in range(3)}
-    settings = replace(frame(9000.0, 9000.0), limits=Limits(), horizon_s=12.0, speeds=speeds)
+    settings = replace(frame(9000.0, 9000.0), limits=PlanLimits(), horizon_s=12.0, speeds=speeds)
     first, problem = make_plan((replace(asked(), train_s=2.0),), settings, "joint")
     own = first.tasks["objects"]
     assert problem is not None
@@ -244,7 +246,9 @@ def test_slow_vehicles_are_planned_into_the_rounds_that_they_have_time_for() -> 
     air_joins = on_air.tasks["objects"].joins
     assert air_joins is not None
     assert all(len(air_joins[name]) * slower.tasks[0].vehicle_train_s[name] <= 12.0 for name in speeds)
-    later = remake_plan(first, problem, "edge", {"objects": 0.4}, Price(own.wireless_mb / 2, own.wireline_mb / 2))
+    later = remake_plan(
+        first, problem, "edge", {"objects": 0.4}, LinkMegabytes(own.wireless_mb / 2, own.wireline_mb / 2)
+    )
     joins = later.tasks["objects"].joins
     assert joins is not None
     for name, joined in own.joins.items():  # what is over stays
@@ -264,7 +268,7 @@ def plan_recipe(name: str, wireless: float = 1, wireline: float = 1, rule: PlanR
     candidates = pool.scenes * pool.spins * pool.cavs
     request = PlanRequest("objects", own.weight, sizes, candidates, load_history("objects"), None, own.train_s)
     settings = PlanSettings(
-        budgets_mb=Price(wireless * recipe.budgets_mb.wireless, wireline * recipe.budgets_mb.wireline),
+        budgets_mb=LinkMegabytes(wireless * recipe.budgets_mb.wireless, wireline * recipe.budgets_mb.wireline),
         headroom=recipe.headroom,
         limits=recipe.limits,
         edge_groups=groups,
@@ -348,7 +352,7 @@ def test_a_models_size_is_what_flower_sends() -> None:
         def train(self, weights, *, steps, learning_rate, seed):
             return LocalUpdate(weights, 12, 0.345)
 
-    book = Ledger(Budget(10, 0))
+    book = Ledger(LinkMegabytes(10, 0))
     federate({"v": Echo()}, weights, Schedule(1, 1, 1e-3, 1e-3, 0), Account(book, "edge", "t", "wireless"))
     assert book.used_mb("wireless") == pytest.approx(sent / 1e6, rel=1e-4)
 

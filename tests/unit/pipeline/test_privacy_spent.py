@@ -15,7 +15,7 @@ from flcav.pipeline.arms import name_repeat
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, RunRecipe
 from flcav.pipeline.results.training import PrivacySpent, StageResult
 from flcav.pipeline.steps.graph import Graph
-from flcav.pipeline.training.private_rounds import Training, compose_trainings, plan_private_rounds
+from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings, plan_private_rounds
 
 PRIVACY = {"clip": 1.0, "noise": 1.0}
 
@@ -26,15 +26,17 @@ def composed(participations: int) -> float:
 
 def test_tasks_and_retrainings_compose_and_do_not_add_up() -> None:
     rules = Rules(privacy=Privacy.model_validate(PRIVACY))
-    one, four = (compose_trainings(rules, [Training("grid", 4, 3)] * number) for number in (1, 4))
+    one, four = (compose_trainings(rules, [PrivateTraining("grid", 4, 3)] * number) for number in (1, 4))
     assert one is not None
     assert four is not None
     assert (one.epsilon, four.epsilon) == pytest.approx((composed(3), composed(12)))
     assert f"{one.epsilon:.0f} {four.epsilon:.0f}" == "9 21"
-    elsewhere = compose_trainings(rules, [Training("grid", 4, 3), Training("ring", 4, 3)])  # other vehicles
+    elsewhere = compose_trainings(
+        rules, [PrivateTraining("grid", 4, 3), PrivateTraining("ring", 4, 3)]
+    )  # other vehicles
     assert elsewhere == one
-    assert compose_trainings(rules, [Training("grid", 4, 0)]) is None
-    assert compose_trainings(Rules(), [Training("grid", 4, 3)]) is None
+    assert compose_trainings(rules, [PrivateTraining("grid", 4, 0)]) is None
+    assert compose_trainings(Rules(), [PrivateTraining("grid", 4, 3)]) is None
     assert one.describe() == f"epsilon {composed(3):.2f} at delta 1e-05"
     assert PrivacySpent(1.0, 1e-5, True).describe() == f"epsilon 1.00 at delta 1e-05 ({SEEDED})"
 
@@ -100,7 +102,9 @@ def test_a_budget_alone_gives_one_noise_for_all_regions() -> None:
     assert few is not None
     assert many is not None
     assert few.deviation > many.deviation
-    spent = compose_trainings(asked, [Training("grid", 8, 7, few.noise), Training("ring", 4, 7, few.noise)])
+    spent = compose_trainings(
+        asked, [PrivateTraining("grid", 8, 7, few.noise), PrivateTraining("ring", 4, 7, few.noise)]
+    )
     assert spent is not None
     assert spent.epsilon <= 6
     assert spent.describe().endswith(f"at delta 1e-05, noise {few.noise:g} x clip")

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.network.plan import Price
+from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import Infeasible
 from flcav.pipeline.plan.replanning import continue_joins, remake_plan
@@ -72,9 +72,9 @@ def test_megabytes_that_a_stage_did_not_send_are_further_rounds_of_the_next() ->
     limited = asked.model_copy(update={"budgets_mb": asked.budgets_mb.model_copy(update={"wireless": 40.0})})
     price = 10 * 0.5 + 6 * 3.0  # of the samples and of six edge rounds of three vehicles
     for sent, rounds in ((price, 5), (price - 3.0, 6), (price - 0.9, 5), (price + 0.1, 5), (price + 3.0, 4)):
-        made = remake_plan(plan, limited, "edge", {"t": 0.6}, Price(sent, 5.0))
+        made = remake_plan(plan, limited, "edge", {"t": 0.6}, LinkMegabytes(sent, 5.0))
         assert (made.tasks["t"].edge_rounds, made.tasks["t"].cloud_rounds) == (6, rounds), sent
-    none = remake_plan(plan, limited, "edge", {"t": 0.6}, Price(39.9, 5.0))
+    none = remake_plan(plan, limited, "edge", {"t": 0.6}, LinkMegabytes(39.9, 5.0))
     assert none.tasks == plan.tasks  # nothing is left for a cloud round
 
 
@@ -82,7 +82,7 @@ def test_vehicles_join_the_cloud_rounds_that_they_have_time_for() -> None:
     first = replace(plan_of(6, 1), joins=dict.fromkeys(VEHICLES, tuple(range(1, 8))))
     plan = Plan("joint", {"t": first})
     for horizon_s, expected in ((None, {*VEHICLES}), (99.0, {*VEHICLES}), (14.0, {*VEHICLES})):
-        made = remake_plan(plan, timed(problem(), horizon_s, "t"), "edge", {"t": 0.6}, Price(0.0, 0.0))
+        made = remake_plan(plan, timed(problem(), horizon_s, "t"), "edge", {"t": 0.6}, LinkMegabytes(0.0, 0.0))
         after = follow_plan(Federation(), made.tasks["t"], after_edge=True).selection.joins
         assert {name for name, own in after.items() if own == (1,)} == expected
 
@@ -90,7 +90,7 @@ def test_vehicles_join_the_cloud_rounds_that_they_have_time_for() -> None:
 def test_all_tasks_go_on_as_planned_where_one_of_them_has_too_little_time_left() -> None:
     first = replace(plan_of(6, 1), joins=dict.fromkeys(VEHICLES, tuple(range(1, 8))))
     late = replace(first, edge_rounds=7, joins=dict.fromkeys(VEHICLES, tuple(range(1, 9))))
-    plan, sent = Plan("joint", {"t": first, "u": late}), Price(0.0, 0.0)
+    plan, sent = Plan("joint", {"t": first, "u": late}), LinkMegabytes(0.0, 0.0)
     for horizon_s, again in ((28.0, False), (30.0, True)):  # 14 rounds of 2 s, 13 of which are over; 15
         made = remake_plan(plan, timed(problem(), horizon_s, "t", "u"), "edge", dict.fromkeys("tu", 0.6), sent)
         assert (made.tasks != plan.tasks) == again

@@ -22,7 +22,7 @@ from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.clock.records import save_rounds
-from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
 from flcav.perception.training import train
@@ -61,7 +61,7 @@ class Walk:
 
 def edge(folder: Path, strategy: Strategy = FEDAVG, report: Report = ignore_progress) -> tuple[Weights, Ledger]:
     """Federate as stage II does: the road's views are booked before the rounds."""
-    book = Ledger(Budget(1.0, 0.0))
+    book = Ledger(LinkMegabytes(1.0, 0.0))
     book.enter(ROAD)
     states = {"edge": FederationState()}
     federating = FederationCheckpoints(OBJECTS, folder, book, report, states, str(strategy), SCHEDULE.rounds)
@@ -78,7 +78,7 @@ def edge(folder: Path, strategy: Strategy = FEDAVG, report: Report = ignore_prog
 
 def cloud(folder: Path, strategy: Strategy = FEDAVG) -> tuple[Weights, Ledger]:
     """Federate as stage III does: on top of what was spent before, edge servers nested below the cloud."""
-    book = Ledger(Budget(10.0, 1.0), [STAGE_ONE, ROAD])
+    book = Ledger(LinkMegabytes(10.0, 1.0), [STAGE_ONE, ROAD])
     states = {name: FederationState() for name in ("cloud", "grid", "ring")}
     federating = FederationCheckpoints(
         OBJECTS, folder, book, lambda done, total, note="": None, states, str(strategy), SCHEDULE.rounds
@@ -230,7 +230,7 @@ def test_the_mean_of_the_last_rounds_is_the_federation_s_result(tmp_path: Path) 
         rounds.append({name: array + np.float32(number**2) for name, array in to_arrays(network).items()})
         write_bytes(round_path(tmp_path, number), save(rounds[-1]))
     federating = FederationCheckpoints(
-        LINEAR, tmp_path, Ledger(Budget(1.0, 1.0)), ignore_progress, {}, "", losses=[0.5] * 3
+        LINEAR, tmp_path, Ledger(LinkMegabytes(1.0, 1.0)), ignore_progress, {}, "", losses=[0.5] * 3
     )
     for averaged, last in ((1, rounds[2:]), (2, rounds[1:]), (9, rounds)):
         federating.finish(network, averaged)
@@ -281,14 +281,14 @@ def test_a_kill_does_not_change_pretraining(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_regions_share_what_stage_one_left_by_their_vehicles() -> None:
-    stage_one = Ledger(Budget(11.0, 5.0), [STAGE_ONE])
+    stage_one = Ledger(LinkMegabytes(11.0, 5.0), [STAGE_ONE])
     shares = [region_budget(stage_one, {"grid": 4, "ring": 3}, town) for town in ("grid", "ring")]
     assert [share.wireless_mb for share in shares] == pytest.approx([4.0, 3.0])
     assert [share.wireline_mb for share in shares] == [0.0, 0.0]  # stage II has no business there
 
 
 def test_tasks_share_both_budgets_as_planned_and_never_more() -> None:
-    whole = Budget(100.0, 50.0)
+    whole = LinkMegabytes(100.0, 50.0)
     assert share_budget(whole, {"a": (30.0, 20.0)}, "a") == whole
     planned = {"a": (10.0, 10.0), "b": (20.0, 0.0), "c": (7.1, 3.3)}
     parts = [share_budget(whole, planned, task) for task in planned]

@@ -19,7 +19,7 @@ from flcav.federation.state import SERVER
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.interface.progress import ignore_progress
-from flcav.network.ledger import Budget, BudgetExceeded, Ledger
+from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.recipe import Training
@@ -67,7 +67,7 @@ def vehicles(learning: Learning, region: str, dies_at: int) -> Any:
 
 def edge(folder: Path, rules: Rules, dies_at: int = 0, report: Any = ignore_progress, wireless_mb: float = 1.0) -> None:
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
-    schedule, book = learning.schedule(ROUNDS, 1, "edge", "a"), Ledger(Budget(wireless_mb, 1.0))
+    schedule, book = learning.schedule(ROUNDS, 1, "edge", "a"), Ledger(LinkMegabytes(wireless_mb, 1.0))
     how = (learning.build_network(), vehicles(learning, "a", dies_at), schedule, FEDAVG, 0, book, folder, report)
     federate_edge(EdgeFederation(learning, *how), rules)
 
@@ -76,7 +76,7 @@ def cloud(folder: Path, rules: Rules, dies_at: int = 0, wireless_mb: float = 1.0
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
     network = learning.build_network()
     regions = {name: RegionStart(vehicles(learning, name, dies_at), to_arrays(network), earlier=0) for name in "ab"}
-    how = (2, Strategies(FEDAVG, FEDAVG), Ledger(Budget(wireless_mb, 1.0)), folder, ignore_progress)
+    how = (2, Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(wireless_mb, 1.0)), folder, ignore_progress)
     federate_cloud(CloudFederation(learning, network, regions, *how), 2, rules)
 
 

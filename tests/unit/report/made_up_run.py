@@ -9,7 +9,7 @@ from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.plans import Placed, Plan, Pole, TaskPlan
 from flcav.pipeline.results.run import ArmResult, LinkUse, Run, Spent
-from flcav.pipeline.results.tests import Difference, Finding, Test, Tested
+from flcav.pipeline.results.tests import Difference, RunFinding, Test, Tested
 from flcav.pipeline.results.training import Pretrained, Validated
 from flcav.report.pictures.clouds import ComparedSweep, MatchedDetections
 from flcav.report.pictures.maps import DENSEST, ErrorMap, poles_of
@@ -72,7 +72,7 @@ def run() -> Run:
             ),
         ),
         findings=tuple(
-            Finding("grid, objects", f"Does {name} help?", said, f"What {name} did.") for name, said in verdicts
+            RunFinding("grid, objects", f"Does {name} help?", said, f"What {name} did.") for name, said in verdicts
         ),
         gap_closed={},
         caveats=("ideal road detector, upper bound",),

@@ -10,7 +10,7 @@ from jinja2 import UndefinedError
 from flcav.pipeline.recipe import MAIN
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.tests import Finding, HomeCost
+from flcav.pipeline.results.tests import HomeCost, RunFinding
 from flcav.pipeline.running import RESULTS
 from flcav.report.pages.html import render
 from flcav.report.pages.run_page import page
@@ -108,7 +108,7 @@ def test_plans_that_were_made_anew_are_told() -> None:
 
 def test_values_are_escaped() -> None:
     told = results()
-    told["findings"] = (Finding("grid", "Really?", "held", "<script>alert('x')</script> & more"),)
+    told["findings"] = (RunFinding("grid", "Really?", "held", "<script>alert('x')</script> & more"),)
     text = render(told, {})
     assert "<script" not in text
     assert "&lt;script&gt;" in text

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
-from flcav.network.clock.records import ClientTiming, RoundRecord
+from flcav.network.clock.records import ClientTiming, RoundTiming
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.coverage import cover_town
 from flcav.network.radio.links import unit_positions
@@ -17,7 +17,7 @@ from flcav.world.map.town import load_town
 
 DONE = ClientTiming("cav0", "pole1", 1, 10.5, 2.0, 3.0, 1.0, 16.5, 9, 9, "")
 LOST = ClientTiming("cav1", "pole1", 1, 10.5, 4.0, 0.5, 0.0, 15.0, 9, 0, "left the town")
-ROUND = RoundRecord(1, 10.0, 17.0, 0.5, 0.5, (DONE, LOST))
+ROUND = RoundTiming(1, 10.0, 17.0, 0.5, 0.5, (DONE, LOST))
 
 
 def test_bars_are_as_long_as_the_times_and_begin_where_they_did():
@@ -46,7 +46,7 @@ def test_who_dropped_out_is_said_with_the_reason():
 
 
 def test_a_round_without_wireline_has_no_row_of_it():
-    figure = timeline_of_rounds([RoundRecord(1, 10.5, 16.5, 0.0, 0.0, (DONE,))])
+    figure = timeline_of_rounds([RoundTiming(1, 10.5, 16.5, 0.0, 0.0, (DONE,))])
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["cav0"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["download", "compute", "upload"]
     with pytest.raises(ValueError, match="at least one round"):

@@ -12,7 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.state import RoundRecord
-from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
+from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link, LinkMegabytes
 from flcav.pipeline.analysis.caveats import PLACED_BARE
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
 from flcav.pipeline.results.run import Run
@@ -29,7 +29,7 @@ def entry(link: Link, direction: Direction, round_: int, client: str, size: int)
 
 
 def checkpoint(folder: Path, entries: list[LedgerEntry], **records: RoundRecord) -> None:
-    Ledger(Budget(1.0, 1.0), entries).save(folder / LEDGER)
+    Ledger(LinkMegabytes(1.0, 1.0), entries).save(folder / LEDGER)
     told = {name.replace("_", "/"): (each,) for name, each in records.items()}
     Checkpoint(1, len(entries), (0.25,), "FedAvg()", {}, told).keep(folder)
 

@@ -33,7 +33,7 @@ from flcav.federation.strategies.median import Median
 from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights, learned_names
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
@@ -133,7 +133,7 @@ def run_federation(
     drives: Drives, start: Weights, liars: tuple[str, ...], lie: str, strategy: Strategy, seed: int
 ) -> Weights:
     """Return the weights after the federation; where they grew until nobody could train, those of the last round."""
-    account = Account(Ledger(Budget(1e6, 1e6)), "edge", WEATHER.name, "wireless")
+    account = Account(Ledger(LinkMegabytes(1e6, 1e6)), "edge", WEATHER.name, "wireless")
     reached: list[Weights] = [start]
     with contextlib.suppress(ClientFailed):
         federate(

@@ -36,7 +36,7 @@ from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import Weights
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.ledger import Budget, Ledger
+from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
@@ -154,7 +154,7 @@ def attack(drives: Drives, known: Vector, rules: Rules, seed: int) -> Attacked:
     """
     members, others = split_members(drives, seed)
     first = {name: take(pictures, [0]) for name, pictures in members.items()}
-    start, account = draw_head(seed), Account(Ledger(Budget(1e6, 1e6)), "edge", WEATHER.name, "wireless")
+    start, account = draw_head(seed), Account(Ledger(LinkMegabytes(1e6, 1e6)), "edge", WEATHER.name, "wireless")
     schedule = Schedule(ROUNDS, STEPS, LEARNING_RATE, LEARNING_RATE / 4, seed)
     vehicles = {name: Vehicle(pictures) for name, pictures in members.items()}
     single = {name: Vehicle(pictures, 1) for name, pictures in first.items()}

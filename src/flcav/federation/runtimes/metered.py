@@ -9,7 +9,7 @@ from flwr.serverapp import Grid
 from flcav.federation.messages.records import CONFIG
 from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.wrapped import WrappedGrid
-from flcav.network.ledger import Budget, Direction, Ledger, LedgerEntry, Link
+from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link, LinkMegabytes
 
 UNDISCLOSED = "undisclosed"  # in the place of a client's name
 UNLIMITED_MB = 1e12  # budget of whoever does not count
@@ -49,7 +49,7 @@ class Account:
 
 def open_account() -> Account:
     """Return the account of a federation without a budget."""
-    return Account(Ledger(Budget(UNLIMITED_MB, UNLIMITED_MB)), "edge", "federation", "wireless")
+    return Account(Ledger(LinkMegabytes(UNLIMITED_MB, UNLIMITED_MB)), "edge", "federation", "wireless")
 
 
 class BudgetedGrid(WrappedGrid):

@@ -32,7 +32,7 @@ class ClientTiming:
 
 
 @dataclass(frozen=True)
-class RoundRecord:
+class RoundTiming:
     """One round on the trace's clock [s]: wireline download, then the clients, then wireline upload."""
 
     round: int  # from 1
@@ -53,14 +53,14 @@ class RoundRecord:
         return max(self.finished, key=lambda client: client.end_s, default=None)
 
 
-_ROUND = tuple(field for field in fields(RoundRecord) if field.name not in ("round", "clients"))
+_ROUND = tuple(field for field in fields(RoundTiming) if field.name not in ("round", "clients"))
 SCHEMA = pa.schema(
     [(field.name, _TYPES[field.type]) for field in fields(ClientTiming)]
     + [(f"round_{field.name}", _TYPES[field.type]) for field in _ROUND]
 )
 
 
-def rounds_table(records: Sequence[RoundRecord]) -> pa.Table:
+def rounds_table(records: Sequence[RoundTiming]) -> pa.Table:
     """Return a table with a row per client and round; what is said of the round is in the columns `round_...`."""
     rows = [
         {**asdict(client), **{f"round_{field.name}": getattr(record, field.name) for field in _ROUND}}
@@ -70,12 +70,12 @@ def rounds_table(records: Sequence[RoundRecord]) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=SCHEMA)
 
 
-def save_rounds(records: Sequence[RoundRecord], path: Path) -> None:
+def save_rounds(records: Sequence[RoundTiming], path: Path) -> None:
     """Write `rounds_table` atomically to a Parquet file."""
     write_parquet(rounds_table(records), path)
 
 
-def load_rounds(path: Path) -> tuple[RoundRecord, ...]:
+def load_rounds(path: Path) -> tuple[RoundTiming, ...]:
     """Return the rounds that `save_rounds` wrote; raises `InputError` where the file is missing or holds none."""
     table = read_parquet(path)
     if table.schema.remove_metadata() != SCHEMA:
@@ -88,5 +88,5 @@ def load_rounds(path: Path) -> tuple[RoundRecord, ...]:
         own = list(group)
         about = {field.name: own[0][f"round_{field.name}"] for field in _ROUND}
         clients = (ClientTiming(**{field.name: row[field.name] for field in fields(ClientTiming)}) for row in own)
-        records.append(RoundRecord(round=number, clients=tuple(clients), **about))
+        records.append(RoundTiming(round=number, clients=tuple(clients), **about))
     return tuple(records)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flcav.config import Config, InputError
-from flcav.network.clock.records import ClientTiming, RoundRecord
+from flcav.network.clock.records import ClientTiming, RoundTiming
 from flcav.network.clock.work import ClientWork
 from flcav.network.radio.budget import Radio, shared_rates_bps
 from flcav.network.radio.links import RadioLinks
@@ -180,7 +180,7 @@ def simulate_rounds(
     start_s: float | None = None,
     edge_rounds_per_cloud_round: int | None = None,
     model_bytes: int = 0,
-) -> tuple[RoundRecord, ...]:
+) -> tuple[RoundTiming, ...]:
     """Return the timed rounds of a federation over radio links, one after another.
 
     Every vehicle of a round's work that is in the town when the round begins takes part. Before each group of edge
@@ -209,6 +209,6 @@ def simulate_rounds(
         here = [name for name, there in zip(links.vehicle, links.present[instant].tolist()) if there and name in work]
         clients = time_clients(links, [work[name] for name in here], number, begins, settings.rounds)
         ends = max(client.end_s for client in clients) + up
-        records.append(RoundRecord(number, now, ends, down, up, clients))
+        records.append(RoundTiming(number, now, ends, down, up, clients))
         now = ends
     return tuple(records)

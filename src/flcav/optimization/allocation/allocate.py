@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.network.plan import Price
+from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.curves.curves import Curve, SharedCurve
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.area import area, maximise_area
@@ -39,7 +39,7 @@ class LearnerError:
 
 
 @dataclass(frozen=True)
-class TaskPlan:
+class TaskAllocation:
     """The plan of one task: its samples and rounds, predicted error and uplink cost."""
 
     name: str
@@ -75,9 +75,9 @@ class Allocation:
     )
     lower_bound: float | None  # proven: no plan has less; None for the area
     gap: float | None  # (objective - lower_bound) / lower_bound
-    tasks: tuple[TaskPlan, ...]
-    used_mb: Price
-    marginal_error_per_gb: Price  # derivative by each budget, per 1000 MB: see `allocate`
+    tasks: tuple[TaskAllocation, ...]
+    used_mb: LinkMegabytes
+    marginal_error_per_gb: LinkMegabytes  # derivative by each budget, per 1000 MB: see `allocate`
     busy_s: float | None = None  # time of the busiest vehicle, where horizon_s limits what vehicles train
     note: str | None = None
     warnings: tuple[str, ...] = ()
@@ -126,7 +126,7 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
         gap=achieved,
         tasks=plans,
         used_mb=sum_prices(plans),
-        marginal_error_per_gb=Price(*(MB_PER_GB * max(float(rate), 0.0) for rate in best.rates[:2])),
+        marginal_error_per_gb=LinkMegabytes(*(MB_PER_GB * max(float(rate), 0.0) for rate in best.rates[:2])),
         busy_s=_busy_s(asked, plans),
         note=NO_CERTIFICATE if lower is None else None,
         warnings=(*_idle_horizon(problem), *_beyond(problem, plans)),
@@ -134,7 +134,7 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
     )
 
 
-def _busy_s(problem: Problem, plans: Sequence[TaskPlan]) -> float | None:
+def _busy_s(problem: Problem, plans: Sequence[TaskAllocation]) -> float | None:
     """Return the time [s] on the problem's `shared_clock`; None where it has none."""
     clock, k = shared_clock(problem), problem.edge_rounds_per_cloud_round
     if clock is None:
@@ -163,12 +163,12 @@ def resolve_problem(problem: Problem) -> Problem:
     return problem.model_copy(update={"tasks": tasks})
 
 
-def build_task_plans(problem: Problem, x: Array) -> tuple[TaskPlan, ...]:
+def build_task_plans(problem: Problem, x: Array) -> tuple[TaskAllocation, ...]:
     """Return the tasks' plans for x (3N,): samples, edge rounds and cloud rounds of each task in order."""
     return tuple(_task_plan(problem, task, row) for task, row in zip(problem.tasks, x.reshape(-1, 3)))
 
 
-def _task_plan(problem: Problem, task: AllocationTask, row: Array) -> TaskPlan:
+def _task_plan(problem: Problem, task: AllocationTask, row: Array) -> TaskAllocation:
     samples, edge_rounds, cloud_rounds = (int(count) for count in row)
     cost = price_counts(problem, task, (samples, edge_rounds, cloud_rounds))
 
@@ -176,25 +176,25 @@ def _task_plan(problem: Problem, task: AllocationTask, row: Array) -> TaskPlan:
         return float(curve.error(samples, edge_rounds, cloud_rounds, problem.edge_rounds_per_cloud_round))
 
     members = [LearnerError(each.name, error(each.curve)) for each in task.learners]
-    return TaskPlan(
+    return TaskAllocation(
         *(task.name, samples, edge_rounds, cloud_rounds, error(task.curve), cost.wireless_mb, cost.wireline_mb),
         upper_error=error(task.upper) if problem.robust and task.upper is not None else None,
         members=tuple(members) if isinstance(task.curve, SharedCurve) else (),
     )
 
 
-def sum_prices(plans: tuple[TaskPlan, ...]) -> Price:
+def sum_prices(plans: tuple[TaskAllocation, ...]) -> LinkMegabytes:
     """Return the total cost of the plans."""
-    return Price(sum(plan.wireless_mb for plan in plans), sum(plan.wireline_mb for plan in plans))
+    return LinkMegabytes(sum(plan.wireless_mb for plan in plans), sum(plan.wireline_mb for plan in plans))
 
 
-def weighted_error(problem: Problem, plans: Sequence[TaskPlan]) -> float:
+def weighted_error(problem: Problem, plans: Sequence[TaskAllocation]) -> float:
     """Return the weighted sum of the predicted errors; of robust plans, of the upper errors."""
     errors = (plan.predicted_error if plan.upper_error is None else plan.upper_error for plan in plans)
     return sum(task.weight * error for task, error in zip(problem.tasks, errors, strict=True))
 
 
-def evaluate_objective(problem: Problem, plans: Sequence[TaskPlan]) -> float:
+def evaluate_objective(problem: Problem, plans: Sequence[TaskAllocation]) -> float:
     """Return the value of the problem's objective at the plans: weighted error, largest error or area."""
     if problem.objective == "weighted":
         return weighted_error(problem, plans)
@@ -215,7 +215,7 @@ def _idle_horizon(problem: Problem) -> tuple[str, ...]:
     return (f"horizon_s = {problem.horizon_s:g} limits nothing: no task has train_s, vehicle_train_s or uplink_mbps",)
 
 
-def _beyond(problem: Problem, plans: tuple[TaskPlan, ...]) -> tuple[str, ...]:
+def _beyond(problem: Problem, plans: tuple[TaskAllocation, ...]) -> tuple[str, ...]:
     """Return a warning for each quantity planned beyond the range in which its curve was measured."""
     return tuple(
         f"task {task.name!r}: {getattr(plan, name)} {name.replace('_', ' ')} are beyond the {most:g} that its curve "

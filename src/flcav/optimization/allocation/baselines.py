@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 from flcav.config import InputError, shorten
-from flcav.network.plan import Price
+from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.allocation.allocate import (
-    TaskPlan,
+    TaskAllocation,
     build_task_plans,
     evaluate_objective,
     resolve_problem,
@@ -42,8 +42,8 @@ class Baseline:
 
     name: str  # of `BASELINES`
     objective: float  # as of `Allocation`
-    tasks: tuple[TaskPlan, ...]
-    used_mb: Price
+    tasks: tuple[TaskAllocation, ...]
+    used_mb: LinkMegabytes
     note: str | None = None  # why the vehicles cannot carry it out; None: they can
 
 

@@ -7,7 +7,7 @@ extrapolated from the derivative at the present one.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from flcav.network.plan import Price
+from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.allocation.allocate import Allocation, relative_gap
 from flcav.optimization.allocation.fleet import allocate_fleet
 from flcav.optimization.problem import Problem
@@ -24,7 +24,7 @@ class BudgetPoint:
     """The optimal objective at one pair of budgets."""
 
     factor: float  # of the problem's own budgets, on the links that were scaled
-    budgets_mb: Price
+    budgets_mb: LinkMegabytes
     objective: float
     lower_bound: float | None  # proven: no plan within these budgets has less; None for the area
     gap: float | None  # (objective - lower_bound) / lower_bound
@@ -66,7 +66,7 @@ def sweep_budgets(
         best = found if best is None else _better(problem, best, found)
         lower = None if found.lower_bound is None else min(found.lower_bound, best.objective)
         gap = None if lower is None else relative_gap(best.objective, lower)
-        points.append(BudgetPoint(factor, Price(*budgets.values()), best.objective, lower, gap))
+        points.append(BudgetPoint(factor, LinkMegabytes(*budgets.values()), best.objective, lower, gap))
     return tuple(points)
 
 

@@ -26,7 +26,7 @@ from itertools import islice
 import numpy as np
 
 from flcav.interface.wording import plural
-from flcav.network.plan import Price
+from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.allocation.allocate import (
     Allocation,
     allocate,
@@ -220,7 +220,7 @@ def _certified(asked: Problem, found: Sequence[Carried], bound: float | None, li
     plan, shares = (max if larger else min)(found, key=lambda carried: carried[0].objective)
     lower = None if bound is None else min(bound, plan.objective)
     gap = None if lower is None else relative_gap(plan.objective, lower)
-    rates = Price(0.0, plan.marginal_error_per_gb.wireline_mb)
+    rates = LinkMegabytes(0.0, plan.marginal_error_per_gb.wireline_mb)
     notes = (plan.note, limit)
     certified = replace(
         plan,

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from flcav.optimization.allocation.allocate import TaskPlan
+from flcav.optimization.allocation.allocate import TaskAllocation
 from flcav.optimization.allocation.vehicles import split_plan
 from flcav.optimization.curves.curves import Additive
 from flcav.optimization.problem import AllocationTask, Budgets, Limits, Problem, Uplink
@@ -55,6 +55,6 @@ def share_by_links(tasks: Mapping[str, UploadDemand], mbps: Mapping[str, float])
                 curve=Additive(),
             )
         )
-        plans.append(TaskPlan(name, asked.samples, 0, 0, 0.0, 0.0, 0.0))
+        plans.append(TaskAllocation(name, asked.samples, 0, 0, 0.0, 0.0, 0.0))
     shares = split_plan(Problem(budgets_mb=Budgets(wireless=1.0, wireline=1.0), tasks=tuple(units)), plans)
     return {name: {share.vehicle: share.samples for share in own} for name, own in shares.items()}

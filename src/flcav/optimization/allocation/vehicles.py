@@ -25,7 +25,7 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array, csr_array
 
 from flcav.interface.wording import plural
-from flcav.optimization.allocation.allocate import TaskPlan
+from flcav.optimization.allocation.allocate import TaskAllocation
 from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible
 
@@ -75,7 +75,7 @@ def trains(problem: Problem) -> bool:
     return any(task.train_s > 0 or any(task.vehicle_train_s.values()) for task in problem.tasks)
 
 
-def split_plan(problem: Problem, plans: Sequence[TaskPlan]) -> Shares:
+def split_plan(problem: Problem, plans: Sequence[TaskAllocation]) -> Shares:
     """Return the split of `plans` (one per task, in their order) over the vehicles: by task, a share per vehicle.
 
     Tasks that do not name their vehicles are left out. Raises `Infeasible` where the vehicles hold too few samples,
@@ -120,11 +120,11 @@ def sum_busy(shares: Shares) -> dict[str, float]:
     return busy
 
 
-def _held(task: AllocationTask, plan: TaskPlan, vehicle: str) -> int:
+def _held(task: AllocationTask, plan: TaskAllocation, vehicle: str) -> int:
     return min(task.samples_held.get(vehicle, plan.samples), plan.samples)
 
 
-def _parts(problem: Problem, task: AllocationTask, plan: TaskPlan) -> list[_TaskOnVehicle]:
+def _parts(problem: Problem, task: AllocationTask, plan: TaskAllocation) -> list[_TaskOnVehicle]:
     groups = np.repeat(np.arange(len(task.edge_groups)), task.edge_groups)
     rounds = plan.edge_rounds + problem.edge_rounds_per_cloud_round * plan.cloud_rounds
     return [
@@ -137,7 +137,9 @@ def _parts(problem: Problem, task: AllocationTask, plan: TaskPlan) -> list[_Task
     ]
 
 
-def _split(parts: Sequence[_TaskOnVehicle], plans: Sequence[TaskPlan], horizon_s: float | None, subject: str) -> Array:
+def _split(
+    parts: Sequence[_TaskOnVehicle], plans: Sequence[TaskAllocation], horizon_s: float | None, subject: str
+) -> Array:
     """Return the samples and rounds (P, 2) of every part; raises `TooSlow` of `subject` where none fits the horizon."""
     size = 2 * len(parts) + 1  # the last variable is a time [s]: the end of stage I, or of the plan
     needs, least = _needs(parts, plans)
@@ -164,7 +166,7 @@ def _split(parts: Sequence[_TaskOnVehicle], plans: Sequence[TaskPlan], horizon_s
     return np.round(found[:-1]).reshape(-1, 2)
 
 
-def _needs(parts: Sequence[_TaskOnVehicle], plans: Sequence[TaskPlan]) -> tuple[csr_array, Array]:
+def _needs(parts: Sequence[_TaskOnVehicle], plans: Sequence[TaskAllocation]) -> tuple[csr_array, Array]:
     """Return constraint rows and their bounds (rows, 2) for the samples of each task and the rounds of each group.
 
     All planned samples are uploaded; the rounds that the vehicles of a group join are together at least the task's.

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult
 
 from flcav.config import InputError, shorten
-from flcav.network.plan import Price, StagePlan, price
+from flcav.network.ledger import LinkMegabytes
+from flcav.network.plan import StagePlan, price
 from flcav.optimization.curves.curves import Additive
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.effective import EffectiveTask, EffectiveTasks, build_effective_tasks
@@ -175,7 +176,7 @@ def stage_plan(problem: Problem, task: AllocationTask, counts: Sequence[int]) ->
     return StagePlan(samples, edge_rounds, cloud_rounds, task.edge_groups, problem.edge_rounds_per_cloud_round)
 
 
-def price_counts(problem: Problem, task: AllocationTask, counts: Sequence[int]) -> Price:
+def price_counts(problem: Problem, task: AllocationTask, counts: Sequence[int]) -> LinkMegabytes:
     """Return the cost on each uplink [MB] of `counts` = samples, edge rounds, cloud rounds of `task`."""
     return price(stage_plan(problem, task, counts), task.sizes)
 

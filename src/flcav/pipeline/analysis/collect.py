@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from flcav.network.ledger import LINKS, Budget, Ledger
+from flcav.network.ledger import LINKS, Ledger, LinkMegabytes
 from flcav.perception.tasks import task_named
 from flcav.pipeline.analysis.caveats import list_caveats, list_cut, list_diverged, list_unreached
 from flcav.pipeline.analysis.costs import collect_home_costs, list_arm_costs
@@ -26,7 +26,7 @@ from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import Pretrained, StageResult, Watched
 from flcav.pipeline.rigs import compare_rigs
 from flcav.pipeline.steps.graph import Graph
-from flcav.pipeline.training.private_rounds import Training, compose_trainings
+from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings
 
 
 def collect_results(graph: Graph, work: Path) -> Run:
@@ -84,7 +84,9 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
     if CLOUD in arm.stages:
         books = [Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks]  # they include the others
     budgets = graph.recipe.budgets_mb
-    book = Ledger(Budget(budgets.wireless, budgets.wireline), (entry for each in books for entry in each.entries))
+    book = Ledger(
+        LinkMegabytes(budgets.wireless, budgets.wireline), (entry for each in books for entry in each.entries)
+    )
     book.save(work.parent / "ledgers" / f"{arm.name}.parquet")
     stages = tuple(StageResult.load(work / step) for step in trained)
     return ArmResult(
@@ -112,7 +114,7 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
     )
 
 
-def list_trainings(graph: Graph, work: Path, arm: Setting) -> Iterator[Training]:
+def list_trainings(graph: Graph, work: Path, arm: Setting) -> Iterator[PrivateTraining]:
     """Yield the trainings of every task with a region's vehicles, an arm's retrainings included."""
     per_cloud_round = arm.federation.edge_rounds_per_cloud_round
     for name in (name_repeat(arm.name, number) for number in (0, *number_retrainings(graph))):
@@ -122,7 +124,7 @@ def list_trainings(graph: Graph, work: Path, arm: Setting) -> Iterator[Training]
                     stage: StageResult.load(work / graph.names.stage(name, stage, region, task)) for stage in arm.stages
                 }
                 rounds = sum(own.rounds * (per_cloud_round if at == CLOUD else 1) for at, own in stages.items())
-                yield Training(region, stages[EDGE].clients, rounds, stages[EDGE].noise)
+                yield PrivateTraining(region, stages[EDGE].clients, rounds, stages[EDGE].noise)
 
 
 def _retrained(graph: Graph, work: Path, arm: Setting) -> tuple[StageResult, ...] | None:

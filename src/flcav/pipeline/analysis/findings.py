@@ -19,7 +19,7 @@ from flcav.pipeline.arms import Setting
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, ELSEWHERE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import ArmResult
-from flcav.pipeline.results.tests import Difference, Finding, Test
+from flcav.pipeline.results.tests import Difference, RunFinding, Test
 from flcav.statistics.seeds import MeanOverSeeds, of_one_training
 from flcav.statistics.verdicts import ESTIMATE, UNDECIDED, Claim, Judged, explain_verdict, judge_known, signed
 
@@ -121,7 +121,7 @@ def findings(
     settings: Mapping[str, Setting],
     recipe: RunRecipe,
     caveats: Mapping[str, str],
-) -> tuple[Finding, ...]:
+) -> tuple[RunFinding, ...]:
     """Return a finding for each difference of the run itself.
 
     `settings`: those of each arm. `caveats`: those of the labels, by task.
@@ -154,7 +154,7 @@ def _finding(
     values: Mapping[tuple[str, str, str, str], Test],
     same: str | None,
     caveats: Mapping[str, str],
-) -> Finding:
+) -> RunFinding:
     """Return the finding of a difference; `same`: what is said where nothing differs."""
     test, before = values[each.arm, each.stage, each.region, each.task], _before(each, values)
     after = test.result
@@ -162,7 +162,7 @@ def _finding(
     loss = asked.kind == "loss"
     open_, undecided = (ESTIMATE, "") if loss else (UNDECIDED, ", so the result is inconclusive")
     if same is not None:
-        return Finding(place, question, open_, f"{same}: there is nothing to compare{undecided}.")
+        return RunFinding(place, question, open_, f"{same}: there is nothing to compare{undecided}.")
     mean, low, high = each.estimate.mean, each.estimate.low, each.estimate.high
     told = (
         f"On {each.region}, {after.measure} of {each.task} was {before.estimate.mean:.3f} "
@@ -171,18 +171,18 @@ def _finding(
     )
     over = f"{after.frames} test frames of {after.scenes} scenes"
     if low is None or high is None:
-        return Finding(place, question, open_, f"{told}, over {over}: too few scenes for an interval.")
+        return RunFinding(place, question, open_, f"{told}, over {over}: too few scenes for an interval.")
     rests = f" ({caveats[each.task]})" if caveats.get(each.task) else ""
     if each.spread is None or (judged is None and not loss):
         unknown = f"how much another training on the same frames would differ is not known{undecided}"
         sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over} alone; {unknown}{rests}."
-        return Finding(place, question, open_, sentence)
+        return RunFinding(place, question, open_, sentence)
     of = f"{over} and over retraining (standard deviation {each.spread.sd:.3f} of {each.spread.trainings} trainings)"
     found = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {of}"
     if judged is None:
-        return Finding(place, question, ESTIMATE, f"{found}: an estimate, no claim{rests}.")
+        return RunFinding(place, question, ESTIMATE, f"{found}: an estimate, no claim{rests}.")
     said = f"{judged.describe('trainings')}: {explain_verdict(judged.verdict)}"
-    return Finding(place, question, judged.verdict, f"{found}; {said}{rests}.")
+    return RunFinding(place, question, judged.verdict, f"{found}; {said}{rests}.")
 
 
 def _tell_trainings(each: Difference) -> str:

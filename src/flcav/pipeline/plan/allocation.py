@@ -8,8 +8,9 @@ import numpy as np
 
 from flcav.config import InputError, parse_config
 from flcav.interface.wording import plural
-from flcav.network.plan import MessageSizes, Price, StagePlan, price
-from flcav.optimization.allocation.allocate import TaskPlan as Allotted
+from flcav.network.ledger import LinkMegabytes
+from flcav.network.plan import MessageSizes, StagePlan, price
+from flcav.optimization.allocation.allocate import TaskAllocation
 from flcav.optimization.allocation.baselines import baseline
 from flcav.optimization.allocation.fleet import allocate_fleet
 from flcav.optimization.allocation.vehicles import Shares
@@ -17,7 +18,7 @@ from flcav.optimization.curves.fitting import fit
 from flcav.optimization.curves.history import History
 from flcav.optimization.problem import Problem
 from flcav.pipeline.arms import PlanRule
-from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, Limits
+from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, PlanLimits
 from flcav.pipeline.results.plans import Plan, TaskPlan
 
 
@@ -39,9 +40,9 @@ class PlanRequest:
 class PlanSettings:
     """Budgets, bounds and topology of the federation, common to the plans of all tasks."""
 
-    budgets_mb: Price
+    budgets_mb: LinkMegabytes
     headroom: float
-    limits: Limits
+    limits: PlanLimits
     edge_groups: tuple[int, ...]  # vehicles of each edge server
     edge_rounds_per_cloud_round: int
     group_samples: tuple[int, ...] = ()  # samples that the vehicles of each edge server hold, of each task
@@ -79,7 +80,7 @@ def make_plan(tasks: tuple[PlanRequest, ...], frame: PlanSettings, rule: PlanRul
     return Plan(rule, {task.name: plans[task.name] for task in tasks}), problem
 
 
-def allocate_tasks(problem: Problem) -> tuple[Sequence[Allotted], Shares]:
+def allocate_tasks(problem: Problem) -> tuple[Sequence[TaskAllocation], Shares]:
     """Return the best plan and, of vehicles with names, each one's share of it."""
     plan, shares = allocate_fleet(problem)
     return plan.tasks, shares
@@ -138,19 +139,19 @@ def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan
     return _task_plan(counts, cost, task.sizes, None)
 
 
-def make_task_plan(sizes: MessageSizes, own: Allotted, problem: Problem, shares: Shares) -> TaskPlan:
+def make_task_plan(sizes: MessageSizes, own: TaskAllocation, problem: Problem, shares: Shares) -> TaskPlan:
     """Return the plan of a task by its allocation in `problem`: scores predicted after each stage, rounds to join."""
     curve = next(each.curve for each in problem.tasks if each.name == own.name)
     k, counts = problem.edge_rounds_per_cloud_round, (own.samples, own.edge_rounds, own.cloud_rounds)
     spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}
     predicted = {stage: max(1 - float(curve.error(*each, k)), 0.0) for stage, each in spent.items()}
     joins = {each.vehicle: each.rounds for each in shares[own.name]} if own.name in shares else None
-    return _task_plan(counts, Price(own.wireless_mb, own.wireline_mb), sizes, predicted, joins)
+    return _task_plan(counts, LinkMegabytes(own.wireless_mb, own.wireline_mb), sizes, predicted, joins)
 
 
 def _task_plan(
     counts: tuple[int, int, int],
-    cost: Price,
+    cost: LinkMegabytes,
     sizes: MessageSizes,
     predicted: Mapping[str, float] | None,
     joins: Mapping[str, tuple[int, ...]] | None = None,

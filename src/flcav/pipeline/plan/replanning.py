@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from flcav.network.plan import Price
+from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.allocation.replanning import PlanState, Sent, TaskState, condition_problem
 from flcav.optimization.allocation.vehicles import Shares, sum_busy
 from flcav.optimization.problem import MOST, AllocationTask, Problem
@@ -26,7 +26,7 @@ def remake_plan(
     problem: Problem,
     stage: Literal["pretrain", "edge"],
     reached: Mapping[str, float],
-    used_mb: Price,
+    used_mb: LinkMegabytes,
 ) -> Plan:
     """Return the plan of the rest of a run after `stage`, which `plan` was carried out in; fixed plans stay.
 

@@ -14,7 +14,7 @@ from flcav.config import InputError
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Outage
 from flcav.federation.selection import Selection
-from flcav.network.clock.records import ClientTiming, RoundRecord
+from flcav.network.clock.records import ClientTiming, RoundTiming
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
 from flcav.network.clock.work import ClientWork
 from flcav.network.radio.links import RadioLinks
@@ -36,7 +36,7 @@ class DrivenRounds:
 
     rules: Rules
     outages: Mapping[tuple[int, str], Outage]  # by round, from 1, and client
-    records: tuple[RoundRecord, ...]  # on the clock of the region's rounds, from 0 s
+    records: tuple[RoundTiming, ...]  # on the clock of the region's rounds, from 0 s
 
     @property
     def seconds(self) -> list[float]:
@@ -110,7 +110,7 @@ def drive_rounds(
                 outages[number, client] = Outage(timing.dropped, timing.uploaded_bytes)
         clients = tuple(replace(t, start_s=t.start_s + shift, end_s=t.end_s + shift) for t in timings.values())
         ends = max((timing.end_s for timing in clients), default=now)
-        records.append(RoundRecord(number, now, ends, 0.0, 0.0, clients))
+        records.append(RoundTiming(number, now, ends, 0.0, 0.0, clients))
         now = ends
     selection = Selection(rule="planned", joins=joins) if rules.selection.predicts else rules.selection
     return DrivenRounds(rules.model_copy(update={"selection": selection}), outages, tuple(records))

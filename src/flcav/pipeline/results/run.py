@@ -9,7 +9,7 @@ from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
 from flcav.pipeline.results.plans import Placed, Plan
 from flcav.pipeline.results.saved import Saved
-from flcav.pipeline.results.tests import Difference, Finding, HomeCost, RegionalTest, Test, Tested
+from flcav.pipeline.results.tests import Difference, HomeCost, RegionalTest, RunFinding, Test, Tested
 from flcav.pipeline.results.training import Pretrained, PrivacySpent, StageResult, Watched
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds
@@ -93,7 +93,7 @@ class Run(Saved):
     watched: tuple[Watched, ...]  # of the run itself
     tested: tuple[Test, ...]
     differences: tuple[Difference, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[RunFinding, ...]
     gap_closed: Mapping[str, float]  # fraction closed of the gap to centralised training
     caveats: tuple[str, ...]  # of the kinds of labels, and of rigs unlike those of the training
     provenance: Provenance

@@ -98,7 +98,7 @@ class HomeCost:
 
 
 @dataclass(frozen=True)
-class Finding:
+class RunFinding:
     """The verdict of a run on one claim, or its estimate of a loss."""
 
     place: str  # region and task

@@ -36,7 +36,7 @@ class Pretrained(Saved):
 
 
 @dataclass(frozen=True)
-class Round:
+class ScoredRound:
     """A round of a federation and the validation score after it."""
 
     round: int
@@ -123,14 +123,14 @@ class Watched(Saved):
     task: str
     region: str
     frames: int
-    rounds: tuple[Round, ...]
+    rounds: tuple[ScoredRound, ...]
 
 
-def average_regions(watched: Sequence[Watched]) -> tuple[Round, ...]:
+def average_regions(watched: Sequence[Watched]) -> tuple[ScoredRound, ...]:
     """Return the mean score over regions of each round that all of `watched` have, weighted by frames."""
     frames = [each.frames for each in watched]
     return tuple(
-        Round(at[0].round, float(np.average([each.score for each in at], weights=frames)))
+        ScoredRound(at[0].round, float(np.average([each.score for each in at], weights=frames)))
         for at in zip(*(each.rounds for each in watched), strict=False)
     )
 

@@ -9,7 +9,7 @@ from flcav.pipeline.arms import Setting
 from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.poles import find_passed, find_sites, place_sensors, read_traces
-from flcav.pipeline.recipe import EDGE, Budgets, Placement
+from flcav.pipeline.recipe import EDGE, Budgets, PlacementSettings
 from flcav.pipeline.results.plans import ErrorRegistry, Plan
 from flcav.pipeline.results.saved import ERRORS, LEDGER
 from flcav.pipeline.results.training import Pretrained
@@ -41,7 +41,7 @@ class PlaceSettings(StepSettings):
     """Settings of the placement of a region's roadside sensors."""
 
     region: str
-    how: Placement
+    how: PlacementSettings
     errors: Mapping[str, str]  # registrations of errors, by task
     weights: Mapping[str, float]  # of an error, by task
     registry: str  # recording of the traffic whose density counts

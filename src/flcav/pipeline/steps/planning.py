@@ -9,8 +9,8 @@ import numpy as np
 from flcav.config import Config, InputError, read_config
 from flcav.fusion.distillation import Distillation
 from flcav.network.clock.rounds import NetworkSettings
-from flcav.network.ledger import BYTES_PER_MB, LINKS, Link
-from flcav.network.plan import MessageSizes, Price
+from flcav.network.ledger import BYTES_PER_MB, LINKS, Link, LinkMegabytes
+from flcav.network.plan import MessageSizes
 from flcav.network.radio.links import RadioLinks
 from flcav.optimization.allocation.uploads import UploadDemand, share_by_held, share_by_links
 from flcav.optimization.problem import Problem
@@ -26,7 +26,7 @@ from flcav.pipeline.plan.exchanges import Held, Sensors, measure_exchange, measu
 from flcav.pipeline.plan.replanning import remake_plan
 from flcav.pipeline.plan.updates import UpdateForm, model_mb, update_forms
 from flcav.pipeline.radio.driving import link_drive, measure_uplinks, predict_air_s
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, Budgets, FixedPlan, Limits
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, Budgets, FixedPlan, PlanLimits
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import PROBLEM
 from flcav.pipeline.results.training import Watched, average_last
@@ -85,7 +85,7 @@ class FirstPlanSettings(StepSettings):
     seed: int
     budgets_mb: Budgets
     headroom: float  # fraction of the budgets left unspent
-    limits: Limits
+    limits: PlanLimits
     horizon_s: float | None  # longest time that a vehicle trains, over all rounds of all tasks [s]
     edge_rounds_per_cloud_round: int
     tasks: Mapping[str, PlannedTask]
@@ -139,7 +139,7 @@ def plan_step(work: Work, settings: FirstPlanSettings) -> None:
 def frame_plan(settings: FirstPlanSettings) -> PlanSettings:
     """Return budgets, bounds and topology of a run's first plan."""
     return PlanSettings(
-        budgets_mb=Price(settings.budgets_mb.wireless, settings.budgets_mb.wireline),
+        budgets_mb=LinkMegabytes(settings.budgets_mb.wireless, settings.budgets_mb.wireline),
         headroom=settings.headroom,
         limits=settings.limits,
         edge_groups=tuple(map(len, settings.held.values())),
@@ -213,7 +213,7 @@ def replan_step(work: Work, settings: ReplanSettings) -> None:
         reached[task.name] = average_last([Watched.load(work.inputs[step]) for step in settings.watched[task.name]])
         for entry in read_entries(work, *settings.books[task.name]):
             used[entry.link] += entry.bytes * (entry.direction == "up")
-    used_mb = Price(*(used[link] / BYTES_PER_MB for link in LINKS))
+    used_mb = LinkMegabytes(*(used[link] / BYTES_PER_MB for link in LINKS))
     remake_plan(done, problem, settings.stage, reached, used_mb).save(work.folder)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from flcav.config import Config
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors
-from flcav.network.ledger import Budget, Ledger, LedgerEntry
+from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.perception.tasks import task_named
 from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.recipe import Budgets, Federation, Training
@@ -79,7 +79,7 @@ def make_step(name: str, run: Callable[..., None], settings: StepSettings, worke
     return Step(name, run, {"settings": settings}, tuple(dict.fromkeys(settings.needs)), workers=workers)
 
 
-def share_budget(budget: Budget, planned: Mapping[str, tuple[float, float]], task: str) -> Budget:
+def share_budget(budget: LinkMegabytes, planned: Mapping[str, tuple[float, float]], task: str) -> LinkMegabytes:
     """Return a task's share of both budgets, in proportion to its planned traffic [MB wireless, wireline].
 
     Shares are rounded down to bytes, so that their sum never exceeds the budget.
@@ -89,19 +89,19 @@ def share_budget(budget: Budget, planned: Mapping[str, tuple[float, float]], tas
         total = sum(each[link] for each in planned.values())
         share = planned[task][link] / total if total else 1 / len(planned)
         parts.append(whole_mb if len(planned) == 1 else np.floor(share * whole_mb * 1e6) / 1e6)
-    return Budget(*map(float, parts))
+    return LinkMegabytes(*map(float, parts))
 
 
-def share_plan_budget(plan: Plan, budgets_mb: Budgets, task: str) -> Budget:
+def share_plan_budget(plan: Plan, budgets_mb: Budgets, task: str) -> LinkMegabytes:
     """Return the share of both budgets that a plan gives to a task."""
     planned = {name: (own.wireless_mb, own.wireline_mb) for name, own in plan.tasks.items()}
-    return share_budget(Budget(budgets_mb.wireless, budgets_mb.wireline), planned, task)
+    return share_budget(LinkMegabytes(budgets_mb.wireless, budgets_mb.wireline), planned, task)
 
 
-def region_budget(stage_one: Ledger, vehicles: Mapping[str, int], region: str) -> Budget:
+def region_budget(stage_one: Ledger, vehicles: Mapping[str, int], region: str) -> LinkMegabytes:
     """Return the budget of a region's stage II: its share, by vehicles, of the wireless budget that stage I left."""
     share = vehicles[region] / sum(vehicles.values())
-    return Budget(share * stage_one.left_mb("wireless"), 0.0)
+    return LinkMegabytes(share * stage_one.left_mb("wireless"), 0.0)
 
 
 def read_entries(work: Work, *steps: str) -> list[LedgerEntry]:
@@ -109,7 +109,9 @@ def read_entries(work: Work, *steps: str) -> list[LedgerEntry]:
     return [entry for step in steps for entry in Ledger.load(work.inputs[step] / LEDGER).entries]
 
 
-def open_region_book(work: Work, share: Budget, pretrained: str, vehicles: Mapping[str, int], region: str) -> Ledger:
+def open_region_book(
+    work: Work, share: LinkMegabytes, pretrained: str, vehicles: Mapping[str, int], region: str
+) -> Ledger:
     """Return an empty ledger of a region's stage II; `share`: the task's in both budgets, before stage I.
 
     `pretrained` is the step of stage I, `vehicles` the number of each federating region.

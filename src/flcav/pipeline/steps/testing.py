@@ -19,7 +19,7 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import SweepComparison, SweepDetections, Tested
-from flcav.pipeline.results.training import Round, StageResult, Watched
+from flcav.pipeline.results.training import ScoredRound, StageResult, Watched
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.settings import StepSettings, make_step
 from flcav.pipeline.training.checkpoints import load_round_network
@@ -111,7 +111,7 @@ def rounds_step(work: Work, settings: RoundsSettings) -> None:
         networks = {each: load_round_network(task, start, folder, each, *how) for each in numbers}
     rounds = []
     for number, network in networks.items():
-        rounds.append(Round(number, score_network(task, network, split.data, split.vehicles)))
+        rounds.append(ScoredRound(number, score_network(task, network, split.data, split.vehicles)))
         work.report(number, len(networks), "")
     Watched(settings.stage, settings.task, settings.region, len(split.vehicles), tuple(rounds)).save(work.folder)
 

@@ -12,7 +12,7 @@ RulesT = TypeVar("RulesT", bound=Rules)
 
 
 @dataclass(frozen=True)
-class Training:
+class PrivateTraining:
     """The rounds of one training of a task with the vehicles of a region, stages II and III together."""
 
     region: str
@@ -66,12 +66,12 @@ def take_noise(rules: RulesT, noise: float | None) -> RulesT:
     return rules.model_copy(update={"privacy": rules.privacy.model_copy(update={"noise": noise})})
 
 
-def compose_trainings(rules: Rules, trainings: Iterable[Training]) -> PrivacySpent | None:
+def compose_trainings(rules: Rules, trainings: Iterable[PrivateTraining]) -> PrivacySpent | None:
     """Return what a vehicle spends that takes part in every training of its region, the most of all regions.
 
     None without noise, or without a round.
     """
-    of_region: dict[str, list[Training]] = {}
+    of_region: dict[str, list[PrivateTraining]] = {}
     for each in trainings:
         if each.rounds:
             of_region.setdefault(each.region, []).append(each)

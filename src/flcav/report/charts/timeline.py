@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from flcav.network.clock.records import ClientTiming, RoundRecord
+from flcav.network.clock.records import ClientTiming, RoundTiming
 from flcav.report import style
 from flcav.report.pictures.maps import HALO
 
@@ -17,7 +17,7 @@ COLOURS = {"download": style.SKY, "compute": style.RULE, "upload": style.BLUE, W
 
 
 @style.styled
-def timeline_of_rounds(records: Sequence[RoundRecord], width_in: float = 7.2) -> Figure:
+def timeline_of_rounds(records: Sequence[RoundTiming], width_in: float = 7.2) -> Figure:
     """Return the rounds as bars over time, a row per client and one for the wireline; raises ValueError for none."""
     if not records:
         raise ValueError("a timeline needs at least one round")
@@ -41,7 +41,7 @@ def timeline_of_rounds(records: Sequence[RoundRecord], width_in: float = 7.2) ->
     return figure
 
 
-def _draw_round(axes: Axes, record: RoundRecord, rows: Sequence[str], origin: float) -> None:
+def _draw_round(axes: Axes, record: RoundTiming, rows: Sequence[str], origin: float) -> None:
     for client in record.clients:
         _draw_client(axes, client, rows.index(client.client), origin)
     if WIRELINE in rows:

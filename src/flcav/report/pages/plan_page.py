@@ -6,8 +6,9 @@ from typing import Any
 
 import networkx as nx
 
-from flcav.network.plan import Price, StagePlan, price
-from flcav.optimization.allocation.allocate import Allocation, TaskPlan, resolve_problem
+from flcav.network.ledger import LinkMegabytes
+from flcav.network.plan import StagePlan, price
+from flcav.optimization.allocation.allocate import Allocation, TaskAllocation, resolve_problem
 from flcav.optimization.allocation.budget_sweep import LINKS, BudgetPoint
 from flcav.optimization.allocation.comparison import PlanComparison
 from flcav.optimization.allocation.problem_file import CURVE, MEASURES, STEPS, TERMS, explain_objective
@@ -108,7 +109,7 @@ def _parts(problem: Problem, plan: Allocation) -> list[plans.StageTraffic]:
     return [{"link": link, "task": task, "stage": stage, "mb": mb} for (link, task, stage), mb in totals.items()]
 
 
-def _stage_prices(problem: Problem, task: AllocationTask, row: TaskPlan) -> dict[str, Price]:
+def _stage_prices(problem: Problem, task: AllocationTask, row: TaskAllocation) -> dict[str, LinkMegabytes]:
     none = StagePlan(0, 0, 0, task.edge_groups, problem.edge_rounds_per_cloud_round)
     return {name: price(replace(none, **{field: getattr(row, field)}), task.sizes) for field, name in STAGES.items()}
 
