@@ -26,8 +26,8 @@ from flcav.interface.progress import ignore_progress
 from flcav.machine.threads import use_threads
 from flcav.pipeline.alone import WORK, list_needed
 from flcav.pipeline.engine import Step, ignore_steps, run_steps
-from flcav.pipeline.engine.engines import perform
 from flcav.pipeline.engine.step import Record, read_record
+from flcav.pipeline.engine.workers import perform
 from flcav.pipeline.graph.graph import Graph
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, load_run_recipe

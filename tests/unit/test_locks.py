@@ -23,8 +23,8 @@ from flcav.machine import locks
 from flcav.machine.locks import only_writer
 from flcav.perception.training.run import train_prepared
 from flcav.pipeline.engine import Step, ignore_steps, run_side_by_side, run_steps
-from flcav.pipeline.engine.engines import perform
 from flcav.pipeline.engine.step import Record
+from flcav.pipeline.engine.workers import perform
 from flcav.pipeline.provenance import provenance
 from flcav.sources.recipe import Recipe
 from flcav.world.opendrive.importing import import_town

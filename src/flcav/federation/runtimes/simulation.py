@@ -19,7 +19,7 @@ from flcav.federation.records import METRICS, read_arrays, to_arrays
 from flcav.federation.runtimes.embedded import keep_identity
 from flcav.federation.state import Arrays, ClientStates, ReadStates
 from flcav.federation.trainable import Trainable
-from flcav.machine.processes import ray_session
+from flcav.machine.actors import ray_session
 
 STARTING_S = 120.0  # for the nodes to be there
 Serve = Callable[[Grid, Mapping[int, str], ReadStates], None]  # grid, names by node, reading of the states

@@ -163,7 +163,7 @@ class _Module(ast.NodeTransformer):
                 bound = _bound(node) or {"", *(each for part in ast.walk(node) for each in _bound(part))}
             for each in bound:
                 self.defined.setdefault(each, []).append(node)
-            if bound == {"PLACES"}:
+            if bound == {"PLACES"} and isinstance(node, ast.Assign):
                 self.places = ast.literal_eval(node.value)
 
     def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
