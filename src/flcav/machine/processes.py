@@ -7,14 +7,16 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import forkserver
 from multiprocessing.context import BaseContext
-from typing import Any
+from typing import TypeVarTuple
 
 from flcav.machine.threads import threads_of_children, use_threads
+
+Arguments = TypeVarTuple("Arguments")
 
 KILLED = "a worker was killed from outside, most often for want of memory: try fewer jobs"
 
@@ -52,7 +54,9 @@ def _exit_after_parent() -> None:
 
 
 @contextlib.contextmanager
-def process_pool(jobs: int, begin: Callable[..., None], *arguments: Any) -> Iterator[ProcessPoolExecutor]:
+def process_pool(
+    jobs: int, begin: Callable[[*Arguments], None], *arguments: *Arguments
+) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool of `jobs` worker processes of one thread each, in which `begin(*arguments)` is called first.
 
     They have the environment of this process and end with it, however it ends; an exception ends them at once. Raises
@@ -70,7 +74,7 @@ def process_pool(jobs: int, begin: Callable[..., None], *arguments: Any) -> Iter
             raise
 
 
-def _begin(variables: Mapping[str, str], begin: Callable[..., None], arguments: Sequence[Any]) -> None:
+def _begin(variables: Mapping[str, str], begin: Callable[[*Arguments], None], arguments: tuple[*Arguments]) -> None:
     """Begin a worker; `variables`: the environment of the process that asks, which may differ from the server's."""
     os.environ.update(variables)
     gc.freeze()  # modules stay: the collector of cyclic garbage need not look at them again and again

@@ -41,12 +41,8 @@ def start_actors(source: Source, work: Path, jobs: int, wrote: Callable[[int], N
     without it, Ray is started on this machine. It calls `wrote` with the number of frames written so far, as parts are
     completed. Raises `InputError` where Ray is not installed.
     """
-    with actor_pool(jobs, _Actor, source, work.absolute()) as pool:
-
-        def start(task: Job) -> Future[None]:
-            return pool.lend(lambda actor: pool.ray.get(actor.perform.remote(task)))
-
-        yield _PoolEngine(jobs, start, wrote)
+    with actor_pool(jobs, _Recorder, source, work.absolute()) as pool:
+        yield _PoolEngine(jobs, lambda task: pool.lend(lambda actor: actor.call(_Recorder.perform, task)), wrote)
 
 
 class _InProcessEngine:
@@ -109,7 +105,7 @@ def _perform(task: Job) -> None:
     perform(source, task, work, count_frame)
 
 
-class _Actor:
+class _Recorder:
     """A Ray actor that performs jobs in sequence; its source keeps the scene that it built last."""
 
     def __init__(self, source: Source, work: Path) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import Queue
 from typing import IO, Any
 
-from flcav.machine.actors import ActorPool, actor_pool
+from flcav.machine.actors import Actor, actor_pool
 from flcav.machine.threads import use_threads
 from flcav.pipeline.engine.source_hash import package_hash
 from flcav.pipeline.engine.step import Record, Step, digest, read_value, remove, reserve_sibling
@@ -45,23 +45,25 @@ def open_actors(jobs: int) -> Iterator[Workers]:
     with actor_pool(jobs, _Worker) as pool:
 
         def submit(folder: Path, step: Step, record: Record) -> Future[Any]:
-            return pool.lend(lambda actor: _perform(pool, actor, folder, step, record, reports))
+            return pool.lend(lambda actor: _perform(actor, folder, step, record, reports))
 
         yield Workers(submit, reports)
 
 
-def _perform(pool: ActorPool, actor: Any, folder: Path, step: Step, record: Record, reports: Queue[Any]) -> Any:
+def _perform(actor: "Actor[_Worker]", folder: Path, step: Step, record: Record, reports: Queue[Any]) -> Any:
     """Send an actor the folders that it does not have yet, let it perform a step, and return the step's value."""
+    from ray import cloudpickle  # pyright: ignore[reportMissingImports]: an extra
+
     run = digest(str(folder))  # its steps have a folder of this name there
-    there = pool.ray.get(actor.holds.remote(package_hash(), run))
+    there = actor.call(_Worker.holds, package_hash(), run)
     for name in {*step.needs, step.name} - set(there):
         with packed(folder / name, stamps(folder / name)) as pieces:
             for piece in pieces:
-                pool.ray.get(actor.take.remote(piece))
-        pool.ray.get(actor.unpack.remote(run, name))
-    working = actor.perform.remote(run, pool.ray.cloudpickle.dumps((step, record)))
+                actor.call(_Worker.take, piece)
+        actor.call(_Worker.unpack, run, name)
+    finish = actor.start(_Worker.perform, run, cloudpickle.dumps((step, record)))
     with tempfile.TemporaryFile() as file:
-        while (heard := pool.ray.get(actor.hear.remote())) is not None:
+        while (heard := actor.call(_Worker.hear)) is not None:
             kind, *said = heard
             if kind == "report":
                 reports.put((folder, step.name, *said))
@@ -71,7 +73,7 @@ def _perform(pool: ActorPool, actor: Any, folder: Path, step: Step, record: Reco
                 replace_folder(folder / step.name, said[0], file)
                 file.seek(0)
                 file.truncate()
-    pool.ray.get(working)
+    finish()
     return read_value(folder / step.name)
 
 
