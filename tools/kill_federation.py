@@ -26,8 +26,8 @@ from flcav.interface.progress import ignore_progress
 from flcav.machine.threads import use_threads
 from flcav.pipeline.alone import WORK, list_needed
 from flcav.pipeline.engine import Step, ignore_steps, run_steps
-from flcav.pipeline.engine.engines import perform
-from flcav.pipeline.engine.step import Record, read_record
+from flcav.pipeline.engine.step import StepRecord, read_record
+from flcav.pipeline.engine.workers import perform
 from flcav.pipeline.provenance import provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, load_run_recipe
 from flcav.pipeline.results.saved import LEDGER, RESULT, WEIGHTS
@@ -84,7 +84,7 @@ def apart(work: Callable[[], object]) -> None:
         sys.exit(1)  # it has said why
 
 
-def kill(step: Step, work: Path, record: Record, whole_s: float, kills: int, seed: int) -> list[dict[str, str]]:
+def kill(step: Step, work: Path, record: StepRecord, whole_s: float, kills: int, seed: int) -> list[dict[str, str]]:
     """Kill the step so many times, and return the hashes of its files at each end; the last one is let go."""
     rng, ends, done = stream(seed, "kills"), [], 0
     shutil.rmtree(work / step.name)

@@ -108,6 +108,23 @@ def test_folders_share_a_cluster_and_a_failing_step_ends_it(tmp_path: Path) -> N
     assert not (tmp_path / "two" / "b" / "done.json").exists()
 
 
+def keep(work: Work, number: int) -> None:
+    (work.folder / "number").write_text(str(number))
+
+
+def read(work: Work) -> str:
+    return (work.inputs["kept"] / "number").read_text()
+
+
+def test_steps_of_one_name_in_two_folders_are_kept_apart(tmp_path: Path) -> None:
+    runs = {
+        tmp_path / str(number): [Step("kept", keep, {"number": number}), Step("read", read, {}, needs=("kept",))]
+        for number in (1, 2)
+    }
+    values = run_side_by_side(runs, jobs=1, notify=lambda *event: None, engine="ray")
+    assert [each["read"] for each in values.values()] == ["1", "2"]
+
+
 def kill_never(work: Work) -> None:
     time.sleep(120)
 

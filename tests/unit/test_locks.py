@@ -23,8 +23,8 @@ from flcav.machine import locks
 from flcav.machine.locks import only_writer
 from flcav.perception.training.run import train_prepared
 from flcav.pipeline.engine import Step, ignore_steps, run_side_by_side, run_steps
-from flcav.pipeline.engine.engines import perform
-from flcav.pipeline.engine.step import Record
+from flcav.pipeline.engine.step import StepRecord
+from flcav.pipeline.engine.workers import perform
 from flcav.pipeline.provenance import provenance
 from flcav.sources.recipe import Recipe
 from flcav.world.opendrive.importing import import_town
@@ -129,7 +129,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "record": lambda out: record(Recipe(town="ring"), out),
     "run steps": lambda out: run_steps([STEP], out, jobs=1, notify=ignore_steps),
     "run side by side": lambda out: run_side_by_side({out: [STEP]}, jobs=1, notify=ignore_steps),
-    "perform": lambda out: perform(HELD, out.parent, Record("", {}, ""), provenance(), ignore_progress),
+    "perform": lambda out: perform(HELD, out.parent, StepRecord("", {}, ""), provenance(), ignore_progress),
     "train": lambda out: train_prepared(SimpleNamespace(out=out)),  # pyright: ignore[reportArgumentType]
     "export": lambda out: export(None, "kitti", out),  # pyright: ignore[reportArgumentType]
     "import": lambda out: import_dataset("kitti", out.parent, out),

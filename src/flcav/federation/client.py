@@ -3,7 +3,6 @@
 import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 from flwr.app import Context, Message, MetricRecord, RecordDict
@@ -89,14 +88,13 @@ def client_app(
     arrives.
     """
     app, clients, requests = ClientApp(), [*trainables], Requests()
-    affordable = lru_cache(maxsize=1)(lambda: affordable_answers(rules.privacy))
 
     def admit(message: Message, context: Context, name: str, work: LocalWork) -> str:
         """Return what is asked for; raises `RequestRefused` where the client is not to answer."""
         asked, before = asked_for(message.content), recall_answered(context)
         repeatable = rules.secure is None and OWN not in context.state and RESIDUAL not in context.state
         answered = before.admit(work.round, asked, requests.digest(message.content), rules, repeatable)
-        if (most := affordable()) is not None and answered.rounds > most - spent:
+        if (most := affordable_answers(rules.privacy)) is not None and answered.rounds > most - spent:
             raise RequestRefused(f"a round more than the {most} that the privacy budget of {name} affords")
         keep_answered(context, answered)
         return asked

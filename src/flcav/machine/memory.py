@@ -1,7 +1,10 @@
-"""Memory of the process: how the C library keeps what is freed."""
+"""Memory of the process: what the C library keeps of what is freed, and the collector of cyclic garbage."""
 
+import contextlib
 import ctypes
+import gc
 import platform
+from collections.abc import Iterator
 from functools import lru_cache
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3)
@@ -20,3 +23,15 @@ def keep_freed_memory() -> None:
         library = ctypes.CDLL(None)
         library.mallopt(_MMAP_THRESHOLD, LARGEST_BYTES)
         library.mallopt(_TRIM_THRESHOLD, KEPT_BYTES)
+
+
+@contextlib.contextmanager
+def pause_collector() -> Iterator[None]:
+    """Pause the collector of cyclic garbage, which looks at many new objects again and again."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

@@ -1,24 +1,26 @@
-"""Worker processes that end with the process that started them, and a session on a Ray cluster."""
+"""Worker processes that end with the process that started them."""
 
 import contextlib
-import logging
+import gc
 import multiprocessing
 import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import forkserver
 from multiprocessing.context import BaseContext
-from types import ModuleType
-from typing import Any
+from typing import TypeVarTuple
 
-from flcav.config import InputError
-from flcav.interface.extras import format_install_command
-from flcav.machine.threads import VARIABLES, threads_of_children
+from flcav.machine.threads import threads_of_children, use_threads
+
+Arguments = TypeVarTuple("Arguments")
+
+KILLED = "a worker was killed from outside, most often for want of memory: try fewer jobs"
 
 _STARTING = threading.Lock()  # of the fork server: only one thread at a time changes the environment
-STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and pieces of files pass through it
 
 
 def start_server() -> BaseContext:
@@ -52,29 +54,30 @@ def _exit_after_parent() -> None:
 
 
 @contextlib.contextmanager
-def ray_session(jobs: int, asked: str = "--engine ray") -> Iterator[ModuleType]:
-    """Yield the module `ray`, connected to the cluster of RAY_ADDRESS or, without it, to a local one of `jobs` CPUs.
+def process_pool(
+    jobs: int, begin: Callable[[*Arguments], None], *arguments: *Arguments
+) -> Iterator[ProcessPoolExecutor]:
+    """Yield a pool of `jobs` worker processes of one thread each, in which `begin(*arguments)` is called first.
 
-    Its workers compute on one thread each. Raises `InputError` where Ray is not installed; `asked` is what needs it.
+    They have the environment of this process and end with it, however it ends; an exception ends them at once. Raises
+    `OSError` where one was killed.
     """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without it, Ray prints a warning
-    try:
-        import ray  # pyright: ignore[reportMissingImports]: an extra
-    except ImportError:
-        raise InputError(f"{asked} needs Ray, which is not installed: {format_install_command('ray')}") from None
-    variables: dict[str, str] = dict.fromkeys(VARIABLES, "1")
-    local: dict[str, Any] = {}
-    if "RAY_ADDRESS" not in os.environ:
-        local = {"num_cpus": jobs, "object_store_memory": STORE_BYTES, "include_dashboard": False}
-        variables["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))  # workers find modules as this process does
-    ray.init(
-        **local,
-        runtime_env={"env_vars": variables},
-        log_to_driver=False,
-        logging_level=logging.ERROR,
-    )
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
+    started = ({**os.environ}, begin, arguments)
+    with ProcessPoolExecutor(jobs, mp_context=start_server(), initializer=_begin, initargs=started) as pool:
+        try:
+            yield pool
+        except BrokenProcessPool:
+            raise OSError(KILLED) from None
+        except BaseException:
+            for process in list(pool._processes.values()):
+                process.terminate()
+            raise
+
+
+def _begin(variables: Mapping[str, str], begin: Callable[[*Arguments], None], arguments: tuple[*Arguments]) -> None:
+    """Begin a worker; `variables`: the environment of the process that asks, which may differ from the server's."""
+    os.environ.update(variables)
+    gc.freeze()  # modules stay: the collector of cyclic garbage need not look at them again and again
+    exit_with_parent()
+    use_threads(1)
+    begin(*arguments)

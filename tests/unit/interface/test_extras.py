@@ -11,7 +11,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from flcav.config import InputError
-from flcav.dataset.recording import ray_engine
+from flcav.dataset.recording.workers import start_actors
 from flcav.interface.extras import format_install_command
 from flcav.world.opendrive import importing
 
@@ -29,7 +29,7 @@ def test_it_names_the_packages_that_the_project_asks_for(extra):
 
 def test_ray_says_how_to_get_it(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(InputError) as told, ray_engine.start_ray_engine(None, tmp_path, 1, lambda count: None):  # type: ignore
+    with pytest.raises(InputError) as told, start_actors(None, tmp_path, 1, lambda count: None):  # type: ignore
         pass
     assert str(told.value).endswith(format_install_command("ray"))
 

@@ -158,6 +158,8 @@ STEPS = {
     "stage III": cloud.cloud_step,
 } | {f"{name}, {part}": getattr(study_named(name), part) for name in STUDIES for part in ("learn", "test")}
 
+OF_STUDIES = ("run", "objects", "weather")  # modules with what a study trains, or measures beyond its task
+
 
 def count_lines(package: Path, modules: Collection[str]) -> int:
     """Return the lines of source of modules of a package; of none, of the whole package."""
@@ -174,6 +176,10 @@ def test_no_step_reaches_the_drawing_of_results_or_the_command_line(run):
     assert count_lines(PACKAGES["flcav"], reached) < 0.51 * count_lines(PACKAGES["flcav"], [])
     assert not [name for name in reached if name.startswith(("flcav.report", "flcav.cli"))]
     assert not [name for name in reached if name.startswith("flcav.pipeline.engine.run")]
+    experiments = {name for name in reached if name.startswith("flcav.experiments")}
+    assert experiments <= {"flcav.experiments.splits", *(f"flcav.experiments.studies.{name}" for name in OF_STUDIES)}
+    observing = [name for name in reached if name.startswith(("flcav.sensors.rendering", "flcav.sensors.radar.radar"))]
+    assert bool(observing) == (run in (record_split, recording.record_step))
 
 
 def test_an_edit_of_flcav_makes_stale_what_it_should(tmp_path):

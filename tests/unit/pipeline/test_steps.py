@@ -19,8 +19,8 @@ import flcav
 from flcav.config import Config, InputError
 from flcav.pipeline.engine import Step, Work, run_side_by_side, run_steps
 from flcav.pipeline.engine.cluster import packed, replace_folder, stamps
-from flcav.pipeline.engine.engines import find_seed
 from flcav.pipeline.engine.step import DONE_NOW
+from flcav.pipeline.engine.workers import find_seed
 from flcav.pipeline.provenance import checkout
 
 
@@ -489,6 +489,14 @@ def test_runs_side_by_side_take_over_what_another_has_done(tmp_path):
     assert (second / "done.json").read_bytes() == (first / "done.json").read_bytes()
     asked_otherwise = {tmp_path / "three": [Step(STEPS[0].name, count, {"start": 3})], tmp_path / "one": [STEPS[0]]}
     assert run_side_by_side(asked_otherwise, jobs=1, notify=lambda *event: None)[tmp_path / "three"] == {"a": 3}
+
+
+def test_a_step_that_is_under_way_in_another_folder_is_waited_for(tmp_path: Path) -> None:
+    runs = {tmp_path / name: STEPS for name in ("one", "two", "three")}
+    values = run_side_by_side(runs, jobs=3, notify=quiet)
+    assert [*values.values()] == [{"a": 1, "b": 2, "sum": 3}] * 3
+    assert {(folder / name / "calls").read_text() for folder in runs for name in "ab"} == {"x"}
+    assert all((tmp_path / "one" / name / "calls").stat().st_nlink == 3 for name in "ab")
 
 
 def test_runs_side_by_side_keep_to_their_own_folders(tmp_path):

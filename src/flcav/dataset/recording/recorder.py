@@ -41,8 +41,7 @@ from flcav.dataset.recording.jobs import (
     split_scene,
 )
 from flcav.dataset.recording.mending import find_damage, has_damaged_table, mend
-from flcav.dataset.recording.ray_engine import start_ray_engine
-from flcav.dataset.recording.workers import start_processes
+from flcav.dataset.recording.workers import start_actors, start_processes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, write_table
 from flcav.interface.progress import DAMAGED, Report, print_progress
 from flcav.machine.locks import LOCK, only_writer
@@ -53,7 +52,7 @@ from flcav.storage.files import flush_all, sha256, write_bytes, write_json
 
 Header = Mapping[str, Mapping[str, Json]]  # "recipe" -> description of the source, "versions" -> of packages
 
-ENGINES = {"processes": start_processes, "ray": start_ray_engine}
+ENGINES = {"processes": start_processes, "ray": start_actors}
 
 
 def record(
@@ -131,8 +130,8 @@ def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report)
         rate = count / max(time.perf_counter() - start, 1e-9)
         progress(total - missing + count, total, f"{rate:.1f} frames/s")
 
-    with ENGINES[engine](source, work, jobs, wrote) as hands:
-        record_scenes(source, hands, work)
+    with ENGINES[engine](source, work, jobs, wrote) as workers:
+        record_scenes(source, workers, work)
 
 
 def _claim(out: Path, header: Header) -> bool:

@@ -1,17 +1,16 @@
-"""Recording engines on this machine: in this process, or in a pool of processes."""
+"""Recording engines: this process, a pool of processes, or actors on the machines of a Ray cluster."""
 
 import contextlib
-import multiprocessing
+import os
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
 from typing import Any
 
-from flcav.dataset.recording.jobs import Engine, Job, perform
-from flcav.machine.processes import exit_with_parent, start_server
-from flcav.machine.threads import use_threads
+from flcav.dataset.recording.jobs import Engine, Job, Part, perform
+from flcav.machine.actors import actor_pool
+from flcav.machine.processes import process_pool, start_server
 from flcav.sources.source import Source
 
 POLL_S = 0.2
@@ -29,13 +28,21 @@ def start_processes(source: Source, work: Path, jobs: int, wrote: Callable[[int]
     if jobs == 1:
         yield _InProcessEngine(source, work, wrote)
         return
-    context = start_server()
-    written = context.Value("q", 0)
-    with (
-        ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(source, work, written)) as pool,
-        _children_end_on_error(),
-    ):
-        yield _PoolEngine(jobs, pool, lambda: wrote(written.value))
+    written = start_server().Value("q", 0)
+    with process_pool(jobs, _begin, source, work, written) as pool:
+        yield _PoolEngine(jobs, lambda task: pool.submit(_perform, task), lambda _: wrote(written.value))
+
+
+@contextlib.contextmanager
+def start_actors(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
+    """Yield an engine of `jobs` Ray actors that perform jobs of `source` below the folder `work`.
+
+    The folder must be on storage shared by all machines, and flcav installed on each. RAY_ADDRESS names the cluster;
+    without it, Ray is started on this machine. It calls `wrote` with the number of frames written so far, as parts are
+    completed. Raises `InputError` where Ray is not installed.
+    """
+    with actor_pool(jobs, _Recorder, source, work.absolute()) as pool:
+        yield _PoolEngine(jobs, lambda task: pool.lend(lambda actor: actor.call(_Recorder.perform, task)), wrote)
 
 
 class _InProcessEngine:
@@ -62,37 +69,30 @@ class _InProcessEngine:
 
 
 class _PoolEngine:
-    """An engine on a process pool."""
+    """An engine on a pool of workers; calls `wrote` with the frames of the parts that are completed."""
 
-    def __init__(self, slots: int, pool: ProcessPoolExecutor, report: Callable[[], None]) -> None:
-        self.slots, self._pool, self._report = slots, pool, report
+    def __init__(self, slots: int, start: Callable[[Job], Future[None]], wrote: Callable[[int], None]) -> None:
+        self.slots, self._start, self._wrote = slots, start, wrote
         self._tasks: dict[Future[None], Job] = {}
+        self._count = 0
 
     def submit(self, task: Job) -> None:
-        self._tasks[self._pool.submit(_perform, task)] = task
+        self._tasks[self._start(task)] = task
 
     def wait(self) -> list[Job]:
         done: set[Future[None]] = set()
         while not done:
             done, _ = wait(self._tasks, timeout=POLL_S, return_when=FIRST_COMPLETED)
-            self._report()
+            self._count += sum(task.frames for each in done if isinstance(task := self._tasks[each], Part))
+            self._wrote(self._count)
         for future in done:
-            _raise_failure(future)
+            future.result()
         return [self._tasks.pop(future) for future in done]
 
 
-def _raise_failure(future: Future[None]) -> None:
-    try:
-        future.result()
-    except BrokenProcessPool:
-        raise OSError("a worker was killed from outside, most often for want of memory: try fewer jobs") from None
-
-
-def _begin(source: Source, work: Path, written: Any) -> None:
+def _begin(*job: Any) -> None:
     global _job
-    _job = source, work, written
-    use_threads(1)
-    exit_with_parent()
+    _job = job
 
 
 def _perform(task: Job) -> None:
@@ -105,12 +105,15 @@ def _perform(task: Job) -> None:
     perform(source, task, work, count_frame)
 
 
-@contextlib.contextmanager
-def _children_end_on_error() -> Iterator[None]:
-    before = set(multiprocessing.active_children())
-    try:
-        yield
-    except BaseException:
-        for child in set(multiprocessing.active_children()) - before:
-            child.terminate()
-        raise
+class _Recorder:
+    """A Ray actor that performs jobs in sequence; its source keeps the scene that it built last."""
+
+    def __init__(self, source: Source, work: Path) -> None:
+        self._source, self._work = source, work
+
+    def perform(self, task: Job) -> None:
+        if not self._work.is_dir():
+            raise OSError(
+                f"{self._work}: not seen from {os.uname().nodename}; record into storage that all nodes share"
+            )
+        perform(self._source, task, self._work, lambda: None)

@@ -8,6 +8,7 @@ import hashlib
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from flwr.app import Array, ArrayRecord, Context, RecordDict
@@ -127,6 +128,7 @@ class Requests:
         return digest
 
 
+@lru_cache(maxsize=64)
 def affordable_answers(privacy: Privacy | None) -> int | None:
     """Return in how many rounds a client's own budget affords an answer with its noise; None: in any number."""
     if privacy is None or not privacy.local or privacy.epsilon is None:

@@ -15,113 +15,66 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Collection, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from pathlib import Path
-from queue import Queue, SimpleQueue
-from types import ModuleType
+from queue import Queue
 from typing import IO, Any
 
-from flcav.machine.processes import ray_session
+from flcav.machine.actors import Actor, actor_pool
 from flcav.machine.threads import use_threads
-from flcav.pipeline.engine.engines import KILLED, Engine, Workers, perform
 from flcav.pipeline.engine.source_hash import package_hash
-from flcav.pipeline.engine.step import Record, Step, read_value, remove, reserve_sibling
+from flcav.pipeline.engine.step import Step, StepRecord, digest, read_value, remove, reserve_sibling
+from flcav.pipeline.engine.workers import Workers, perform
 from flcav.pipeline.provenance import provenance
 from flcav.storage.files import flush_tree
 
 PIECE_BYTES = 8_000_000
 SENDING = 1 / 20  # of a step's time, at most, for sending files back
-LEAVING_S = 5.0  # for actors to remove their files
 
 Stamps = dict[str, tuple[int, int]]  # of each file of a folder: time of its last change [ns], size [bytes]
 
 
 @contextlib.contextmanager
-def ray_cluster(jobs: int) -> Iterator[Engine]:
-    """Yield an engine on the cluster that RAY_ADDRESS names, or on `jobs` processors of this machine.
+def open_actors(jobs: int) -> Iterator[Workers]:
+    """Yield `jobs` actors on the cluster that RAY_ADDRESS names, or on as many processors of this machine.
 
-    Raises `InputError` where Ray is not installed.
+    A step raises `OSError` where its actor was killed, or runs another flcav. Raises `InputError` where Ray is not
+    installed.
     """
-    with ray_session(jobs) as ray:
-        yield _Cluster(ray)
+    reports: Queue[Any] = Queue()
+    with actor_pool(jobs, _Worker) as pool:
+
+        def submit(folder: Path, step: Step, record: StepRecord) -> Future[Any]:
+            return pool.lend(lambda actor: _perform(actor, folder, step, record, reports))
+
+        yield Workers(submit, reports)
 
 
-class _Cluster:
-    """An engine of Ray actors, each driven by a thread of this process."""
+def _perform(actor: "Actor[_Worker]", folder: Path, step: Step, record: StepRecord, reports: Queue[Any]) -> Any:
+    """Send an actor the folders that it does not have yet, let it perform a step, and return the step's value."""
+    from ray import cloudpickle  # pyright: ignore[reportMissingImports]: an extra
 
-    def __init__(self, ray: ModuleType) -> None:
-        self._ray = ray
-        self._actors: list[Any] = []
-
-    @contextlib.contextmanager
-    def hands(self, folder: Path, jobs: int) -> Iterator[Workers]:
-        """Yield `jobs` actors; a step raises `OSError` where its actor was killed, or runs another flcav."""
-        remote = self._ray.remote(num_cpus=1, max_concurrency=3)(_Worker)  # perform, hear and leave at the same time
-        actors = [remote.remote() for _ in range(jobs)]
-        self._actors += actors
-        reports: Queue[Any] = Queue()
-        free: SimpleQueue[Any] = SimpleQueue()
-        for actor in actors:
-            free.put(actor)
-
-        def submit(step: Step, record: Record) -> Future[Any]:
-            return threads.submit(self._perform, free, step, record, folder, reports)
-
-        with ThreadPoolExecutor(jobs) as threads:
-            try:
-                yield Workers(submit, reports)
-            finally:
-                self._leave(actors)
-
-    def stop(self) -> None:
-        """Stop all actors; the files of their last reports have been received."""
-        self._leave(self._actors)
-
-    def _leave(self, actors: Iterable[Any]) -> None:
-        if left := [actor.leave.remote() for actor in actors]:
-            self._ray.wait(left, num_returns=len(left), timeout=LEAVING_S)
-        for actor in actors:
-            self._ray.kill(actor)
-
-    def _perform(self, free: SimpleQueue[Any], step: Step, record: Record, folder: Path, reports: Queue[Any]) -> Any:
-        from ray.exceptions import RayActorError, RayTaskError  # pyright: ignore[reportMissingImports]
-
-        actor = free.get()
-        try:
-            self._send(actor, step, folder)
-            working = actor.perform.remote(self._ray.cloudpickle.dumps((step, record)))
-            self._hear(actor, folder / step.name, lambda *told: reports.put((step.name, *told)))
-            self._ray.get(working)
-            return read_value(folder / step.name)
-        except RayTaskError as error:
-            raise error.cause from None
-        except RayActorError:
-            raise OSError(KILLED) from None
-        finally:
-            free.put(actor)
-
-    def _send(self, actor: Any, step: Step, folder: Path) -> None:
-        """Send the actor the folders that it does not have yet."""
-        there = self._ray.get(actor.holds.remote(package_hash()))
-        for name in {*step.needs, step.name} - set(there):
-            with packed(folder / name, stamps(folder / name)) as pieces:
-                for piece in pieces:
-                    self._ray.get(actor.take.remote(piece))
-            self._ray.get(actor.unpack.remote(name))
-
-    def _hear(self, actor: Any, own: Path, report: Any) -> None:
-        """Receive what a step sends until it ends: pass on its reports, and update its folder `own`."""
-        with tempfile.TemporaryFile() as file:
-            while (heard := self._ray.get(actor.hear.remote())) is not None:
-                kind, *said = heard
-                if kind == "report":
-                    report(*said)
-                elif kind == "piece":
-                    file.write(said[0])
-                else:
-                    replace_folder(own, said[0], file)
-                    file.seek(0)
-                    file.truncate()
+    run = digest(str(folder))  # its steps have a folder of this name there
+    there = actor.call(_Worker.holds, package_hash(), run)
+    for name in {*step.needs, step.name} - set(there):
+        with packed(folder / name, stamps(folder / name)) as pieces:
+            for piece in pieces:
+                actor.call(_Worker.take, piece)
+        actor.call(_Worker.unpack, run, name)
+    finish = actor.start(_Worker.perform, run, cloudpickle.dumps((step, record)))
+    with tempfile.TemporaryFile() as file:
+        while (heard := actor.call(_Worker.hear)) is not None:
+            kind, *said = heard
+            if kind == "report":
+                reports.put((folder, step.name, *said))
+            elif kind == "piece":
+                file.write(said[0])
+            else:
+                replace_folder(folder / step.name, said[0], file)
+                file.seek(0)
+                file.truncate()
+    finish()
+    return read_value(folder / step.name)
 
 
 class _Worker:
@@ -133,29 +86,30 @@ class _Worker:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the actor lives
         self._told: Queue[Any] = Queue(maxsize=2)  # bounded: a step waits until it is heard
 
-    def holds(self, package: str) -> list[str]:
-        """Return the steps whose folders are here; raises `OSError` where the hash of flcav here is not `package`."""
+    def holds(self, package: str, run: str) -> list[str]:
+        """Return the steps of a run whose folders are here; raises `OSError` where flcav's hash is not `package`."""
         if package != package_hash():
             raise OSError(f"{os.uname().nodename} runs another flcav: install the same on all machines of the cluster")
-        return [path.name for path in self._folder.iterdir()]
+        return [path.name for path in (self._folder / run).glob("*")]
 
     def take(self, piece: bytes) -> None:
         """Append a piece to the archive that is being received."""
         self._file.write(piece)
 
-    def unpack(self, name: str) -> None:
-        """Unpack the received archive as the folder of the step `name`."""
-        replace_folder(self._folder / name, None, self._file)
+    def unpack(self, run: str, name: str) -> None:
+        """Unpack the received archive as the folder of the step `name` of a run."""
+        replace_folder(self._folder / run / name, None, self._file)
         self._file.seek(0)
         self._file.truncate()
 
-    def perform(self, pickled: bytes) -> None:
-        """Perform a pickled (step, record); reports and files are queued for `hear`."""
+    def perform(self, run: str, pickled: bytes) -> None:
+        """Perform a pickled (step, record) of a run; reports and files are queued for `hear`."""
         try:
             step, record = pickle.loads(pickled)  # within try: the end is told even if this fails
-            sender = _Sender(self._folder / step.name, self._told)
+            folder = self._folder / run
+            sender = _Sender(folder / step.name, self._told)
             try:
-                perform(step, self._folder, record, provenance(), sender.report)
+                perform(step, folder, record, provenance(), sender.report)
             finally:
                 sender.send()  # of a refused federation, too, that it has removed its secrets
         finally:

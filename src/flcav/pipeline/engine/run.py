@@ -12,7 +12,7 @@ stale, and so are all steps that depend on them: they are refused, done again or
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty
@@ -21,7 +21,7 @@ from typing import Any
 from flcav.config import InputError, read_json
 from flcav.interface.progress import DAMAGED
 from flcav.machine.locks import only_writer
-from flcav.pipeline.engine.engines import Engine, Processes
+from flcav.pipeline.engine.cluster import open_actors
 from flcav.pipeline.engine.source_hash import Sources, find_definitions
 from flcav.pipeline.engine.step import (
     DONE,
@@ -30,8 +30,8 @@ from flcav.pipeline.engine.step import (
     KEPT,
     STALE,
     Notify,
-    Record,
     Step,
+    StepRecord,
     find_damage,
     make_edited_error,
     make_stale_error,
@@ -41,26 +41,14 @@ from flcav.pipeline.engine.step import (
     reserve_sibling,
     take_over,
 )
+from flcav.pipeline.engine.workers import Workers, open_processes
 from flcav.storage.files import write_json
 
-
-@contextlib.contextmanager
-def _processes(jobs: int) -> Iterator[Engine]:
-    yield Processes()
-
-
-@contextlib.contextmanager
-def _ray(jobs: int) -> Iterator[Engine]:
-    from flcav.pipeline.engine.cluster import ray_cluster
-
-    with ray_cluster(jobs) as engine:
-        yield engine
-
-
-_ENGINES: Mapping[str, Callable[[int], contextlib.AbstractContextManager[Engine]]] = {
-    "processes": _processes,
-    "ray": _ray,
+ENGINES: Mapping[str, Callable[[int], contextlib.AbstractContextManager[Workers]]] = {
+    "processes": open_processes,
+    "ray": open_actors,
 }
+POLL_S = 0.2
 
 
 def run_steps(
@@ -81,12 +69,7 @@ def run_steps(
     "redo" and else refused. Raises `InputError` for what is refused, and where another process runs steps in the
     folder; `OSError` where a worker was killed.
     """
-    with only_writer(folder):
-        plan = _plan_steps(steps, folder, notify, stale, Sources())
-        if plan.waiting:
-            with _open_engine(engine, jobs) as workers:
-                _run(plan, workers, jobs, notify)
-        return plan.values
+    return _run({folder: steps}, {folder: notify}, jobs, stale, engine)[folder]
 
 
 def run_side_by_side(
@@ -98,54 +81,54 @@ def run_side_by_side(
     engine: str = "processes",
     names: Mapping[Path, str] | None = None,
 ) -> dict[Path, dict[str, Any]]:
-    """Run the steps of each folder, up to `jobs` folders in parallel; return each folder's values as `run_steps` does.
+    """Run the steps of each folder, on the same `jobs` workers; return each folder's values as `run_steps` does.
 
-    A step that is finished in another of the folders, asked in the same way and by the same code, is taken over.
-    `names`: prefixes of the folders' steps in `notify` (None: the folders' own names).
+    Earlier folders come first. A step that is finished in another of the folders, asked in the same way and by the same
+    code, is taken over; one that is under way there is waited for. `names`: prefixes of the folders' steps in `notify`
+    (None: the folders' own names).
     """
-    sources = Sources()
 
     def named(folder: Path) -> Notify:
         name = folder.name if names is None else names[folder]
         return lambda step, done, total, note: notify(f"{name}/{step}", done, total, note)
 
-    with contextlib.ExitStack() as locks:
-        for folder in runs:
-            locks.enter_context(only_writer(folder))
-        plans = [_plan_steps(steps, folder, named(folder), stale, sources) for folder, steps in runs.items()]
-        waiting = [plan for plan in plans if plan.waiting]
-        if waiting:
-            with _open_engine(engine, jobs) as workers, ThreadPoolExecutor(jobs) as threads:
-                each = max(1, jobs // len(runs))
-                started = [threads.submit(_run, plan, workers, each, named(plan.folder), [*runs]) for plan in waiting]
-                try:
-                    for future in wait(started, return_when=FIRST_EXCEPTION).done:
-                        future.result()
-                except BaseException:
-                    threads.shutdown(wait=False, cancel_futures=True)
-                    workers.stop()
-                    raise
-        return {plan.folder: plan.values for plan in plans}
+    return _run(runs, {folder: named(folder) for folder in runs}, jobs, stale, engine)
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _Run:
     """The work that is left in a folder."""
 
     folder: Path
-    records: Mapping[str, Record]
+    records: Mapping[str, StepRecord]
     waiting: list[Step]
     values: dict[str, Any]  # of finished steps
+    notify: Notify
+
+    def finish(self, step: Step) -> None:
+        """Take the value of a step whose folder is complete."""
+        self.values[step.name] = read_value(self.folder / step.name)
+        self.notify(step.name, 1, 1, DONE_NOW)
 
 
-def _open_engine(engine: str, jobs: int) -> contextlib.AbstractContextManager[Engine]:
-    """Return a context of an engine; raises `InputError` for an unknown one."""
-    if engine not in _ENGINES:
-        raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(_ENGINES)}")
-    return _ENGINES[engine](jobs)
+def _run(
+    steps: Mapping[Path, Sequence[Step]], notify: Mapping[Path, Notify], jobs: int, stale: str, engine: str
+) -> dict[Path, dict[str, Any]]:
+    """Run the steps of each folder; return the values of each."""
+    with contextlib.ExitStack() as locks:
+        for folder in steps:
+            locks.enter_context(only_writer(folder))
+        sources = Sources()
+        runs = [_plan(own, folder, notify[folder], stale, sources) for folder, own in steps.items()]
+        if any(run.waiting for run in runs):
+            if engine not in ENGINES:
+                raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
+            with ENGINES[engine](jobs) as workers:
+                _perform(runs, workers, jobs)
+        return {run.folder: run.values for run in runs}
 
 
-def _plan_steps(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Plan:
+def _plan(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Run:
     """Return the work that is left of `steps`, notifying of those done before; raises `InputError` as `run_steps`.
 
     A finished step that lacks a file is left to do: its own checkpoints, and what else is whole, it goes on from.
@@ -160,41 +143,56 @@ def _plan_steps(steps: Sequence[Step], folder: Path, notify: Notify, stale: str,
         if done.exists():
             values[step.name] = read_value(folder / step.name)
             notify(step.name, 1, 1, KEPT if step.name in kept else DONE_BEFORE)
-    return _Plan(folder, records, [step for step in steps if step.name not in values], values)
+    waiting = _most_waited_for_first([step for step in steps if step.name not in values])
+    return _Run(folder, records, waiting, values, notify)
 
 
-def _run(plan: _Plan, workers: Engine, jobs: int, notify: Notify, folders: Sequence[Path] = ()) -> None:
-    """Do the work that is left; steps that are finished in another of `folders` are taken over."""
-    waiting, values = _most_waited_for_first(plan.waiting), plan.values
-    with workers.hands(plan.folder, jobs) as hands:
-        running: dict[Future[Any], tuple[Step, int]] = {}
-        while waiting or running:
-            ready = [step for step in waiting if all(name in values for name in step.needs)]
-            free = jobs - sum(taken for _, taken in running.values())
-            for step, taken in _share_workers(ready, free, lent=hands.lent):
-                waiting.remove(step)
-                others = [folder / step.name for folder in folders if folder != plan.folder]
-                if take_over(plan.folder / step.name, plan.records[step.name], others):
-                    values[step.name] = read_value(plan.folder / step.name)
-                    notify(step.name, 1, 1, DONE_NOW)
-                    continue
-                running[hands.submit(step.on(taken), plan.records[step.name])] = step, taken
-            finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
-            _drain(hands.reports, notify)
-            for future in finished:
-                step, _ = running.pop(future)
-                values[step.name] = future.result()
-                notify(step.name, 1, 1, DONE_NOW)
+def _perform(runs: Sequence[_Run], workers: Workers, jobs: int) -> None:
+    """Do the work that is left on `jobs` workers; steps that are finished in another folder are taken over."""
+    by_folder = {run.folder: run for run in runs}
+    running: dict[Future[Any], tuple[_Run, Step, int]] = {}
+    while running or any(run.waiting for run in runs):
+        free = jobs - sum(taken for _, _, taken in running.values())
+        ready = _list_ready(runs, [(run, step) for run, step, _ in running.values()])
+        for run, step, taken in _share_workers(ready, free, lent=workers.lent):
+            run.waiting.remove(step)
+            record = run.records[step.name]
+            others = [other.folder / step.name for other in runs if other is not run]
+            if take_over(run.folder / step.name, record, others):
+                run.finish(step)
+            else:
+                running[workers.submit(run.folder, step.on(taken), record)] = run, step, taken
+        finished, _ = wait(running, timeout=POLL_S, return_when=FIRST_COMPLETED)
+        with contextlib.suppress(Empty):
+            while True:
+                folder, *report = workers.reports.get_nowait()
+                by_folder[folder].notify(*report)
+        for future in finished:
+            run, step, _ = running.pop(future)
+            future.result()
+            run.finish(step)
 
 
-def _share_workers(ready: Sequence[Step], free: int, *, lent: bool) -> list[tuple[Step, int]]:
-    """Return the steps that begin on `free` workers, and how many each has: one and, if `lent`, spare ones."""
-    spare, shares = max(0, free - len(ready)) if lent else 0, []
-    for step in ready[:free]:
+def _list_ready(runs: Sequence[_Run], running: Sequence[tuple[_Run, Step]]) -> list[tuple[_Run, Step]]:
+    """Return the steps that can begin: what they need is finished, and no other folder is about to do the same."""
+    begun = [(step.name, run.records[step.name]) for run, step in running]
+    ready = []
+    for run in runs:
+        for step in run.waiting:
+            asked = step.name, run.records[step.name]
+            if all(name in run.values for name in step.needs) and asked not in begun:
+                begun.append(asked)
+                ready.append((run, step))
+    return ready
+
+
+def _share_workers(ready: Sequence[tuple[_Run, Step]], free: int, *, lent: bool) -> Iterator[tuple[_Run, Step, int]]:
+    """Yield the steps that begin on `free` workers, and how many each has: one and, if `lent`, spare ones."""
+    spare = max(0, free - len(ready)) if lent else 0
+    for run, step in ready[:free]:
         more = min(step.workers - 1, spare)
         spare -= more
-        shares.append((step, 1 + more))
-    return shares
+        yield run, step, 1 + more
 
 
 def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
@@ -209,20 +207,20 @@ def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
 
 def _settle_records(
     steps: Sequence[Step], folder: Path, stale: str, sources: Sources
-) -> tuple[dict[str, Record], set[str]]:
+) -> tuple[dict[str, StepRecord], set[str]]:
     """Return the record by which each step is, or is to be, done, and the stale steps.
 
     "redo" removes these, and those of other arguments.
     """
     if stale not in STALE:
         raise InputError(f"stale '{stale}': choose one of {', '.join(STALE)}")
-    records: dict[str, Record] = {}
-    outdated: dict[str, tuple[Record, Record]] = {}
-    edited: dict[str, tuple[Record, Record]] = {}
+    records: dict[str, StepRecord] = {}
+    outdated: dict[str, tuple[StepRecord, StepRecord]] = {}
+    edited: dict[str, tuple[StepRecord, StepRecord]] = {}
     for step in steps:
         asked = step.fingerprint({name: records[name].fingerprint for name in step.needs})
         code = sources.hashes(find_definitions((step.run, step.arguments)))
-        record = Record.of(asked, code, [records[name] for name in step.needs], step.asked)
+        record = StepRecord.of(asked, code, [records[name] for name in step.needs], step.asked)
         held = read_record(folder / step.name)
         if held is not None and held.fingerprint != asked:
             edited[step.name] = held, record
@@ -257,11 +255,3 @@ def stopwatch(folder: Path) -> Callable[[], float]:
         return elapsed
 
     return clock
-
-
-def _drain(reports: Any, notify: Notify) -> None:
-    while True:
-        try:
-            notify(*reports.get_nowait())
-        except Empty:
-            return

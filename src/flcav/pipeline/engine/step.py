@@ -95,7 +95,7 @@ def _fields(value: Any) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Record:
+class StepRecord:
     """The record of a step's execution: hashes of what was asked and of the code that did it."""
 
     fingerprint: str  # see `Step.fingerprint`
@@ -108,9 +108,9 @@ class Record:
         cls,
         fingerprint: str,
         code: Mapping[str, str],
-        needs: Iterable["Record"],
+        needs: Iterable["StepRecord"],
         asked: Mapping[str, Json] | None = None,
-    ) -> "Record":
+    ) -> "StepRecord":
         """Return the record of a step done by `code`, where the steps it needs have the records `needs`."""
         return cls(fingerprint, code, digest([sorted(code.items()), *(need.lineage for need in needs)]), asked)
 
@@ -120,7 +120,7 @@ def digest(value: Any, **how: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True, **how).encode()).hexdigest()[:16]
 
 
-def read_record(folder: Path) -> Record | None:
+def read_record(folder: Path) -> StepRecord | None:
     """Read the record by which the step in `folder` was done or, if it is not, begun; None where it was neither.
 
     Without recorded code, `code` is empty and `lineage` is "". Where that by which it was done is damaged, it is the
@@ -134,7 +134,7 @@ def read_record(folder: Path) -> Record | None:
             if not isinstance(values, dict) or not isinstance(values.get("fingerprint"), str):
                 raise InputError(f"{path}: not the record of a step; choose another folder")
             known = (values["fingerprint"], values.get("code") or {}, values.get("lineage") or "")
-            return Record(*known, values.get("asked"))
+            return StepRecord(*known, values.get("asked"))
     return None
 
 
@@ -143,12 +143,12 @@ def read_value(folder: Path) -> Any:
     return json.loads((folder / DONE).read_text())["value"]
 
 
-def write_started(folder: Path, record: Record) -> None:
+def write_started(folder: Path, record: StepRecord) -> None:
     """Write the record of the step in `folder` that begins."""
     write_json(folder / STARTED, asdict(record))
 
 
-def write_done(folder: Path, record: Record, value: Any, provenance: Mapping[str, Any]) -> None:
+def write_done(folder: Path, record: StepRecord, value: Any, provenance: Mapping[str, Any]) -> None:
     """Write record, value and provenance of the step in `folder`, and the sizes of its files; it is finished with that.
 
     The files are on the disk before.
@@ -180,14 +180,14 @@ def find_damage(folder: Path) -> str | None:
     return None
 
 
-def changed_modules(held: Record, wanted: Record) -> list[str]:
+def changed_modules(held: StepRecord, wanted: StepRecord) -> list[str]:
     """Return the modules whose reached code differs between two records; none where `held` does not know its code."""
     if not held.code:
         return []
     return [name for name in sorted({*held.code, *wanted.code}) if held.code.get(name) != wanted.code.get(name)]
 
 
-def make_stale_error(folder: Path, outdated: Mapping[str, tuple[Record, Record]]) -> InputError:
+def make_stale_error(folder: Path, outdated: Mapping[str, tuple[StepRecord, StepRecord]]) -> InputError:
     """Return the error for a folder whose steps are of other code; `outdated`: records (held, wanted) by step."""
     modules = {name: changed_modules(*records) for name, records in outdated.items()}
     unknown = [name for name, (held, _) in outdated.items() if not held.code]
@@ -205,7 +205,9 @@ def make_stale_error(folder: Path, outdated: Mapping[str, tuple[Record, Record]]
     )
 
 
-def make_edited_error(folder: Path, edited: Mapping[str, tuple[Record, Record]], steps: Sequence[Step]) -> InputError:
+def make_edited_error(
+    folder: Path, edited: Mapping[str, tuple[StepRecord, StepRecord]], steps: Sequence[Step]
+) -> InputError:
     """Return the error for a folder some of whose `steps` are of other arguments: records (held, wanted) by step."""
     changes: dict[str, list[str]] = {}  # steps by how their arguments differ
     after = []
@@ -227,7 +229,7 @@ def make_edited_error(folder: Path, edited: Mapping[str, tuple[Record, Record]],
     )
 
 
-def describe_differences(held: Record, wanted: Record) -> list[str]:
+def describe_differences(held: StepRecord, wanted: StepRecord) -> list[str]:
     """Return the arguments of a step that are not as they were, in words; none where they were not recorded."""
     if held.asked is None or wanted.asked is None:
         return []
@@ -247,7 +249,7 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def take_over(folder: Path, record: Record, others: Iterable[Path]) -> bool:
+def take_over(folder: Path, record: StepRecord, others: Iterable[Path]) -> bool:
     """Make `folder` a step that is finished in one of the folders `others` by the same record; False where none is.
 
     Files are linked, not copied, and the folder appears at once. A step that has begun is left to go on.
