@@ -101,6 +101,10 @@ class Requests:
         self._last: Mapping[str, tuple[list[bytes], bytes]] = {}  # by record: its data and their digest
         self._lock = threading.Lock()
 
+    def __reduce__(self) -> tuple[type["Requests"], tuple[()]]:
+        """Return how another process makes its own: what is kept here is only for speed."""
+        return Requests, ()
+
     def digest(self, content: RecordDict) -> bytes:
         """Return the digest of all that is asked, which is 32 bytes (BLAKE2b); not of the note that nothing arrives."""
         hashed = hashlib.blake2b(digest_size=32)
