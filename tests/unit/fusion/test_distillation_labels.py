@@ -31,7 +31,7 @@ from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels import quality, road_average
+from flcav.pipeline.labels import quality
 from flcav.pipeline.labels.quality import measure_labels, read_history
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.sensors.frame import Annotations, Calibration, Frame
