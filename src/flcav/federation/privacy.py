@@ -7,16 +7,18 @@ of its own, or, where the noise is `seeded`, by the seed of the round, which all
 """
 
 import bisect
+import functools
 import itertools
 import logging
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
+from scipy.optimize import root_scalar
 
 from flcav.config import Config, InputError
 from flcav.federation.noise import Normals, secret_noise
@@ -28,6 +30,7 @@ from flcav.statistics.streams import stream
 Arrays = dict[str, NDArray[np.number]]  # by name
 ROUNDING = 1e-12  # relative: more than the sum of squares of a clipped change is off in float64
 MOST_NOISE = 1e6
+SMALLEST = 1e-12  # epsilon, and the inverse of the largest, that noise is sought for
 SEEDED = "seeded, no guarantee against who knows the seed"  # of epsilon whose noise can be drawn again
 
 
@@ -74,7 +77,7 @@ class Privacy(Config):
         return not self.seeded and self.amplified(selection)
 
     def amplified(self, selection: Selection) -> bool:
-        """Return whether epsilon is smaller since nobody knows who takes part in a round."""
+        """Return whether secret sampling of the clients of a round amplifies privacy."""
         return not self.local and selection.rule in ("poisson", "uniform")
 
 
@@ -161,19 +164,16 @@ def compose_epsilon(
     part as often as any. Local noise is between any two data sets of a client, again twice the norm apart.
     """
     import dp_accounting  # 1 s
-    from dp_accounting import NeighboringRelation, rdp
+    from dp_accounting import rdp
 
-    logging.getLogger("absl").setLevel(logging.ERROR)  # warns of each order of Renyi divergence that it leaves out
     replaced = privacy.local or selection.rule == "uniform"  # else a client is added or removed
-    relation = NeighboringRelation.ADD_OR_REMOVE_ONE
-    if privacy.amplified(selection) and selection.rule == "uniform":
-        relation = NeighboringRelation.REPLACE_ONE
     times = Counter[tuple[int, float]]()  # by number of clients, and noise
     for (clients, rounds), found in zip(trainings, noises, strict=False):
         noise = privacy.multiplier if found is None else found
         taken = rounds if privacy.amplified(selection) else most_participations(selection, clients, rounds)
         times[clients, noise / 2 if replaced else noise] += taken
-    accountant = rdp.RdpAccountant(neighboring_relation=relation)
+    accountant = rdp.RdpAccountant()
+    orders, spent = accountant._orders, accountant._rdp  # Renyi divergence, by order
     for (clients, noise), number in (+times).items():
         gaussian = dp_accounting.GaussianDpEvent(noise)
         event: dp_accounting.DpEvent = gaussian
@@ -183,8 +183,21 @@ def compose_epsilon(
         elif privacy.amplified(selection):
             assert selection.clients is not None
             event = dp_accounting.SampledWithoutReplacementDpEvent(clients, selection.clients, gaussian)
-        accountant.compose(event, number)
-    return float(accountant.get_epsilon(privacy.delta))
+        spent = spent + number * _measure_divergence(event)
+    return float(rdp.compute_epsilon(orders, spent, privacy.delta)[0])
+
+
+@functools.lru_cache(maxsize=1024)
+def _measure_divergence(event: Any) -> NDArray[np.float64]:
+    """Return the Renyi divergence of an event of `dp_accounting` at each of the accountant's orders."""
+    from dp_accounting import NeighboringRelation, SampledWithoutReplacementDpEvent, rdp
+
+    logging.getLogger("absl").setLevel(logging.ERROR)  # warns of each order of Renyi divergence that it leaves out
+    one_replaced = isinstance(event, SampledWithoutReplacementDpEvent)
+    relation = NeighboringRelation.REPLACE_ONE if one_replaced else NeighboringRelation.ADD_OR_REMOVE_ONE
+    accountant = rdp.RdpAccountant(neighboring_relation=relation)
+    accountant.compose(event)
+    return accountant._rdp
 
 
 def find_noise(privacy: Privacy, selection: Selection, clients: int, rounds: int) -> Privacy:
@@ -192,15 +205,28 @@ def find_noise(privacy: Privacy, selection: Selection, clients: int, rounds: int
     if privacy.noise is not None or privacy.epsilon is None:
         return privacy
 
-    def spends(noise: float) -> float:
-        return compose_epsilon(privacy.model_copy(update={"noise": noise}), selection, [(clients, max(rounds, 1))])
+    noise = _find_least_noise(privacy.model_dump_json(), selection.model_dump_json(), clients, max(rounds, 1))
+    return privacy.model_copy(update={"noise": noise})
 
-    least, most = -2.0, math.log10(MOST_NOISE)  # exponents of 10
-    while most - least > 1e-4:
-        middle = (least + most) / 2
-        least, most = (least, middle) if spends(10**middle) <= privacy.epsilon else (middle, most)
-    place = 10 ** (2 - math.floor(most))
-    return privacy.model_copy(update={"noise": min(math.ceil(10**most * place) / place, MOST_NOISE)})
+
+@functools.lru_cache(maxsize=256)
+def _find_least_noise(privacy: str, selection: str, clients: int, rounds: int) -> float:
+    """Return the noise of `find_noise`; settings are JSON, by which they are looked up."""
+    asked, drawn = Privacy.model_validate_json(privacy), Selection.model_validate_json(selection)
+
+    def exceeds(exponent: float) -> float:
+        """Return the logarithm of epsilon over the budget, for noise of 10^exponent."""
+        with_noise = asked.model_copy(update={"noise": 10**exponent})
+        spent = compose_epsilon(with_noise, drawn, [(clients, rounds)])
+        return float(np.log(np.clip(spent, SMALLEST, 1 / SMALLEST) / (asked.epsilon or 1.0)))
+
+    ends = -2.0, math.log10(MOST_NOISE)
+    if exceeds(ends[1]) > 0:
+        return MOST_NOISE
+    found = ends[0] if exceeds(ends[0]) <= 0 else float(root_scalar(exceeds, bracket=ends, xtol=1e-5).root)
+    place = 10 ** (2 - math.floor(found))
+    noise = math.ceil(10**found * place) / place
+    return noise if exceeds(math.log10(noise)) <= 0 else min(noise + 1 / place, MOST_NOISE)
 
 
 def most_participations(selection: Selection, clients: int, rounds: int) -> int:
