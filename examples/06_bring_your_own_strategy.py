@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flcav import Dataset, Recipe, federate, record, task_named
-from flcav.federation import FedAvg, Schedule, Update, Weights, average
+from flcav.federation import FedAvg, Schedule, Update, average
 from flcav.perception import TaskClient, build_network, from_arrays, to_arrays
 
 WEATHER = task_named("weather")
@@ -25,7 +25,7 @@ SCHEDULE = Schedule(rounds=10, steps=5, learning_rate=4e-3, final_learning_rate=
 class LossWeighted:
     power: float = 2.0
 
-    def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
+    def combine(self, start, updates: Sequence[Update]):
         return average([u.weights for u in updates], [u.samples * u.loss**self.power for u in updates])
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from flcav.federation.state import FederationState, RoundRecord
     from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy, strategy_named
     from flcav.federation.strategies.fedavg import average
-    from flcav.federation.trainable import LocalUpdate, Trainable, Update, Weights
+    from flcav.federation.trainable import LocalUpdate, Trainable, Update
     from flcav.federation.upload import Upload
 
 PLACES = {
@@ -37,7 +37,6 @@ PLACES = {
     "LocalUpdate": "flcav.federation.trainable",
     "Trainable": "flcav.federation.trainable",
     "Update": "flcav.federation.trainable",
-    "Weights": "flcav.federation.trainable",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, PLACES)
