@@ -36,7 +36,7 @@ def radio(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunRecipe, Ru
     asked["regions"]["grid"]["speed"] = {"cav1": 0.5, "cav3": 0.3}  # cav3 trains for longer than the deadline
     asked["budgets_mb"]["wireless"] = 6.97  # three rounds, and most of one more
     asked["arms"] = {"timely": {"federation": asked["federation"] | {"selection": TIMELY}}}
-    limits = {"samples": [3, 3], "edge_rounds": [1, 3], "cloud_rounds": [1, 3]}
+    limits = {"samples": [3, 3], "edge_rounds": [2, 3], "cloud_rounds": [1, 3]}
     asked |= {"retrainings": 1, "training": QUICK, "limits": limits, "horizon_s": 24.0}
     recipe, out = RunRecipe.model_validate(asked), tmp_path_factory.mktemp("radio")
     return out, recipe, run(recipe, out)
