@@ -39,10 +39,14 @@ class Sources:
         self._packages = packages
         self._module = functools.cache(self._read)
         self._reach = functools.cache(self._resolve_mentions)
+        self._of_starts = functools.cache(self._hash_reached)  # steps of one kind start at the same definitions
 
-    @pause_collector()  # syntax trees are all kept
     def hashes(self, starts: Iterable[Place]) -> dict[str, str]:
         """Return, by module, a hash of the definitions in it that are reachable from `starts`."""
+        return self._of_starts(frozenset(starts))
+
+    @pause_collector()  # syntax trees are all kept
+    def _hash_reached(self, starts: frozenset[Place]) -> dict[str, str]:
         reached: dict[str, set[ast.stmt]] = defaultdict(set)
         left, seen = [*starts], set[Place]()
         while left:
