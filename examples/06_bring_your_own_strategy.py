@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from flcav import Dataset, Recipe, federate, record, task_named
 from flcav.federation import FedAvg, Schedule, Update, average
@@ -40,7 +41,7 @@ def main(out: Path) -> None:
         network = build_network(WEATHER, CONFIG, seed=1)
         update = federate(clients, to_arrays(network), SCHEDULE, strategy=strategy)
         from_arrays(network, update.weights)
-        recall = WEATHER.evaluate(network, data, data.select(agents=["cav2"])).recall
+        recall: Any = WEATHER.evaluate(network, data, data.select(agents=["cav2"])).as_json()["recall"]
         print(f"{strategy}: a third vehicle's pictures, recall", ", ".join(f"{k} {v:.2f}" for k, v in recall.items()))
 
 

@@ -14,7 +14,6 @@ from flcav.federation.messages.conduct import (
     ANSWERED,
     RequestRefused,
     Requests,
-    affordable_answers,
     asked_for,
     keep_answered,
     recall_answered,
@@ -87,14 +86,14 @@ def client_app(
     use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
     arrives.
     """
-    app, clients, requests = ClientApp(), [*trainables], Requests()
+    app, clients, requests = ClientApp(), [*trainables], Requests(rules.privacy)
 
     def admit(message: Message, context: Context, name: str, work: LocalWork) -> str:
         """Return what is asked for; raises `RequestRefused` where the client is not to answer."""
         asked, before = asked_for(message.content), recall_answered(context)
         repeatable = rules.secure is None and OWN not in context.state and RESIDUAL not in context.state
         answered = before.admit(work.round, asked, requests.digest(message.content), rules, repeatable)
-        if (most := affordable_answers(rules.privacy)) is not None and answered.rounds > most - spent:
+        if (most := requests.affordable) is not None and answered.rounds > most - spent:
             raise RequestRefused(f"a round more than the {most} that the privacy budget of {name} affords")
         keep_answered(context, answered)
         return asked

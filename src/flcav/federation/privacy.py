@@ -173,7 +173,8 @@ def compose_epsilon(
         taken = rounds if privacy.amplified(selection) else most_participations(selection, clients, rounds)
         times[clients, noise / 2 if replaced else noise] += taken
     accountant = rdp.RdpAccountant()
-    orders, spent = accountant._orders, accountant._rdp  # Renyi divergence, by order
+    orders: Any = accountant._orders
+    spent: Any = accountant._rdp  # Renyi divergence, by order
     for (clients, noise), number in (+times).items():
         gaussian = dp_accounting.GaussianDpEvent(noise)
         event: dp_accounting.DpEvent = gaussian

@@ -8,7 +8,7 @@ import hashlib
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 
 import numpy as np
 from flwr.app import Array, ArrayRecord, Context, RecordDict
@@ -95,15 +95,25 @@ def keep_answered(context: Context, answered: Answered) -> None:
 
 
 class Requests:
-    """Digests of requests; the clients of a process share the arrays of theirs, which are hashed once."""
+    """Requests as the clients of a process see them: in how many rounds they answer, and digests of what is asked.
 
-    def __init__(self) -> None:
+    The clients share the arrays of theirs, which are hashed once.
+    """
+
+    def __init__(self, privacy: Privacy | None) -> None:
+        """Answer within the budget of `privacy`."""
+        self._privacy = privacy
         self._last: Mapping[str, tuple[list[bytes], bytes]] = {}  # by record: its data and their digest
         self._lock = threading.Lock()
 
-    def __reduce__(self) -> tuple[type["Requests"], tuple[()]]:
+    def __reduce__(self) -> tuple[type["Requests"], tuple[Privacy | None]]:
         """Return how another process makes its own: what is kept here is only for speed."""
-        return Requests, ()
+        return Requests, (self._privacy,)
+
+    @cached_property
+    def affordable(self) -> int | None:
+        """Number of rounds in which a client's budget affords an answer, see `affordable_answers`."""
+        return affordable_answers(self._privacy)
 
     def digest(self, content: RecordDict) -> bytes:
         """Return the digest of all that is asked, which is 32 bytes (BLAKE2b); not of the note that nothing arrives."""
@@ -132,7 +142,6 @@ class Requests:
         return digest
 
 
-@lru_cache(maxsize=64)
 def affordable_answers(privacy: Privacy | None) -> int | None:
     """Return in how many rounds a client's own budget affords an answer with its noise; None: in any number."""
     if privacy is None or not privacy.local or privacy.epsilon is None:
