@@ -6,14 +6,14 @@ import json
 import numpy as np
 from cpu_time import cpu_ms
 
-from flcav.fusion.average import Told, average_boxes
+from flcav.fusion.average import BoxReport, average_boxes
 from flcav.geometry import Boxes
 
 AGENTS, OBJECTS, SPINS, EVERY_S = 10, 50, 10, 0.1
 SIGMA = np.array((0.2, 0.2, 0.2, 0.1, 0.1, 0.1, 0.05))
 
 
-def draw_window(seed: int) -> list[Told]:
+def draw_window(seed: int) -> list[BoxReport]:
     """Return what `AGENTS` agents tell of the same `OBJECTS` moving objects in each of `SPINS` spins."""
     rng = np.random.default_rng(seed)
     place, velocity = rng.uniform(-200, 200, (OBJECTS, 2)), rng.normal(0, 5, (OBJECTS, 2))
@@ -32,7 +32,7 @@ def draw_window(seed: int) -> list[Told]:
                 np.full(OBJECTS, 0.8),
                 np.tile(SIGMA**2, (OBJECTS, 1)),
             )
-            told.append(Told(f"agent{agent}", spin * EVERY_S, boxes))
+            told.append(BoxReport(f"agent{agent}", spin * EVERY_S, boxes))
     return told
 
 

@@ -156,7 +156,7 @@ def compose_epsilon(
     """Return epsilon at `privacy.delta` of several trainings with one client's data, by Renyi differential privacy.
 
     trainings: of each the number of clients, in the same order, and of rounds; the turns of round-robin go on in all
-    rounds of a training, and begin anew with the next. noises: of each training (None: that of `privacy`).
+    rounds of a training, and restart with the next. noises: of each training (None: that of `privacy`).
 
     Central, Poisson sampling: amplified, neighbours differ by a client that is added or removed. Central, a fixed
     number drawn without replacement: amplified, neighbours differ in the data of one client, which changes a sum by up

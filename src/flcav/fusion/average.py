@@ -28,7 +28,7 @@ UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of bo
 
 
 @dataclass(frozen=True)
-class Told:
+class BoxReport:
     """Boxes that one agent sends of one spin, in the world frame."""
 
     agent: str
@@ -43,10 +43,10 @@ class RoadAverage:
     boxes: Boxes  # (K,) world frame, at the time asked for, with scores and variances
     velocity: Array  # (K, 2) along x and y of the world [m/s]
     agents: NDArray[np.int64]  # (K,) number of agents that saw the object
-    member: tuple[NDArray[np.int64], ...]  # for each `Told` the object of each of its boxes
+    member: tuple[NDArray[np.int64], ...]  # for each `BoxReport` the object of each of its boxes
 
 
-def average_boxes(told: Sequence[Told], at_s: float) -> RoadAverage:
+def average_boxes(told: Sequence[BoxReport], at_s: float) -> RoadAverage:
     """Return the objects at `at_s` [s] that agents tell of in a window of spins.
 
     An agent's score of an object is the mean over all its spins, zero where it does not tell of the object; the average
@@ -113,8 +113,8 @@ class _Lines:
         return (wtt * wx - wt * wxt) / det, (w * wxt - wt * wx) / det, np.stack((wtt, -wt, w)) / det
 
 
-def _associate(told: Sequence[Told], at_s: float) -> tuple[NDArray[np.int64], ...]:
-    """Return for each `Told` the number of the object that each of its boxes belongs to, from 0."""
+def _associate(told: Sequence[BoxReport], at_s: float) -> tuple[NDArray[np.int64], ...]:
+    """Return for each `BoxReport` the number of the object that each of its boxes belongs to, from 0."""
     most = sum(len(one.boxes) for one in told)
     lines, labels, count = _Lines(most), np.zeros(most, dtype=np.int64), 0
     known: dict[str, int] = {}

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.fusion.average import YAW, Told, variance_of
+from flcav.fusion.average import YAW, BoxReport, variance_of
 from flcav.geometry import Boxes
 
 Array = NDArray[np.float64]
@@ -31,13 +31,13 @@ class Sighting:
     navigation: Navigation | None = None  # None: surveyed, a road sensor
 
 
-def tell(sighting: Sighting) -> Told:
+def tell(sighting: Sighting) -> BoxReport:
     """Return what an agent tells of a spin: boxes in the world, with the uncertainty of its pose in their variances.
 
     A heading error moves a box at distance r by r times the error, across the line of sight.
     """
     boxes = sighting.boxes.transform(sighting.world_from_agent)
-    return Told(sighting.agent, sighting.time_s, add_pose_variance(boxes, sighting))
+    return BoxReport(sighting.agent, sighting.time_s, add_pose_variance(boxes, sighting))
 
 
 def add_pose_variance(boxes: Boxes, sighting: Sighting) -> Boxes:

@@ -32,7 +32,7 @@ class StudyRecipe:
     quick_epochs: int = 1  # epochs at the scale "quick"
 
     def tests_of(self, seed: int) -> Mapping[str, RecipeFields]:
-        """Return the test recordings of one seed of the study, by name: traffic and weather are drawn anew."""
+        """Return the test recordings of one seed of the study, by name: traffic and weather are redrawn."""
         return {name: {**fields, "seed": test_seed(fields, seed)} for name, fields in self.tests.items()}
 
     def at_scale(self, scale: str) -> "StudyRecipe":

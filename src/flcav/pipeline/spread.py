@@ -1,6 +1,6 @@
 """The spread of retraining: how a run's figures vary over trainings on the same frames with other random numbers.
 
-Initial weights, the order of batches and augmentation are drawn anew; recordings, the plan, uploaded samples and
+Initial weights, the order of batches and augmentation are redrawn; recordings, the plan, uploaded samples and
 roadside sensors stay. A run with `retrainings` measures the spread and writes it as a table (spread.csv), which the
 recipe of another run names (`spread`), or the package holds. Runs of the same recipe on other kinds of processor are
 further trainings, whose sensors are placed by their own network's errors (tools/ship_spreads.py).

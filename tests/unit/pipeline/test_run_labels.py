@@ -17,7 +17,7 @@ from flcav.pipeline.label_sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.labels import pseudo_labels
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold, select_frames_near
 from flcav.pipeline.plan import exchanges
-from flcav.pipeline.plan.exchanges import Held, Sensors, measure_labels
+from flcav.pipeline.plan.exchanges import RegionDrive, Sensors, measure_labels
 from flcav.pipeline.recipe import RunRecipe
 
 
@@ -122,7 +122,7 @@ def test_a_vehicle_s_messages_are_priced_for_all_spins_of_its_windows(monkeypatc
     monkeypatch.setattr(exchanges, "_sighting_bytes", lambda *about: 1000)
 
     def priced_mb(recorded: bool, window_s: float) -> float:
-        region = Held(drive, recorded, training_frames=20, vehicles=2)
+        region = RegionDrive(drive, recorded, training_frames=20, vehicles=2)
         sensors = Sensors((), 1, 40.0, 60.0)
         return measure_labels([region], sensors, Distillation(window_s=window_s), cast(Any, None))
 

@@ -115,7 +115,7 @@ def repeat_faults(out: Path, seeds: int, progress: Report = ignore_progress) -> 
 
 
 def choose_liars(drives: Drives, seed: int) -> tuple[str, ...]:
-    """Return the names of the vehicles that lie, drawn anew for each seed."""
+    """Return the names of the Byzantine clients, redrawn for each seed."""
     names = [*drives.vehicles]
     return tuple(names[i] for i in sorted(stream(seed, "byzantine").permutation(len(names))[:BYZANTINE]))
 

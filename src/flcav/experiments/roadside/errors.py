@@ -13,9 +13,9 @@ from flcav.geometry import pose
 class Errors:
     """Standard deviations of the errors of vehicles, and what the radio does to messages of all agents."""
 
-    position_m: float = 0.0  # along x and along y, drawn anew at each spin
+    position_m: float = 0.0  # along x and along y, redrawn at each spin
     constant_m: float = 0.0  # along x and along y, the same all along
-    heading_deg: float = 0.0  # drawn anew at each spin
+    heading_deg: float = 0.0  # redrawn at each spin
     latency_s: float = 0.0  # delay of every message
     loss: float = 0.0  # probability that a message is lost
     clock_s: float = 0.0  # offset of a vehicle's clock, the same all along

@@ -18,7 +18,7 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.roadside.cameras import CALIBRATED, CORRECTED, CameraResult, associate_camera
-from flcav.fusion.average import Told, average_boxes
+from flcav.fusion.average import BoxReport, average_boxes
 from flcav.fusion.detector import THRESHOLD, load_road_network
 from flcav.fusion.registration import Offset, measure_offset, register
 from flcav.fusion.road import MIN_RETURNS
@@ -199,7 +199,7 @@ def _count_found(
         distance = np.linalg.norm(targets.center[:, :2], axis=1)
         cars += np.histogram(distance, EDGES_M)[0]
         for arm, poses in placed.items():
-            told = [Told(f"suite{row}", 0.0, boxes[row].transform(pose)) for row, pose in enumerate(poses)]
+            told = [BoxReport(f"suite{row}", 0.0, boxes[row].transform(pose)) for row, pose in enumerate(poses)]
             labels = average_boxes(told, 0.0).boxes
             target = assign_targets(labels, targets, OVERLAP, "bev")
             hits[arm] += np.histogram(distance[target[target >= 0]], EDGES_M)[0]

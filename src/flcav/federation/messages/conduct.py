@@ -61,7 +61,7 @@ class Answered:
         """Return what is answered last after a request for `asked` in a round; raises `RequestRefused`.
 
         The same request may come again, as after a stop of the server, where the same answer can be given:
-        `repeatable`. Under secure aggregation a round may begin anew, with new masks, until its sum is unmasked.
+        `repeatable`. Under secure aggregation a round may restart, with new masks, until its sum is unmasked.
         """
         requests = agreed_requests(rules)
         if asked not in requests:

@@ -1,4 +1,4 @@
-"""Sensitivity to the budgets: the optimal objective over scaled budgets (a Pareto front), solved anew at each.
+"""Sensitivity to the budgets: the optimal objective over scaled budgets (a Pareto front), solved at each.
 
 Plans are in whole samples and rounds, so the objective falls in steps: the gain of a larger budget is computed, not
 extrapolated from the derivative at the present one.
@@ -32,7 +32,7 @@ class BudgetPoint:
 
 @dataclass(frozen=True)
 class Saving:
-    """The gain of the plan solved anew with more of one link's budget."""
+    """The gain of the plan solved with more of one link's budget."""
 
     link: str  # one of `LINKS`
     added: float  # share of the budget
@@ -49,7 +49,7 @@ def sweep_budgets(
     """Return the optimal objective at each of `factors`, ascending, times the budgets of the `scaled` links.
 
     Factors whose budgets allow no plan are left out. `plan` is the one at the problem's own budgets (factor 1). The
-    plan of a smaller budget is kept where solving anew finds no better one, which can happen where vehicles' links
+    plan of a smaller budget is kept where solving again finds no better one, which can happen where vehicles' links
     limit the plans: it is within the larger budget too.
     """
     points: list[BudgetPoint] = []
@@ -71,7 +71,7 @@ def sweep_budgets(
 
 
 def compute_savings(problem: Problem, plan: Allocation) -> tuple[Saving, ...]:
-    """Return the gains over `plan` of 10 % and of 50 % more budget on each link alone, each solved anew."""
+    """Return the gains over `plan` of 10 % and of 50 % more budget on each link alone, each solved again."""
     found = []
     for link in LINKS:
         points = sweep_budgets(problem, plan, (link,), (1.0, *(1 + added for added in ADDED)))

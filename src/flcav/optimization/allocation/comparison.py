@@ -26,7 +26,7 @@ class PlanComparison:
 
 
 def compare_plan(problem: Problem, plan: Allocation, shares: Shares, savings: tuple[Saving, ...]) -> PlanComparison:
-    """Solve `problem` anew at multiples of its budgets and by each baseline, and return that beside its `plan`.
+    """Solve `problem` at multiples of its budgets and by each baseline, and return that beside its `plan`.
 
     Of a problem with one task "equal-tasks" is left out. Raises `Infeasible` as `baseline` does.
     """

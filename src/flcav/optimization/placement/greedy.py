@@ -1,6 +1,6 @@
 """The lazy greedy algorithm of budgeted maximum coverage, and exchanges of the chosen.
 
-A candidate's gain only falls as others are chosen, so that one whose old gain is too small need not be computed anew
+A candidate's gain only falls as others are chosen, so that one whose old gain is too small need not be recomputed
 (Minoux 1978). With unit costs the greedy choice covers at least 1 - 1/e of the optimum (Nemhauser, Wolsey and Fisher
 1978; here Euler's number); by gain over cost, or the best single candidate if that covers more, at least (1 - 1/e) / 2
 (Khuller, Moss and Naor 1999). One sensor a pole costs no part of this: ranges are nested, so that a longer one

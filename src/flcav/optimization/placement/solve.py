@@ -246,7 +246,7 @@ def improve(instance: CoverageInstance, budget: float, chosen: Sequence[int], re
 
 
 def keep_candidates(instance: CoverageInstance, kept: NDArray[np.bool_]) -> CoverageInstance:
-    """Return the instance in which only the candidates `kept` (N,) cover anything, its groups merged anew."""
+    """Return the instance in which only the candidates `kept` (N,) cover anything, its groups merged again."""
     covers = csr_array(diags_array(kept.astype(np.float64)) @ instance.covers)
     covers.eliminate_zeros()
     return merge_errors(covers, instance.weight, instance.cost, instance.sensors)

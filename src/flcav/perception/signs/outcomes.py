@@ -23,7 +23,7 @@ class SignsOutcomes:
     """Measure of the sign task: COCO's mAP at IoU 0.5."""
 
     measure_name = "mAP50"
-    redraws = 200  # few, since each bootstrap sample matches all images anew
+    redraws = 200  # few, since each bootstrap sample matches all images again
 
     def outcomes(
         self, network: SignDetector, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress

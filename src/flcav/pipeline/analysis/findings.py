@@ -27,7 +27,7 @@ Kind = Literal["claim", "primary", "secondary", "loss"]
 
 
 @dataclass(frozen=True)
-class Asked:
+class ClaimQuestion:
     """The question that a difference answers, and what it is to the run: a claim, or an estimate of a loss."""
 
     question: str
@@ -39,17 +39,17 @@ class Asked:
         return self.kind if self.kind in ("primary", "secondary") else None
 
 
-def ask(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) -> Asked:
+def ask(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) -> ClaimQuestion:
     """Return what a difference of the run itself is asked; `settings`: those of each arm."""
     question = _question(each, recipe, settings)
     if each.before_arm != MAIN and _is_bound(settings[MAIN], settings[each.before_arm], each.task):
-        return Asked(question, "loss")
+        return ClaimQuestion(question, "loss")
     if not recipe.primary_claims:
-        return Asked(question, "claim")
-    return Asked(question, "primary" if _name_claim(each) in recipe.primary_claims else "secondary")
+        return ClaimQuestion(question, "claim")
+    return ClaimQuestion(question, "primary" if _name_claim(each) in recipe.primary_claims else "secondary")
 
 
-def judge_asked(asked: Sequence[Asked], means: Sequence[MeanOverSeeds | None]) -> list[Judged | None]:
+def judge_asked(asked: Sequence[ClaimQuestion], means: Sequence[MeanOverSeeds | None]) -> list[Judged | None]:
     """Return the verdict on each claim; primary ones are judged together, others together.
 
     None for what is no claim, and where there is no number (None) to judge.
@@ -150,7 +150,7 @@ def _mean(each: Difference, scenes: int) -> MeanOverSeeds | None:
 def _finding(
     each: Difference,
     judged: Judged | None,
-    asked: Asked,
+    asked: ClaimQuestion,
     values: Mapping[tuple[str, str, str, str], Test],
     same: str | None,
     caveats: Mapping[str, str],

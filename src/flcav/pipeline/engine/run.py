@@ -1,7 +1,7 @@
 """Execution of steps in dependency order, by processes or on a cluster, resuming from those that are finished.
 
 A step is finished when its folder has a `done.json`: value, fingerprint, hash of the code it reaches, sizes of its
-files, and provenance. One with a file that is missing or of another size is done anew.
+files, and provenance. One with a file that is missing or of another size is repeated.
 That is written last, so an interrupted run resumes after its last finished step; a step may also keep checkpoints of
 its own. `started.json` has fingerprint and code before, so that a checkpoint is not resumed with other arguments.
 

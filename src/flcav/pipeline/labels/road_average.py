@@ -2,7 +2,7 @@
 
 Before each round every vehicle detects with the weights that the round begins with, in its frames and in what it
 recorded around them, sends boxes and its own poses up, and receives the road average of its frames' windows; its
-samples are then labelled anew. A window is centred on its frame: labels are made after the drive, so that what came
+samples are then relabelled. A window is centred on its frame: labels are made after the drive, so that what came
 after the frame is known, too. All messages are entered in the ledger; what a vehicle tells of a spin is sent once, for
 all windows that the spin is in. After stage II samples are labelled once, before the first round.
 """

@@ -54,7 +54,7 @@ def measure_exchange(
 
 
 @dataclass(frozen=True)
-class Held:
+class RegionDrive:
     """A drive of a region before its training, and how many training frames its vehicles will hold."""
 
     drive: Frames
@@ -73,7 +73,7 @@ class Sensors:
     near_m: float  # vehicles label frames recorded within this distance of a sensor [m]
 
 
-def measure_labels(regions: Sequence[Held], sensors: Sensors, how: Distillation, config: SecondConfig) -> float:
+def measure_labels(regions: Sequence[RegionDrive], sensors: Sensors, how: Distillation, config: SecondConfig) -> float:
     """Return what a vehicle sends to have its samples labelled once by the road average [MB], in the mean.
 
     A recorded region has in its windows what it has. In a town one more spin is recorded before each frame and after;
@@ -91,7 +91,7 @@ def measure_labels(regions: Sequence[Held], sensors: Sensors, how: Distillation,
     return sent / vehicles / BYTES_PER_MB
 
 
-def _expect_sensors(region: Held, sensors: Sensors) -> np.ndarray:
+def _expect_sensors(region: RegionDrive, sensors: Sensors) -> np.ndarray:
     """Return the places (S, 2) of a region's sensors, world [m]: on named poles, and those with most traffic."""
     sites = find_sites(region.drive, region.drive if region.recorded else None)
     named = np.flatnonzero(np.isin(sites.number, sensors.poles))

@@ -54,7 +54,7 @@ class Plan(Saved):
 
     rule: str
     tasks: Mapping[str, TaskPlan]
-    after: Annotated[str | None, LEFT_OUT] = None  # stage after which it was made anew; None: before the run
+    after: Annotated[str | None, LEFT_OUT] = None  # stage after which it was updated; None: before the run
     reached: Annotated[Mapping[str, float] | None, LEFT_OUT] = None  # score then, by task, which it rests on
 
 

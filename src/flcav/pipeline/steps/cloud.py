@@ -74,7 +74,7 @@ class CloudFederation:
     report: Report
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
     keeps_statistics: bool = False  # whether each region's statistics of batch normalisation are written, too
-    rate: float | None = None  # of the first round, where it is begun anew
+    rate: float | None = None  # of the first round, where it is restarted
 
     def afford(self, rules: Rules, rounds: int) -> int:
         """Return as many of `rounds` as the privacy budget affords in every region; without one all."""
@@ -150,7 +150,7 @@ def federate_cloud(
     parties = {f"{EDGE}/{region}": rules.secret_parties([*each.clients]) for region, each in own.regions.items()}
     checkpoints.keep_secrets(parties)
     earlier = max(each.earlier for each in own.regions.values())
-    schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier, anew=own.rate)
+    schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier, restart=own.rate)
     wireless = Account(own.book, CLOUD, task.name, "wireless", outages)
     everybody = {name: client for region in own.regions for name, client in own.vehicles(region).items()}
     with checkpoints.refusals(), open_processes(everybody, processes) as runtime:

@@ -22,7 +22,7 @@ from flcav.pipeline.arms import PlanRule, Setting
 from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.plan.allocation import PlanRequest, PlanSettings, make_plan
-from flcav.pipeline.plan.exchanges import Held, Sensors, measure_exchange, measure_labels
+from flcav.pipeline.plan.exchanges import RegionDrive, Sensors, measure_exchange, measure_labels
 from flcav.pipeline.plan.replanning import remake_plan
 from flcav.pipeline.plan.updates import UpdateForm, model_mb, update_forms
 from flcav.pipeline.radio.driving import link_drive, measure_uplinks, predict_air_s
@@ -105,7 +105,7 @@ class FirstPlanSettings(StepSettings):
 
 
 class ReplanSettings(StepSettings):
-    """Settings of the plan of the rest of a run, made anew after a stage."""
+    """Settings of the updated plan of the rest of a run, after a stage."""
 
     stage: Literal["pretrain", "edge"]
     first: str  # step of the first plan
@@ -176,7 +176,9 @@ def _measure_labels(
 ) -> float:
     """Return what a vehicle sends to have its samples labelled once [MB]; `held` as in `FirstPlanSettings`."""
     regions = [
-        Held(Frames.open(work.inputs[step]), region in how.recorded, sum(held[region].values()), len(held[region]))
+        RegionDrive(
+            Frames.open(work.inputs[step]), region in how.recorded, sum(held[region].values()), len(held[region])
+        )
         for region, step in how.drives.items()
     ]
     sensors = Sensors(how.poles, how.count, how.traffic_m, how.near_m)
@@ -204,7 +206,7 @@ def _predict(region: str, task: str, scenes: Sequence[RadioLinks], whole_mb: flo
 
 
 def replan_step(work: Work, settings: ReplanSettings) -> None:
-    """Plan the rest of the run anew after a stage, from what was reached and sent."""
+    """Update the plan of the rest of the run after a stage, from the scores reached and the megabytes sent."""
     problem = read_config(Problem, work.inputs[settings.first] / PROBLEM)
     done = Plan.load(work.inputs[settings.plan])
     reached: dict[str, float] = {}
@@ -280,7 +282,7 @@ def make_plan_step(outline: Outline, arm: Setting) -> Step:
 
 
 def make_replan_step(outline: Outline, stage: str) -> Step:
-    """Return the step that plans the rest of the run anew after stage I or II, from what the run itself reached."""
+    """Return the step that updates the plan after stage I or II, from what the run itself reached."""
     names, main = outline.names, outline.settings[MAIN]
     tasks = [name for name, task in outline.recipe.tasks.items() if task.history is not None]
     edges = {task: tuple(names.edge(MAIN, region, task) for region in main.regions) for task in tasks}

@@ -42,14 +42,16 @@ class Learning:
         """Return a network with initial weights drawn from the seed."""
         return build_network(self.task, self.config, self.seed)
 
-    def schedule(self, rounds: int, steps: int, *names: str, earlier: int = 0, anew: float | None = None) -> Schedule:
+    def schedule(
+        self, rounds: int, steps: int, *names: str, earlier: int = 0, restart: float | None = None
+    ) -> Schedule:
         """Return the clients' schedule of `rounds` rounds with `steps` local steps; `names` seed the stream.
 
         The learning rate falls over the first rounds after pretraining; where there were `earlier` ones, it stays at
-        its end. Begun anew, at `anew`, it costs what the earlier rounds reached: reproductions/runs/retraining.
+        its end. Restarted, at `restart`, it loses what the earlier rounds reached: reproductions/runs/retraining.
         """
         rate, training = self.task.practice.learning_rate, self.training
-        first = anew or (training.final_rate if earlier else training.local_rate)
+        first = restart or (training.final_rate if earlier else training.local_rate)
         return Schedule(rounds, steps, first * rate, training.final_rate * rate, derive_seed(self.seed, *names))
 
 

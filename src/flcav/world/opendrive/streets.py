@@ -1,6 +1,6 @@
 """Rewriting of netconvert's plain nodes, edges and connections as the streets of a town.
 
-Access to lanes is assigned anew: vehicles use the driving lanes, pedestrians the sidewalk nearest to them (added to
+Access to lanes is reassigned: vehicles use the driving lanes, pedestrians the sidewalk nearest to them (added to
 town streets where a map has no sidewalk at all), and other lanes keep their place but are closed to traffic.
 """
 

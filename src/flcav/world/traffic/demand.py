@@ -1,6 +1,6 @@
 """Traffic demand: SUMO's route file of random tours, and parked vehicles along the streets.
 
-Vehicles and pedestrians are under way to the end of the run. Both parts are drawn anew for every traffic seed.
+Vehicles and pedestrians are under way to the end of the run. Both parts are redrawn for every traffic seed.
 """
 
 from collections.abc import Iterator
