@@ -321,7 +321,7 @@ def test_further_rounds_stay_at_the_rate_at_which_the_earlier_ones_ended() -> No
     first, further = learning.schedule(3, 16, "edge", "grid"), learning.schedule(3, 16, "cloud", "", earlier=3)
     assert [first.work(number).learning_rate / rate for number in (1, 3)] == pytest.approx([0.5, 0.1])
     assert [further.work(number).learning_rate / rate for number in (1, 2, 3)] == pytest.approx([0.1] * 3)
-    anew = learning.schedule(3, 16, "cloud", "", earlier=3, anew=0.4)
+    anew = learning.schedule(3, 16, "cloud", "", earlier=3, restart=0.4)
     assert [anew.work(number).learning_rate / rate for number in (1, 2, 3)] == pytest.approx([0.4, 0.2, 0.1])
     assert anew.work(1).seed == further.work(1).seed
 
