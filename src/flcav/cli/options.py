@@ -18,7 +18,7 @@ THREADS = typer.Option(
     1,
     "--threads",
     min=1,
-    help="Threads to compute on; part of what a seed names: another number, other weights.",
+    help="Threads to compute on; part of what a seed reproduces: another number gives other weights.",
 )
 AGENTS = typer.Option(
     None,
@@ -27,7 +27,9 @@ AGENTS = typer.Option(
     "sensors stand as the network expects: docs/tasks.md.",
 )
 AROUND = typer.Option(
-    False, "--around", help="objects: look to all four sides, by quarter turns of the sweep, and not ahead alone."
+    False,
+    "--around",
+    help="objects: detect in 360 degrees, in four passes over the rotated sweep, and not ahead alone.",
 )
 JOBS = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each.")
 

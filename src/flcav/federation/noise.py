@@ -57,7 +57,7 @@ def derive_key(secret: Secret, purpose: str, round_: int, seed: int) -> bytes:
 def secret_noise(key: bytes, change: Weights) -> SecretNormals:
     """Return the noise of a change in the round of `key`: the same for the same change, and for another one another.
 
-    So a round that is repeated after a stop sends the same again, and no two changes can be told from their difference.
+    So a round that is repeated after a stop sends the same again, and the difference of two messages reveals no change.
     """
     hashed = hashlib.blake2b(key=key, digest_size=SECRET_BYTES)
     for name, array in change.items():

@@ -37,7 +37,7 @@ def rounds(
         min=0,
         max=1e6,
         callback=check_all_finite,
-        help="Time of a local step [s]; several are dealt to the vehicles in turn.",
+        help="Time of a local step [s]; several are assigned to the vehicles round-robin.",
     ),
     count: int = typer.Option(1, "--rounds", min=1, max=100_000, help="Edge rounds, one after another."),
     edge_rounds_per_cloud_round: int | None = typer.Option(

@@ -62,7 +62,7 @@ def allocate(
     out: Path | None = OUT,
     verify: bool = VERIFY,
 ) -> None:
-    """Split both uplink budgets over tasks and training stages so that they err least, by the problem's objective."""
+    """Split both uplink budgets over tasks and training stages to minimise the weighted error."""
     _plan(problem, progress, as_json, baseline, out, verify)
 
 

@@ -90,7 +90,7 @@ def is_usable(content: RecordDict, expected: Expected) -> bool:
 def read_masked(content: RecordDict, expected: Expected, peers: Sequence[str]) -> LocalUpdate | Sequence[str]:
     """Return a masked update, or the names of those of `peers` whose shares for the client do not open.
 
-    Masked values cannot be told from others. Raises `ReplyRefused`.
+    Masked values cannot be distinguished from others. Raises `ReplyRefused`.
     """
     if ASK in content:
         accused = read_entry(content, NAMES)

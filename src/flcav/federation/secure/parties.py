@@ -156,7 +156,7 @@ def find_liars(
 ) -> dict[str, str]:
     """Return who reveals shares that do not fit those of the others, with the reason; arguments as of `unmask_sum`.
 
-    A client that dealt shares that do not fit together cannot be told from those that it dealt wrong ones. Raises
+    A client that dealt inconsistent shares cannot be distinguished from those that it dealt wrong ones. Raises
     `SumLost` where no `threshold` shares of a secret fit, or fewer clients than that are left.
     """
     places = {name: place for place, name in enumerate(keys)}

@@ -1,7 +1,7 @@
 """The file of the secrets that noise is drawn by, in the folder of a federation while it is under way.
 
-Before the first message its SHA-256 is written beside it. By that hash a file that was lost or changed is told from one
-that has not been written yet. A hash of random bytes does not reveal them.
+Before the first message its SHA-256 is written beside it, by which a file that was lost or changed is distinguished
+from one that has not been written yet. A hash of random bytes does not reveal them.
 """
 
 import contextlib
