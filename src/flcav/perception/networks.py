@@ -145,7 +145,7 @@ def evaluate(
         network: the network or its file of weights; None: that of the package.
         agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
         within: "AHEAD,SIDE" [m], to which the range is limited; of the task `objects`.
-        around: whether to detect in 360°, in four passes over the rotated sweep, and not ahead alone; of the task `objects`.
+        around: whether to detect in 360°, in four passes over the rotated sweep; of the task `objects`.
         tracks: whether to add the tracking metrics MOTA and AMOTA; of the task `objects`.
         device: "auto", "cpu" or "cuda".
         threads: number of CPU threads.
@@ -250,7 +250,7 @@ def infer(
         inputs: files, folders of files, or folders of datasets.
         network: the network or its file of weights; None: that of the package.
         threshold: score below which detections are left out; None: the task's default.
-        around: whether to detect in 360°, in four passes over the rotated sweep, and not ahead alone; of the task `objects`.
+        around: whether to detect in 360°, in four passes over the rotated sweep; of the task `objects`.
         agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
         device: "auto", "cpu" or "cuda".
         threads: number of CPU threads.
@@ -298,7 +298,7 @@ def register_errors(
         data: dataset or its folder.
         network: the network or its file of weights; None: that of the package.
         threshold: score below which detections are ignored; None: the task's default.
-        around: whether to detect in 360°, in four passes over the rotated sweep, and not ahead alone; of the task `objects`.
+        around: whether to detect in 360°, in four passes over the rotated sweep; of the task `objects`.
         agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
         device: "auto", "cpu" or "cuda".
         threads: number of CPU threads.
