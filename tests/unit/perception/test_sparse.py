@@ -6,7 +6,7 @@ import torch.nn.functional as F
 
 from flcav.perception.ops import rulebook
 from flcav.perception.ops.rulebook import build_strided_rulebook, build_submanifold_rulebook, decode_keys, encode_cells
-from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d, sparse_convolution
+from flcav.perception.ops.sparse import SparseTensor, StridedConv3d, SubmanifoldConv3d, second_core, sparse_convolution
 
 GRIDS = [((9, 14, 11), 2, 0.15), ((5, 20, 7), 3, 0.4), ((4, 3, 3), 1, 1.0), ((6, 9, 8), 2, 0.01)]
 STRIDED = [
@@ -57,6 +57,20 @@ def test_strided_is_the_dense_convolution(shape, samples, share, kernel, stride,
     weight = layer.weight.view(*kernel, 5, 6).permute(4, 3, 0, 1, 2)
     dense = F.conv3d(dense_of(features, cells, shape, samples), weight, stride=stride, padding=padding)
     assert_same(dense, layer(x).dense(), features, layer.weight)
+
+
+@pytest.mark.parametrize(("shape", "samples", "share"), GRIDS)
+def test_gradients_on_two_cores_have_the_same_bits(shape, samples, share):
+    _, _, features, x = scene(shape, samples, share, channels=16)
+    layer = SubmanifoldConv3d(16, 32).double()
+
+    def gradients() -> tuple[torch.Tensor, ...]:
+        return torch.autograd.grad(layer(x).features.sin().sum(), (features, layer.weight))
+
+    alone = gradients()
+    with second_core():
+        both = gradients()
+    assert all(torch.equal(one, other) for one, other in zip(alone, both, strict=True))
 
 
 def test_features_that_need_no_gradient_get_none():

@@ -6,7 +6,10 @@ features and the weight alone. Convolutions: Graham et al., "3D Semantic Segment
 Convolutional Networks", CVPR 2018.
 """
 
+import contextlib
 import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
@@ -73,6 +76,20 @@ def sparse_convolution(features: Tensor, weight: Tensor, rules: Rulebook) -> Ten
         return _SparseConvolution.apply(features, weight.to(features.dtype), rules)
 
 
+_second: ThreadPoolExecutor | None = None  # of one thread
+
+
+@contextlib.contextmanager
+def second_core() -> Iterator[None]:
+    """Compute gradients of weights beside those of features, in a second thread, within the context: the same bits."""
+    global _second
+    with ThreadPoolExecutor(1) as _second:
+        try:
+            yield
+        finally:
+            _second = None
+
+
 class _SparseConvolution(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, weight: Tensor, rules: Rulebook) -> Tensor:
@@ -99,7 +116,13 @@ class _SparseConvolution(torch.autograd.Function):
             return None, grad_weight, None
         grad_features = torch.zeros_like(features, memory_format=torch.contiguous_format)
         turned = weight.detach().transpose(1, 2).contiguous().numpy()
-        blocks.gradients(*arrays, turned, *_pairs(ctx.rules), grad_features.numpy(), grad_weight.numpy())
+        source, target, begins = _pairs(ctx.rules)
+        if _second is None:
+            blocks.gradients(*arrays, turned, source, target, begins, grad_features.numpy(), grad_weight.numpy())
+        else:
+            beside = _second.submit(blocks.weight_gradient, *arrays, source, target, begins, grad_weight.numpy())
+            blocks.convolve(arrays[1], turned, target, source, begins, grad_features.numpy())
+            beside.result()
         return grad_features, grad_weight, None
 
 

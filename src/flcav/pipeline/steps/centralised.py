@@ -3,6 +3,7 @@
 The latter is a control that takes as many optimiser steps as stage II.
 """
 
+import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 
 from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
+from flcav.perception.ops.sparse import second_core
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task
 from flcav.perception.training import Checkpointing, Validation, train, train_steps
@@ -114,8 +116,11 @@ class PretrainSettings(StepSettings):
         return (self.plan, *self.pools.values(), *self.validation)
 
 
-def pretrain_step(work: Work, settings: PretrainSettings) -> None:
-    """Run stage I of a task: upload the planned samples, train on them, fix the score threshold of pseudo-labels."""
+def pretrain_step(work: Work, settings: PretrainSettings, processes: int = 1) -> None:
+    """Run stage I of a task: upload the planned samples, train on them, fix the score threshold of pseudo-labels.
+
+    Where it has several `processes`, gradients are computed on two cores, to the same weights.
+    """
     task, learning = settings.learning.task, settings.learning.resolve()
     plan = Plan.load(work.inputs[settings.plan])
     opened = {region: Frames.open(work.inputs[step]) for region, step in settings.pools.items()}
@@ -133,7 +138,8 @@ def pretrain_step(work: Work, settings: PretrainSettings) -> None:
             received = upload_samples(book, learning.task, learning.config, region, opened[region], frames)
             samples += [received[number] for number in range(len(received))]  # in memory: each is drawn many times
     book.save(work.folder / LEDGER)
-    validated = pretrain(learning, samples, watched, work.folder, work.report)
+    with second_core() if processes > 1 else contextlib.nullcontext():
+        validated = pretrain(learning, samples, watched, work.folder, work.report)
     trained = load_stage_network(learning.task, work.folder)
     Pretrained(
         task=task,
@@ -159,7 +165,7 @@ def list_pretraining(outline: Outline, arm: Setting) -> Iterator[Step]:
             upload_seed=recipe.seed,
             thresholded=any(kind.from_detections for kind in kinds),
         )
-        yield make_step(names.pretrain(arm.name, task), pretrain_step, settings)
+        yield make_step(names.pretrain(arm.name, task), pretrain_step, settings, workers=2)
 
 
 class CentralSettings(StepSettings):
