@@ -8,7 +8,7 @@ from flcav.machine.threads import use_threads
 
 use_threads(1)  # of each of the two workers and its children: threads that wait for a core burn time
 
-LONGEST = ("test_runs.py", "test_run_recipes.py", "test_examples.py", "test_wheel.py")
+LONGEST = ("test_runs.py", "test_run_recipes.py", "test_examples.py", "test_wheel.py", "test_stopped_runs.py")
 
 
 @pytest.fixture(scope="session", autouse=True)
