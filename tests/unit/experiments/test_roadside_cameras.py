@@ -86,8 +86,9 @@ def test_a_camera_has_a_row_for_each_choice_of_extrinsics() -> None:
     told = Associated(off, 4.25, pairs=8, right=6, found=5, lone_cars=2, lone_boxes=1, residual_px=12.34)
     camera = CameraResult("left", 20, 10, 9, dict.fromkeys((CALIBRATED, CORRECTED, EXACT), told), True)
     intervals = 9
-    arms: tuple[str, ...] = ("first suite alone", "three suites as calibrated", "three suites registered")
-    found, ranges = dict.fromkeys(arms, (0,) * intervals), dict.fromkeys(arms, 0.0)
+    arms = ("first suite alone", "three suites as calibrated", "three suites registered")
+    found: dict[str, tuple[int, ...]] = {arm: (0,) * intervals for arm in arms}
+    ranges: dict[str, float] = {arm: 0.0 for arm in arms}
     result = Fig4((), (0,) * intervals, found, ranges, (camera,), provenance())
     rows = fig4_tables(result)["cameras"].splitlines()
     assert len(rows) == 2 + 3
