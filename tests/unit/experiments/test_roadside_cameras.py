@@ -87,8 +87,8 @@ def test_a_camera_has_a_row_for_each_choice_of_extrinsics() -> None:
     camera = CameraResult("left", 20, 10, 9, dict.fromkeys((CALIBRATED, CORRECTED, EXACT), told), True)
     intervals = 9
     arms = ("first suite alone", "three suites as calibrated", "three suites registered")
-    found: dict[str, tuple[int, ...]] = {arm: (0,) * intervals for arm in arms}
-    ranges: dict[str, float] = {arm: 0.0 for arm in arms}
+    found: dict[str, tuple[int, ...]] = dict.fromkeys(arms, (0,) * intervals)
+    ranges: dict[str, float] = dict.fromkeys(arms, 0.0)
     result = Fig4((), (0,) * intervals, found, ranges, (camera,), provenance())
     rows = fig4_tables(result)["cameras"].splitlines()
     assert len(rows) == 2 + 3
