@@ -52,6 +52,7 @@ LEARNED = (  # those that decide a federation
     "distillation",
     "federation",
 )
+TRACKED = (*PRETRAINED, "placement", "labels")  # those that decide the vehicles' tracks
 OF_EDGE = (*LEARNED[:-1], "edge_federation")  # those that decide a federation without the cloud
 
 
@@ -81,7 +82,7 @@ class Setting:
     @property
     def edge_federation(self) -> Federation:
         """Return the federation without what decides stage III alone."""
-        of_cloud = ("personal", "cloud_strategy", "cloud_rate", "score_statistics")
+        of_cloud = ("personal", "cloud_strategy", "cloud_rate", "replay", "score_statistics")
         return self.federation.model_copy(update={name: Federation.model_fields[name].default for name in of_cloud})
 
 
@@ -179,6 +180,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
             f"federation.network: rounds are timed before they are run, and {selection.rule} selection under "
             "central noise draws in secret; 'privacy.seeded' simulates both"
         )
+    if how.replay and (how.personal or isinstance(edge, FedMD)):
+        raise InputError("federation.replay: the cloud's own training goes with whole networks, not personal or fedmd")
     _check_numbers(recipe, setting, edge)
     _check_bare_labels(setting)
     if isinstance(edge, FedMD) and setting.central is None:
@@ -298,6 +301,10 @@ class Names:
     def place(self, arm: str, region: str) -> str:
         """Return the step that places roadside sensors in a region."""
         return f"{region}-place" + self._suffix(arm, PLACED)
+
+    def tracks(self, arm: str, region: str, task: str) -> str:
+        """Return the tracks around a task's training frames in a region."""
+        return f"{region}-tracks-{task}" + self._suffix(arm, TRACKED, task)
 
     def edge(self, arm: str, region: str, task: str) -> str:
         """Return stage II of a task in a region."""

@@ -158,7 +158,7 @@ def _record_scene(graph: Graph, task: str, folder: Path) -> tuple[Frames, int, f
         split = Frames.open(folder)
         return split, len(split.vehicles) * len(pools), 0.0
     asked = make_recording_recipe(recipe, region, "pool", task, name)
-    first = asked.model_copy(update={"scenes": 1, "spins_per_scene": 1, "cavs": 1, "window_s": 0.0, "frames": None})
+    first = asked.model_copy(update={"scenes": 1, "spins_per_scene": 1, "cavs": 1, "frames": None})
     with tempfile.TemporaryDirectory() as unused:  # compiles what the recording calls
         record_frames(first, graph.beside, Path(unused) / "first", ignore_progress)
     began = time.perf_counter()

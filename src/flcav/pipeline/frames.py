@@ -60,12 +60,13 @@ class Frames:
 
 
 def make_recording_recipe(
-    recipe: RunRecipe, region: str, split: SplitName, task: str, name: str, window_s: float = 0.0
+    recipe: RunRecipe, region: str, split: SplitName, task: str, name: str, window: Mapping[str, float] = {}
 ) -> Recipe:
     """Return the recording recipe of a split in a region's town, without poles.
 
     Settings of the task, the run, the region, and the run's entry of the task override each other in this order.
-    window_s: as in `Recipe`. Raises `InputError`, naming the recording by its `name`, where they do not go together.
+    window: fields of `Recipe` of the spins around others. Raises `InputError`, naming the recording by its `name`,
+    where they do not go together.
     """
     place, frames = recipe.regions[region], getattr(recipe.sized_splits, split)
     changes = [as_shared(task_named(task)).recording, recipe.recording.fields(), place.recording.fields()]
@@ -84,7 +85,7 @@ def make_recording_recipe(
         "scenes": frames.scenes,
         "spins_per_scene": spins,
         "cavs": recipe.vehicles(region) if split == "edge" else frames.cavs,
-        "window_s": window_s,
+        **window,
     }
     return parse_config(Recipe, fields, name)
 

@@ -15,8 +15,14 @@ class LabelSource:
     from_detections: bool = False  # pseudo-labels of the frozen stage I network
     from_poles: bool = False  # boxes of roadside sensors
     trained: bool = False  # these boxes are a trained detector's, not an ideal one's
+    tracked: bool = False  # each vehicle's tracks, from the sweeps that it recorded around its frames
     averaged: bool = False  # the road average of a window's poles and vehicles, renewed before each round of stage II
     caveat: str = ""  # stated with every result that depends on them
+
+    @property
+    def placed(self) -> bool:
+        """Return whether labels reach a vehicle's frames by its poses."""
+        return self.from_poles or self.tracked
 
     @property
     def bound(self) -> bool:
@@ -29,6 +35,10 @@ LABEL_SOURCES: Mapping[str, LabelSource] = {
     "road": LabelSource(from_detections=True, from_poles=True, trained=True, caveat="trained road detector"),
     "road-average": LabelSource(
         from_detections=True, from_poles=True, trained=True, averaged=True, caveat="trained road detector"
+    ),
+    "tracks": LabelSource(from_detections=True, tracked=True),
+    "road+tracks": LabelSource(
+        from_detections=True, from_poles=True, trained=True, tracked=True, caveat="trained road detector"
     ),
     "ideal-road": LabelSource(from_detections=True, from_poles=True, caveat="ideal road detector, upper bound"),
     "annotated": LabelSource(caveat="ground truth as labels, upper bound"),

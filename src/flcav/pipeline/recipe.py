@@ -24,6 +24,7 @@ from flcav.world.weather import WeatherSchedule
 
 MAIN = "main"  # the arm that the recipe itself describes
 PRETRAIN, EDGE, CLOUD, CENTRAL = "pretrain", "edge", "cloud", "central"
+TRACKING = "tracking"  # of the objects around training frames, for labels of stages II and III
 ELSEWHERE = "elsewhere"  # the claim that federated learning helps in regions that do not federate
 MORE_EDGE = "more_edge"  # after stage II: as many further edge rounds as stage III has, without the cloud
 
@@ -232,6 +233,7 @@ class Federation(Rules):
     cloud_rate: float | None = Field(
         default=None, gt=0
     )  # learning rate of the first cloud round; default: `final_rate`
+    replay: bool = False  # the cloud takes part in its averages, by training on the samples of stage I, which it has
     score_statistics: bool = False  # validate stage III also with each region's own statistics of batch normalisation
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
 

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flcav.config import InputError, Json, shorten
 from flcav.sensors.frame import LONGEST_NAME, Frame, format_key
 from flcav.sensors.observe import observe
@@ -63,7 +65,8 @@ class EmbeddedSource:
 
     def describe(self) -> Mapping[str, Json]:
         """Return the recipe as JSON values, with names resolved: numbers of poles, rigs, hashes of the town's files."""
-        own, asked = self.recipe.model_dump(mode="json"), {"randomise", "window_s"}  # said where they are not left out
+        own = self.recipe.model_dump(mode="json")
+        asked = {"randomise", "window_s", "window_every_s", "window_range_m"}  # said where they are not left out
         return {
             **{name: value for name, value in own.items() if name not in asked or value},
             "town": self.town.name,
@@ -84,7 +87,10 @@ class EmbeddedSource:
         return [f"{self.town.name}-{self.recipe.seed}-{scene:03d}" for scene in range(count)]
 
     def frame_count(self, scene: str) -> int:
-        """Return the number of frames of a scene; the last scene has fewer where the recipe limits frames."""
+        """Return the number of frames of a scene; the last scene has fewer where the recipe limits frames.
+
+        With `window_range_m` it is the largest number: how many are recorded depends on the traffic.
+        """
         return min(self._per_scene, self._frames - self.scenes().index(scene) * self._per_scene)
 
     def frames(self, scene: str) -> Iterator[Frame]:
@@ -99,6 +105,8 @@ class EmbeddedSource:
         weather = recipe.weather.draw(stream(recipe.seed, scene, "weather"))
         for number in numbers:
             index, agent = divmod(number, len(self.agents))
+            if not self._records(trace, index, agent):
+                continue
             yield observe(
                 world,
                 self.vehicle_rigs[agent] if agent < recipe.cavs else recipe.pole_rig,
@@ -109,6 +117,17 @@ class EmbeddedSource:
                 weather=weather.at(float(trace.time_s[index] - trace.time_s[0])),
                 error=recipe.calibration_error,
             )
+
+    def _records(self, trace: Trace, index: int, agent: int) -> bool:
+        """Return whether an agent records the spin `index`: those of windows only near poles, with `window_range_m`."""
+        near_m, middles = self.recipe.window_range_m, self.recipe.find_middles(index)
+        if near_m is None or not self.poles or index in middles:
+            return True
+        if agent >= self.recipe.cavs:
+            return False
+        sites = self.town.poles.position[np.isin(self.town.poles.id, self.poles), :2]
+        places = trace.position[middles, trace.actor.tolist().index(self.agents[agent]), :2]
+        return bool((np.linalg.norm(places[:, None] - sites, axis=2) <= near_m).any())
 
     def trace(self, scene: str) -> Trace:
         """Return the simulated traffic of the scene, sampled at the times of its spins."""

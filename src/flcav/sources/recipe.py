@@ -60,7 +60,7 @@ class Recipe(Config):
     """A recording recipe: a town, its traffic runs, and the agents that observe them.
 
     A scene is one traffic run with its own parked cars. After a warm-up of `warmup_s`, in which the town fills, every
-    agent observes `spins_per_scene` spins, `every_s` apart, and with `window_s` one more before and after each of them.
+    agent observes `spins_per_scene` spins, `every_s` apart, and with `window_s` more before and after each of them.
     Raises pydantic's ValidationError, which names the field.
 
     >>> from flcav import Recipe
@@ -86,7 +86,13 @@ class Recipe(Config):
     )  # LiDAR spins without those of `window_s`; every agent records a frame at each
     every_s: Duration = 1.0  # time between two of these spins, a multiple of 0.1 s
     window_s: Annotated[float, Field(ge=0, le=10), AfterValidator(_multiple_of_step)] = (
-        0.0  # above 0: a further spin so long before and after each of the others, a multiple of 0.1 s
+        0.0  # above 0: further spins up to so long before and after each of the others, a multiple of 0.1 s
+    )
+    window_every_s: Annotated[float, Field(ge=0.1), AfterValidator(_multiple_of_step)] | None = (
+        None  # time between the spins of a window, a multiple of 0.1 s; None: only those at its ends
+    )
+    window_range_m: Annotated[float, Field(gt=0)] | None = (
+        None  # where poles record, vehicles record windows only of spins within this of one of them, and poles none [m]
     )
     cavs: int = Field(default=1, ge=0, le=1000)  # connected vehicles that record: cav0, cav1, ...
     poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()  # numbers of the poles that record
@@ -118,6 +124,16 @@ class Recipe(Config):
                 raise ValueError(f"scenarios: '{scenario.kind}' is at {scenario.at_s:g} s, after the last spin")
         return self
 
+    @model_validator(mode="after")
+    def _whole_windows(self) -> "Recipe":
+        if self.window_every_s is not None and self.window_every_s > self.window_s:
+            raise ValueError(
+                f"window_every_s = {self.window_every_s:g} leaves no spin within window_s = {self.window_s:g}"
+            )
+        if self.window_range_m is not None and not self.window_s:
+            raise ValueError("window_range_m: there are no windows around spins; give 'window_s'")
+        return self
+
     @property
     def warmup_steps(self) -> tuple[int, int]:
         """Return the shortest and the longest warm-up of a scene, in steps of the traffic."""
@@ -134,6 +150,12 @@ class Recipe(Config):
         """Return the numbers of the `spins_per_scene` spins, among those of their windows."""
         return tuple(np.flatnonzero(np.isin(self._steps(), self._middle_steps())).tolist())
 
+    def find_middles(self, spin: int) -> NDArray[np.int64]:
+        """Return the numbers, among all spins, of the `spins_per_scene` spins whose window has the spin `spin`."""
+        middle = np.array(self.middle_spins)
+        away = np.abs(self._steps()[middle] - self._steps()[spin])
+        return middle[away <= round(self.window_s / STEP_S)]
+
     def times_s(self, warmup_steps: int) -> NDArray[np.float64]:
         """Return (spins,) the times of the spins [s] after a warm-up of `warmup_steps` steps of STEP_S."""
         return np.round((warmup_steps + self._steps()) * np.float64(STEP_S), 1)
@@ -143,8 +165,11 @@ class Recipe(Config):
 
     def _steps(self) -> NDArray[np.int64]:
         """Return the steps of all spins since the end of the warm-up, ascending."""
-        middle, aside = self._middle_steps(), round(self.window_s / STEP_S)
-        return np.unique(np.concatenate((middle - aside, middle, middle + aside)))
+        aside = round(self.window_s / STEP_S)
+        every = aside if self.window_every_s is None else round(self.window_every_s / STEP_S)
+        offsets = np.arange(every, aside + 1, every) if every else np.zeros(0, dtype=np.int64)
+        around = np.concatenate((-offsets, (0,), offsets)).astype(np.int64)
+        return np.unique(self._middle_steps()[:, None] + around)
 
 
 def recipe_path(name: str) -> Path:

@@ -248,7 +248,7 @@ def test_recordings_of_an_own_town_name_its_files(tmp_path: Path) -> None:
     ("changes", "said"),
     [
         ({"tasks": {"radar": {"history": "objects"}}}, "task 'radar'"),
-        ({"tasks": {"objects": {"history": "objects", "labels": "annotated"}}}, "'annotated' is none of road"),
+        ({"tasks": {"objects": {"history": "objects", "labels": "future"}}}, "'future' is none of road"),
         ({"tasks": {"objects": {"history": "none.csv"}}}, "'none.csv' is no history of the package"),
         ({"tasks": {"signs": {"history": "objects"}}}, "has no rows of 'signs'"),
         (

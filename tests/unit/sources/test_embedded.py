@@ -60,6 +60,31 @@ def test_a_window_is_recorded_and_said_where_there_is_one():
     assert "window_s" not in small().describe()
 
 
+def test_windows_are_recorded_of_vehicles_near_a_pole_and_of_no_pole():
+    """With a range: whole windows of the vehicles near a recording pole at the spin in the middle, none of others."""
+    how = {"poles": [1], "scenes": 1, "cavs": 4, "window_s": 0.4, "window_every_s": 0.2, "spins_per_scene": 2}
+    plain = small(**how, every_s=4.0)
+    source = small(**how, every_s=4.0, window_range_m=60.0)
+    (scene,) = source.scenes()
+    trace, pole = source.trace(scene), source.town.poles.position[source.town.poles.id.tolist().index(1), :2]
+    assert trace.time_s.tolist() == [34.6, 34.8, 35.0, 35.2, 35.4, 38.6, 38.8, 39.0, 39.2, 39.4]
+    kept = {(frame.index, frame.agent) for frame in source.frames(scene)}
+    for agent in (*source.agents,):
+        for middle in source.recipe.middle_spins:
+            wanted = {middle}
+            if agent.startswith("cav"):
+                place = trace.position[middle, trace.actor.tolist().index(agent), :2]
+                if np.linalg.norm(place - pole) <= 60:
+                    wanted = set(range(middle - 2, middle + 3))
+            assert {index for index, name in kept if name == agent and abs(index - middle) <= 2} == wanted
+    assert len(kept) < len([*plain.frames(scene)]) == plain.frame_count(scene) == 50
+    same = {(frame.index, frame.agent): frame for frame in plain.frames(scene)}
+    for frame in source.frames(scene):
+        np.testing.assert_array_equal(frame.lidar["lidar"], same[frame.index, frame.agent].lidar["lidar"])
+    nobody = small(**how | {"poles": []}, every_s=4.0, window_range_m=60.0)  # no pole to be near: all of them
+    assert len([*nobody.frames(scene)]) == 40
+
+
 def test_a_scene_is_the_same_whatever_was_asked_before_and_in_a_copy():
     source = small()
     last = next(iter(source.frames("suburb-3-001")))

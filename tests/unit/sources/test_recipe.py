@@ -42,6 +42,17 @@ def test_a_window_is_a_spin_before_and_one_after_each():
     assert (plain.times_s(600).tolist(), plain.middle_spins) == ([60.0, 61.0, 62.0], (0, 1, 2))
 
 
+def test_a_window_of_several_spins():
+    recipe = parsed(every_s=4.0, spins_per_scene=2, window_s=0.4, window_every_s=0.2)
+    assert recipe.times_s(600).tolist() == [59.6, 59.8, 60.0, 60.2, 60.4, 63.6, 63.8, 64.0, 64.2, 64.4]
+    assert recipe.middle_spins == (2, 7)
+    assert [recipe.find_middles(spin).tolist() for spin in (0, 2, 9)] == [[2], [2], [7]]
+    dense = parsed(every_s=0.5, spins_per_scene=2, window_s=0.4, window_every_s=0.2)
+    assert dense.find_middles(dense.middle_spins[0]).tolist() == [2]
+    shared = [spin for spin in range(dense.spins) if len(dense.find_middles(spin)) == 2]
+    assert dense.times_s(600)[shared].tolist() == [60.1, 60.2, 60.3, 60.4]
+
+
 def test_a_range_of_warm_ups_is_one_of_the_recipes_settings():
     recipe = parsed(warmup_s=[60, 90.5])
     assert recipe.warmup_steps == (600, 905)
@@ -60,6 +71,9 @@ def test_a_range_of_warm_ups_is_one_of_the_recipes_settings():
         ({"every_s": 0.25}, "field 'every_s' = 0.25: must be a multiple of 0.1 s"),
         ({"window_s": 0.25}, "field 'window_s' = 0.25: must be a multiple of 0.1 s"),
         ({"window_s": -0.5}, "field 'window_s' = -0.5"),
+        ({"window_s": 0.4, "window_every_s": 0.5}, ".*window_every_s = 0.5 leaves no spin within window_s = 0.4"),
+        ({"window_every_s": 0.25}, "field 'window_every_s' = 0.25: must be a multiple of 0.1 s"),
+        ({"window_range_m": 50.0}, ".*window_range_m: there are no windows around spins; give 'window_s'"),
         ({"window_s": 0.5, "warmup_s": 0.5}, ".*window_s = 0.5 puts the first spin before the traffic"),
         ({"warmup_s": float("inf")}, "field 'warmup_s' = inf: must be seconds"),
         ({"warmup_s": 0}, "field 'warmup_s' = 0: must be seconds above 0"),

@@ -65,7 +65,8 @@ def _make_parts(source: Source, out: Path, damaged: Collection[str], record: Cal
     touched = {name[:end] for name in names for end, letter in enumerate(name) if letter == "."}
     parts = [part for scene in source.scenes() for part in split_scene(source, scene)]
     for part in parts:
-        own = keys[part.scene][part.first : part.first + part.frames]
+        whole = len(keys[part.scene]) == source.frame_count(part.scene)  # else no frame's part is known, as of windows
+        own = keys[part.scene][part.first : part.first + part.frames] if whole else keys[part.scene]
         if touched.isdisjoint(own) and (part.number or trace_path(part.scene) not in damaged):
             part.folder(out / WORK).mkdir(parents=True)  # as if it were recorded
     (out / WORK).mkdir(exist_ok=True)

@@ -32,6 +32,7 @@ class Account:
     task: str  # its name
     link: Link  # wireless or wireline
     outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by round and client
+    within: frozenset[str] = frozenset()  # clients in the server itself, whose messages cross no link
     concealed: bool = False  # whether nobody is to know who was drawn: entries have a client's region alone
 
     def find_away(self, round_: int) -> dict[str, str]:
@@ -67,6 +68,8 @@ class BudgetedGrid(WrappedGrid):
     def _checked(self, reply: Message) -> Message:
         if reply.has_content():
             name = self._names[reply.metadata.src_node_id]
+            if name in self._account.within:
+                return reply
             self._account.ledger.check(self._account.describe("up", self._round, name, wire_bytes(reply.content)))
         return reply
 
@@ -98,7 +101,8 @@ class MeteredGrid(WrappedGrid):
 
     def _enter(self, direction: Direction, round_: int, size: int, node: int) -> None:
         account, self._round = self._account, round_
-        account.ledger.enter(account.describe(direction, round_, self._names[node], size))
+        if self._names[node] not in account.within:
+            account.ledger.enter(account.describe(direction, round_, self._names[node], size))
 
     def push_messages(self, messages: Iterable[Message]) -> list[str]:
         """Send messages, entering each as downlink first; return their ids."""

@@ -45,15 +45,19 @@ class Augmentation:
     view: Annotated[float, Field(ge=0, le=1)] = 0.0  # probability of a cut to the field of view of a forward camera
 
 
-@dataclass(frozen=True, config=STRICT)
+@dataclass(frozen=True, config=STRICT, kw_only=True)
 class SecondConfig:
-    """Configuration of a SECOND network, in the LiDAR frame: x forward, y left, z up, metres, origin at the sensor."""
+    """Configuration of a SECOND network, in the LiDAR frame: x forward, y left, z up, metres, origin at the sensor.
+
+    With `pillar_channels` the backbone takes pillars through 2D convolutions, not voxels through sparse 3D ones.
+    """
 
     anchors: Annotated[tuple[Anchor, ...], Field(min_length=1)]  # one per class, in the order of the scores
     range_m: tuple[float, float, float, float, float, float]  # x, y, z minima, then maxima
-    voxel_m: tuple[Positive, Positive, Positive]  # x, y, z
-    sparse_channels: tuple[Count, Count, Count, Count]  # of the 3D backbone at strides 1, 2, 4, 8
-    sparse_out: Count  # channels after the last convolution along z
+    voxel_m: tuple[Positive, Positive, Positive]  # x, y, z; pillars have no z
+    sparse_channels: tuple[Count, Count, Count, Count] = (16, 16, 32, 32)  # of the 3D backbone at strides 1, 2, 4, 8
+    sparse_out: Count = 32  # channels after the last convolution along z
+    pillar_channels: tuple[Count, ...] = ()  # of the 2D backbone of pillars at strides 2, 4, ...; (): voxels in 3D
     bev_layers: tuple[Layers, Layers]  # 3x3 convolutions after the first, at strides 1 and 2 of the head's grid
     bev_channels: tuple[Count, Count]  # of these two scales
     bev_up_channels: tuple[Count, Count]  # of these two scales, brought to the head's grid

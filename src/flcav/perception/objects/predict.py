@@ -191,8 +191,8 @@ def predict(network: Second, clouds: Sequence[NDArray[np.float32]]) -> HeadOutpu
     return network(voxels_of(network, clouds))
 
 
-def voxels_of(network: Second, clouds: Sequence[NDArray[np.float32]]) -> SparseTensor:
-    """Return the input voxels of `network` for a batch of point clouds (N_i, 4), LiDAR frame, on its device."""
+def voxels_of(network: Second, clouds: Sequence[NDArray[np.float32]]) -> SparseTensor | Tensor:
+    """Return the input of `network` for a batch of point clouds (N_i, 4), LiDAR frame, on its device."""
     device = network.head.weight.device
     points = torch.from_numpy(np.concatenate(clouds)).to(device)
     sizes = torch.tensor([len(cloud) for cloud in clouds], device=device)

@@ -37,7 +37,7 @@ class ObjectsTask(ObjectsOutcomes):
     configurations = CONFIGURATIONS
     practice = Practice(batch=2, learning_rate=2e-3)
     recording: Mapping[str, Json] = {}
-    labels = ("road", "ideal-road", "road-average", "own-detections")
+    labels = ("road", "ideal-road", "road-average", "own-detections", "tracks", "road+tracks", "annotated")
     threshold = THRESHOLD
 
     def __init__(self) -> None:

@@ -11,6 +11,7 @@ from flcav.fusion.detector import road_detector
 from flcav.fusion.labels import label_sample
 from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.road import RoadView, build_road_view, label_ideally
+from flcav.geometry import Boxes
 from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send
@@ -19,7 +20,7 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.truth import asked_of, choose_lidar
+from flcav.perception.objects.truth import FrameTruth, asked_of, choose_lidar
 from flcav.perception.task import Task
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.sightings import navigate
@@ -38,7 +39,14 @@ def fit_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
     """
     frames = [split.data.frame(i) for split in splits for i in split.vehicles]
     truths = [asked_of(frame, network.config) for frame in frames]
-    found = detect_in(network, frames)
+    return find_precise_score(detect_in(network, frames), truths)
+
+
+def find_precise_score(found: Sequence[Boxes], truths: Sequence[FrameTruth]) -> float:
+    """Return the lowest score from which on `PRECISION` of the boxes found in frames match a target at IoU 0.5; or 1.
+
+    It is 1 where no score has that precision.
+    """
     matches = match(found, [t.targets for t in truths], [t.neutral for t in truths], 0.5)
     precision = np.cumsum(matches.hit) / np.arange(1, len(matches.hit) + 1)
     good = np.flatnonzero(precision >= PRECISION)

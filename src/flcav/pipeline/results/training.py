@@ -33,6 +33,16 @@ class Pretrained(Saved):
     validated: tuple[Validated, ...]
     steps: int  # of the optimiser
     threshold: float | None  # lowest score of detections that serve as labels; None where none do
+    track_threshold: float | None = None  # lowest score of tracks that serve as labels; None where none do
+
+
+@dataclass(frozen=True)
+class TrackedFrames(Saved):
+    """The tracks around the training frames of a region's vehicles, which are in the same folder."""
+
+    region: str
+    frames: int
+    tracks: int  # of all frames
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,14 @@ from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold
+from flcav.pipeline.labels.tracks import fit_track_threshold
 from flcav.pipeline.recipe import CENTRAL, PRETRAIN, Budgets, Role
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.training import Pretrained, StageResult, Validated
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.planning import list_frames
-from flcav.pipeline.steps.regions import select_group
+from flcav.pipeline.steps.regions import load_uploads, select_group
 from flcav.pipeline.steps.settings import LearningSettings, RegionInputs, StepSettings, make_step, share_plan_budget
 from flcav.pipeline.training.checkpoints import LAST
 from flcav.pipeline.training.learning import Learning, load_stage_network
@@ -109,6 +110,7 @@ class PretrainSettings(StepSettings):
     budgets_mb: Budgets  # of the run
     upload_seed: int  # of the draw of uploads, the same in retrainings
     thresholded: bool  # whether detections serve as labels, from some score on
+    tracked: bool = False  # whether tracks do
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -148,6 +150,7 @@ def pretrain_step(work: Work, settings: PretrainSettings, processes: int = 1) ->
         validated=validated,
         steps=learning.training.steps,
         threshold=fit_label_threshold(trained, watched) if settings.thresholded else None,
+        track_threshold=fit_track_threshold(trained, watched, work.report) if settings.tracked else None,
     ).save(work.folder)
 
 
@@ -164,6 +167,7 @@ def list_pretraining(outline: Outline, arm: Setting) -> Iterator[Step]:
             budgets_mb=recipe.budgets_mb,
             upload_seed=recipe.seed,
             thresholded=any(kind.from_detections for kind in kinds),
+            tracked=outline.tracks(task),
         )
         yield make_step(names.pretrain(arm.name, task), pretrain_step, settings, workers=2)
 
@@ -187,13 +191,11 @@ def central_step(work: Work, settings: CentralSettings) -> None:
     learning, inputs = settings.learning.resolve(), settings.inputs
     trained = load_stage_network(learning.task, work.inputs[inputs.pretrain])
     if settings.source == "pretrain":
-        uploaded = Pretrained.load(work.inputs[inputs.pretrain]).uploaded
-        parts = [(Frames.open(work.inputs[inputs.pools[name]]), frames) for name, frames in uploaded.items()]
+        samples = load_uploads(work, learning, trained.config, inputs.pretrain, inputs.pools)
     else:
         split = Frames.open(work.inputs[inputs.frames])
-        parts = [(split, select_group(work, split, inputs))]
-    each = (learning.task.samples(split.data, trained.config, frames) for split, frames in parts)
-    samples = [own[number] for own in each for number in range(len(own))]  # in memory: each is drawn many times
+        held = learning.task.samples(split.data, trained.config, select_group(work, split, inputs))
+        samples = [held[number] for number in range(len(held))]  # in memory: each is drawn many times
     rounds = Plan.load(work.inputs[inputs.plan]).tasks[settings.learning.task].edge_rounds
     losses = train_centrally(learning, trained, samples, rounds, settings.vehicles, settings.source)
     save_network(learning.task, trained, work.folder / WEIGHTS)

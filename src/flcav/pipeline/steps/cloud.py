@@ -33,7 +33,7 @@ from flcav.pipeline.recipe import CLOUD, EDGE
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult, StatisticsScore
 from flcav.pipeline.steps.outline import Outline
-from flcav.pipeline.steps.regions import drive_region, label_samples, learn_by_distillation
+from flcav.pipeline.steps.regions import drive_region, label_samples, learn_by_distillation, load_uploads
 from flcav.pipeline.steps.settings import FederationSettings, RegionInputs, make_step, read_entries, share_plan_budget
 from flcav.pipeline.training.checkpoints import FederationCheckpoints
 from flcav.pipeline.training.learning import (
@@ -75,6 +75,7 @@ class CloudFederation:
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
     keeps_statistics: bool = False  # whether each region's statistics of batch normalisation are written, too
     rate: float | None = None  # of the first round, where it is restarted
+    replay: TaskClient | None = None  # the cloud's own training on the samples of stage I, in each of its averages
 
     def afford(self, rules: Rules, rounds: int) -> int:
         """Return as many of `rounds` as the privacy budget affords in every region; without one all."""
@@ -156,10 +157,10 @@ def federate_cloud(
     with checkpoints.refusals(), open_processes(everybody, processes) as runtime:
         servers = own.open_servers(rules, wireless, done, states, runtime)
         federate(
-            servers,
+            servers if own.replay is None else {**servers, CLOUD: own.replay},
             start,
             schedule,
-            Account(own.book, CLOUD, task.name, "wireline"),
+            Account(own.book, CLOUD, task.name, "wireline", within=frozenset({CLOUD})),
             strategy=own.strategies.cloud,
             rules=rules.of_servers(),
             state=state,
@@ -208,12 +209,14 @@ class CloudSettings(FederationSettings):
     """Settings of stage III."""
 
     regions: Mapping[str, RegionInputs]  # that federate, each with its stage II
+    pools: Mapping[str, str] = {}  # recordings of the candidates for upload, by region, where the cloud trains on them
     validation: Mapping[str, str] = {}  # recordings that the regions' own statistics are scored on, by region
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Return the names of the steps whose results it takes."""
-        return (*(step for inputs in self.regions.values() for step in inputs.needs), *self.validation.values())
+        more = (*self.pools.values(), *self.validation.values())
+        return (*(step for inputs in self.regions.values() for step in inputs.needs), *more)
 
     @property
     def first(self) -> RegionInputs:
@@ -317,7 +320,14 @@ def _open_federation(
         shared=shared,
         keeps_statistics=bool(settings.validation),
         rate=settings.federation.cloud_rate,
+        replay=_open_replay(work, settings, learning, start.config) if settings.federation.replay else None,
     )
+
+
+def _open_replay(work: Work, settings: CloudSettings, learning: Learning, config: Any) -> TaskClient:
+    """Return the cloud's own training on the samples that it was sent in stage I."""
+    samples = load_uploads(work, learning, config, settings.first.pretrain, settings.pools)
+    return TaskClient(learning.task, config, samples, batch=learning.batch)
 
 
 def _score_statistics(work: Work, settings: CloudSettings, federation: CloudFederation) -> tuple[StatisticsScore, ...]:
@@ -347,6 +357,7 @@ def make_cloud_step(outline: Outline, arm: Setting, task: str) -> Step:
     settings = CloudSettings(
         **outline.federation(arm, task, CLOUD),
         regions={region: outline.inputs(arm, region, task, CLOUD) for region in arm.regions},
+        pools=outline.pools(task) if arm.federation.replay else {},
         validation={region: names.recording(region, "validation", task) for region in scored},
     )
     at_once = max(outline.vehicles[region] for region in arm.regions)  # of one edge server

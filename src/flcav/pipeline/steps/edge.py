@@ -25,7 +25,6 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import Setting, find_strategies
 from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.plan.updates import follow_plan
 from flcav.pipeline.radio.driving import DrivenRounds
@@ -301,11 +300,11 @@ def _drive(work: Work, settings: EdgeSettings, federation: EdgeFederation, plan:
 
 def list_edge_steps(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
     """Yield stage II of an arm for a task, in each of its regions."""
-    averaged = any(LABEL_SOURCES[each.labels[task]].averaged for each in outline.settings.values())
+    scored = outline.tracks(task) or bool(outline.averaging(task))
     for region in arm.regions:
         name, inputs = outline.names.edge(arm.name, region, task), outline.inputs(arm, region, task, EDGE)
         about = outline.federation(arm, task, EDGE)
-        settings = EdgeSettings(**about, inputs=inputs, scored=averaged, last=arm.stages[-1] == EDGE)
+        settings = EdgeSettings(**about, inputs=inputs, scored=scored, last=arm.stages[-1] == EDGE)
         yield make_step(name, edge_step, settings, outline.vehicles[region])
 
 

@@ -14,6 +14,7 @@ from flcav.pipeline.steps.placing import list_placements
 from flcav.pipeline.steps.planning import make_plan_step, make_replan_step
 from flcav.pipeline.steps.recording import list_recordings, make_recording
 from flcav.pipeline.steps.testing import list_tests, list_validations
+from flcav.pipeline.steps.tracking import list_tracks
 
 
 class Graph(Outline):
@@ -42,6 +43,8 @@ class Graph(Outline):
                 yield make_recording(self, region, EDGE, task, self.sites(region))
         for arm in arms:
             for task in self.recipe.tasks:
+                if not arm.central:
+                    yield from list_tracks(self, arm, task)
                 yield from (list_central_steps if arm.central else list_edge_steps)(self, arm, task)
         if replanned:
             yield from self._replan(EDGE)

@@ -13,7 +13,8 @@ from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import count_training_frames
 from flcav.pipeline.label_sources import LABEL_SOURCES, choose_labels
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, Region, RunRecipe, SplitName, find_path
+from flcav.pipeline.labels.tracks import WINDOW_EVERY_S, WINDOW_S
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, Region, Role, RunRecipe, SplitName, find_path
 from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.steps.settings import LearningSettings, RegionInputs
 from flcav.statistics.streams import derive_seed
@@ -89,16 +90,36 @@ class Outline:
         arms = [arm for arm in self.settings.values() if arm.central is None]
         return [arm.distillation for arm in arms if LABEL_SOURCES[arm.labels[task]].averaged]
 
+    def tracks(self, task: str) -> bool:
+        """Return whether vehicles label frames of a task by tracks in any arm."""
+        return any(LABEL_SOURCES[arm.labels[task]].tracked for arm in self.settings.values())
+
     def window_s(self, task: str) -> float:
         """Return how long before and after a task's training frames others are recorded for labels [s]; 0: none are.
 
         Raises `InputError` where arms differ in it, other than by 0, and a region is recorded in a town.
         """
-        windows = sorted({each.window_s for each in self.averaging(task)} - {0.0})
+        tracked = {WINDOW_S} if self.tracks(task) else set[float]()
+        windows = sorted(({each.window_s for each in self.averaging(task)} | tracked) - {0.0})
         if len(windows) > 1 and len(self.recorded) < len(self.federating):
             told = " and ".join(f"{each:g} s" for each in windows)
-            raise InputError(f"distillation.window_s: arms have {told}; in a town all have one window, or 0")
+            why = f" (labels by tracks: {WINDOW_S:g} s)" if tracked else ""
+            raise InputError(f"distillation.window_s: arms have {told}{why}; in a town all have one window, or 0")
         return max(windows, default=0.0)
+
+    def window(self, task: str, role: Role, split: SplitName) -> Mapping[str, float]:
+        """Return the fields of `flcav.sources.recipe.Recipe` of what a split records around its frames for labels.
+
+        Beside training frames these are the frames of pretraining towns by which the score of tracks is chosen.
+        """
+        if not (split == EDGE or (self.tracks(task) and role == "pretrain" and split == "validation")):
+            return {}
+        window = {"window_s": self.window_s(task)}
+        if self.tracks(task):
+            window |= {"window_every_s": WINDOW_EVERY_S}
+            if split == EDGE and self.helped(task):
+                window |= {"window_range_m": self.recipe.placement.group_range_m}
+        return window
 
     def pools(self, task: str) -> dict[str, str]:
         """Return the steps that record a task's candidates for upload, by region."""
@@ -115,8 +136,9 @@ class Outline:
         )
 
     def inputs(self, arm: Setting, region: str, task: str, stage: str) -> RegionInputs:
-        """Return the steps that a stage of a task in a region rests on."""
+        """Return the steps that a stage of a task in a region rests on; of TRACKING those of its vehicles' tracks."""
         names = self.names
+        tracked = LABEL_SOURCES[arm.labels[task]].tracked and stage in (EDGE, CLOUD, MORE_EDGE)
         return RegionInputs(
             region=region,
             plan=names.plan(arm.name, stage),
@@ -125,6 +147,7 @@ class Outline:
             place=names.place(arm.name, region),
             errors=names.errors(arm.name, region, task) if task in arm.placement.tasks else None,
             edge=names.edge(arm.name, region, task) if stage in (CLOUD, MORE_EDGE) else None,
+            tracks=names.tracks(arm.name, region, task) if tracked else None,
             sites=self.sites(region) if self.helped(task) else (),
             group_range_m=self.recipe.placement.group_range_m,
             recorded=self.recipe.regions[region].data is not None,
@@ -143,7 +166,7 @@ class Outline:
             "vehicles": self.vehicles,
             "labels": arm.labels[task],
             "distillation": arm.distillation if LABEL_SOURCES[arm.labels[task]].averaged else None,
-            "navigation": recipe.navigation if LABEL_SOURCES[arm.labels[task]].from_poles else NavigationErrors(),
+            "navigation": recipe.navigation if LABEL_SOURCES[arm.labels[task]].placed else NavigationErrors(),
             "train_s": recipe.tasks[task].train_s if timed else 0.0,
             "speeds": speeds if timed else {},
         }

@@ -77,8 +77,7 @@ def make_recording(outline: Outline, region: str, split: SplitName, task: str, p
         path, whole = outline.find_data(own, split), isinstance(own.data, Mapping)
         about = {"split": split, "role": own.role, "seed": recipe.seed, "whole": whole}
         return make_step(name, deal_step, DealSettings(path=str(path), version=hash_manifest(path), **about))
-    window_s = outline.window_s(task) if split == EDGE else 0.0
-    asked = make_recording_recipe(recipe, region, split, task, name, window_s)
+    asked = make_recording_recipe(recipe, region, split, task, name, outline.window(task, own.role, split))
     version = hash_town(asked.town, beside)
     looked = str(beside) if version else ""  # a town of the package depends on no folder
     seen = places if outline.helped(task) else ()

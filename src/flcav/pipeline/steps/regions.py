@@ -16,10 +16,11 @@ from flcav.perception.objects.distillation.loss import DistillationTerms, Distil
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.label_sources import LABEL_SOURCES
+from flcav.pipeline.label_sources import LABEL_SOURCES, LabelSource
 from flcav.pipeline.labels.pseudo_labels import annotated_samples, pseudo_label_samples, select_frames_near
 from flcav.pipeline.labels.quality import measure_labels, read_history
 from flcav.pipeline.labels.road_average import RoadAverageLabels
+from flcav.pipeline.labels.tracks import load_tracks, track_label_samples
 from flcav.pipeline.poles import find_sites
 from flcav.pipeline.radio.driving import CLOCK, DrivenRounds, Fleet, drive_rounds, link_scenes
 from flcav.pipeline.results.plans import Placed
@@ -53,6 +54,12 @@ def _select_near(work: Work, split: Frames, inputs: RegionInputs) -> tuple[int, 
     return select_frames_near(split, sites.position[np.isin(sites.number, list(numbers)), :2], inputs.group_range_m)
 
 
+def choose_poles(work: Work, split: Frames, inputs: RegionInputs, kind: LabelSource) -> tuple[int, ...]:
+    """Return the poles whose sensors give a region's vehicles labels of a kind: none where no frame is near one."""
+    near = kind.from_poles and _select_near(work, split, inputs)
+    return Placed.load(work.inputs[inputs.place]).chosen if near else ()
+
+
 def label_samples(
     work: Work, settings: FederationSettings, inputs: RegionInputs, book: Ledger, stage: str
 ) -> LabelledSamples:
@@ -66,9 +73,9 @@ def label_samples(
     frames, frozen = select_group(work, split, inputs), load_stage_network(task, work.inputs[inputs.pretrain])
     if not kind.from_detections:
         return LabelledSamples(annotated_samples(task, frozen.config, split, frames, inputs.region), ())
-    near = kind.from_poles and _select_near(work, split, inputs)
-    poles = Placed.load(work.inputs[inputs.place]).chosen if near else ()
-    threshold = Pretrained.load(work.inputs[inputs.pretrain]).threshold
+    poles = choose_poles(work, split, inputs, kind)
+    pretrained = Pretrained.load(work.inputs[inputs.pretrain])
+    threshold = pretrained.track_threshold if kind.tracked else pretrained.threshold
     assert threshold is not None  # fixed wherever labels come from detections
     if settings.distillation is not None:
         folder = work.folder if inputs.edge is None else None
@@ -79,7 +86,22 @@ def label_samples(
         return LabelledSamples(averaged, poles)
     first = book if inputs.edge is None else None  # later labels are those of stage II
     where = (split, frames, poles, inputs.region, work.report, first, kind.trained, settings.navigation)
+    if inputs.tracks is not None:
+        tracks = load_tracks(work.inputs[inputs.tracks])
+        return LabelledSamples(track_label_samples(tracks, frozen.config, threshold, *where), poles)
     return LabelledSamples(pseudo_label_samples(frozen, threshold, *where), poles)
+
+
+def load_uploads(work: Work, learning: Learning, config: Any, pretrained: str, pools: Mapping[str, str]) -> list[Any]:
+    """Return the samples that were uploaded for stage I, the step `pretrained`, in memory: each is drawn many times.
+
+    pools: the steps that recorded the candidates for upload, by region.
+    """
+    samples: list[Any] = []
+    for name, frames in Pretrained.load(work.inputs[pretrained]).uploaded.items():
+        own = learning.task.samples(Frames.open(work.inputs[pools[name]]).data, config, frames)
+        samples += [own[number] for number in range(len(own))]
+    return samples
 
 
 def learn_by_distillation(learning: Learning, how: Distillation) -> Learning:

@@ -48,6 +48,7 @@ class RegionInputs(StepSettings):
     place: str  # placement of the arm's own sensors
     errors: str | None = None  # registration of the task's errors, whose messages come before the rounds
     edge: str | None = None  # stage II that the stage goes on from
+    tracks: str | None = None  # tracks of the vehicles' frames, where labels come from them
     sites: tuple[str, ...] = ()  # placements of all arms: vehicles train on frames near one of their sensors
     group_range_m: float  # as near as that [m]
     recorded: bool  # whether the region is a recorded dataset, whose poles are those that it was recorded from
@@ -56,7 +57,7 @@ class RegionInputs(StepSettings):
     @property
     def needs(self) -> tuple[str, ...]:
         """Return the names of all these steps."""
-        named = (self.plan, self.pretrain, self.errors, self.frames, self.place, self.edge)
+        named = (self.plan, self.pretrain, self.errors, self.frames, self.place, self.edge, self.tracks)
         return (*(name for name in named if name is not None), *self.sites, *self.pools.values())
 
 

@@ -1,0 +1,54 @@
+"""Pillars: statistics of the points above each cell of the ground, as a dense bird's-eye map.
+
+The grid is that of Lang et al., "PointPillars: Fast Encoders for Object Detection from Point Clouds", CVPR 2019, and
+the statistics take the place of its learned encoder: they cost one pass over the points, and the highest point of a
+pillar tells a network how high an object is.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+BINS_M = (0.3, 0.7, 1.1, 1.5, 1.9, 2.4)  # heights above the ground at which bins of occupancy begin
+STATISTICS = 7 + len(BINS_M)  # channels of the map
+EXTREMES = ("amax", "amin")
+
+
+def pillar_statistics(
+    points: Tensor, sample: Tensor, samples: int, range_m: Sequence[float], pillar_m: Sequence[float], ground_z_m: float
+) -> Tensor:
+    """Return the map (samples, STATISTICS, rows along y, columns along x) of a batch of point clouds.
+
+    Channels: half the logarithm of one plus the number of points; highest, lowest and mean height above the ground
+    [m]; mean intensity; mean place in the pillar along x and along y, in [-1/2, 1/2]; whether there is a point in each
+    bin of heights. All are 0 where there is none.
+
+    Args:
+        points: (N, 4) x, y, z [m], intensity; those outside the range are left out.
+        sample: (N,) number of each point's cloud.
+        samples: number of clouds.
+        range_m: minima x, y, z, then maxima [m], of a LiDAR's frame.
+        pillar_m: size of a pillar along x and along y [m].
+        ground_z_m: height of the ground [m].
+    """
+    low, size = points.new_tensor(range_m[:2]), points.new_tensor(pillar_m[:2])
+    columns, rows = (round((range_m[i + 3] - range_m[i]) / pillar_m[i]) for i in range(2))
+    place = (points[:, :2] - low) / size
+    cell = torch.floor(place)
+    inside = ((cell >= 0) & (cell < points.new_tensor((columns, rows)))).all(1)
+    inside &= (points[:, 2] >= range_m[2]) & (points[:, 2] < range_m[5])
+    kept = inside.nonzero()[:, 0]
+    cell, height = cell[kept], points[kept, 2] - ground_z_m
+    x, y = cell.long().unbind(1)
+    key = (sample[kept] * rows + y) * columns + x
+    cells = samples * rows * columns
+    count = torch.bincount(key, minlength=cells).to(points.dtype)
+    whole = torch.column_stack((height, points[kept, 3], place[kept] - cell - 0.5))
+    mean = whole.new_zeros(cells, 4).index_add_(0, key, whole) / count.clamp(min=1)[:, None]
+    extremes = [whole.new_zeros(cells).scatter_reduce_(0, key, height, how, include_self=False) for how in EXTREMES]
+    bins = whole.new_zeros(len(BINS_M), cells)
+    for number, (low_m, high_m) in enumerate(zip(BINS_M, (*BINS_M[1:], torch.inf), strict=True)):
+        bins[number, key[(height >= low_m) & (height < high_m)]] = 1
+    channels = torch.cat((torch.log1p(count)[None] / 2, torch.stack(extremes), mean.T, bins))
+    return channels.view(STATISTICS, samples, rows, columns).transpose(0, 1)

@@ -1,0 +1,59 @@
+"""The step in which a region's vehicles track objects through the sweeps around their training frames, for labels."""
+
+from collections.abc import Iterator
+
+from flcav.fusion.navigation import NavigationErrors
+from flcav.perception.tasks import task_named
+from flcav.pipeline.arms import Setting
+from flcav.pipeline.engine import Step, Work
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.label_sources import LABEL_SOURCES
+from flcav.pipeline.labels.pseudo_labels import road_views
+from flcav.pipeline.labels.tracks import save_tracks, track_frame
+from flcav.pipeline.recipe import TRACKING
+from flcav.pipeline.results.training import TrackedFrames
+from flcav.pipeline.steps.outline import Outline
+from flcav.pipeline.steps.regions import choose_poles, select_group
+from flcav.pipeline.steps.settings import RegionInputs, StepSettings, make_step
+from flcav.pipeline.training.learning import load_stage_network
+
+
+class TrackSettings(StepSettings):
+    """Settings of the tracks of a region's vehicles."""
+
+    task: str
+    inputs: RegionInputs
+    labels: str  # kind of labels, see `LABEL_SOURCES`
+    navigation: NavigationErrors  # of the vehicles
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Return the names of the steps whose results it takes."""
+        return self.inputs.needs
+
+
+def track_step(work: Work, settings: TrackSettings) -> None:
+    """Track the objects around each training frame of a region's vehicles, by the pretrained network's detections."""
+    inputs, kind = settings.inputs, LABEL_SOURCES[settings.labels]
+    split = Frames.open(work.inputs[inputs.frames])
+    network = load_stage_network(task_named(settings.task), work.inputs[inputs.pretrain])
+    frames, poles = select_group(work, split, inputs), choose_poles(work, split, inputs, kind)
+    spins = {i: (split.data.keys[i].scene, split.data.keys[i].index) for i in frames}
+    views = road_views(split, poles, kind.trained, set(spins.values()))
+    tracks = {}
+    for done, i in enumerate(frames, start=1):
+        seen = [*views.get(spins[i], {}).values()]
+        tracks[i] = track_frame(network, split, i, seen, settings.navigation)
+        work.report(done, len(frames), "tracks")
+    save_tracks(tracks, work.folder)
+    TrackedFrames(inputs.region, len(tracks), sum(map(len, tracks.values()))).save(work.folder)
+
+
+def list_tracks(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
+    """Yield the tracks of an arm for a task in each of its regions, where its labels come from them."""
+    for region in arm.regions if LABEL_SOURCES[arm.labels[task]].tracked else ():
+        inputs = outline.inputs(arm, region, task, TRACKING)
+        settings = TrackSettings(
+            task=task, inputs=inputs, labels=arm.labels[task], navigation=outline.recipe.navigation
+        )
+        yield make_step(outline.names.tracks(arm.name, region, task), track_step, settings)
