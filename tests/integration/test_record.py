@@ -215,6 +215,19 @@ def test_damaged_files_are_recorded_again_from_their_traffic(
     assert digests(data) == digests(reference)
 
 
+def test_damaged_files_of_windows_are_recorded_again(tmp_path: Path):
+    """Where windows are recorded near poles alone, no file tells which part of the recording it is of."""
+    near = {"poles": [2], "scenes": 1, "window_s": 0.4, "window_every_s": 0.2, "window_range_m": 50.0}
+    source, data = EmbeddedSource(Recipe.model_validate(SMALL | near)), tmp_path / "data"
+    record(source, data)
+    whole = digests(data)
+    frames = Dataset.open(data).keys
+    assert 6 < len(frames) < source.frame_count(source.scenes()[0])
+    (data / f"lidar/{Dataset.open(data).name(len(frames) - 1)}.bin").unlink()
+    assert record(source, data)
+    assert digests(data) == whole
+
+
 def test_birdseye_draws_the_frame_asked_for(reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "view.png"
     assert flcav("birdseye", reference, "--frame", "suburb-4-001_0001_cav1", "--out", out) == 0

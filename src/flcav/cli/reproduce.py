@@ -42,6 +42,7 @@ class Target(StrEnum):
     fig3b = "fig3b"
     fig4 = "fig4"
     fig6a_allocation = "fig6a-allocation"
+    gap = "gap"
     placement = "placement"
     road_average = "road-average"
     road_detector = "road-detector"
@@ -261,6 +262,14 @@ def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: EngineNa
     _write_figures(out, results.as_json(), {"arms.png": draw_labels(results)}, results.sentences())
 
 
+def _gap(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
+    from flcav.experiments.gap.run import compare_gap, draw_gap
+    from flcav.experiments.scales import shrink_recipe
+
+    results = compare_gap(*_run_seeds(Target.gap, "gap", out, seeds, scale, jobs, engine, stale, shrink_recipe))
+    _write_figures(out, results.as_json(), {"arms.png": draw_gap(results)}, results.sentences())
+
+
 def _federation_exchange(
     target: Target, out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale
 ) -> None:
@@ -296,6 +305,7 @@ COMPARISONS: Mapping[str, Callable[[Path, int, str, int, EngineName, Stale], Non
     Target.distillation: _distillation,
     **{target: partial(_federation_exchange, Target(target)) for target in EXCHANGES},
     Target.fig6a_allocation: _fig6a_allocation,
+    Target.gap: _gap,
     Target.placement: _placement,
 }
 

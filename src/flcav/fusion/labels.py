@@ -54,9 +54,16 @@ def label_sample(
     ignored = ((label != "") & ~targets) | is_lookalike(told.label, config.classes)
 
     cells = cell_centers(config)
-    looked = _find_observed(frame, lidar, views, cells)
+    height = float(frame.agent_from_sensor[lidar][2, 3])
+    cells_world = transform_points(world_from_lidar, np.c_[cells, np.full(len(cells), -height)])[:, :2]
+    looked = np.zeros(len(cells), dtype=bool)
+    for view in views:
+        looked |= view.at(view.ground, cells_world) | view.at(view.occupied, cells_world)
     own = detections[~_contradicted(detections, told, cells, looked)]
-    known = _find_free(frame, lidar, points, cells, relief) | looked
+    above = points[:, 2] + height
+    if relief is not None:
+        above = relief.above(transform_points(world_from_lidar, points[:, :3].astype(np.float64)))
+    known = _free_ground(points, above, cells) | looked
     boxes = concatenate([road[targets], own])
     exact = np.arange(len(boxes)) < targets.sum() if views else None
     sample = Sample(points, boxes, road[ignored], cells[known].astype(np.float32), exact)
@@ -70,25 +77,20 @@ def label_by_tracks(
     views: Sequence[RoadView],
     config: SecondConfig,
     lidar: str = "lidar",
-    relief: Relief | None = None,
 ) -> Sample:
     """Return a training sample of a vehicle's `frame`, labelled by the tracks of its drive; network's frame.
 
     Boxes to find are the tracks (LiDAR frame) that score `threshold` or more and from which this sweep has returns;
-    others, and boxes of lookalike classes in the `views` of roadside sensors, are ignored in the loss. `free` and
-    `relief` are as in `label_sample`.
+    others, and boxes of lookalike classes in the `views` of roadside sensors, are ignored in the loss. Elsewhere there
+    is nothing: what no sweep of the drive has a track of, however faint, is background.
     """
     assert tracks.score is not None
-    world_from_lidar = frame.world_from_sensor(lidar)
     points = crop_to_range(frame.lidar[lidar], config)
-    told = concatenate([view.boxes for view in views]).transform(inverse(world_from_lidar))
+    told = concatenate([view.boxes for view in views]).transform(inverse(frame.world_from_sensor(lidar)))
     targets = (tracks.score >= threshold) & (points_in_boxes(points, tracks, margin_m=0.1).sum(axis=1) > 0)
     boxes = replace(tracks, score=None, variance=None)
     ignored = concatenate([boxes[~targets], told[is_lookalike(told.label, config.classes)]])
-    cells = cell_centers(config)
-    known = _find_free(frame, lidar, points, cells, relief) | _find_observed(frame, lidar, views, cells)
-    sample = Sample(points, boxes[targets], ignored, cells[known].astype(np.float32))
-    return move_sample(sample, network_from_lidar(frame, config, lidar))
+    return move_sample(Sample(points, boxes[targets], ignored), network_from_lidar(frame, config, lidar))
 
 
 def _distinct(boxes: Boxes) -> NDArray[np.int64]:
@@ -119,28 +121,6 @@ def _contradicted(detections: Boxes, told: Boxes, cells: NDArray, looked: NDArra
     seen = (inside & looked).sum(axis=1) > CONTRADICTED * np.maximum(inside.sum(axis=1), 1)
     offset = np.linalg.norm(detections.center[:, None, :2] - told.center[None, :, :2], axis=-1)
     return seen | (offset < told.size[None, :, 0] / 2).any(axis=1)
-
-
-def _find_observed(
-    frame: Frame, lidar: str, views: Sequence[RoadView], cells: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Return (K,): whether a roadside sensor observed each cell, of centres `cells` (K, 2) in the LiDAR frame."""
-    height = float(frame.agent_from_sensor[lidar][2, 3])
-    world = transform_points(frame.world_from_sensor(lidar), np.c_[cells, np.full(len(cells), -height)])[:, :2]
-    looked = np.zeros(len(cells), dtype=bool)
-    for view in views:
-        looked |= view.at(view.ground, world) | view.at(view.occupied, world)
-    return looked
-
-
-def _find_free(
-    frame: Frame, lidar: str, points: NDArray[np.float32], cells: NDArray[np.float64], relief: Relief | None
-) -> NDArray[np.bool_]:
-    """Return (K,): whether the vehicle of `frame` saw each cell as free ground, by its returns `points` (N, 4)."""
-    above = points[:, 2] + float(frame.agent_from_sensor[lidar][2, 3])
-    if relief is not None:
-        above = relief.above(transform_points(frame.world_from_sensor(lidar), points[:, :3].astype(np.float64)))
-    return _free_ground(points, above, cells)
 
 
 def _free_ground(points: NDArray[np.float32], above: NDArray, cells: NDArray[np.float64]) -> NDArray[np.bool_]:

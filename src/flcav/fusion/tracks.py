@@ -36,7 +36,7 @@ ROOM_M = (1.6, 0.45)  # along and across: how far an object may go on beyond the
 EDGE_M = 0.08  # closeness of returns nearer to an edge than this is that of this
 HIDDEN = 0.9  # where the highest return is below this share of the detected height, the roof was not seen
 RING_RAD = 0.003  # elevations of returns of one beam differ by less
-LENGTH_M = 2.35, 1.4  # length of a vehicle by its height: 4.4 m at 1.46 m, 5.1 m at 1.95 m, 6 m at 2.6 m
+LENGTH_M = 2.35, 1.4  # length of a vehicle by its height: a hatchback of 1.46 m has 4.4 m, a van of 1.95 m 5.1 m
 
 
 @dataclass(frozen=True)
@@ -110,10 +110,10 @@ def fit_vehicle(box: Array, returns: Array, origin: Array) -> Array:
         axes = np.array([turned, (-turned[1], turned[0])]) @ axes
         plane = returns[:, :2] @ axes.T
     u, v = plane.T
-    beside = (np.abs(u) < length / 2 + MARGIN_M) & (np.abs(v) < width / 2 + ROOM_M[1])
-    sides = _find_extent(v[beside], (width + MARGIN_M) / 2, GAP_M[1])
-    beside = (v > sides[0] - BIN_M) & (v < sides[1] + BIN_M) & (np.abs(u) < length / 2 + ROOM_M[0])
-    ends = _find_extent(u[beside], length / 2, GAP_M[0])
+    near = (np.abs(u) < length / 2 + MARGIN_M) & (np.abs(v) < width / 2 + ROOM_M[1])
+    sides = _find_extent(v[near], (width + MARGIN_M) / 2, GAP_M[1])
+    near = (v > sides[0] - BIN_M) & (v < sides[1] + BIN_M) & (np.abs(u) < length / 2 + ROOM_M[0])
+    ends = _find_extent(u[near], length / 2, GAP_M[0])
     low, high = np.transpose((ends, sides))
     inside = ((plane > low - BIN_M) & (plane < high + BIN_M)).all(1)
     if inside.sum() < LEAST_RETURNS:

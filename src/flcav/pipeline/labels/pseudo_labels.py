@@ -39,17 +39,17 @@ def fit_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
     """
     frames = [split.data.frame(i) for split in splits for i in split.vehicles]
     truths = [asked_of(frame, network.config) for frame in frames]
-    return find_precise_score(detect_in(network, frames), truths)
+    return find_precise_score(detect_in(network, frames), truths, PRECISION)
 
 
-def find_precise_score(found: Sequence[Boxes], truths: Sequence[FrameTruth]) -> float:
-    """Return the lowest score from which on `PRECISION` of the boxes found in frames match a target at IoU 0.5; or 1.
+def find_precise_score(found: Sequence[Boxes], truths: Sequence[FrameTruth], least: float) -> float:
+    """Return the lowest score from which on a share `least` of the boxes found in frames match a target at IoU 0.5.
 
     It is 1 where no score has that precision.
     """
     matches = match(found, [t.targets for t in truths], [t.neutral for t in truths], 0.5)
     precision = np.cumsum(matches.hit) / np.arange(1, len(matches.hit) + 1)
-    good = np.flatnonzero(precision >= PRECISION)
+    good = np.flatnonzero(precision >= least)
     return float(matches.score[good[-1]]) if len(good) else 1.0
 
 

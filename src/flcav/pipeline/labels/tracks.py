@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.ground import Ground
 from flcav.fusion.average import BoxReport
 from flcav.fusion.labels import label_by_tracks
 from flcav.fusion.navigation import NavigationErrors
@@ -31,6 +30,7 @@ from flcav.pipeline.recipe import EDGE
 from flcav.storage.files import write_bytes
 
 TRACKS = "tracks.msgpack"
+PRECISION = 0.95  # least of labels by tracks, on validation frames of the towns of pretraining
 WINDOW_S, WINDOW_EVERY_S = 1.0, 0.2  # of the sweeps that are recorded around a frame
 
 
@@ -51,7 +51,7 @@ def track_label_samples(
 
     Those that score `threshold` or more are to be detected. See `pseudo_label_samples` for the other arguments.
     """
-    data, relief = split.data, Ground(split.data).relief
+    data = split.data
     views = road_views(split, poles, trained, {(data.keys[i].scene, data.keys[i].index) for i in frames})
     samples: dict[str, list[Sample]] = {}
     for done, i in enumerate(frames):
@@ -61,7 +61,7 @@ def track_label_samples(
             about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
             told = [RoadView.from_message(send(book, view.message(), **about)) for view in told]
         frame, lidar = replace(frame, world_from_agent=navigate(data, i, frame, errors)), choose_lidar(frame)
-        sample = label_by_tracks(frame, tracks[i], threshold, told, config, lidar, relief)
+        sample = label_by_tracks(frame, tracks[i], threshold, told, config, lidar)
         samples.setdefault(name, []).append(sample)
         report(done, len(frames), "labels")
     return samples
@@ -107,10 +107,7 @@ def load_tracks(folder: Path) -> dict[int, Boxes]:
 
 
 def fit_track_threshold(network: Second, splits: Sequence[Frames], report: Report = ignore_progress) -> float:
-    """Return the lowest score of tracks whose precision is that of pseudo-labels, on validation frames.
-
-    See `flcav.pipeline.labels.pseudo_labels.fit_label_threshold`.
-    """
+    """Return the score threshold of labels: the lowest with a precision of `PRECISION` on validation frames, or 1."""
     frames = [(split, i) for split in splits for i in split.vehicles]
     truths = [asked_of(split.data.frame(i), network.config) for split, i in frames]
 
@@ -120,7 +117,7 @@ def fit_track_threshold(network: Second, splits: Sequence[Frames], report: Repor
             yield tracks[in_range(tracks, network.config)]
             report(done, len(frames), "labels")
 
-    return find_precise_score([*found()], truths)
+    return find_precise_score([*found()], truths, PRECISION)
 
 
 def _classify(boxes: Boxes, config: SecondConfig) -> Boxes:

@@ -1,0 +1,1 @@
+"""Where the gap between pretraining and ground truth is, of recipes/runs/gap.yaml."""

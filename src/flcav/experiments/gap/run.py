@@ -1,0 +1,142 @@
+"""Where the gap between pretraining and ground truth is: the arms of recipes/runs/gap.yaml, on the same frames.
+
+Centralised training on ground truth (*oracle*) bounds what any stage II can reach on these frames; stage II on ground
+truth tells what the federation itself costs, with its rates and steps; the others tell what labels cost. Beside the
+town that federates stands the town of pretraining, where boxes may get worse. Over seeds, which have recordings of
+their own, intervals cover training and traffic. The verdicts on all differences are corrected together.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from flcav.config import Json
+from flcav.pipeline.analysis.histories import gap_closed
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.results.run import Run
+from flcav.report import style
+from flcav.report.charts import figures
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import Claim, Judged, judge
+from flcav.storage.records import Record
+
+TASK, TOWN, HOME = "objects", "grid", "suburb"
+PRETRAINED, MORE, ORACLE = "pretrained", "more pretraining", "centralised on ground truth"
+TRUTH, SLOW = "edge FL on ground truth", "edge FL on ground truth, a third of the steps at half the rate"
+ROAD, TRACKS, JOINED = "edge FL on road labels", "edge FL on tracks", "edge FL on road labels and tracks"
+GLOBAL = "edge + cloud FL on tracks, with replay"
+ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
+    PRETRAINED: (MAIN, PRETRAIN),
+    MORE: ("more", CENTRAL),
+    SLOW: ("slow", EDGE),
+    ROAD: ("road", EDGE),
+    TRACKS: (MAIN, EDGE),
+    JOINED: ("joined", EDGE),
+    TRUTH: ("truth", EDGE),
+    GLOBAL: (MAIN, CLOUD),
+    ORACLE: ("oracle", CENTRAL),
+}
+AT_HOME = (PRETRAINED, GLOBAL)  # scored in the town of pretraining, too
+COMPARED = (  # (after, before): claims that the difference in AP50 is positive
+    (TRUTH, SLOW),
+    (TRUTH, PRETRAINED),
+    (ORACLE, TRUTH),
+    (TRACKS, PRETRAINED),
+    (TRACKS, MORE),
+    (TRACKS, ROAD),
+    (JOINED, TRACKS),
+    (TRUTH, TRACKS),
+)
+
+
+@dataclass(frozen=True)
+class GapArm:
+    """What an arm reaches in one seed, and the labels that it learns from."""
+
+    ap50: float
+    ap70: float
+    precision: float | None  # of its labels; None of an arm without any
+    recall: float | None
+
+
+@dataclass(frozen=True)
+class GapResult(Record):
+    """Results of the comparison: numbers by seed and arm, and means over seeds."""
+
+    seeds: Mapping[str, Mapping[str, GapArm]]  # by seed and arm, in the town that federates
+    home: Mapping[str, Mapping[str, GapArm]]  # in the town of pretraining
+    ap50: Mapping[str, MeanOverSeeds]  # by arm
+    ap70: Mapping[str, MeanOverSeeds]
+    closed50: Mapping[str, MeanOverSeeds]  # share of the gap in AP50 from pretrained to centralised on ground truth
+    closed70: Mapping[str, MeanOverSeeds]
+    differences: Mapping[str, MeanOverSeeds]  # "after - before", in AP50
+    cost_at_home: Mapping[str, MeanOverSeeds]  # of edge + cloud FL against pretrained, in AP50 and AP70
+    recipe: Mapping[str, Json]
+    provenance: Provenance
+
+    def sentences(self) -> list[str]:
+        """Return AP and share of the gap by arm, the verdicts on differences, and the change at home, in words."""
+        reached = [
+            f"{arm}: AP50 {mean.describe()}, of the gap {self.closed50[arm].describe()}; "
+            f"AP70 {self.ap70[arm].describe()}, of the gap {self.closed70[arm].describe()}"
+            for arm, mean in self.ap50.items()
+        ]
+        judged = judge_differences(self)
+        told = [
+            f"{name}: {mean.describe(sign=True)}, {judged[name].verdict}: {judged[name].describe()}"
+            for name, mean in self.differences.items()
+        ]
+        home = [f"at home, {name}: {mean.describe(sign=True)}" for name, mean in self.cost_at_home.items()]
+        return [*reached, *told, *home]
+
+
+def compare_gap(recipe: RunRecipe, runs: Sequence[Run]) -> GapResult:
+    """Return the results of the arms of `recipe`, from a run of each seed."""
+    seeds = {str(run.recipe.seed): {name: _reached(run, name, TOWN) for name in ARMS} for run in runs}
+    home = {str(run.recipe.seed): {name: _reached(run, name, HOME) for name in AT_HOME} for run in runs}
+    each, at_home = [*seeds.values()], [*home.values()]
+
+    def mean(arm: str, field: str) -> MeanOverSeeds:
+        return mean_over_seeds([getattr(seed[arm], field) for seed in each], share=True)
+
+    def closed(arm: str, field: str) -> MeanOverSeeds:
+        of = [[getattr(seed[name], field) for name in (PRETRAINED, arm, ORACLE)] for seed in each]
+        return mean_over_seeds([gap_closed(*values) for values in of])
+
+    def gain(seeds: Sequence[Mapping[str, GapArm]], after: str, before: str, field: str) -> MeanOverSeeds:
+        return mean_over_seeds([getattr(seed[after], field) - getattr(seed[before], field) for seed in seeds])
+
+    return GapResult(
+        seeds=seeds,
+        home=home,
+        ap50={arm: mean(arm, "ap50") for arm in ARMS},
+        ap70={arm: mean(arm, "ap70") for arm in ARMS},
+        closed50={arm: closed(arm, "ap50") for arm in ARMS},
+        closed70={arm: closed(arm, "ap70") for arm in ARMS},
+        differences={f"{after} - {before}": gain(each, after, before, "ap50") for after, before in COMPARED},
+        cost_at_home={name: gain(at_home, GLOBAL, PRETRAINED, name.lower()) for name in ("AP50", "AP70")},
+        recipe=recipe.model_dump(mode="json", exclude={"seed"}),
+        provenance=provenance(),
+    )
+
+
+def _reached(run: Run, name: str, town: str) -> GapArm:
+    arm, stage = ARMS[name]
+    test = run.test(arm=arm, stage=stage, region=town, task=TASK)
+    ap70 = test.numbers["AP70"]
+    assert ap70 is not None  # the town has targets
+    stages = [each for each in run.arms[arm].stages if (each.stage, each.region) == (stage, TOWN)]
+    labels = stages[0].labels if stages and stage == EDGE else None
+    quality = (labels[0].precision, labels[0].recall) if labels else (None, None)
+    return GapArm(test.estimate.mean, ap70, *quality)
+
+
+def judge_differences(results: GapResult) -> dict[str, Judged]:
+    """Return the verdicts on the claims that the differences are positive, corrected together."""
+    judged = judge([Claim(mean) for mean in results.differences.values()])
+    return dict(zip(results.differences, judged, strict=True))
+
+
+def draw_gap(results: GapResult) -> bytes:
+    """Return the forest plot of the AP50 of all arms as a PNG."""
+    return style.png(figures.arms({TOWN: {name: results.ap50[name] for name in ARMS}}))

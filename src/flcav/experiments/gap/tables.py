@@ -1,0 +1,57 @@
+"""Markdown tables of where the gap is."""
+
+import numpy as np
+
+from flcav.experiments.gap.run import ARMS, AT_HOME, HOME, GapArm, GapResult, judge_differences
+from flcav.storage.markdown import format_table
+
+
+def gap_tables(results: GapResult) -> dict[str, str]:
+    """Return Markdown by name: arms, differences, home, seeds."""
+    return {
+        "arms": _arms(results),
+        "differences": _differences(results),
+        "home": _home(results),
+        "seeds": _seeds(results),
+    }
+
+
+def _arms(results: GapResult) -> str:
+    rows = []
+    for name in ARMS:
+        own = [seed[name] for seed in results.seeds.values()]
+        labels = (_mean([getattr(each, field) for each in own]) for field in ("precision", "recall"))
+        numbers = (results.ap50, results.closed50, results.ap70, results.closed70)
+        rows.append([name, *(each[name].describe() for each in numbers), *labels])
+    titles = ("arm", "AP50", "share of its gap", "AP70", "share of its gap", "labels' precision", "labels' recall")
+    return format_table(titles, rows)
+
+
+def _differences(results: GapResult) -> str:
+    judged = judge_differences(results)
+    rows = [
+        [name, mean.describe(sign=True), judged[name].p_cell, judged[name].verdict]
+        for name, mean in results.differences.items()
+    ]
+    return format_table(("difference in AP50", "mean over seeds", "p, corrected", "claim that it is positive"), rows)
+
+
+def _home(results: GapResult) -> str:
+    rows = [[f"{name}, difference", mean.describe(sign=True)] for name, mean in results.cost_at_home.items()]
+    for name in AT_HOME:
+        own = [seed[name] for seed in results.home.values()]
+        rows.append([name, f"AP50 {_mean([each.ap50 for each in own])}, AP70 {_mean([each.ap70 for each in own])}"])
+    return format_table((f"in {HOME}", "mean over seeds"), rows)
+
+
+def _seeds(results: GapResult) -> str:
+    def cell(arm: GapArm) -> str:
+        return f"{arm.ap50:.3f}, {arm.ap70:.3f}"
+
+    rows = [[name, *(cell(seed[name]) for seed in results.seeds.values())] for name in ARMS]
+    return format_table(("AP50, AP70", *(f"seed {seed}" for seed in results.seeds)), rows)
+
+
+def _mean(values: list[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return f"{np.mean(known):.3f}" if known else ""

@@ -1,0 +1,80 @@
+"""Where the gap is: numbers of runs, shares of the gap, costs at home, tables and the picture."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from flcav.experiments.gap.run import (
+    ARMS,
+    GLOBAL,
+    HOME,
+    JOINED,
+    MORE,
+    ORACLE,
+    PRETRAINED,
+    ROAD,
+    SLOW,
+    TRACKS,
+    TRUTH,
+    GapResult,
+    compare_gap,
+    draw_gap,
+)
+from flcav.experiments.gap.tables import gap_tables
+from flcav.pipeline.recipe import MAIN, load_run_recipe
+from flcav.pipeline.results.training import LabelQuality
+from flcav.sources.recipe import recipe_path
+
+RECIPE = load_run_recipe(recipe_path("runs/gap"))
+AP50 = {
+    PRETRAINED: 0.5,
+    MORE: 0.53,
+    SLOW: 0.6,
+    ROAD: 0.66,
+    TRACKS: 0.7,
+    JOINED: 0.72,
+    TRUTH: 0.8,
+    GLOBAL: 0.68,
+    ORACLE: 0.9,
+}
+
+
+def run_of(seed: int, more: float) -> Any:
+    """Return what is asked of a run: `AP50` and `more` in the town that federates, .9 and .88 at home."""
+
+    def test(arm: str, stage: str, region: str, task: str) -> Any:
+        name = next(name for name, each in ARMS.items() if each == (arm, stage))
+        ap50 = AP50[name] + more if region != HOME else 0.9 if name == PRETRAINED else 0.88
+        return SimpleNamespace(estimate=SimpleNamespace(mean=ap50), numbers={"AP70": ap50 / 2})
+
+    labels = (LabelQuality(1, 10, 20, 0.9, 0.8),)
+    stages = [SimpleNamespace(stage="edge", region="grid", labels=labels)]
+    arms = {arm: SimpleNamespace(stages=stages) for arm in (MAIN, *RECIPE.arms)}
+    return SimpleNamespace(recipe=SimpleNamespace(seed=seed), test=test, arms=arms)
+
+
+def test_the_arms_are_those_of_the_recipe() -> None:
+    assert {arm for arm, _ in ARMS.values()} == {MAIN, *RECIPE.arms}
+    assert set(AP50) == set(ARMS)
+
+
+def test_shares_of_the_gap_and_costs_at_home() -> None:
+    found = compare_gap(RECIPE, cast(Any, [run_of(1, 0.0), run_of(2, 0.02)]))
+    assert found.closed50[PRETRAINED].mean == 0
+    assert found.closed50[ORACLE].mean == pytest.approx(1)
+    assert found.closed50[TRACKS].mean == pytest.approx(0.5)  # (.7 - .5) / (.9 - .5)
+    assert found.closed70[TRUTH].mean == pytest.approx(0.75)
+    assert found.differences[f"{TRACKS} - {ROAD}"].mean == pytest.approx(0.04)
+    assert {name: mean.mean for name, mean in found.cost_at_home.items()} == pytest.approx(
+        {"AP50": -0.02, "AP70": -0.01}
+    )
+    assert (found.seeds["1"][TRACKS].precision, found.seeds["1"][ORACLE].precision) == (0.9, None)
+    assert GapResult.from_json(found.as_json(), "x") == found
+    shown = gap_tables(found)
+    assert f"| {TRACKS} | 0.710" in shown["arms"]
+    assert shown["arms"].splitlines()[6].endswith("| 0.900 | 0.800 |")
+    assert "AP50 0.880, AP70 0.440" in shown["home"]
+    assert f"| {ORACLE} | 0.900, 0.450 | 0.920, 0.460 |" in shown["seeds"]
+    assert any(line.startswith("at home, AP50: -0.020") for line in found.sentences())
+    assert draw_gap(found).startswith(b"\x89PNG")
