@@ -67,7 +67,7 @@ def shrunk(name: str) -> RunRecipe:
         task["training"] = None
         if task["plan"]:
             task["plan"] = {"samples": 4, "edge_rounds": 1, "cloud_rounds": 1}
-    del asked["regions"]["ring"]
+    asked["regions"].pop("ring", None)
     for region in asked["regions"].values():
         region["vehicles"] = 1 if region["role"] == "federate" else None
     limits = {"samples": (20, None), "edge_rounds": (1, 1), "cloud_rounds": (1, 1)}
@@ -109,6 +109,28 @@ def test_a_forecast_refuses_what_the_run_would(tmp_path: Path) -> None:
     federation = recipe.federation.model_copy(update={"privacy": Privacy(noise=0.5, epsilon=0.1)})
     with pytest.raises(InputError, match="a first round comes to epsilon"):
         forecast_run(recipe.model_copy(update={"federation": federation}))
+
+
+def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(tmp_path: Path) -> None:
+    """Both stages take the tracks of one step; the cloud's own training crosses no link."""
+    recipe = shrunk("gap")
+    arms = {name: arm for name, arm in recipe.arms.items() if name in ("joined", "truth")}
+    found = run(recipe.model_copy(update={"arms": arms}), tmp_path)
+    work = tmp_path / "work"
+    assert {path.name for path in work.glob("*tracks*")} == {"grid-tracks-objects", "grid-tracks-objects-joined"}
+    split = Frames.open(work / "grid-edge-objects")
+    (poles,) = split.poles.values()
+    assert (len(split.data) - len(poles), len(split.vehicles), len(poles)) == (11, 1, 1)  # a window of 2 s
+    watched = Frames.open(work / "suburb-validation-objects")
+    assert (len(watched.data), len(watched.vehicles)) == (11, 1)
+    assert 0 < (Pretrained.load(work / "pretrain-objects").track_threshold or 0) <= 1
+    for name in (MAIN, *arms):
+        (labels,) = next(each.labels or () for each in found.arms[name].stages if each.stage == EDGE)
+        assert labels.recall == (1 if name == "truth" else labels.recall)
+    sent = Ledger.load(work / "cloud-fl-objects" / LEDGER).entries
+    assert {entry.client for entry in sent if entry.stage == CLOUD} == {"grid", "grid/cav0"}
+    (cloud,) = (each for each in found.arms[MAIN].stages if each.stage == CLOUD)
+    assert cloud.records[0].clients == ("grid", "cloud-replay")
 
 
 def test_three_tasks_share_a_plan_and_a_ledger(three_tasks: tuple[Path, Run]) -> None:

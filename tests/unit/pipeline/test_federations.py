@@ -63,7 +63,7 @@ def test_the_cloud_s_replay_is_one_more_in_its_averages_and_sends_nothing(tmp_pa
         ends[folder] = to_arrays(load_stage_network(learning.task, tmp_path / folder))
         assert {entry.client for entry in book.entries} == {"a", "b", "a/cav0", "b/cav0"}
     work = learning.schedule(1, 2, "cloud", "").work(1)
-    own = replay.train(start, steps=2, learning_rate=work.learning_rate, seed=derive_seed(work.seed, "cloud"))
+    own = replay.train(start, steps=2, learning_rate=work.learning_rate, seed=derive_seed(work.seed, "cloud-replay"))
     for name, array in ends["without"].items():
         wanted = (5 * array.astype(np.float64) + 4 * own.weights[name].astype(np.float64)) / 9
         np.testing.assert_allclose(ends["with"][name], wanted, rtol=1e-5)

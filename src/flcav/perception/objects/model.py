@@ -198,7 +198,7 @@ def tiny_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -
 
 
 def pillars_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -> SecondConfig:
-    """Return a configuration with pillars, of the range of `tiny_config`: 0.20 M parameters, a third of its time.
+    """Return a configuration with pillars, of the range of `tiny_config`: 0.20 M parameters, half of its time.
 
     Raises `InputError` for unknown classes.
     """

@@ -50,6 +50,8 @@ from flcav.pipeline.training.private_rounds import take_noise
 from flcav.pipeline.training.records import read_rounds
 from flcav.pipeline.training.statistics import keep_statistics, score_statistics
 
+REPLAY = "cloud-replay"  # the cloud's own training among the edge servers; no region has a hyphen in its name
+
 
 @dataclass(frozen=True)
 class RegionStart:
@@ -157,10 +159,10 @@ def federate_cloud(
     with checkpoints.refusals(), open_processes(everybody, processes) as runtime:
         servers = own.open_servers(rules, wireless, done, states, runtime)
         federate(
-            servers if own.replay is None else {**servers, CLOUD: own.replay},
+            servers if own.replay is None else {**servers, REPLAY: own.replay},
             start,
             schedule,
-            Account(own.book, CLOUD, task.name, "wireline", within=frozenset({CLOUD})),
+            Account(own.book, CLOUD, task.name, "wireline", within=frozenset({REPLAY})),
             strategy=own.strategies.cloud,
             rules=rules.of_servers(),
             state=state,
