@@ -125,11 +125,13 @@ def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(tmp_path:
     assert (len(watched.data), len(watched.vehicles)) == (11, 1)
     assert 0 < (Pretrained.load(work / "pretrain-objects").track_threshold or 0) <= 1
     for name in (MAIN, *arms):
-        (labels,) = next(each.labels or () for each in found.arms[name].stages if each.stage == EDGE)
-        assert labels.recall == (1 if name == "truth" else labels.recall)
+        labels = next(each.labels for each in found.arms[name].stages if each.stage == EDGE)
+        assert labels is not None
+        assert labels[0].recall == (1 if name == "truth" else labels[0].recall)
     sent = Ledger.load(work / "cloud-fl-objects" / LEDGER).entries
     assert {entry.client for entry in sent if entry.stage == CLOUD} == {"grid", "grid/cav0"}
     (cloud,) = (each for each in found.arms[MAIN].stages if each.stage == CLOUD)
+    assert cloud.records
     assert cloud.records[0].clients == ("grid", "cloud-replay")
 
 
