@@ -11,6 +11,7 @@ from typing import Annotated
 
 from flcav.statistics.power import MOST_SEEDS, SampleSize, plan_sample, seeds_to_tell
 from flcav.statistics.seeds import LEVEL, MeanOverSeeds
+from flcav.storage.markdown import format_table
 from flcav.storage.records import LEFT_OUT
 
 HELD, NOT_HELD, UNDECIDED = "held", "did not hold", "undecided"
@@ -130,6 +131,27 @@ def judge_known(claims: Sequence[Claim | None]) -> list[Judged | None]:
     """Return `judge` of the claims that there are; None where there is none, which does not count."""
     found = iter(judge([claim for claim in claims if claim is not None]))
     return [None if claim is None else next(found) for claim in claims]
+
+
+def judge_means(means: Mapping[str, MeanOverSeeds]) -> dict[str, Judged]:
+    """Return `judge` of the claims that the means are above 0, by name."""
+    return dict(zip(means, judge([Claim(mean) for mean in means.values()]), strict=True))
+
+
+def describe_means(means: Mapping[str, MeanOverSeeds]) -> list[str]:
+    """Return each mean with the verdict on the claim that it is above 0, in words."""
+    return [
+        f"{name}: {means[name].describe(sign=True)}, {one.verdict}: {one.describe()}"
+        for name, one in judge_means(means).items()
+    ]
+
+
+def tabulate_means(title: str, means: Mapping[str, MeanOverSeeds]) -> str:
+    """Return a Markdown table of the means, of the `title`, with the verdicts on the claims that they are above 0."""
+    rows = [
+        [name, means[name].describe(sign=True), one.p_cell, one.verdict] for name, one in judge_means(means).items()
+    ]
+    return format_table((title, "mean over seeds", "p, corrected", "claim that it is positive"), rows)
 
 
 def _judged(claim: Claim, p: float, family: int) -> Judged:

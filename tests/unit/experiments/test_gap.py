@@ -43,7 +43,7 @@ AP50 = {
 def run_of(seed: int, more: float) -> Any:
     """Return what is asked of a run: `AP50` and `more` in the town that federates, .9 and .88 at home."""
 
-    def test(arm: str, stage: str, region: str, task: str) -> Any:
+    def tested(arm: str, stage: str, region: str, task: str) -> Any:
         name = next(name for name, each in ARMS.items() if each == (arm, stage))
         ap50 = AP50[name] + more if region != HOME else 0.9 if name == PRETRAINED else 0.88
         return SimpleNamespace(estimate=SimpleNamespace(mean=ap50), numbers={"AP70": ap50 / 2})
@@ -51,7 +51,7 @@ def run_of(seed: int, more: float) -> Any:
     labels = (LabelQuality(1, 10, 20, 0.9, 0.8),)
     stages = [SimpleNamespace(stage="edge", region="grid", labels=labels)]
     arms = {arm: SimpleNamespace(stages=stages) for arm in (MAIN, *RECIPE.arms)}
-    return SimpleNamespace(recipe=SimpleNamespace(seed=seed), test=test, arms=arms)
+    return SimpleNamespace(recipe=SimpleNamespace(seed=seed), test=tested, arms=arms)
 
 
 def test_the_arms_are_those_of_the_recipe() -> None:

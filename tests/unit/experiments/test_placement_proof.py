@@ -14,7 +14,7 @@ from shapely.geometry import Point
 
 from flcav.experiments.maps import import_map
 from flcav.experiments.placement import predictors, spread
-from flcav.experiments.placement.claims import describe_claims, judge_claims, list_claims
+from flcav.experiments.placement.claims import describe_claims, list_claims
 from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps, overlap_of_circles
 from flcav.experiments.placement.predictors import RECALL, count_added_labels, expect_labels
 from flcav.experiments.placement.records import (
@@ -44,6 +44,7 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import load_run_recipe
 from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.sources.recipe import recipe_path
+from flcav.statistics.verdicts import judge_means
 from flcav.world.map.town import load_town
 
 RECIPE = load_run_recipe(recipe_path("runs/placement"))
@@ -260,7 +261,7 @@ def test_claims_are_of_means_over_regions_and_judged_together(beside: Path) -> N
     assert len(claims) == 2 * (1 + 1 + 2)  # for both kinds of test frames
     beyond = claims[f"gain {TOWN}: rank correlation with errors covered - with traffic density"]
     assert beyond.mean == pytest.approx(np.mean([(0.8 + i / 1e3 - 0.1 + 0.6 - i / 10) / 2 for i in range(3)]))
-    told = judge_claims(claims)
+    told = judge_means(claims)
     first = told[f"gain {TOWN}: rank correlation with errors covered"]
     p = claims[f"gain {TOWN}: rank correlation with errors covered"].p_value(0.0)
     assert p is not None

@@ -19,7 +19,8 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import asked_of, in_range
 from flcav.perception.weights import find_shipped, load_network
 from flcav.pipeline.frames import Frames, list_window, record_frames
-from flcav.pipeline.labels.tracks import load_tracks, save_tracks, track_frame, track_label_samples
+from flcav.pipeline.labels.pseudo_labels import label_frames
+from flcav.pipeline.labels.tracks import label_tracked, load_tracks, save_tracks, track_frame
 from flcav.sources.recipe import Recipe
 
 DRIVE = {"town": "suburb", "seed": 5, "scenes": 2, "spins_per_scene": 1, "cavs": 2, "warmup_s": 40.0, "window_s": 0.6}
@@ -70,7 +71,7 @@ def test_no_annotation_has_a_part_in_a_label(folder: Path, network, tmp_path: Pa
         split = Frames.open(where)
         tracks = {i: track_frame(network, split, i) for i in split.vehicles[:2]}
         about = (split, split.vehicles[:2], (), "suburb", ignore_progress)
-        samples = track_label_samples(tracks, network.config, 0.3, *about)
+        samples = label_frames(label_tracked(tracks, 0.3, network.config), *about)
         out = tmp_path / where.name
         out.mkdir(exist_ok=True)
         save_tracks(tracks, out)
@@ -107,14 +108,14 @@ def test_tracks_below_the_threshold_and_lookalikes_of_the_road_are_ignored(folde
     tracks = track_frame(network, split, i)
     assert tracks.score is not None
     cut = float(np.median(tracks.score))
-    (sample,) = track_label_samples({i: tracks}, network.config, cut, split, (i,), (), "suburb", ignore_progress)[
-        "suburb/cav0"
-    ]
+    (sample,) = label_frames(
+        label_tracked({i: tracks}, cut, network.config), split, (i,), (), "suburb", ignore_progress
+    )["suburb/cav0"]
     assert 0 < len(sample.boxes) <= int((tracks.score >= cut).sum())
     assert len(sample.boxes) + len(sample.ignore) == len(tracks)
     assert sample.exact is None
     assert sample.free is None
-    (none,) = track_label_samples({i: tracks}, network.config, 2.0, split, (i,), (), "suburb", ignore_progress)[
+    (none,) = label_frames(label_tracked({i: tracks}, 2.0, network.config), split, (i,), (), "suburb", ignore_progress)[
         "suburb/cav0"
     ]
     assert (len(none.boxes), len(none.ignore)) == (0, len(tracks))

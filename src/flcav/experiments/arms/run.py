@@ -20,7 +20,7 @@ from flcav.report import style
 from flcav.report.charts import figures
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
-from flcav.statistics.verdicts import Claim, Judged, judge
+from flcav.statistics.verdicts import Judged, judge_means
 from flcav.storage.records import Record
 
 TASK = "objects"
@@ -217,8 +217,7 @@ def judge_differences(summary: ArmsSummary) -> dict[str, Judged]:
 
     Nobody claims that the trained road detector beats an ideal one: what is lost to that is an estimate.
     """
-    claims = {name: Claim(mean) for name, mean in summary.differences.items() if not name.endswith(f" - {IDEAL}")}
-    return dict(zip(claims, judge(list(claims.values())), strict=True))
+    return judge_means({name: mean for name, mean in summary.differences.items() if not name.endswith(f" - {IDEAL}")})
 
 
 def _known(number: float | None) -> float:

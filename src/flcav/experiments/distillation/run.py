@@ -17,7 +17,7 @@ from flcav.pipeline.results.training import LabelQuality
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
-from flcav.statistics.verdicts import Claim, Judged, judge
+from flcav.statistics.verdicts import describe_means
 from flcav.storage.records import Record
 
 TASK, TOWN = "objects", "grid"
@@ -75,13 +75,8 @@ class DistillationResult(Record):
     def sentences(self) -> list[str]:
         """Return AP50 by arm, the verdicts on differences, and what the trained road detector costs, in words."""
         reached = [f"{arm}: AP50 {mean.describe()}" for arm, mean in self.ap50.items()]
-        judged = judge_differences(self)
-        told = [
-            f"{name}: {mean.describe(sign=True)}, {judged[name].verdict}: {judged[name].describe()}"
-            for name, mean in self.differences.items()
-        ]
         share = f"share of the gain with an ideal road detector that the trained one brings: {self.closed.describe()}"
-        return [*reached, *told, share]
+        return [*reached, *describe_means(self.differences), share]
 
 
 def compare_labels(recipe: RunRecipe, runs: Sequence[Run]) -> DistillationResult:
@@ -115,12 +110,6 @@ def _reached(run: Run, arm: str, stage: str) -> DistillationArm:
     labels = next(each.labels for each in run.arms[arm].stages if each.stage == stage and each.region == TOWN)
     sent = sum(each.mb for each in run.arms[arm].spent if (each.stage, each.link) == (stage, "wireless"))
     return DistillationArm(test.estimate.mean, ap70, sent, labels or ())
-
-
-def judge_differences(results: DistillationResult) -> dict[str, Judged]:
-    """Return the verdicts on the claims that the differences are positive, corrected together."""
-    judged = judge([Claim(mean) for mean in results.differences.values()])
-    return dict(zip(results.differences, judged, strict=True))
 
 
 def draw_labels(results: DistillationResult) -> bytes:

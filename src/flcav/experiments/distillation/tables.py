@@ -2,13 +2,18 @@
 
 import numpy as np
 
-from flcav.experiments.distillation.run import ARMS, PRETRAINED, DistillationResult, judge_differences
+from flcav.experiments.distillation.run import ARMS, PRETRAINED, DistillationResult
+from flcav.statistics.verdicts import tabulate_means
 from flcav.storage.markdown import format_table
 
 
 def tables(results: DistillationResult) -> dict[str, str]:
     """Return Markdown by name: arms, differences, labels."""
-    return {"arms": _arms(results), "differences": _differences(results), "labels": _labels(results)}
+    return {
+        "arms": _arms(results),
+        "differences": tabulate_means("difference in AP50", results.differences),
+        "labels": _labels(results),
+    }
 
 
 def _arms(results: DistillationResult) -> str:
@@ -18,15 +23,6 @@ def _arms(results: DistillationResult) -> str:
         ap70, sent = (float(np.mean([getattr(each, field) for each in own])) for field in ("ap70", "up_mb"))
         rows.append([name, results.ap50[name].describe(), f"{ap70:.3f}", f"{sent:.2f} MB" if sent else ""])
     return format_table(("stage II learns from", "AP50", "AP70, mean", "wireless uplink of stage II, mean"), rows)
-
-
-def _differences(results: DistillationResult) -> str:
-    judged = judge_differences(results)
-    rows = [
-        [name, mean.describe(sign=True), judged[name].p_cell, judged[name].verdict]
-        for name, mean in results.differences.items()
-    ]
-    return format_table(("difference in AP50", "mean over seeds", "p, corrected", "claim that it is positive"), rows)
 
 
 def _labels(results: DistillationResult) -> str:

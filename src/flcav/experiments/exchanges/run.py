@@ -27,7 +27,7 @@ from flcav.pipeline.running import WORK
 from flcav.report import style
 from flcav.report.charts.exchanges import Mark, draw_exchanges
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
-from flcav.statistics.verdicts import Claim, Judged, judge
+from flcav.statistics.verdicts import Judged, judge_means
 from flcav.storage.records import LEFT_OUT, Record
 
 NONE, NO_CLOUD, WHOLE = "no federation", "no cloud round", "whole weights (FedAvg)"
@@ -220,8 +220,7 @@ def measure_places(run: Run, arm: str, stage: str) -> dict[str, float]:
 
 def judge_differences(results: ExchangeResult) -> dict[str, Judged]:
     """Return the verdicts on the differences in the own region, corrected together."""
-    judged = judge([Claim(each[OWN]) for each in results.differences.values()])
-    return dict(zip(results.differences, judged, strict=True))
+    return judge_means({name: each[OWN] for name, each in results.differences.items()})
 
 
 def draw_results(results: ExchangeResult) -> bytes:

@@ -1,1 +1,1 @@
-"""Where the gap between pretraining and ground truth is, of recipes/runs/gap.yaml."""
+"""Comparison of federations and label sources by the share of the oracle's gain that they reach."""

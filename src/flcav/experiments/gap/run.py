@@ -1,4 +1,4 @@
-"""Where the gap between pretraining and ground truth is: the arms of recipes/runs/gap.yaml, on the same frames.
+"""Comparison of federations and label sources by their share of the oracle's gain: the arms of recipes/runs/gap.yaml.
 
 Centralised training on ground truth (*oracle*) bounds what any stage II can reach on these frames; stage II on ground
 truth tells what the federation itself costs, with its rates and steps; the others tell what labels cost. Beside the
@@ -17,7 +17,7 @@ from flcav.pipeline.results.run import Run
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
-from flcav.statistics.verdicts import Claim, Judged, judge
+from flcav.statistics.verdicts import describe_means
 from flcav.storage.records import Record
 
 TASK, TOWN, HOME = "objects", "grid", "suburb"
@@ -51,7 +51,7 @@ COMPARED = (  # (after, before): claims that the difference in AP50 is positive
 
 @dataclass(frozen=True)
 class GapArm:
-    """What an arm reaches in one seed, and the labels that it learns from."""
+    """AP of an arm in one seed, and precision and recall of the labels that it learns from."""
 
     ap50: float
     ap70: float
@@ -81,13 +81,8 @@ class GapResult(Record):
             f"AP70 {self.ap70[arm].describe()}, of the gap {self.closed70[arm].describe()}"
             for arm, mean in self.ap50.items()
         ]
-        judged = judge_differences(self)
-        told = [
-            f"{name}: {mean.describe(sign=True)}, {judged[name].verdict}: {judged[name].describe()}"
-            for name, mean in self.differences.items()
-        ]
         home = [f"at home, {name}: {mean.describe(sign=True)}" for name, mean in self.cost_at_home.items()]
-        return [*reached, *told, *home]
+        return [*reached, *describe_means(self.differences), *home]
 
 
 def compare_gap(recipe: RunRecipe, runs: Sequence[Run]) -> GapResult:
@@ -129,12 +124,6 @@ def _reached(run: Run, name: str, town: str) -> GapArm:
     labels = stages[0].labels if stages and stage == EDGE else None
     quality = (labels[0].precision, labels[0].recall) if labels else (None, None)
     return GapArm(test.estimate.mean, ap70, *quality)
-
-
-def judge_differences(results: GapResult) -> dict[str, Judged]:
-    """Return the verdicts on the claims that the differences are positive, corrected together."""
-    judged = judge([Claim(mean) for mean in results.differences.values()])
-    return dict(zip(results.differences, judged, strict=True))
 
 
 def draw_gap(results: GapResult) -> bytes:

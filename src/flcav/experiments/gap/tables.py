@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from flcav.experiments.gap.run import ARMS, AT_HOME, HOME, GapArm, GapResult, judge_differences
+from flcav.experiments.gap.run import ARMS, AT_HOME, HOME, GapArm, GapResult
+from flcav.statistics.verdicts import tabulate_means
 from flcav.storage.markdown import format_table
 
 
@@ -10,7 +11,7 @@ def gap_tables(results: GapResult) -> dict[str, str]:
     """Return Markdown by name: arms, differences, home, seeds."""
     return {
         "arms": _arms(results),
-        "differences": _differences(results),
+        "differences": tabulate_means("difference in AP50", results.differences),
         "home": _home(results),
         "seeds": _seeds(results),
     }
@@ -25,15 +26,6 @@ def _arms(results: GapResult) -> str:
         rows.append([name, *(each[name].describe() for each in numbers), *labels])
     titles = ("arm", "AP50", "share of its gap", "AP70", "share of its gap", "labels' precision", "labels' recall")
     return format_table(titles, rows)
-
-
-def _differences(results: GapResult) -> str:
-    judged = judge_differences(results)
-    rows = [
-        [name, mean.describe(sign=True), judged[name].p_cell, judged[name].verdict]
-        for name, mean in results.differences.items()
-    ]
-    return format_table(("difference in AP50", "mean over seeds", "p, corrected", "claim that it is positive"), rows)
 
 
 def _home(results: GapResult) -> str:

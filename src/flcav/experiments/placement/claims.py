@@ -7,7 +7,7 @@ import numpy as np
 
 from flcav.experiments.placement.records import COVERAGE, FRAMES, RULES, TRAFFIC, PlacementProof, SeedGains
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
-from flcav.statistics.verdicts import Claim, Judged, judge
+from flcav.statistics.verdicts import describe_means
 
 
 def list_claims(results: PlacementProof) -> dict[str, MeanOverSeeds]:
@@ -27,18 +27,9 @@ def list_claims(results: PlacementProof) -> dict[str, MeanOverSeeds]:
     return claims
 
 
-def judge_claims(claims: dict[str, MeanOverSeeds]) -> dict[str, Judged]:
-    """Return the verdict on each claim, by p-values that are corrected together."""
-    return dict(zip(claims, judge([Claim(mean) for mean in claims.values()]), strict=True))
-
-
 def describe_claims(results: PlacementProof) -> list[str]:
     """Return each claim with its mean and its verdict in words."""
-    claims = list_claims(results)
-    return [
-        f"{name}: {claims[name].describe(sign=True)}, {one.verdict}: {one.describe()}"
-        for name, one in judge_claims(claims).items()
-    ]
+    return describe_means(list_claims(results))
 
 
 def _beyond_traffic(seed: SeedGains, frames: str) -> float:

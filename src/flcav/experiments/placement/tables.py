@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flcav.experiments.placement.claims import judge_claims, list_claims
+from flcav.experiments.placement.claims import list_claims
 from flcav.experiments.placement.records import (
     EXPECTED,
     FRAMES,
@@ -14,6 +14,7 @@ from flcav.experiments.placement.records import (
     RegionProof,
 )
 from flcav.statistics.power import MOST_SEEDS
+from flcav.statistics.verdicts import judge_means
 from flcav.storage.markdown import format_table
 
 POOLED = "mean over regions"
@@ -45,7 +46,7 @@ def _claims(results: PlacementProof) -> str:
             one.verdict,
             one.takes_cell,
         ]
-        for name, one in judge_claims(claims).items()
+        for name, one in judge_means(claims).items()
     ]
     return format_table(
         ("claim, of the mean over regions", "mean over seeds", "p, corrected", "verdict", "if undecided: seeds"), rows

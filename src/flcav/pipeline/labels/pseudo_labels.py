@@ -1,6 +1,6 @@
 """Pseudo-labels by the pretrained network and roadside sensors, and ground truth as labels."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,8 +25,10 @@ from flcav.perception.task import Task
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.sightings import navigate
 from flcav.pipeline.recipe import EDGE
+from flcav.sensors.frame import Frame
 
 Spin = tuple[str, int]  # scene, and number in the scene
+LabelFrame = Callable[[int, Frame, Sequence[RoadView]], Sample]  # labels a frame, see `label_frames`
 
 EXACT = NavigationErrors()
 PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
@@ -82,19 +84,42 @@ def pseudo_label_samples(
     downlinks; stage III passes none, since its labels are those of stage II. A vehicle places them by its pose as its
     navigation, with `errors`, has it.
     """
-    data, relief = split.data, Ground(split.data).relief
+    relief = Ground(split.data).relief
+
+    def label(i: int, frame: Frame, told: Sequence[RoadView]) -> Sample:
+        (detections,) = detect_in(network, [frame], score_threshold=threshold)
+        return label_sample(frame, detections, told, network.config, choose_lidar(frame), relief)
+
+    return label_frames(label, split, frames, poles, region, report, book, trained, errors)
+
+
+def label_frames(
+    label: LabelFrame,
+    split: Frames,
+    frames: Sequence[int],
+    poles: Sequence[int],
+    region: str,
+    report: Report,
+    book: Ledger | None = None,
+    trained: bool = False,
+    errors: NavigationErrors = EXACT,
+) -> dict[str, list[Sample]]:
+    """Return each vehicle's samples, by "region/vehicle", as `label` makes them.
+
+    It is given a frame's number, the frame with the pose of the vehicle's navigation, and what road sensors see of it.
+    See `pseudo_label_samples` for the other arguments.
+    """
+    data = split.data
     views = road_views(split, poles, trained, {(data.keys[i].scene, data.keys[i].index) for i in frames})
     samples: dict[str, list[Sample]] = {}
     for done, i in enumerate(frames):
         key, frame = data.keys[i], data.frame(i)
-        lidar = choose_lidar(frame)
-        (detections,) = detect_in(network, [frame], score_threshold=threshold)
         told, name = [*views.get((key.scene, key.index), {}).values()], f"{region}/{key.agent}"
         if book is not None:
             about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
             told = [RoadView.from_message(send(book, view.message(), **about)) for view in told]
-        frame = replace(frame, world_from_agent=navigate(data, i, frame, errors))
-        samples.setdefault(name, []).append(label_sample(frame, detections, told, network.config, lidar, relief))
+        known = replace(frame, world_from_agent=navigate(data, i, frame, errors))
+        samples.setdefault(name, []).append(label(i, known, told))
         report(done, len(frames), "labels")
     return samples
 

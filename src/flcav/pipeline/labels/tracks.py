@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +14,16 @@ from flcav.fusion.road import RoadView
 from flcav.fusion.tracks import LEAST_SCORE, Sweep, track_objects
 from flcav.geometry import Boxes, concatenate, inverse, transform_points
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.ledger import Ledger
-from flcav.network.messages import from_names, pack, send, to_names, unpack
+from flcav.network.messages import from_names, pack, to_names, unpack
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import LOWEST_SCORE, detect_in
 from flcav.perception.objects.samples import Sample
-from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import asked_of, choose_lidar, detection_labels, in_range
 from flcav.pipeline.frames import Frames, list_window
-from flcav.pipeline.labels.pseudo_labels import EXACT, find_precise_score, road_views
+from flcav.pipeline.labels.pseudo_labels import EXACT, LabelFrame, find_precise_score
 from flcav.pipeline.labels.sightings import navigate
-from flcav.pipeline.recipe import EDGE
+from flcav.sensors.frame import Frame
 from flcav.storage.files import write_bytes
 
 TRACKS = "tracks.msgpack"
@@ -34,37 +31,13 @@ PRECISION = 0.95  # least of labels by tracks, on validation frames of the towns
 WINDOW_S, WINDOW_EVERY_S = 1.0, 0.2  # of the sweeps that are recorded around a frame
 
 
-def track_label_samples(
-    tracks: Mapping[int, Boxes],
-    config: SecondConfig,
-    threshold: float,
-    split: Frames,
-    frames: Sequence[int],
-    poles: Sequence[int],
-    region: str,
-    report: Report,
-    book: Ledger | None = None,
-    trained: bool = False,
-    errors: NavigationErrors = EXACT,
-) -> dict[str, list[Sample]]:
-    """Return each vehicle's frames labelled by `tracks`, in the frame of their LiDAR, by "region/vehicle".
+def label_tracked(tracks: Mapping[int, Boxes], threshold: float, config: SecondConfig) -> LabelFrame:
+    """Return the labelling of frames by `tracks`, in the frame of their LiDAR, that score `threshold` or more."""
 
-    Those that score `threshold` or more are to be detected. See `pseudo_label_samples` for the other arguments.
-    """
-    data = split.data
-    views = road_views(split, poles, trained, {(data.keys[i].scene, data.keys[i].index) for i in frames})
-    samples: dict[str, list[Sample]] = {}
-    for done, i in enumerate(frames):
-        key, frame = data.keys[i], data.frame(i)
-        told, name = [*views.get((key.scene, key.index), {}).values()], f"{region}/{key.agent}"
-        if book is not None:
-            about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
-            told = [RoadView.from_message(send(book, view.message(), **about)) for view in told]
-        frame, lidar = replace(frame, world_from_agent=navigate(data, i, frame, errors)), choose_lidar(frame)
-        sample = label_by_tracks(frame, tracks[i], threshold, told, config, lidar)
-        samples.setdefault(name, []).append(sample)
-        report(done, len(frames), "labels")
-    return samples
+    def label(i: int, frame: Frame, told: Sequence[RoadView]) -> Sample:
+        return label_by_tracks(frame, tracks[i], threshold, told, config, choose_lidar(frame))
+
+    return label
 
 
 def track_frame(

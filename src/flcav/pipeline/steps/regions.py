@@ -17,10 +17,15 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.label_sources import LABEL_SOURCES, LabelSource
-from flcav.pipeline.labels.pseudo_labels import annotated_samples, pseudo_label_samples, select_frames_near
+from flcav.pipeline.labels.pseudo_labels import (
+    annotated_samples,
+    label_frames,
+    pseudo_label_samples,
+    select_frames_near,
+)
 from flcav.pipeline.labels.quality import measure_labels, read_history
 from flcav.pipeline.labels.road_average import RoadAverageLabels
-from flcav.pipeline.labels.tracks import load_tracks, track_label_samples
+from flcav.pipeline.labels.tracks import label_tracked, load_tracks
 from flcav.pipeline.poles import find_sites
 from flcav.pipeline.radio.driving import CLOCK, DrivenRounds, Fleet, drive_rounds, link_scenes
 from flcav.pipeline.results.plans import Placed
@@ -88,7 +93,7 @@ def label_samples(
     where = (split, frames, poles, inputs.region, work.report, first, kind.trained, settings.navigation)
     if inputs.tracks is not None:
         tracks = load_tracks(work.inputs[inputs.tracks])
-        return LabelledSamples(track_label_samples(tracks, frozen.config, threshold, *where), poles)
+        return LabelledSamples(label_frames(label_tracked(tracks, threshold, frozen.config), *where), poles)
     return LabelledSamples(pseudo_label_samples(frozen, threshold, *where), poles)
 
 
