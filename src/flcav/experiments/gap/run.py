@@ -22,7 +22,7 @@ from flcav.storage.records import Record
 
 TASK, TOWN, HOME = "objects", "grid", "suburb"
 PRETRAINED, MORE, ORACLE = "pretrained", "more pretraining", "centralised on ground truth"
-TRUTH, SLOW = "edge FL on ground truth", "edge FL on ground truth, a third of the steps at half the rate"
+TRUTH, SLOW = "edge FL on ground truth", "edge FL on ground truth, few steps"
 ROAD, TRACKS, JOINED = "edge FL on road labels", "edge FL on tracks", "edge FL on road labels and tracks"
 GLOBAL = "edge + cloud FL on tracks, with replay"
 ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
