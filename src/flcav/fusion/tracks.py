@@ -13,10 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
-from flcav.fusion.average import BoxReport, average_boxes
-from flcav.geometry import Boxes, heading_vectors
+from flcav.fusion.average import BoxReport, RoadAverage, average_boxes
+from flcav.geometry import Boxes, concatenate, heading_vectors
 
 Array = NDArray[np.float64]
 
@@ -34,6 +33,7 @@ BIN_M, BIN_RETURNS = 0.1, 2  # of the histogram along an axis by which an object
 GAP_M = (0.35, 0.25)  # along and across: a longer gap without returns ends an object
 ROOM_M = (1.6, 0.45)  # along and across: how far an object may go on beyond the detected box
 EDGE_M = 0.08  # closeness of returns nearer to an edge than this is that of this
+LONGEST_M = 6.3  # of cars and vans
 HIDDEN = 0.9  # where the highest return is below this share of the detected height, the roof was not seen
 RING_RAD = 0.003  # elevations of returns of one beam differ by less
 LENGTH_M = 2.35, 1.4  # length of a vehicle by its height: a hatchback of 1.46 m has 4.4 m, a van of 1.95 m 5.1 m
@@ -53,38 +53,49 @@ def track_objects(sweeps: Sequence[Sweep], at_s: float, others: Sequence[BoxRepo
     """Return the objects at `at_s` [s] of a vehicle's sweeps around it, world frame.
 
     An object's score is its mean over the sweeps, zero in those without a detection of it; with boxes of `others`, such
-    as road sensors, the probability that not all err, see `average_boxes`. Objects that score less than `least` are
-    left out. Vehicles are fitted to their returns, see `fit_vehicle`.
+    as road sensors, the probability that not all err, see `average_boxes`. The underside of what the vehicle saw itself
+    is where it saw it: from above, road sensors know it less well. Objects that score less than `least` are left out. Vehicles are fitted to their returns, see `fit_vehicle`; trucks and buses then score 0.
     """
     average = average_boxes([*(BoxReport("vehicle", each.time_s, each.boxes) for each in sweeps), *others], at_s)
     assert average.boxes.score is not None
     kept = np.flatnonzero(average.boxes.score >= least)
     boxes, velocity = average.boxes[kept], average.velocity[kept]
-    trees = [KDTree(each.points[:, :2]) for each in sweeps]
-    rows = boxes.array()
+    rows, score = boxes.array(), average.boxes.score[kept]
+    feet = _average_feet(sweeps, average)[kept]
+    seen = np.isfinite(feet)
+    rows[seen, 2] = feet[seen] + rows[seen, 5] / 2
     for number in np.flatnonzero(boxes.size[:, 0] >= VEHICLE_M):
-        returns, origin = gather_returns(rows[number], velocity[number], sweeps, trees, at_s)
+        returns, origin = gather_returns(rows[number], velocity[number], sweeps, at_s)
         rows[number] = fit_vehicle(rows[number], returns, origin)
-    return Boxes.from_array(rows, boxes.label, boxes.score)
+        if rows[number, 3] > LONGEST_M:
+            score[number] = 0.0
+    return Boxes.from_array(rows, boxes.label, score)
 
 
-def gather_returns(
-    box: Array, velocity: Array, sweeps: Sequence[Sweep], trees: Sequence[KDTree], at_s: float
-) -> tuple[Array, Array]:
+def _average_feet(sweeps: Sequence[Sweep], average: RoadAverage) -> Array:
+    """Return the mean height (K,) of the undersides that the vehicle itself saw of each object [m]; NaN where none."""
+    of = np.concatenate([np.zeros(0, np.int64), *average.member[: len(sweeps)]])
+    boxes = concatenate([each.boxes for each in sweeps])
+    counts = np.bincount(of, minlength=len(average.agents))
+    sums = np.bincount(of, boxes.center[:, 2] - boxes.size[:, 2] / 2, len(counts))
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
+
+def gather_returns(box: Array, velocity: Array, sweeps: Sequence[Sweep], at_s: float) -> tuple[Array, Array]:
     """Return the returns (N, 3) around an object in all sweeps, and the nearest place (3,) that it was seen from.
 
     Both are x, y from the object's centre and height above its underside [m], along the axes of the world. box: (7,) at
-    `at_s`, world frame; velocity: (2,) [m/s]; trees: of the x, y of each sweep's returns.
+    `at_s`, world frame; velocity: (2,) [m/s].
     """
     moves = bool(np.hypot(*velocity) >= STANDING_MPS)
     foot = box[:3] - (0, 0, box[5] / 2)
     returns, origins = [np.zeros((0, 3))], [np.full(3, np.inf)]
-    for sweep, tree in zip(sweeps, trees, strict=True):
+    for sweep in sweeps:
         after_s = sweep.time_s - at_s
         if moves and abs(after_s) > MOVING_S:
             continue
         place = foot + np.append(velocity * after_s * moves, 0)
-        near = sweep.points[tree.query_ball_point(place[:2], REACH_M)] - place
+        near = sweep.points[((sweep.points[:, :2] - place[:2]) ** 2).sum(1) < REACH_M**2] - place
         returns.append(near[(near[:, 2] > ABOVE_M) & (near[:, 2] < BELOW_M)])
         origins.append(sweep.origin - place)
     return np.concatenate(returns), min(origins, key=lambda each: float(np.hypot(*each[:2])))
@@ -95,8 +106,7 @@ def fit_vehicle(box: Array, returns: Array, origin: Array) -> Array:
 
     Its underside stays. The heading is turned to the edges of the returns. Along and across it goes as far as there are
     returns without a gap, and away from the `origin` (3,), which sees the near side, at least as far as detected, or
-    as vehicles of its height do. It is as high as the highest return, and half a beam more where that is above the
-    LiDAR, which then sees no roof.
+    as vehicles of its height do. It is higher than the highest return by half of what lies between two beams.
     """
     x, y, _, length, width, height, yaw = box
     along = heading_vectors(yaw)
@@ -120,9 +130,11 @@ def fit_vehicle(box: Array, returns: Array, origin: Array) -> Array:
         return box
     top = float(np.percentile(returns[inside, 2], 99))
     if top >= HIDDEN * height:
-        height = top if top < origin[2] else top + _beam_height(returns[inside], origin) / 2
-    size = np.maximum((max(length, LENGTH_M[0] + LENGTH_M[1] * height), width), high - low)
+        height = top + _beam_height(returns[inside], origin) / 2
     middle, seen_from = (low + high) / 2, axes @ origin[:2]
+    if high[0] - low[0] < length or abs(seen_from[1]) < abs(seen_from[0]):  # else its flank is seen to the end
+        length = max(length, LENGTH_M[0] + LENGTH_M[1] * height)
+    size = np.maximum((length, width), high - low)
     beside = np.abs(seen_from) > np.array((length, width)) / 2
     middle -= np.sign(np.where(beside, seen_from, middle)) * (size - (high - low)) / 2  # half of what is hidden
     x, y = (x, y) + middle @ axes

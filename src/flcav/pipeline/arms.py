@@ -35,7 +35,7 @@ from flcav.pipeline.recipe import (
 PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
 PLANNED = ("plan",)  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
 PLACED = ("plan", "placement")  # those that decide where sensors stand
-PRETRAINED = ("plan", "pretraining", "repeat")  # those that decide pretraining
+PRETRAINED = ("plan", "pretraining", "pretrain_repeat")  # those that decide pretraining
 OF_ROUNDS = (  # fields of `Training` of federations alone
     "local_steps",
     "local_rate",
@@ -62,6 +62,7 @@ class Setting:
 
     name: str
     repeat: int  # 0: the arm itself; n: its n-th retraining
+    pretrain_repeat: int  # of its pretraining; 0 where retrainings share it
     plan: PlanRule
     placement: PlacementSettings
     labels: Mapping[str, str]  # kind of labels, by task
@@ -112,6 +113,7 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
     return Setting(
         name,
         repeat,
+        repeat if recipe.retrain_from == PRETRAIN else 0,
         arm.plan,
         PlacementSettings.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
         dict(labels) | dict(arm.labels),

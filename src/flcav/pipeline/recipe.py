@@ -233,7 +233,9 @@ class Federation(Rules):
     cloud_rate: float | None = Field(
         default=None, gt=0
     )  # learning rate of the first cloud round; default: `final_rate`
-    replay: bool = False  # the cloud takes part in its averages, by training on the samples of stage I, which it has
+    replay: float = Field(
+        default=0.0, ge=0, lt=1
+    )  # weight in the cloud's averages of its own training on the samples of stage I, which it has
     score_statistics: bool = False  # validate stage III also with each region's own statistics of batch normalisation
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
 
@@ -295,6 +297,9 @@ class RunRecipe(Config):
 
     seed: int = Field(default=1, ge=0, lt=2**31)  # of all random draws
     retrainings: int = Field(default=0, ge=0, le=100)  # of every arm, on the same frames with other random numbers
+    retrain_from: Literal["pretrain", "edge"] = (
+        "pretrain"  # first stage that retrainings repeat; edge: all go on from one pretrained network
+    )
     spread: str | None = None  # spread of retraining of a run without: a name of the package's, or a CSV file
     test_draw: int = Field(default=0, ge=0)  # draw of the test scenes; another one after results were looked at
     size: Literal["toy", "demo", "full"] = "demo"  # preset of `splits` and `training` where they are not given

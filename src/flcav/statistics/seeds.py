@@ -33,6 +33,12 @@ class SharedScenes:
 OWN_SCENES = SharedScenes()  # every seed has test scenes of its own
 
 
+def average_shared(parts: Sequence[SharedScenes]) -> SharedScenes:
+    """Return the part of the spread of a mean over regions, whose scenes are independent, from that of each region."""
+    sd = float(np.linalg.norm([part.sd for part in parts])) / len(parts)
+    return SharedScenes(sd, sum(part.scenes for part in parts))
+
+
 @dataclass(frozen=True)
 class MeanOverSeeds(Estimate):
     """The mean over seeds with its 95 % confidence interval, over seeds and scenes.

@@ -67,8 +67,8 @@ def test_the_order_of_points_does_not_matter():
 
 def test_the_heads_grid_is_that_of_the_voxels():
     config = pillars_config()
-    assert head_shape(config) == (60, 60)
-    assert len(anchor_boxes(config)) == 60 * 60 * 2
+    assert head_shape(config) == (48, 48)
+    assert len(anchor_boxes(config)) == 48 * 48 * 2
 
 
 def test_no_intensity_is_no_input():
@@ -99,7 +99,7 @@ def test_it_learns_to_find_a_box():
     torch.manual_seed(0)
     network = second(pillars_config())
     first = float(batch_loss(network, [sample]).detach())
-    train_steps(OBJECTS, network, [sample], steps=80, batch=1, learning_rate=2e-3, seed=0)
+    train_steps(OBJECTS, network, [sample], steps=160, batch=1, learning_rate=2e-3, seed=0)
     assert float(batch_loss(network, [sample]).detach()) < first / 3
     found = detect(network, sample.points, score_threshold=0.3)
     away = np.linalg.norm(found.center[:, None, :2] - boxes.center[None, :, :2], axis=2)

@@ -16,6 +16,7 @@ from flcav.perception.outcomes import Outcomes, compute_interval, compute_measur
 from flcav.perception.tasks import task_named
 from flcav.pipeline.analysis.differences import collect_test, list_differences
 from flcav.pipeline.analysis.histories import gaps_closed
+from flcav.pipeline.arms import name_repeat
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results import tests as results
 from flcav.pipeline.results.saved import OUTCOMES
@@ -96,7 +97,9 @@ def arm(name: str, stages: Sequence[str], regions: Sequence[str] = ("ring",), re
     return SimpleNamespace(name=name, stages=stages, regions=regions, repeat=repeat)
 
 
-def graph_of(arms: Sequence[SimpleNamespace], spreads: Any = None, retrainings: int = 0) -> Any:
+def graph_of(
+    arms: Sequence[SimpleNamespace], spreads: Any = None, retrainings: int = 0, primary: Sequence[str] = ()
+) -> Any:
     regions = ("suburb", "ring", "far")
 
     def tested(own: SimpleNamespace) -> list[tuple[str, str, str]]:
@@ -109,7 +112,7 @@ def graph_of(arms: Sequence[SimpleNamespace], spreads: Any = None, retrainings: 
         settings={each.name: each for each in arms},
         tested=tested,
         spreads=spreads or {},
-        recipe=SimpleNamespace(seed=7, retrainings=retrainings),
+        recipe=SimpleNamespace(seed=7, retrainings=retrainings, primary_claims=primary),
     )
 
 
@@ -252,6 +255,38 @@ def test_a_gap_begins_at_the_arm_s_own_pretraining_where_it_has_one() -> None:
         "grid, objects: edge FL": pytest.approx(0.75),
         "grid, objects: edge FL (longer)": pytest.approx(0.5),
     }
+
+
+@pytest.mark.parametrize("retrainings", [0, 2])
+def test_a_primary_claim_is_of_the_mean_over_regions_whose_scenes_are_independent(
+    tmp_path: Path, retrainings: int
+) -> None:
+    where = ("ring", "far")
+    for number, region in enumerate(where):
+        save_test(tmp_path, f"test-{PRETRAIN}-weather-{region}", named(number))
+        for repeat in range(1 + retrainings):
+            name = name_repeat(MAIN, repeat)
+            save_test(tmp_path, f"test-{EDGE}-{name}-{region}-{region}", named(10 * repeat + number + 5, 0.1))
+    arms = [arm(MAIN, [EDGE], where)]
+    key = ("weather", "ring and far", MAIN, EDGE, MAIN, PRETRAIN)
+    graph = graph_of(arms, {key: TABLE}, retrainings, ("edge",))
+    *single, joint = list_differences(graph, tmp_path)
+    own = [each for each in single if each.region in where]
+    assert (joint.region, joint.regions, joint.name[:12]) == ("ring and far", where, "ring and far")
+    assert joint.trainings == pytest.approx(np.mean([each.trainings for each in own], axis=0))
+    assert len(joint.trainings) == 1 + retrainings
+    assert joint.estimate.low is not None
+    assert joint.estimate.high is not None
+    if retrainings:
+        assert joint.over_trainings is not None
+        shared = [each.over_trainings.shared for each in own if each.over_trainings is not None]
+        assert joint.over_trainings.shared.sd == pytest.approx(np.hypot(*(each.sd for each in shared)) / 2)
+        assert joint.over_trainings.shared.scenes == 2 * SCENES
+    else:
+        below = [each.over_scenes.mean - (each.over_scenes.low or 0) for each in own]
+        wide = np.hypot(np.hypot(*below) / 2, stats.t(8).ppf(0.975) * TABLE.sd)
+        assert joint.estimate.mean - joint.estimate.low == pytest.approx(wide)
+    assert len(list_differences(graph_of(arms, None, retrainings), tmp_path)) == len(single)
 
 
 @pytest.mark.parametrize(("stage", "wanted"), [(EDGE, [1, 2, 3]), (PRETRAIN, [0])])

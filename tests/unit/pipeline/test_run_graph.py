@@ -13,6 +13,7 @@ from flcav.pipeline.steps.planning import UploadSettings
 from flcav.sources.recipe import recipe_path
 
 OBJECTS = {"objects": {"history": "objects"}}
+TRACKED = {"objects": {"history": "objects", "labels": "tracks"}}
 SEVERAL = {
     "objects": {"history": "objects"},
     **{name: {"plan": {"samples": 20, "edge_rounds": 1, "cloud_rounds": 1}} for name in ("signs", "trajectory")},
@@ -161,6 +162,16 @@ def test_a_retraining_repeats_what_learns_and_nothing_else() -> None:
     assert uploads == {1}
     ours = {step.name: step.arguments for step in plain.steps}
     assert all(step.arguments == ours[step.name] for step in again.steps if step.name in ours)
+
+
+def test_retrainings_may_share_one_pretrained_network_and_its_tracks() -> None:
+    graph = Graph(recipe_of(tasks=TRACKED, retrainings=2, retrain_from="edge"), Path())
+    names = {step.name for step in graph.steps if "again2" in step.name and not step.name.startswith("test-")}
+    assert names == {"grid-edge-fl-objects-main-again2", "cloud-fl-objects-main-again2"}
+    by_name = {step.name: settings_of(step) for step in graph.steps}
+    first, again = (by_name[f"grid-edge-fl-objects{end}"] for end in ("", "-main-again2"))
+    assert first.inputs == again.inputs
+    assert first.learning.seed != again.learning.seed
 
 
 def test_an_arm_may_train_otherwise_on_the_same_frames() -> None:

@@ -1,6 +1,6 @@
 """Tests of a run's networks, with intervals over scenes and retrainings, and their paired differences."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,15 +8,15 @@ import numpy as np
 
 from flcav.perception.outcomes import Outcomes, Values, difference, share_test_scenes
 from flcav.perception.tasks import task_named
-from flcav.pipeline.analysis.findings import name_stage
+from flcav.pipeline.analysis.findings import is_joint, name_stage
 from flcav.pipeline.arms import Setting, name_repeat
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import Difference, RegionalTest, Test, Tested
 from flcav.pipeline.spread import difference_key, test_key
 from flcav.pipeline.steps.graph import Graph
-from flcav.statistics.estimates import Estimate, measure_spread, widen, widen_share
-from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.estimates import Estimate, Spread, average_estimates, measure_spread, widen, widen_share
+from flcav.statistics.seeds import MeanOverSeeds, average_shared, mean_over_seeds
 
 
 def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, task: str) -> Test:
@@ -24,6 +24,7 @@ def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, ta
     step = test_folder(graph, arm, stage, region, task)
     result = Tested.load(work / step)
     again = [test_folder(graph, name_repeat(arm, n), stage, region, task) for n in number_retrainings(graph)]
+    again = [each for each in again if each != step]  # all of them, unless retrainings share this network
     retrained = tuple(Tested.load(work / each).estimate.mean for each in again)
     values = (result.estimate.mean, *retrained)
     spread = measure_spread(values) or graph.spreads.get(test_key(task, region, arm, stage))
@@ -89,7 +90,10 @@ def collect_regional_tests(graph: Graph, work: Path, arm: Setting) -> tuple[Regi
 
 
 def list_differences(graph: Graph, work: Path) -> list[Difference]:
-    """Return each stage minus the one before it, and the run itself minus each other arm at the same stage."""
+    """Return each stage minus the one before it, and the run itself minus each other arm at the same stage.
+
+    Those that a primary claim is of follow in the mean over regions.
+    """
     main = graph.settings[MAIN]
     pairs: list[tuple[tuple[str, str], tuple[str, str], str, str]] = []
     for arm in graph.settings.values():
@@ -105,7 +109,42 @@ def list_differences(graph: Graph, work: Path) -> list[Difference]:
         steps = test_folder(graph, *after, region, task), test_folder(graph, *before, region, task)
         if steps[0] != steps[1] and steps not in found:
             found[steps] = _difference(graph, work, after, before, region, task)
-    return list(found.values())
+    return [*found.values(), *_join_regions(graph, found.values())]
+
+
+def _join_regions(graph: Graph, differences: Iterable[Difference]) -> Iterator[Difference]:
+    """Yield the mean over regions of each difference that the recipe's primary claims are of."""
+    groups: dict[tuple[str, ...], list[Difference]] = {}
+    for each in differences:
+        if is_joint(each, graph.recipe, graph.settings):
+            key = (each.arm, each.stage, each.before_arm, each.before_stage, each.task)
+            groups.setdefault(key, []).append(each)
+    for group in groups.values():
+        yield _join(graph, group)
+
+
+def _join(graph: Graph, group: Sequence[Difference]) -> Difference:
+    """Return the mean over regions of a difference in each, whose test scenes are independent."""
+    first, regions = group[0], tuple(each.region for each in group)
+    place = " and ".join(regions)
+    over_scenes = average_estimates([each.over_scenes for each in group])
+    values = np.mean([each.trainings for each in group], axis=0).tolist()
+    joint = replace(
+        first,
+        name=first.name.replace(first.region, place, 1),
+        region=place,
+        estimate=over_scenes,
+        over_scenes=over_scenes,
+        spread=measure_spread(values),
+        retrained=tuple(values[1:]),
+        over_trainings=None,
+        regions=regions,
+    )
+    trained = [each.over_trainings for each in group if each.over_trainings is not None]
+    if len(trained) == len(group):
+        mean = mean_over_seeds(values, shared=average_shared([each.shared for each in trained]))
+        return replace(joint, estimate=mean.as_estimate(), over_trainings=mean)
+    return _widen(joint, graph.spreads.get(difference_key(joint)))
 
 
 def _difference(
@@ -129,8 +168,13 @@ def _difference(
     found = Difference(name, *after, *before, region, task, over_scenes, over_scenes, measure_spread(values), retrained)
     if trained is not None:
         return replace(found, estimate=trained.as_estimate(), over_trainings=trained)
-    spread = found.spread or graph.spreads.get(difference_key(found))
-    return found if spread is None else replace(found, estimate=widen(over_scenes, spread), spread=spread)
+    return _widen(found, graph.spreads.get(difference_key(found)))
+
+
+def _widen(found: Difference, known: Spread | None) -> Difference:
+    """Return a difference with the interval of its own spread of retraining, else of a `known` one."""
+    spread = found.spread or known
+    return found if spread is None else replace(found, estimate=widen(found.over_scenes, spread), spread=spread)
 
 
 def _owner(graph: Graph, arm: str, stage: str, region: str, task: str) -> str:

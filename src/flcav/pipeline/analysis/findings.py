@@ -6,14 +6,16 @@ by the spread of retraining, and the p-value is that of this interval. A claim h
 p-value (Holm) is at most 0.05. It is undecided else, and where the spread is not known: another training on the same
 frames might say otherwise.
 
-A recipe may name its primary claims (`primary_claims`) before it is run. They are corrected for one another, and all
-others, exploratory ones, apart from them. Nobody claims that the run beats an upper bound, such as an arm with an ideal
+A recipe may name its primary claims (`primary_claims`) before it is run. Each is of the mean over the regions that
+federate. They are corrected for one another, and all others, exploratory ones, apart from them. Nobody claims that the run beats an upper bound, such as an arm with an ideal
 road detector: there the difference is an estimate of what is lost.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
+
+import numpy as np
 
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.label_sources import LABEL_SOURCES
@@ -46,7 +48,16 @@ def ask(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) ->
         return ClaimQuestion(question, "loss")
     if not recipe.primary_claims:
         return ClaimQuestion(question, "claim")
-    return ClaimQuestion(question, "primary" if _name_claim(each) in recipe.primary_claims else "secondary")
+    primary = _name_claim(each) in recipe.primary_claims and not is_joint(each, recipe, settings)
+    return ClaimQuestion(question, "primary" if primary else "secondary")
+
+
+def is_joint(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) -> bool:
+    """Return whether a primary claim is of the mean over regions of this difference, which is that of one of them."""
+    arms = (settings[MAIN], settings[each.before_arm])
+    federating = [region for region in arms[0].regions if region in arms[1].regions]
+    named = each.arm == MAIN and _name_claim(each) in recipe.primary_claims
+    return named and each.regions is None and each.region in federating and len(federating) > 1
 
 
 def judge_asked(asked: Sequence[ClaimQuestion], means: Sequence[MeanOverSeeds | None]) -> list[Judged | None]:
@@ -131,7 +142,7 @@ def findings(
     asked = [ask(each, recipe, settings) for each in own]
     same = [_tell_same_poles(each, arms, settings) for each in own]
     means = [
-        None if none_differs else _mean(each, values[each.arm, each.stage, each.region, each.task].result.scenes)
+        None if none_differs else _mean(each, sum(test.result.scenes for test in _after(each, values)))
         for each, none_differs in zip(own, same, strict=True)
     ]
     return tuple(
@@ -156,8 +167,10 @@ def _finding(
     caveats: Mapping[str, str],
 ) -> RunFinding:
     """Return the finding of a difference; `same`: what is said where nothing differs."""
-    test, before = values[each.arm, each.stage, each.region, each.task], _before(each, values)
-    after = test.result
+    tests, measure = _after(each, values), _after(each, values)[0].result.measure
+    earlier, later = (
+        float(np.mean([test.estimate.mean for test in own])) for own in (_before(each, values), tests)
+    )
     place, question = f"{each.region}, {each.task}", asked.question
     loss = asked.kind == "loss"
     open_, undecided = (ESTIMATE, "") if loss else (UNDECIDED, ", so the result is inconclusive")
@@ -165,11 +178,12 @@ def _finding(
         return RunFinding(place, question, open_, f"{same}: there is nothing to compare{undecided}.")
     mean, low, high = each.estimate.mean, each.estimate.low, each.estimate.high
     told = (
-        f"On {each.region}, {after.measure} of {each.task} was {before.estimate.mean:.3f} "
-        f"({name_stage(each.before_arm, each.before_stage)}) and {test.estimate.mean:.3f} "
+        f"On {each.region}, {measure} of {each.task} was {earlier:.3f} "
+        f"({name_stage(each.before_arm, each.before_stage)}) and {later:.3f} "
         f"({name_stage(each.arm, each.stage)}){_tell_trainings(each)}: {signed(mean)}"
     )
-    over = f"{after.frames} test frames of {after.scenes} scenes"
+    frames, scenes = (sum(counts) for counts in zip(*((t.result.frames, t.result.scenes) for t in tests), strict=True))
+    over = f"{frames} test frames of {scenes} scenes"
     if low is None or high is None:
         return RunFinding(place, question, open_, f"{told}, over {over}: too few scenes for an interval.")
     rests = f" ({caveats[each.task]})" if caveats.get(each.task) else ""
@@ -189,9 +203,15 @@ def _tell_trainings(each: Difference) -> str:
     return "" if each.over_trainings is None else f" in the mean of {each.over_trainings.seeds} trainings"
 
 
-def _before(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) -> Test:
-    key = (each.before_arm, each.before_stage, each.region, each.task)
-    return values.get(key) or values[MAIN, *key[1:]]
+def _after(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) -> list[Test]:
+    """Return the later tests of a difference, one per region."""
+    return [values[each.arm, each.stage, region, each.task] for region in each.places]
+
+
+def _before(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) -> list[Test]:
+    """Return the earlier tests of a difference, one per region; arms share those of the run itself."""
+    keys = [(each.before_stage, region, each.task) for region in each.places]
+    return [values.get((each.before_arm, *key)) or values[MAIN, *key] for key in keys]
 
 
 def _tell_same_poles(each: Difference, arms: Mapping[str, ArmResult], settings: Mapping[str, Setting]) -> str | None:

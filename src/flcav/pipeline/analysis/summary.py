@@ -10,7 +10,7 @@ from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.recipe import MAIN
 from flcav.pipeline.results.run import Mean, Run, Summary
 from flcav.pipeline.results.tests import Difference, Test
-from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.seeds import MeanOverSeeds, average_shared, mean_over_seeds
 
 
 def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
@@ -60,9 +60,12 @@ def _mean_measure(tests: Sequence[Test], works: Sequence[Path]) -> MeanOverSeeds
 def _mean_difference(
     rows: Sequence[Difference], tests: Sequence[dict[tuple[str, str, str, str], Test]], works: Sequence[Path]
 ) -> MeanOverSeeds:
-    one, folders = rows[0], []
-    for own, work in zip(tests, works, strict=True):
-        pair = ((one.arm, one.stage), (one.before_arm, one.before_stage))
-        tested = [own.get((*each, one.region, one.task)) or own[MAIN, each[1], one.region, one.task] for each in pair]
-        folders.append([work / test.step for test in tested])
-    return mean_of_tests(one.task, [row.estimate.mean for row in rows], folders)
+    one, values, parts = rows[0], [row.estimate.mean for row in rows], []
+    pair = ((one.arm, one.stage), (one.before_arm, one.before_stage))
+    for region in one.places:
+        folders = []
+        for own, work in zip(tests, works, strict=True):
+            tested = [own.get((*each, region, one.task)) or own[MAIN, each[1], region, one.task] for each in pair]
+            folders.append([work / test.step for test in tested])
+        parts.append(mean_of_tests(one.task, values, folders).shared)
+    return mean_over_seeds(values, shared=average_shared(parts))

@@ -77,6 +77,12 @@ class Difference:
     spread: Spread | None  # as in `Test`
     retrained: tuple[float, ...] = ()  # the difference in each retraining
     over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # as in `Test`
+    regions: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # whose mean it is; None: `region` alone
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Return the regions that it is of."""
+        return self.regions or (self.region,)
 
     @property
     def trainings(self) -> tuple[float, ...]:

@@ -17,7 +17,7 @@ from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.trainable import Trainable, Weights
+from flcav.federation.trainable import Trainable, Update, Weights
 from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
 from flcav.perception.client import TaskClient
@@ -63,6 +63,18 @@ class RegionStart:
 
 
 @dataclass(frozen=True)
+class Replay:
+    """The cloud's own training on what it was sent in stage I, which counts for a given number of samples."""
+
+    client: TaskClient
+    samples: int
+
+    def train(self, weights: Weights, **how: Any) -> Update:
+        """Return the update of `TaskClient.train`, with that number."""
+        return replace(self.client.train(weights, **how), samples=self.samples)
+
+
+@dataclass(frozen=True)
 class CloudFederation:
     """The federation of edge servers with the cloud: what its rounds begin with, and where they are kept."""
 
@@ -77,13 +89,25 @@ class CloudFederation:
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
     keeps_statistics: bool = False  # whether each region's statistics of batch normalisation are written, too
     rate: float | None = None  # of the first round, where it is restarted
-    replay: TaskClient | None = None  # the cloud's own training on the samples of stage I, in each of its averages
+    replay: TaskClient | None = None  # the cloud's own training on the samples of stage I
+    replay_share: float = 0.0  # of it in each of the cloud's averages
 
     def afford(self, rules: Rules, rounds: int) -> int:
         """Return as many of `rounds` as the privacy budget affords in every region; without one all."""
         for own in self.regions.values() if rules.privacy is not None else ():
             rounds = min(rounds, afford_cloud_rounds(rules, [*own.clients], rounds, self.edge_rounds, own.earlier))
         return rounds
+
+    def open_replay(self) -> dict[str, Trainable]:
+        """Return the cloud's own training by its name, if there is any.
+
+        It counts for so many samples that its share is right where all vehicles take part in a round.
+        """
+        if self.replay is None:
+            return {}
+        steps = self.learning.training.local_steps
+        samples = sum(each.count_samples(steps) for own in self.regions.values() for each in own.clients.values())
+        return {REPLAY: Replay(self.replay, round(samples * self.replay_share / (1 - self.replay_share)))}
 
     def vehicles(self, region: str) -> Mapping[str, Trainable]:
         """Return the clients of a region's edge server, by name."""
@@ -159,7 +183,7 @@ def federate_cloud(
     with checkpoints.refusals(), open_processes(everybody, processes) as runtime:
         servers = own.open_servers(rules, wireless, done, states, runtime)
         federate(
-            servers if own.replay is None else {**servers, REPLAY: own.replay},
+            {**servers, **own.open_replay()},
             start,
             schedule,
             Account(own.book, CLOUD, task.name, "wireline", within=frozenset({REPLAY})),
@@ -323,6 +347,7 @@ def _open_federation(
         keeps_statistics=bool(settings.validation),
         rate=settings.federation.cloud_rate,
         replay=_open_replay(work, settings, learning, start.config) if settings.federation.replay else None,
+        replay_share=settings.federation.replay,
     )
 
 
