@@ -43,6 +43,7 @@ class Target(StrEnum):
     fig4 = "fig4"
     fig6a_allocation = "fig6a-allocation"
     gap = "gap"
+    networks = "networks"
     placement = "placement"
     road_average = "road-average"
     road_detector = "road-detector"
@@ -270,6 +271,17 @@ def _gap(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale
     _write_figures(out, results.as_json(), {"arms.png": draw_gap(results)}, results.sentences())
 
 
+@when_interrupted()
+def _networks(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
+    from flcav.cli.steps import live_steps
+    from flcav.experiments.networks.run import draw_networks, search_networks
+
+    with live_steps(Target.networks.value) as notify:
+        how: Any = {"jobs": jobs, "notify": notify, "stale": stale, "engine": engine}
+        results = search_networks(out, seeds=range(1, seeds + 1), quick=scale != "paper", **how)
+    _write_figures(out, results.as_json(), {"networks.png": draw_networks(results)}, results.sentences())
+
+
 def _federation_exchange(
     target: Target, out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale
 ) -> None:
@@ -306,6 +318,7 @@ COMPARISONS: Mapping[str, Callable[[Path, int, str, int, EngineName, Stale], Non
     **{target: partial(_federation_exchange, Target(target)) for target in EXCHANGES},
     Target.fig6a_allocation: _fig6a_allocation,
     Target.gap: _gap,
+    Target.networks: _networks,
     Target.placement: _placement,
 }
 

@@ -78,7 +78,7 @@ def demo(
     engine: EngineName = ENGINE,
     stale: Stale = STALE,
 ) -> None:
-    """Run recipes/runs/demo.yaml: pretraining, a roadside sensor, edge FL and cloud FL on three towns."""
+    """Run recipes/runs/demo.yaml: pretraining, roadside sensors, edge FL and cloud FL on three towns."""
     _run(recipe, seed, out, jobs, 1, engine, stale, False, "demo")
 
 
@@ -128,9 +128,12 @@ def _run(
 
 def _tell(results: "list[Run]", summary: "Summary | None") -> None:
     from flcav.pipeline.analysis.caveats import PLACED_BARE
+    from flcav.pipeline.analysis.costs import tell_gain
     from flcav.pipeline.results.training import TOGETHER
 
     if summary is None:
+        for sentence in tell_gain(results[0]):
+            typer.echo(sentence)
         for finding in results[0].findings:
             typer.echo(f"{finding.question}: {finding.decision}. {finding.sentence}")
         for name, arm in results[0].arms.items():

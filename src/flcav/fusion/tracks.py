@@ -54,7 +54,8 @@ def track_objects(sweeps: Sequence[Sweep], at_s: float, others: Sequence[BoxRepo
 
     An object's score is its mean over the sweeps, zero in those without a detection of it; with boxes of `others`, such
     as road sensors, the probability that not all err, see `average_boxes`. The underside of what the vehicle saw itself
-    is where it saw it: from above, road sensors know it less well. Objects that score less than `least` are left out. Vehicles are fitted to their returns, see `fit_vehicle`; trucks and buses then score 0.
+    is where it saw it: from above, road sensors know it less well. Objects that score less than `least` are left out.
+    Vehicles are fitted to their returns, see `fit_vehicle`; trucks and buses then score 0.
     """
     average = average_boxes([*(BoxReport("vehicle", each.time_s, each.boxes) for each in sweeps), *others], at_s)
     assert average.boxes.score is not None

@@ -154,3 +154,22 @@ def test_those_on_foot_keep_their_average():
 def test_nothing_detected_is_nothing_labelled():
     sweeps = [replace(each, boxes=Boxes.from_array(np.zeros((0, 7)), "", np.zeros(0))) for each in drive(np.ones(7))]
     assert len(track_objects(sweeps, 10.0)) == 0
+
+
+def test_the_underside_is_where_the_vehicle_saw_it_whatever_a_road_sensor_tells():
+    true = np.array((18.0, 5.0, 0.75, 4.4, 1.8, 1.5, 0.0))
+    lifted = Boxes.from_array(np.array([true + (0, 0, 0.3, 0, 0, 0, 0)]), "Car", np.ones(1))
+    sure = replace(lifted, variance=np.full((1, 7), 1e-4))
+    (found,) = track_objects(drive(true), 10.0, [BoxReport("pole 1", 10.0, sure)]).array()
+    assert found[2] - found[5] / 2 == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("length", "score"), [(5.9, 0.8), (8.0, 0.0)])
+def test_a_van_is_a_label_and_a_lorry_is_none(length, score):
+    true = np.array((20.0, 6.0, 1.25, length, 2.0, 2.5, 0.0))
+    sweeps = [
+        replace(each, boxes=Boxes.from_array(np.array([(*true[:2], 1.1, 5.5, 2.0, 2.2, 0.0)]), "Car", np.array([0.8])))
+        for each in drive(true)
+    ]
+    found = track_objects(sweeps, 10.0)
+    assert found.score == pytest.approx([score])

@@ -14,7 +14,7 @@ from flcav.report.charts import figures
 from flcav.report.pages import html
 from flcav.report.pages.run_page import page
 
-DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo"
+DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo_road"
 
 
 @pytest.fixture(scope="module")

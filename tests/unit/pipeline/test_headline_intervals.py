@@ -270,7 +270,7 @@ def test_a_primary_claim_is_of_the_mean_over_regions_whose_scenes_are_independen
     arms = [arm(MAIN, [EDGE], where)]
     key = ("weather", "ring and far", MAIN, EDGE, MAIN, PRETRAIN)
     graph = graph_of(arms, {key: TABLE}, retrainings, ("edge",))
-    *single, joint = list_differences(graph, tmp_path)
+    joint, *single = list_differences(graph, tmp_path)
     own = [each for each in single if each.region in where]
     assert (joint.region, joint.regions, joint.name[:12]) == ("ring and far", where, "ring and far")
     assert joint.trainings == pytest.approx(np.mean([each.trainings for each in own], axis=0))
@@ -280,11 +280,11 @@ def test_a_primary_claim_is_of_the_mean_over_regions_whose_scenes_are_independen
     if retrainings:
         assert joint.over_trainings is not None
         shared = [each.over_trainings.shared for each in own if each.over_trainings is not None]
-        assert joint.over_trainings.shared.sd == pytest.approx(np.hypot(*(each.sd for each in shared)) / 2)
+        assert joint.over_trainings.shared.sd == pytest.approx(np.linalg.norm([each.sd for each in shared]) / 2)
         assert joint.over_trainings.shared.scenes == 2 * SCENES
     else:
         below = [each.over_scenes.mean - (each.over_scenes.low or 0) for each in own]
-        wide = np.hypot(np.hypot(*below) / 2, stats.t(8).ppf(0.975) * TABLE.sd)
+        wide = np.hypot(np.linalg.norm(below) / 2, stats.t(8).ppf(0.975) * TABLE.sd)
         assert joint.estimate.mean - joint.estimate.low == pytest.approx(wide)
     assert len(list_differences(graph_of(arms, None, retrainings), tmp_path)) == len(single)
 

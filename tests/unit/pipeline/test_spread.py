@@ -78,7 +78,7 @@ def test_a_further_run_is_one_more_training_of_every_figure() -> None:
 
 
 def test_pages_judge_a_run_by_the_present_table() -> None:
-    run = Run.load(RUNS / "demo", "results.json")
+    run = Run.load(RUNS / "demo_road", "results.json")
     spreads = read_spreads("demo", Path())
     widened = widen_anew(run, spreads)
     for before, after in zip(run.differences, widened.differences, strict=True):

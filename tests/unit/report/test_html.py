@@ -16,7 +16,7 @@ from flcav.report.pages.html import render
 from flcav.report.pages.run_page import page
 from flcav.statistics.estimates import Estimate
 
-DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo"
+DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo_road"
 PIXEL = b"\x89PNG made up"
 PICTURES: dict[str, bytes] = dict.fromkeys(("map_grid", "before_after", "rounds_objects", "megabytes"), PIXEL)
 

@@ -75,6 +75,27 @@ def _row(name: str, arm: ArmResult, task: str, tests: Sequence[Test], before: fl
     )
 
 
+def tell_gain(run: Run) -> tuple[str, ...]:
+    """Return sentences for each task: what the run gained, for how many megabytes, and at what cost at home."""
+    told, home, arm = [], list_home_costs(run), run.arms[MAIN]
+    for cost in list_arm_costs(run):
+        if cost.arm != MAIN:
+            continue
+        links = [f"{arm.sent_mb(cost.task, link):.1f} MB of {link} uplink" for link in arm.links]
+        told.append(
+            f"Federated learning took {cost.measure} of {cost.task} from {cost.before:.3f} to {cost.after.mean:.3f} on "
+            f"{' and '.join(cost.regions)}, for {' and '.join(links)}, pretraining included."
+        )
+        for region in dict.fromkeys(each.region for each in home if each.task == cost.task):
+            changes = [
+                f"{each.measure} from {each.before:.3f} to {each.after:.3f}"
+                for each in home
+                if (each.region, each.task) == (region, cost.task)
+            ]
+            told.append(f"On {region}, where it was pretrained, it took {' and '.join(changes)}.")
+    return tuple(told)
+
+
 def collect_home_costs(graph: Graph, work: Path) -> tuple[HomeCost, ...]:
     """Return the costs of further measures than the tasks' own, of which `Difference` tells."""
     return tuple(

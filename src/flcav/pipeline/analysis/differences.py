@@ -92,7 +92,7 @@ def collect_regional_tests(graph: Graph, work: Path, arm: Setting) -> tuple[Regi
 def list_differences(graph: Graph, work: Path) -> list[Difference]:
     """Return each stage minus the one before it, and the run itself minus each other arm at the same stage.
 
-    Those that a primary claim is of follow in the mean over regions.
+    Those that a primary claim is of come first, in the mean over regions.
     """
     main = graph.settings[MAIN]
     pairs: list[tuple[tuple[str, str], tuple[str, str], str, str]] = []
@@ -109,7 +109,7 @@ def list_differences(graph: Graph, work: Path) -> list[Difference]:
         steps = test_folder(graph, *after, region, task), test_folder(graph, *before, region, task)
         if steps[0] != steps[1] and steps not in found:
             found[steps] = _difference(graph, work, after, before, region, task)
-    return [*found.values(), *_join_regions(graph, found.values())]
+    return [*_join_regions(graph, found.values()), *found.values()]
 
 
 def _join_regions(graph: Graph, differences: Iterable[Difference]) -> Iterator[Difference]:

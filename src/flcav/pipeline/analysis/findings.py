@@ -7,8 +7,9 @@ p-value (Holm) is at most 0.05. It is undecided else, and where the spread is no
 frames might say otherwise.
 
 A recipe may name its primary claims (`primary_claims`) before it is run. Each is of the mean over the regions that
-federate. They are corrected for one another, and all others, exploratory ones, apart from them. Nobody claims that the run beats an upper bound, such as an arm with an ideal
-road detector: there the difference is an estimate of what is lost.
+federate. They are corrected for one another, and all others, exploratory ones, apart from them. Nobody claims that the
+run beats an upper bound, such as an arm with an ideal road detector: there the difference is an estimate of what is
+lost.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,8 +49,26 @@ def ask(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) ->
         return ClaimQuestion(question, "loss")
     if not recipe.primary_claims:
         return ClaimQuestion(question, "claim")
-    primary = _name_claim(each) in recipe.primary_claims and not is_joint(each, recipe, settings)
-    return ClaimQuestion(question, "primary" if primary else "secondary")
+    return ClaimQuestion(question, "primary" if _name_claim(each) in recipe.primary_claims else "secondary")
+
+
+def ask_all(
+    differences: Sequence[Difference], recipe: RunRecipe, settings: Mapping[str, Setting]
+) -> list[ClaimQuestion]:
+    """Return what each difference is asked; one of a region whose mean over regions is asked, too, is secondary."""
+    joint = {_pair(each) for each in differences if each.regions is not None}
+    asked = [ask(each, recipe, settings) for each in differences]
+    return [
+        replace(own, kind="secondary")
+        if own.kind == "primary" and each.regions is None and _pair(each) in joint
+        else own
+        for each, own in zip(differences, asked, strict=True)
+    ]
+
+
+def _pair(each: Difference) -> tuple[str, ...]:
+    """Return what a difference is of, wherever it was tested."""
+    return each.arm, each.stage, each.before_arm, each.before_stage, each.task
 
 
 def is_joint(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) -> bool:
@@ -139,7 +158,7 @@ def findings(
     """
     values = {(test.arm, test.stage, test.region, test.task): test for test in tests}
     own = [each for each in differences if each.arm == MAIN]
-    asked = [ask(each, recipe, settings) for each in own]
+    asked = ask_all(own, recipe, settings)
     same = [_tell_same_poles(each, arms, settings) for each in own]
     means = [
         None if none_differs else _mean(each, sum(test.result.scenes for test in _after(each, values)))
@@ -168,9 +187,7 @@ def _finding(
 ) -> RunFinding:
     """Return the finding of a difference; `same`: what is said where nothing differs."""
     tests, measure = _after(each, values), _after(each, values)[0].result.measure
-    earlier, later = (
-        float(np.mean([test.estimate.mean for test in own])) for own in (_before(each, values), tests)
-    )
+    earlier, later = (float(np.mean([test.estimate.mean for test in own])) for own in (_before(each, values), tests))
     place, question = f"{each.region}, {each.task}", asked.question
     loss = asked.kind == "loss"
     open_, undecided = (ESTIMATE, "") if loss else (UNDECIDED, ", so the result is inconclusive")

@@ -55,7 +55,7 @@ def history_recipes(
 
 
 def _fix_plan(recipe: RunRecipe, task: str, seed: int, samples: int, edge_rounds: int, cloud_rounds: int) -> RunRecipe:
-    """Return the recipe with this task alone, a fixed plan, ample budgets, and no arms."""
+    """Return the recipe with this task alone, a fixed plan, ample budgets and time, and no arms."""
     asked = recipe.model_dump(mode="json")
     plan = {"samples": samples, "edge_rounds": edge_rounds, "cloud_rounds": cloud_rounds}
     placed = {} if task in recipe.placement.tasks else {"rule": "none", "tasks": []}
@@ -71,6 +71,9 @@ def _fix_plan(recipe: RunRecipe, task: str, seed: int, samples: int, edge_rounds
             "budgets_mb": {"wireless": AMPLE_MB, "wireline": AMPLE_MB},
             "placement": asked["placement"] | placed,
             "arms": {},
+            "primary_claims": (),
+            "horizon_s": None,
+            "stragglers": asked["stragglers"] if recipe.federation.network else None,
         },
         f"the run of seed {seed} with {samples} samples",
     )

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from flcav.pipeline.analysis.differences import mean_of_tests
-from flcav.pipeline.analysis.findings import ask, judge_asked, name_stage
+from flcav.pipeline.analysis.findings import ask_all, judge_asked, name_stage
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.recipe import MAIN
 from flcav.pipeline.results.run import Mean, Run, Summary
@@ -31,7 +31,7 @@ def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
     recipe = runs[0].recipe
     settings = resolve_settings(recipe)
     own = [number for number, each in enumerate(runs[0].differences) if each.arm == MAIN]
-    asked = [ask(runs[0].differences[number], recipe, settings) for number in own]
+    asked = ask_all([runs[0].differences[number] for number in own], recipe, settings)
     judged = judge_asked(asked, [differences[number].estimate for number in own])
     for number, about, one in zip(own, asked, judged, strict=True):
         differences[number] = replace(differences[number], judged=one, kind=about.named)

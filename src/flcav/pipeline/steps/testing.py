@@ -126,20 +126,28 @@ SHOWN_SCORE = 0.3  # lowest score of a detection that is shown
 
 
 def detect_before_after(before: Path, after: Path, split: Frames) -> SweepComparison:
-    """Return the detections of two networks in the test frame with the most targets.
+    """Return the detections of two networks in the test frame of median gain: of those the one with the most targets.
 
-    `before`, `after`: folders of the steps that trained the networks. Detections score `SHOWN_SCORE` or more.
+    Gain is how many more targets are found, less how many more false boxes there are. `before`, `after`: folders of the
+    steps that trained the networks. Detections score `SHOWN_SCORE` or more.
     """
-    networks = {name: load_stage_network(OBJECTS, folder) for name, folder in (("before", before), ("after", after))}
-    config = networks["before"].config
-    truths = [asked_of(split.data.frame(i), config) for i in split.vehicles]
-    best = int(np.argmax([len(truth.targets) for truth in truths]))
-    frame, truth = split.data.frame(split.vehicles[best]), truths[best]
-    seen = {
-        name: _matched(detect_in(network, [frame], score_threshold=SHOWN_SCORE)[0], truth)
-        for name, network in networks.items()
-    }
-    return SweepComparison(split.vehicles[best], _rows(truth.targets), seen["before"], seen["after"])
+    networks = [load_stage_network(OBJECTS, folder) for folder in (before, after)]
+    looks = []
+    for i in split.vehicles:
+        frame = split.data.frame(i)
+        truth = asked_of(frame, networks[0].config)
+        seen = [_matched(detect_in(each, [frame], score_threshold=SHOWN_SCORE)[0], truth) for each in networks]
+        looks.append(SweepComparison(i, _rows(truth.targets), *seen))
+    gains = np.array([_right(each.after) - _right(each.before) for each in looks])
+    held = np.array([len(each.targets) for each in looks])
+    asked = np.sort(gains[held >= min(1, held.max())])
+    median = asked[len(asked) // 2]
+    return looks[int(np.where(gains == median, held, -1).argmax())]
+
+
+def _right(seen: SweepDetections) -> int:
+    """Return how many targets are found, less the false boxes."""
+    return sum(seen.found) - (len(seen.hit) - sum(seen.hit))
 
 
 def _matched(found: Boxes, truth: FrameTruth) -> SweepDetections:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from flcav.report import style
+from flcav.statistics.seeds import MeanOverSeeds
 
 SHADES = LinearSegmentedColormap.from_list("shares", ["white", style.BLUE])
 SIDE_IN, LABELS_IN = 3.6, 1.1
@@ -117,3 +118,28 @@ def _draw(axes: Axes, slices: Mapping[str, Sequence[Bar]]) -> None:
     axes.set_yticks(range(len(slices)), list(slices))
     axes.invert_yaxis()
     axes.margins(x=0.14)
+
+
+@style.styled
+def costs(
+    panels: Mapping[str, Mapping[str, tuple[float, MeanOverSeeds]]], cost: str, measure: str, front: Sequence[str]
+) -> Figure:
+    """Return a panel per title with a measure against its cost, named points with intervals; `front` joins the best."""
+    figure = style.canvas(PANEL_IN * len(panels), 3.6)
+    for axes, (title, points) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+        best = sorted((points[name][0], points[name][1].mean) for name in front)
+        axes.plot(*zip(*best, strict=True), color=style.SKY, zorder=1)
+        for name, (x, mean) in points.items():
+            colour = style.BLUE if name in front else style.MUTED
+            if mean.low is not None and mean.high is not None:
+                axes.plot([x, x], [mean.low, mean.high], color=colour, linewidth=1)
+            axes.plot(x, mean.mean, "o", color=colour, markersize=5)
+            left = x > 0.6 * max(each[0] for each in points.values())
+            shift = {"xytext": (-6 if left else 6, 4), "ha": "right" if left else "left"}
+            axes.annotate(name, (x, mean.mean), textcoords="offset points", color=colour, fontsize=style.SMALL, **shift)
+        axes.set_xlim(0, None)
+        axes.set_xlabel(cost)
+        axes.set_ylabel(measure)
+        axes.set_title(title)
+        axes.grid(axis="y")
+    return figure

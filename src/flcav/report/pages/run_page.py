@@ -15,7 +15,7 @@ from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.analysis.caveats import PLACED_BARE
-from flcav.pipeline.analysis.costs import list_arm_costs, list_home_costs
+from flcav.pipeline.analysis.costs import list_arm_costs, list_home_costs, tell_gain
 from flcav.pipeline.analysis.findings import WORDS
 from flcav.pipeline.arms import Names
 from flcav.pipeline.frames import Frames
@@ -88,6 +88,7 @@ def page(run: Run) -> dict[str, Any]:
         "first": first,
         "stages": [row for row in rows if row["main"] and row["region"] == first],
         "tests": rows,
+        "gains": tell_gain(run),
         "findings": run.findings,
         "placed": main.placed,
         "plans": main.plans,

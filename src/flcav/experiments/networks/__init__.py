@@ -1,0 +1,1 @@
+"""Search of a network that is worth its training time."""
