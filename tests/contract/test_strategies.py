@@ -218,7 +218,7 @@ def test_it_travels_to_the_step_that_federates_and_is_in_its_fingerprint(strateg
 
 def test_another_strategy_leaves_what_comes_before_it_as_it_is():
     def prints(of: str) -> dict[str, str]:
-        recipe = load_run_recipe(recipe_path("runs/demo"))
+        recipe = load_run_recipe(recipe_path("runs/demo_road"))
         changed = recipe.model_copy(update={"federation": Federation(strategy=of)})
         found: dict[str, str] = {}
         for step in Graph(changed, Path()).steps:

@@ -92,6 +92,7 @@ def _spread(run: Run) -> str:
     rows = [
         [name, f"{np.mean(values):.3f}", f"{np.std(values, ddof=1):.4f}", f"{min(values):.3f}", f"{max(values):.3f}"]
         for name, values in found.items()
+        if len(values) > 1
     ]
     return format_table(("figure", "mean", "sd of retraining", "least", "most"), rows)
 

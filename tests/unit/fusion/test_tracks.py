@@ -158,7 +158,7 @@ def test_nothing_detected_is_nothing_labelled():
 
 def test_the_underside_is_where_the_vehicle_saw_it_whatever_a_road_sensor_tells():
     true = np.array((18.0, 5.0, 0.75, 4.4, 1.8, 1.5, 0.0))
-    lifted = Boxes.from_array(np.array([true + (0, 0, 0.3, 0, 0, 0, 0)]), "Car", np.ones(1))
+    lifted = Boxes.from_array(np.array([(*true[:2], true[2] + 0.3, *true[3:])]), "Car", np.ones(1))
     sure = replace(lifted, variance=np.full((1, 7), 1e-4))
     (found,) = track_objects(drive(true), 10.0, [BoxReport("pole 1", 10.0, sure)]).array()
     assert found[2] - found[5] / 2 == pytest.approx(0.0, abs=0.02)

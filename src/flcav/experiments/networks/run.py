@@ -104,9 +104,9 @@ def search_networks(
 
 def list_steps(seeds: Sequence[int], quick: bool) -> list[Step]:
     """Return the steps: recordings, and a training of each candidate per seed."""
-    recorded = {name: read_recipe(TRAINED) | fields for name, fields in RECORDING.items()}
+    recorded = {name: {**read_recipe(TRAINED), **fields} for name, fields in RECORDING.items()}
     if quick:
-        recorded = {name: fields | {"scenes": 2, "spins_per_scene": 2} for name, fields in recorded.items()}
+        recorded = {name: {**fields, "scenes": 2, "spins_per_scene": 2} for name, fields in recorded.items()}
     steps = [Step(name, record_split, {"recipe": fields}) for name, fields in recorded.items()]
     how = {"samples": 4, "steps": 2} if quick else {"samples": SAMPLES, "steps": STEPS}
     for seed in seeds:
