@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from flcav.config import InputError, parse_config
+from flcav.pipeline.analysis.histories import history_recipes
 from flcav.pipeline.recipe import SIZES, SPLITS_OF, RunRecipe, load_run_recipe
 
 RUNS = Path(__file__).parents[3] / "recipes" / "runs"
@@ -81,3 +82,11 @@ def test_what_cannot_be_run_is_refused_in_a_sentence(changes: dict[str, Any], sa
         parsed(**changes)
     assert said in str(refused.value)
     assert str(refused.value).startswith("run.yaml: ")
+
+
+def test_a_history_of_a_recipe_with_arms_claims_and_a_horizon_has_ample_time_and_claims_nothing() -> None:
+    (own,) = history_recipes(load_run_recipe(RUNS / "demo.yaml"), "objects", [40], 10, 5, [101]).values()
+    plan = own.tasks["objects"].plan
+    assert plan is not None
+    assert (plan.samples, plan.edge_rounds, plan.cloud_rounds, own.seed) == (40, 10, 5, 101)
+    assert (own.horizon_s, own.primary_claims, dict(own.arms), own.retrainings) == (None, (), {}, 0)

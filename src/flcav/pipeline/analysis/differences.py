@@ -8,7 +8,7 @@ import numpy as np
 
 from flcav.perception.outcomes import Outcomes, Values, difference, share_test_scenes
 from flcav.perception.tasks import task_named
-from flcav.pipeline.analysis.findings import is_joint, name_stage
+from flcav.pipeline.analysis.findings import is_joint, name_stage, pair_of
 from flcav.pipeline.arms import Setting, name_repeat
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results.saved import OUTCOMES
@@ -117,8 +117,7 @@ def _join_regions(graph: Graph, differences: Iterable[Difference]) -> Iterator[D
     groups: dict[tuple[str, ...], list[Difference]] = {}
     for each in differences:
         if is_joint(each, graph.recipe, graph.settings):
-            key = (each.arm, each.stage, each.before_arm, each.before_stage, each.task)
-            groups.setdefault(key, []).append(each)
+            groups.setdefault(pair_of(each), []).append(each)
     for group in groups.values():
         yield _join(graph, group)
 

@@ -56,17 +56,17 @@ def ask_all(
     differences: Sequence[Difference], recipe: RunRecipe, settings: Mapping[str, Setting]
 ) -> list[ClaimQuestion]:
     """Return what each difference is asked; one of a region whose mean over regions is asked, too, is secondary."""
-    joint = {_pair(each) for each in differences if each.regions is not None}
+    joint = {pair_of(each) for each in differences if each.regions is not None}
     asked = [ask(each, recipe, settings) for each in differences]
     return [
         replace(own, kind="secondary")
-        if own.kind == "primary" and each.regions is None and _pair(each) in joint
+        if own.kind == "primary" and each.regions is None and pair_of(each) in joint
         else own
         for each, own in zip(differences, asked, strict=True)
     ]
 
 
-def _pair(each: Difference) -> tuple[str, ...]:
+def pair_of(each: Difference) -> tuple[str, ...]:
     """Return what a difference is of, wherever it was tested."""
     return each.arm, each.stage, each.before_arm, each.before_stage, each.task
 
