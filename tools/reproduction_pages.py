@@ -1,8 +1,8 @@
 """Fill the tables of a reproduction's page from its numbers: python tools/reproduction_pages.py reproductions/NAME.
 
 A page (README.md) marks a table's place by `<!-- NAME -->` and `<!-- end -->`; the text between is replaced by the
-table of that name, made from the folder's result.json, or from results.json where the page is of a run (`flcav run`).
-All other text stays.
+table of that name, made from the folder's result.json, or from results.json where the page is of a run (`flcav run`);
+where it is of a run's seeds, from theirs and summary.json. All other text stays.
 """
 
 import re
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from flcav.config import InputError, Json, read_json
-from flcav.experiments import run_tables
+from flcav.experiments import run_tables, seed_tables
 from flcav.experiments.arms import tables as arms_tables
 from flcav.experiments.arms.run import ArmsResult
 from flcav.experiments.attacks import tables as attack_tables
@@ -28,6 +28,8 @@ from flcav.experiments.fig3b import tables as fig3b_tables
 from flcav.experiments.fig3b.run import Fig3b
 from flcav.experiments.fig6a import tables as fig6a_tables
 from flcav.experiments.fig6a.results import AllocationResult
+from flcav.experiments.networks.run import NetworksResult
+from flcav.experiments.networks.tables import networks_tables
 from flcav.experiments.placement import tables as placement_tables
 from flcav.experiments.placement.run import PlacementProof
 from flcav.experiments.roadside import tables as roadside_tables
@@ -43,8 +45,8 @@ from flcav.experiments.studies import signs as signs_tables
 from flcav.experiments.studies import trajectory as trajectory_tables
 from flcav.experiments.studies import weather as weather_tables
 from flcav.experiments.studies.run import EvaluationT, Study, StudyResult, results_of_json
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.running import RESULTS
+from flcav.pipeline.results.run import Run, Summary
+from flcav.pipeline.running import RESULTS, seed_folders
 from flcav.storage.files import write_bytes
 from flcav.storage.records import from_json
 
@@ -73,6 +75,7 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "fig4": _told(Fig4, roadside_tables.fig4_tables),
     "fig6a-allocation": _told(AllocationResult, fig6a_tables.tables),
     "leakage": _told(LeakageResult, attack_tables.leakage_tables),
+    "networks": _told(NetworksResult, networks_tables),
     "placement": _told(PlacementProof, placement_tables.tables),
     "road-average": _told(RoadAverageResult, roadside_tables.average_tables),
     "road-detector": _told(RoadDetectorResult, roadside_tables.detector_tables),
@@ -104,6 +107,10 @@ def tables_of(folder: Path) -> Tables:
     """Return the tables of a reproduction's folder as Markdown, by name."""
     if (folder / RESULTS).is_file():
         return run_tables.tables(Run.load(folder, RESULTS))
+    if (folder / Summary.file).is_file():
+        return seed_tables.tables(
+            [Run.load(each) for _, each in sorted(seed_folders(folder).items())], Summary.load(folder)
+        )
     path = folder / "result.json"
     return TABLES[folder.name](read_json(path), str(path))
 

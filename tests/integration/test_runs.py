@@ -95,7 +95,8 @@ def test_place_compares_with_the_traffic_of_a_dataset_and_sees_no_errors_behind_
 
 def test_central_arms_take_as_many_steps_as_stage_two_on_their_own_samples(finished: Path, result: Run) -> None:
     pretrained, plan = result.pretrained[0], result.arms[MAIN].plan.tasks["objects"]
-    more, oracle = (StageResult.load(finished / f"work/grid-central-objects-{arm}") for arm in ("more", "oracle"))
+    steps = ("central-objects-more", "grid-central-objects-oracle")
+    more, oracle = (StageResult.load(finished / "work" / step) for step in steps)
     edge = StageResult.load(finished / "work/grid-edge-fl-objects")
     assert more.samples == sum(map(len, pretrained.uploaded.values())) == plan.samples
     assert oracle.samples == edge.samples
@@ -230,6 +231,7 @@ def test_the_proof_by_training_compares_two_plans(studied: Studied, result: Run)
 def test_the_summary_of_seeds_is_beside_them(studied: tuple[Path, Any, Any]) -> None:
     summary = json.loads((studied[0] / Summary.file).read_text())
     assert summary["seeds"] == [1]
+    assert {claim["held"] + claim["did_not_hold"] + claim["undecided"] for claim in summary["claims"]} == {1}
     assert {row["name"] for row in summary["gap_closed"]} >= {"grid, objects: edge FL"}
     judged = {row["name"] for row in summary["differences"] if "judged" in row}
     assert "grid, objects: edge + cloud FL - further edge FL" in judged

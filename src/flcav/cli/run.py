@@ -74,12 +74,13 @@ def demo(
     ),
     seed: int | None = typer.Option(None, "--seed", min=0, help="Seed of traffic, sensors and training, if not 1."),
     recipe: Path = typer.Option(Path("recipes/runs/demo.yaml"), "--recipe", help="Another run recipe."),
+    seeds: int = SEEDS,
     jobs: int = JOBS,
     engine: EngineName = ENGINE,
     stale: Stale = STALE,
 ) -> None:
     """Run recipes/runs/demo.yaml: pretraining, roadside sensors, edge FL and cloud FL on three towns."""
-    _run(recipe, seed, out, jobs, 1, engine, stale, False, "demo")
+    _run(recipe, seed, out, jobs, seeds, engine, stale, False, "demo")
 
 
 def _run(
@@ -95,12 +96,13 @@ def _run(
 ) -> None:
     use_threads(1)
     from flcav.cli.steps import live_steps
+    from flcav.experiments.seed_tables import draw_seeds
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import run as run_one
     from flcav.pipeline.running import run_seeds
     from flcav.report.pages.run_page import write_report
     from flcav.sources.recipe import find_recipe
-    from flcav.storage.files import check_writable
+    from flcav.storage.files import check_writable, write_bytes
 
     check_writable(out)
     found = find_recipe(path)
@@ -115,6 +117,7 @@ def _run(
         else:
             runs, summary = run_seeds(asked, out, seeds=seeds, notify=notify, **how)
             results = {out / f"seed{each.recipe.seed}": each for each in runs}
+            write_bytes(out / "seeds.png", draw_seeds(runs))
     reports = [write_report(result, folder) for folder, result in results.items()]
     if as_json:
         first = next(iter(results.values()))
@@ -146,6 +149,8 @@ def _tell(results: "list[Run]", summary: "Summary | None") -> None:
         kind = f" ({row.kind} claim)" if row.kind else ""
         judged = f": {row.judged.verdict}{kind}, {row.judged.describe()}" if row.judged else ""
         typer.echo(f"{row.name}: {row.estimate.describe()} over {plural(len(summary.seeds), 'seed')}{judged}")
+    for claim in summary.claims:
+        typer.echo(claim.describe())
 
 
 def compare(

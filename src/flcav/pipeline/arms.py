@@ -321,8 +321,9 @@ class Names:
         return f"{CLOUD}-fl-{task}" + self._suffix(arm, LEARNED, task)
 
     def central(self, arm: str, region: str, task: str) -> str:
-        """Return the centralised training of an arm in a region."""
-        return f"{region}-{CENTRAL}-{task}-{arm}"
+        """Return the centralised training of an arm in a region; further pretraining is the same in all."""
+        shared = self._settings[arm].central == PRETRAIN
+        return f"{CENTRAL}-{task}-{arm}" if shared else f"{region}-{CENTRAL}-{task}-{arm}"
 
     def stage(self, arm: str, stage: str, region: str, task: str) -> str:
         """Return the step that trained an arm's network for a region in a stage."""

@@ -69,9 +69,9 @@ def make_recording_recipe(
     where they do not go together.
     """
     place, frames = recipe.regions[region], getattr(recipe.sized_splits, split)
-    changes = [as_shared(task_named(task)).recording, recipe.recording.fields(), place.recording.fields()]
+    changes = [as_shared(task_named(task)).recording, recipe.recording.fields(split), place.recording.fields(split)]
     how: dict[str, Any] = {"every_s": frames.every_s}
-    for more in (*changes, recipe.tasks[task].recording.fields()):
+    for more in (*changes, recipe.tasks[task].recording.fields(split)):
         how |= more
     spins = frames.spins
     if how["every_s"] < frames.every_s:  # the same duration, sampled more often

@@ -19,6 +19,7 @@ from flcav.optimization.problem import Budgets
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
 from flcav.statistics.streams import stream
+from flcav.world.map.parameters import RareKinds
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.weather import WeatherSchedule
 
@@ -144,10 +145,13 @@ class Recording(Config):
     every_s: Duration | None = None
     calibration_error: CalibrationError | None = None
     scenarios: tuple[Scenario, ...] | None = None
+    rare: RareKinds | None = None
+    rare_splits: tuple[SplitName, ...] | None = None  # that `rare` is for; None: all
 
-    def fields(self) -> dict[str, Any]:
-        """Return the fields that are not None, as JSON values."""
-        return {name: value for name, value in self.model_dump(mode="json").items() if value is not None}
+    def fields(self, split: SplitName) -> dict[str, Any]:
+        """Return the fields of a split that are not None, as JSON values."""
+        others = {"rare_splits"} if split in (self.rare_splits or (split,)) else {"rare", "rare_splits"}
+        return self.model_dump(mode="json", exclude=others, exclude_none=True)
 
 
 class TaskRecipe(Config):

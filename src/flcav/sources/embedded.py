@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,9 @@ class EmbeddedSource:
         self.town = load_town(recipe.town, beside)
         if recipe.randomise is not None:
             self.town = randomise_town(self.town, stream(recipe.seed, "streets", self.town.name))
+        if recipe.rare:
+            drawn = self.town.parameters.model_copy(update={"rare": recipe.rare})
+            self.town = replace(self.town, parameters=drawn)
         check_town_name(self.town.name)
         known = self.town.poles.id.tolist()
         self.poles = known if recipe.poles == "all" else list(recipe.poles)
@@ -66,7 +70,13 @@ class EmbeddedSource:
     def describe(self) -> Mapping[str, Json]:
         """Return the recipe as JSON values, with names resolved: numbers of poles, rigs, hashes of the town's files."""
         own = self.recipe.model_dump(mode="json")
-        asked = {"randomise", "window_s", "window_every_s", "window_range_m"}  # said where they are not left out
+        asked = {
+            "randomise",
+            "rare",
+            "window_s",
+            "window_every_s",
+            "window_range_m",
+        }  # left out where they are not asked for
         return {
             **{name: value for name, value in own.items() if name not in asked or value},
             "town": self.town.name,

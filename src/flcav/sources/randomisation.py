@@ -22,7 +22,7 @@ from flcav.world.map.parameters import BOUNDARIES, CLUTTER, KERBSIDE, MOST, Stre
 from flcav.world.map.relief import Relief
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import HEIGHTS, Town, furnish_town, lift_town
-from flcav.world.shapes import SHAPES
+from flcav.world.shapes import RARE, SHAPES
 from flcav.world.static import LAND_M
 from flcav.world.trace import Trace
 
@@ -58,7 +58,9 @@ def town_files(town: Town) -> Mapping[str, bytes]:
 
 def _draw_parameters(town: TownParameters, draw: Draw) -> TownParameters:
     """Return parameters of the same net: other streets, other traffic."""
-    shapes = {kind: _mix([shape.name for shape in SHAPES[kind]], draw) for kind in ("car", "van")}
+    shapes = {
+        kind: _mix([shape.name for shape in SHAPES[kind] if shape.name not in RARE], draw) for kind in ("car", "van")
+    }
     mix = _mix(["van", "truck", "bus", "motorcycle", "bicycle"], draw)
     others = draw.uniform(0.15, 0.5)
     values = town.model_dump() | {

@@ -12,6 +12,7 @@ from flcav.config import Config, InputError, read_config, shorten
 from flcav.interface.wording import suggest
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS, Rig
+from flcav.world.map.parameters import RareKinds
 from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
 from flcav.world.weather import WEATHERS, WeatherSchedule
@@ -101,6 +102,7 @@ class Recipe(Config):
     weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])  # preset, values, keyframes, classes
     calibration_error: CalibrationError = CalibrationError()  # errors of the calibration that agents assume
     scenarios: tuple[Scenario, ...] = ()  # corner cases, in every scene
+    rare: RareKinds = Field(default={})  # shares of rare kinds of objects among the vehicles of their category
     randomise: Literal["streets"] | None = None  # streets, sizes of cars and vehicles' LiDARs drawn by `seed`
 
     @model_validator(mode="after")

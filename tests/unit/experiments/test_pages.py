@@ -6,6 +6,7 @@ from reproduction_pages import TABLES, fill, fill_folder, tables_of
 
 from flcav.config import InputError, read_json
 from flcav.experiments.arms.run import ARMS, ArmsResult, order_arms
+from flcav.pipeline.results.run import Summary
 from flcav.pipeline.running import RESULTS
 from flcav.storage.markdown import format_table
 
@@ -13,7 +14,7 @@ REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"
 RUNS = sorted((REPRODUCTIONS / "runs").glob("*"))
 FEDERATIONS = sorted((REPRODUCTIONS / "federation").glob("*"))
 PAGES = [*(folder for folder in (*REPRODUCTIONS.iterdir(), *FEDERATIONS) if folder.name in TABLES), *RUNS]
-MADE = [folder for folder in PAGES if (folder / "result.json").exists() or (folder / RESULTS).exists()]
+MADE = [folder for folder in PAGES if any((folder / name).exists() for name in ("result.json", RESULTS, Summary.file))]
 
 
 @pytest.mark.parametrize("folder", MADE, ids=lambda folder: folder.name)

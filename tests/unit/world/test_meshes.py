@@ -9,7 +9,8 @@ from flcav.world.shapes import SHAPES
 from flcav.world.trace import CATEGORIES
 
 EVERY_SHAPE = [(category, index) for category in SHAPES for index in range(len(SHAPES[category]))]
-CARS = [pair for pair in EVERY_SHAPE if pair[0] in ("car", "van")]
+UNUSUAL = ("overturned", "box_van")  # one lies on its side, the other is built as a truck is
+CARS = [(kind, row) for kind, row in EVERY_SHAPE if kind in ("car", "van") and SHAPES[kind][row].name not in UNUSUAL]
 
 
 def parallel_hits(category: str, index: int, along: int, steps: int = 60):

@@ -71,12 +71,9 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
     names, tasks = graph.names, graph.recipe.tasks
     plans = dict.fromkeys(names.plan(arm.name, stage) for stage in (PRETRAIN, *arm.stages))
     *earlier, plan = (Plan.load(work / name) for name in plans)
-    trained = [
-        names.stage(arm.name, stage, region, task)
-        for task in tasks
-        for stage in arm.stages
-        for region in (arm.regions if stage != CLOUD else arm.regions[:1])
-    ]
+    trained = dict.fromkeys(
+        names.stage(arm.name, stage, region, task) for task in tasks for stage in arm.stages for region in arm.regions
+    )
     books = [Ledger.load(work / names.pretrain(arm.name, task) / LEDGER) for task in tasks]
     if arm.stages != (CENTRAL,):
         last = names.more_edge if MORE_EDGE in arm.stages else names.edge

@@ -1,6 +1,6 @@
 """Costs of federated learning: of an arm, and in the towns of pretraining."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,7 @@ def list_arm_costs(run: Run) -> tuple[ArmCost, ...]:
     for name, arm in run.arms.items():
         for task in run.recipe.tasks:
             stages = [each for each in arm.stages if each.task == task]
-            regions = {each.region for each in stages if each.region}
+            regions = (run.recipe.arms[name].regions if name != MAIN else ()) or run.recipe.with_role("federate")
             tests = _find_tests(run, name, task, stages[-1].stage if stages else "", regions)
             before = _find_tests(run, MAIN, task, PRETRAIN, regions)
             if tests and len(before) == len(tests):
@@ -41,7 +41,7 @@ def list_arm_costs(run: Run) -> tuple[ArmCost, ...]:
     return tuple(rows)
 
 
-def _find_tests(run: Run, arm: str, task: str, stage: str, regions: set[str]) -> list[Test]:
+def _find_tests(run: Run, arm: str, task: str, stage: str, regions: Collection[str]) -> list[Test]:
     asked = (arm, stage, task)
     return [test for test in run.tested if (test.arm, test.stage, test.task) == asked and test.region in regions]
 

@@ -1,5 +1,6 @@
 """Means over the seeds of a run: measures, differences and closed gaps, with intervals over seeds and scenes."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -8,9 +9,12 @@ from flcav.pipeline.analysis.differences import mean_of_tests
 from flcav.pipeline.analysis.findings import ask_all, judge_asked, name_stage
 from flcav.pipeline.arms import resolve_settings
 from flcav.pipeline.recipe import MAIN
-from flcav.pipeline.results.run import Mean, Run, Summary
+from flcav.pipeline.results.run import ClaimCount, Mean, Run, Summary
 from flcav.pipeline.results.tests import Difference, Test
 from flcav.statistics.seeds import MeanOverSeeds, average_shared, mean_over_seeds
+from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED
+
+VERDICTS = (HELD, NOT_HELD, UNDECIDED)  # of a claim
 
 
 def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
@@ -41,7 +45,18 @@ def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
         tuple(measures),
         tuple(differences),
         tuple(closed),
+        count_claims(runs),
     )
+
+
+def count_claims(runs: Sequence[Run]) -> tuple[ClaimCount, ...]:
+    """Return how many of the runs, which ask the same questions, decide each claim in which way."""
+    claims = []
+    for one, *others in zip(*(run.findings for run in runs), strict=True):
+        ways = Counter(each.verdict for each in (one, *others))
+        if one.verdict in VERDICTS:
+            claims.append(ClaimCount(one.question, one.place, one.kind, *(ways[way] for way in VERDICTS)))
+    return tuple(claims)
 
 
 def _key(test: Test) -> tuple[str, str, str, str]:

@@ -125,6 +125,25 @@ class Mean:
 
 
 @dataclass(frozen=True)
+class ClaimCount:
+    """How the runs of several seeds decide one claim, each by itself."""
+
+    question: str
+    place: str  # region, or regions, and task
+    kind: Annotated[str | None, LEFT_OUT]  # primary | secondary, where the recipe names primary claims
+    held: int
+    did_not_hold: int
+    undecided: int
+
+    def describe(self) -> str:
+        """Return the counts in words."""
+        named = f" ({self.kind} claim)" if self.kind else ""
+        seeds = self.held + self.did_not_hold + self.undecided
+        rest = f"did not hold in {self.did_not_hold}, undecided in {self.undecided}"
+        return f"{self.place}: {self.question}{named}: held in {self.held} of {seeds} seeds, {rest}"
+
+
+@dataclass(frozen=True)
 class Summary(Saved):
     """Means over several seeds of a recipe; verdicts are corrected together, on primary claims apart from others."""
 
@@ -133,3 +152,4 @@ class Summary(Saved):
     measures: tuple[Mean, ...]
     differences: tuple[Mean, ...]
     gap_closed: tuple[Mean, ...]
+    claims: tuple[ClaimCount, ...] = ()

@@ -23,7 +23,7 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold
 from flcav.pipeline.labels.tracks import fit_track_threshold
-from flcav.pipeline.recipe import CENTRAL, PRETRAIN, Budgets, Role
+from flcav.pipeline.recipe import CENTRAL, PRETRAIN, Budgets
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.training import Pretrained, StageResult, Validated
@@ -172,13 +172,27 @@ def list_pretraining(outline: Outline, arm: Setting) -> Iterator[Step]:
         yield make_step(names.pretrain(arm.name, task), pretrain_step, settings, workers=2)
 
 
-class CentralSettings(StepSettings):
-    """Settings of centralised training for a region."""
+class MoreSettings(StepSettings):
+    """Settings of further pretraining, the same for all regions of an arm."""
+
+    learning: LearningSettings
+    plan: str  # whose edge rounds it is as long as
+    pretrain: str
+    pools: Mapping[str, str]  # recordings of the candidates for upload, by region
+    vehicles: int  # whose local steps it takes: those of the largest region
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Return the names of the steps whose results it takes."""
+        return (self.plan, self.pretrain, *self.pools.values())
+
+
+class OracleSettings(StepSettings):
+    """Settings of centralised training on the annotated frames of a region's vehicles."""
 
     learning: LearningSettings
     inputs: RegionInputs
-    vehicles: int  # of the region, whose local steps it takes
-    source: Role  # pretrain: the uploaded samples; federate: the training frames of the region's vehicles
+    vehicles: int  # whose local steps it takes: those of the region
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -186,31 +200,51 @@ class CentralSettings(StepSettings):
         return self.inputs.needs
 
 
-def central_step(work: Work, settings: CentralSettings) -> None:
+def more_step(work: Work, settings: MoreSettings) -> None:
+    """Continue pretraining, for as many optimiser steps as stage II takes in the largest region."""
+    learning = settings.learning.resolve()
+    trained = load_stage_network(learning.task, work.inputs[settings.pretrain])
+    samples = load_uploads(work, learning, trained.config, settings.pretrain, settings.pools)
+    _train_on(work, learning, trained, samples, settings.plan, settings.vehicles, None)
+
+
+def oracle_step(work: Work, settings: OracleSettings) -> None:
     """Continue training centrally on ground truth, for as many optimiser steps as stage II takes in the region."""
     learning, inputs = settings.learning.resolve(), settings.inputs
-    trained = load_stage_network(learning.task, work.inputs[inputs.pretrain])
-    if settings.source == "pretrain":
-        samples = load_uploads(work, learning, trained.config, inputs.pretrain, inputs.pools)
-    else:
-        split = Frames.open(work.inputs[inputs.frames])
-        held = learning.task.samples(split.data, trained.config, select_group(work, split, inputs))
-        samples = [held[number] for number in range(len(held))]  # in memory: each is drawn many times
-    rounds = Plan.load(work.inputs[inputs.plan]).tasks[settings.learning.task].edge_rounds
-    losses = train_centrally(learning, trained, samples, rounds, settings.vehicles, settings.source)
-    save_network(learning.task, trained, work.folder / WEIGHTS)
-    about = (CENTRAL, settings.learning.task, inputs.region, rounds, len(samples), 1, ())
-    StageResult(*about, losses).save(work.folder)
+    trained, split = (
+        load_stage_network(learning.task, work.inputs[inputs.pretrain]),
+        Frames.open(work.inputs[inputs.frames]),
+    )
+    held = learning.task.samples(split.data, trained.config, select_group(work, split, inputs))
+    samples = [held[number] for number in range(len(held))]  # in memory: each is drawn many times
+    _train_on(work, learning, trained, samples, inputs.plan, settings.vehicles, inputs.region)
+
+
+def _train_on(
+    work: Work, learning: Learning, network: Any, samples: Sequence[Any], plan: str, vehicles: int, region: str | None
+) -> None:
+    """Train a network centrally; write its weights and the result of the stage: `region` None is that of all."""
+    task = learning.task.name
+    rounds = Plan.load(work.inputs[plan]).tasks[task].edge_rounds
+    losses = train_centrally(learning, network, samples, rounds, vehicles, PRETRAIN if region is None else "federate")
+    save_network(learning.task, network, work.folder / WEIGHTS)
+    StageResult(CENTRAL, task, region, rounds, len(samples), 1, (), losses).save(work.folder)
 
 
 def list_central_steps(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
-    """Yield the centralised training of an arm for a task, in each of its regions."""
+    """Yield the centralised training of an arm for a task: one for all of its regions, or one in each."""
+    names, learning = outline.names, outline.learning(arm, task)
+    if arm.central == PRETRAIN:
+        settings = MoreSettings(
+            learning=learning,
+            plan=names.plan(arm.name, CENTRAL),
+            pretrain=names.pretrain(arm.name, task),
+            pools=outline.pools(task),
+            vehicles=max(outline.vehicles[region] for region in arm.regions),
+        )
+        yield make_step(names.central(arm.name, arm.regions[0], task), more_step, settings)
+        return
     for region in arm.regions:
         inputs = outline.inputs(arm, region, task, CENTRAL)
-        settings = CentralSettings(
-            learning=outline.learning(arm, task),
-            inputs=inputs.model_copy(update={"pools": outline.pools(task)}),
-            vehicles=outline.vehicles[region],
-            source=arm.central or "pretrain",
-        )
-        yield make_step(outline.names.central(arm.name, region, task), central_step, settings)
+        settings = OracleSettings(learning=learning, inputs=inputs, vehicles=outline.vehicles[region])
+        yield make_step(names.central(arm.name, region, task), oracle_step, settings)

@@ -8,7 +8,7 @@ from flcav.report import style
 from flcav.report.charts import runs
 from flcav.report.charts.runs import Row
 from flcav.report.pictures import clouds, maps
-from flcav.statistics.seeds import MeanOverSeeds
+from flcav.statistics.estimates import Estimate
 
 WIDTH = 3.8  # [inch] of a figure that a phone shows
 ACROSS = 2  # entries of a map's key in a line
@@ -72,14 +72,14 @@ def gains(costs: Mapping[str, Sequence[Row]]) -> Figure:
 
 
 @style.styled
-def arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> Figure:
-    """Return a forest plot of AP50 by arm, a panel per town."""
+def arms(towns: Mapping[str, Mapping[str, Estimate]], label: str = "AP50 (95 % interval)") -> Figure:
+    """Return a forest plot of AP50, or of what `label` says, by arm, a panel per town."""
     figure = style.canvas(6.4, 0.9 + 0.32 * sum(map(len, towns.values())))
     panels = figure.subplots(len(towns), sharex=True, squeeze=False)[:, 0]
     for axes, (town, rows) in zip(panels, towns.items(), strict=True):
         runs.draw_arms(axes, town, rows)
         axes.set_title(town, fontweight="bold")
-    figure.axes[-1].set_xlabel("AP50 (95 % interval)")
+    figure.axes[-1].set_xlabel(label)
     return figure
 
 

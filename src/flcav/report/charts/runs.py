@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from flcav.report import style
-from flcav.statistics.seeds import MeanOverSeeds
+from flcav.statistics.estimates import Estimate
 
 Row = Mapping[str, Any]
 
@@ -169,7 +169,7 @@ def draw_gains(axes: Axes, rows: Sequence[Row]) -> None:
     axes.grid(axis="y")
 
 
-def draw_arms(axes: Axes, town: str, rows: Mapping[str, MeanOverSeeds]) -> None:
+def draw_arms(axes: Axes, town: str, rows: Mapping[str, Estimate]) -> None:
     """Draw the forest plot of a town: mean and interval of each arm, with the numbers."""
     colour = _colour(town, [town])
     for y, ap in enumerate(rows.values()):

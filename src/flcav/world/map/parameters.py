@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from flcav.config import Config
 from flcav.interface.wording import suggest
-from flcav.world.shapes import SHAPES
+from flcav.world.shapes import ANGLED, PARKED_ONLY, RARE, SHAPES
 
 LARGEST_M = 1000.0
 MOST = 10_000  # vehicles, or pedestrians
@@ -62,6 +62,17 @@ def _mix(value: dict[str, float], allowed: list[str]) -> dict[str, float]:
     return value
 
 
+def _rare_kinds(value: dict[str, float]) -> dict[str, float]:
+    """Return the shares; raises `ValueError` for an unknown kind, and where those of a category exceed its vehicles."""
+    if unknown := sorted(set(value) - set(RARE)):
+        raise ValueError(f"unknown {unknown[0]!r}; allowed: {', '.join(RARE)}{suggest(unknown[0], list(RARE))}")
+    for category in dict.fromkeys(RARE.values()):
+        shares = [share for kind, share in value.items() if RARE[kind] == category and kind != ANGLED]
+        if min(shares, default=0.0) < 0 or sum(shares) > 1 or not 0 <= value.get(ANGLED, 0.0) <= 1:
+            raise ValueError(f"shares of kinds of '{category}' must be >= 0 and at most 1 together")
+    return value
+
+
 def _clutter_mix(value: dict[str, float]) -> dict[str, float]:
     return _mix(value, list(CLUTTER))
 
@@ -76,6 +87,7 @@ def _kerbside_mix(value: dict[str, float]) -> dict[str, float]:
 
 Interval = Annotated[tuple[float, float], AfterValidator(_interval)]
 Extent = Annotated[tuple[float, float], AfterValidator(_extent)]
+RareKinds = Annotated[dict[str, float], AfterValidator(_rare_kinds)]
 VehicleMix = Annotated[dict[str, float], AfterValidator(_vehicle_mix)]
 ClutterMix = Annotated[dict[str, float], AfterValidator(_clutter_mix)]
 BoundaryMix = Annotated[dict[str, float], AfterValidator(_boundary_mix)]
@@ -212,6 +224,7 @@ class TownParameters(Config):
     pedestrians: Many  # pedestrians walking at once
     mix: VehicleMix  # categories of moving vehicles with their weights
     shapes: dict[str, dict[str, float]] = Field(default={})  # weights of shapes, by category; equal where left out
+    rare: RareKinds = Field(default={})  # kinds of corner cases, with their shares among the vehicles of their category
     streets: dict[str, StreetParameters]  # parameters of the streets, by the net's edge type
     poles: tuple[PoleParameters, ...] = ()  # candidate sites of roadside sensors
     signs: tuple[SignParameters, ...] = ()  # signs of the map; signs of the same sort are not placed by rule then
@@ -227,14 +240,16 @@ class TownParameters(Config):
     def _known_shapes(self) -> "TownParameters":
         for category, weights in self.shapes.items():
             _mix({category: 1.0}, list(SHAPES))
-            _mix(weights, [shape.name for shape in SHAPES[category]])
+            _mix(weights, [shape.name for shape in SHAPES[category] if shape.name not in RARE])
         ids = [pole.id for pole in self.poles]
         if len(set(ids)) != len(ids):
             raise ValueError("pole ids must differ")
         return self
 
-    def shape_weights(self, category: str) -> list[float]:
-        """Return the probabilities of a category's shapes, in the order of `SHAPES`."""
-        weights = self.shapes.get(category) or {shape.name: 1.0 for shape in SHAPES[category]}
-        total = sum(weights.values())
-        return [weights.get(shape.name, 0.0) / total for shape in SHAPES[category]]
+    def shape_weights(self, category: str, *, parked: bool = False) -> list[float]:
+        """Return the probabilities of a category's shapes, in the order of `SHAPES`: of moving or `parked` vehicles."""
+        rare = {kind: share for kind, share in self.rare.items() if kind != ANGLED and RARE[kind] == category}
+        rare = {kind: share for kind, share in rare.items() if parked or kind not in PARKED_ONLY}
+        weights = self.shapes.get(category) or {shape.name: 1.0 for shape in SHAPES[category] if shape.name not in RARE}
+        total, common = sum(weights.values()), 1 - sum(rare.values())
+        return [rare.get(shape.name, weights.get(shape.name, 0.0) / total * common) for shape in SHAPES[category]]

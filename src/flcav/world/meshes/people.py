@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flcav.world.materials import Material
-from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join_meshes, sheet, tube
+from flcav.world.meshes.mesh import Mesh, box, ellipsoid, join_meshes, sheet, transform_mesh, tube
 from flcav.world.shapes import Shape
 
 Point = tuple[float, float, float]
@@ -80,6 +80,10 @@ def bicycle(shape: Shape) -> Mesh:
     parts.append(box((-0.60, 0, 0.68), (0.03, 0.07, 0.07), Material.TAILLAMP))
     neck = (-0.18 + lean, 0.0, 0.97 + np.sqrt(0.55**2 - lean**2))
     parts.append(_rider(saddle, neck, knee_x=0.18, feet=((0.02, 0.18), (-0.14, 0.42)), hand=(0.38, 0.25, 1.02)))
+    if shape.name == "cargo_bike":  # the front wheel is ahead of a box for children or goods
+        parts = [transform_mesh(join_meshes(parts), -0.40, 0.0)]
+        parts.append(box((0.62, 0.0, 0.52), (0.85, 0.62, 0.55), Material.PAINT))
+        parts += [_spoked_wheel(1.06, 0.25, 0.03), box((0.75, 0.0, 0.20), (0.9, 0.06, 0.06), Material.METAL)]
     return join_meshes(parts)
 
 

@@ -1,5 +1,9 @@
 """Meshes of cars, vans, trucks and buses: their profiles, and what is built onto the body."""
 
+from collections.abc import Callable
+
+import numpy as np
+
 from flcav.world.materials import Material
 from flcav.world.meshes.bodywork import Profile, roof_sign, vehicle_body, wheel
 from flcav.world.meshes.mesh import Mesh, add_mirror_image, box, join_meshes, transform_mesh
@@ -134,6 +138,8 @@ _BUS = Profile(
 
 def car(shape: Shape) -> Mesh:
     """Return the car or van `shape`, in its body frame; a taxi has a roof sign."""
+    if shape.name in _MAKERS:
+        return _MAKERS[shape.name](shape)
     if shape.name == "taxi":
         top = shape.height - TAXI_SIGN_M
         return join_meshes((vehicle_body(PROFILES["taxi"], shape.length, shape.width, top), roof_sign(-0.2, top)))
@@ -171,6 +177,56 @@ def bus(shape: Shape) -> Mesh:
         parts.append(add_mirror_image(box((row, width * 0.27, height * 0.42), (0.12, 0.90, 0.70), Material.INTERIOR)))
         row += 0.95
     return join_meshes(parts)
+
+
+def _trailer_car(shape: Shape) -> Mesh:
+    """Return a hatchback with a trailer of boards, which stands 0.5 m behind it on an axle of its own."""
+    length, width, height = shape[1:]
+    front, rear, bed = 4.05, -length / 2, 2.55
+    middle, wall = rear + bed / 2, width / 2 - 0.20
+    parts = [transform_mesh(vehicle_body(PROFILES["hatchback"], front, width, height), length / 2 - front / 2, 0)]
+    parts.append(box((middle, 0, 0.52), (bed, 2 * wall, 0.08), Material.TRIM))
+    parts.append(add_mirror_image(box((middle, wall, 0.78), (bed, 0.04, 0.45), Material.METAL)))
+    parts += [box((x, 0, 0.78), (0.04, 2 * wall, 0.45), Material.METAL) for x in (rear + 0.02, rear + bed - 0.02)]
+    parts.append(box((middle, 0, 0.95), (bed * 0.8, wall * 1.6, 0.30), Material.CLOTH))  # its load
+    parts.append(box((rear + bed + 0.42, 0, 0.45), (0.9, 0.08, 0.08), Material.METAL))  # drawbar
+    parts.append(add_mirror_image(transform_mesh(wheel(0.29, 0.16), middle, width / 2 - 0.10)))
+    parts.append(_rear_lights(rear, width * 0.8))
+    return join_meshes(parts)
+
+
+def _overturned(shape: Shape) -> Mesh:
+    """Return a hatchback that lies on its right side."""
+    upright = vehicle_body(PROFILES["hatchback"], shape.length, shape.height, shape.width)
+    x, y, z = upright.vertices.T
+    low = float(y.min())
+    return Mesh(np.stack((x, shape.width / 2 - z, y - low), axis=1).astype(np.float32), upright.faces, upright.material)
+
+
+def _ladder_van(shape: Shape) -> Mesh:
+    """Return a panel van with two ladders on its roof."""
+    length, width, top = shape.length, shape.width, shape.height - 0.30
+    parts = [vehicle_body(PROFILES["panel_van"], length, width, top)]
+    for x in (-0.38 * length, 0.05 * length):
+        parts.append(box((x, 0, top + 0.08), (0.06, 0.80 * width, 0.16), Material.METAL))
+    for y, z in ((0.25, 0.20), (-0.30, 0.20), (-0.30, 0.27)):
+        rails = [
+            box((-0.15 * length, y + d, top + z), (0.68 * length, 0.04, 0.06), Material.METAL) for d in (-0.2, 0.2)
+        ]
+        rungs = [
+            box((x, y, top + z), (0.04, 0.40, 0.04), Material.METAL)
+            for x in np.linspace(-0.47 * length, 0.17 * length, 12)
+        ]
+        parts += [*rails, *rungs]
+    return join_meshes(parts)
+
+
+_MAKERS: dict[str, Callable[[Shape], Mesh]] = {
+    "trailer_car": _trailer_car,
+    "overturned": _overturned,
+    "ladder_van": _ladder_van,
+    "box_van": lambda shape: truck(shape),
+}
 
 
 def _cargo(middle: float, bed: float, width: float, height: float) -> Mesh:

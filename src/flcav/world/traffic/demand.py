@@ -3,7 +3,7 @@
 Vehicles and pedestrians are under way to the end of the run. Both parts are redrawn for every traffic seed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement, tostring
@@ -19,7 +19,7 @@ from flcav.world.map.imported import outline_space
 from flcav.world.map.parameters import TownParameters
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
-from flcav.world.shapes import SHAPES
+from flcav.world.shapes import ANGLED, RARE, SHAPES
 from flcav.world.traffic.passages import find_passages
 from flcav.world.traffic.reach import find_driven, find_walked
 
@@ -29,6 +29,7 @@ FROM_JUNCTION_M = 6.0  # kept free at both ends of a parking lane
 KERB_GAP_M = (0.1, 0.3)  # limits of the gap between wheels and kerb
 BUMPER_GAP_M = (0.6, 1.8)  # limits of the gap between neighbours
 CROOKED = 0.12  # share of vehicles parked at a larger angle
+ANGLE_RAD = (0.35, 0.75)  # of vehicles parked at an angle: half on the pavement
 BACKWARDS = 0.06  # share of vehicles parked against the driving direction
 VANS = 0.1  # share of vans in the parking spaces of a map
 DOOR_M = 0.2  # by which a parking space is wider than the vehicle in it, at least
@@ -79,16 +80,20 @@ def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) 
             along = FROM_JUNCTION_M + random.uniform(0.0, 3.0)
             while True:
                 category = categories[int(random.choice(len(categories), p=shares / shares.sum()))]
-                shape = int(random.choice(len(SHAPES[category]), p=parameters.shape_weights(category)))
+                shape = _draw_parked_shape(category, parameters, random)
                 length, width = SHAPES[category][shape].length, SHAPES[category][shape].width
                 taken, backwards = random.random() < street.parked, random.random() < BACKWARDS
                 crooked = random.normal(0.0, 0.07 if random.random() < CROOKED else 0.012)
                 kerb_gap, bumper_gap = random.uniform(*KERB_GAP_M), random.uniform(*BUMPER_GAP_M)
                 if along + length > verge.line.length - FROM_JUNCTION_M:
                     break
-                if taken and width < lane.width + OVERHANG_M:
+                angled = parameters.rare.get(ANGLED, 0.0) if category == RARE[ANGLED] else 0.0
+                if angled and random.random() < angled:
+                    crooked = float(random.choice((-1, 1)) * random.uniform(*ANGLE_RAD))
+                elif taken and width < lane.width + OVERHANG_M:
                     room = lane.width + OVERHANG_M - width
                     crooked = float(np.clip(crooked, -0.8 * room / length, 0.8 * room / length))
+                if taken and width < lane.width + OVERHANG_M:
                     needed = width + length * abs(np.sin(crooked))
                     right = lane.width / 2 - min(kerb_gap, lane.width + OVERHANG_M - needed) - needed / 2
                     x, y, heading = verge.at(along + length / 2, right)
@@ -102,11 +107,16 @@ def _park_in_spaces(parameters: TownParameters, random: np.random.Generator) -> 
     """Yield the vehicles in the parking spaces of a map: of those that fit, in the middle, either way round."""
     for space in parameters.parking:
         taken, category = random.random() < parameters.parking_taken, "van" if random.random() < VANS else "car"
-        shape = int(random.choice(len(SHAPES[category]), p=parameters.shape_weights(category)))
+        shape = _draw_parked_shape(category, parameters, random)
         yaw = np.radians(space.yaw_deg) + random.normal(0.0, 0.015) + np.pi * (random.random() < 0.5)
         size = SHAPES[category][shape]
         if taken and size.length <= space.length_m and size.width + DOOR_M <= space.width_m:
             yield Parked(category, shape, space.x, space.y, float(wrap_angle(yaw)))
+
+
+def _draw_parked_shape(category: str, parameters: TownParameters, random: np.random.Generator) -> int:
+    """Return the row of `SHAPES[category]` of a parked vehicle."""
+    return int(random.choice(len(SHAPES[category]), p=parameters.shape_weights(category, parked=True)))
 
 
 class Successor(NamedTuple):
@@ -151,6 +161,7 @@ def write_demand(
     watched = weigh_pole_approaches(net, parameters)
     watching = np.array([watched.get(edge.id, 0.0) for edge in driven])
     by_car, on_foot = find_driven(net, driven), find_walked(net, walked)
+    mid_car, mid_foot = find_middles(driven), find_middles(walked)
     reach = FASTEST * until_s
     trips: list[tuple[float, Element]] = []
     passages = find_passages(net, driven)
@@ -158,7 +169,7 @@ def write_demand(
     for i in range(cavs):
         random = stream(seed, "cav", i)
         weight, depart = watching if watching.any() else traffic, 0.0
-        edges = draw_tour(driven, by_car, weight, reach, random)
+        edges = draw_tour(driven, mid_car, by_car, weight, reach, random)
         if edges[-1] in exits:
             depart = round(max(from_s - (i + 1) * HEADWAY_S, 0.0), 1)
             least_s = until_s - depart
@@ -171,7 +182,7 @@ def write_demand(
         random = stream(seed, "vehicle", i)
         kind = draw_type(categories[int(random.choice(len(categories), p=shares / shares.sum()))], parameters, random)
         depart = round(float(random.uniform(0.0, fill_s)), 1)
-        tour = draw_tour(driven, by_car, traffic, reach, random)
+        tour = draw_tour(driven, mid_car, by_car, traffic, reach, random)
         if tour[-1] not in exits:
             trips.append((depart, _vehicle(f"veh{i}", kind, depart, tour)))
             continue
@@ -188,7 +199,7 @@ def write_demand(
         random = stream(seed, "pedestrian", i)
         kind = draw_type("pedestrian", parameters, random)
         depart = round(float(random.uniform(0.0, fill_s)), 1)
-        tour = draw_tour(walked, on_foot, footfall, FASTEST_WALK * until_s, random)
+        tour = draw_tour(walked, mid_foot, on_foot, footfall, FASTEST_WALK * until_s, random)
         tour = [edge for i, edge in enumerate(tour) if edge != tour[i - 1] or not i]  # nobody walks on the spot
         if len(tour) > 1:
             trips.append((depart, _person(f"ped{i}", kind, depart, tour)))
@@ -214,15 +225,25 @@ def weigh_pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str,
     return out
 
 
+def find_middles(edges: Sequence[Edge]) -> Array:
+    """Return the middle (N, 2) of the first lane of each edge [m]."""
+    return np.array([edge.lanes[0].shape.mean(axis=0) for edge in edges]).reshape(-1, 2)
+
+
 def draw_tour(
-    edges: list[Edge], reach: NDArray[np.bool_], weight: Array, length_m: float, random: np.random.Generator
+    edges: Sequence[Edge],
+    middle: Array,
+    reach: NDArray[np.bool_],
+    weight: Array,
+    length_m: float,
+    random: np.random.Generator,
 ) -> list[str]:
     """Return the ids of edges to visit in order, drawn by `weight` (N,), at least `length_m` long as the crow flies.
 
-    `reach` (N, N) says which edges can be reached from which. The tour starts where it can go on, if there is such an
-    edge, and ends early where it cannot. Weights that are all zero count as equal.
+    `middle` (N, 2) are the edges' places [m], see `find_middles`; `reach` (N, N) says which edges can be reached from
+    which. The tour starts where it can go on, if there is such an edge, and ends early where it cannot. Weights that
+    are all zero count as equal.
     """
-    middle = np.array([edge.lanes[0].shape.mean(axis=0) for edge in edges])
     weight = weight if weight.any() else np.ones(len(edges))
     going_on = weight * (reach & (weight > 0)).any(axis=1)
     share = going_on / going_on.sum() if going_on.any() else weight / weight.sum()

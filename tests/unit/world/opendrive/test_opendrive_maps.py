@@ -22,7 +22,7 @@ from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map
 from flcav.world.opendrive.objects.signs import find_signs
 from flcav.world.static import TownPart, build_static_world
-from flcav.world.traffic.demand import draw_tour
+from flcav.world.traffic.demand import draw_tour, find_middles
 from flcav.world.traffic.reach import find_driven, find_walked
 from flcav.world.traffic.traffic import simulate
 
@@ -157,7 +157,7 @@ def test_tours_go_only_where_there_is_a_way() -> None:
     reach = find_driven(net, edges)
     np.testing.assert_array_equal(reach, np.array([[1, 1, 1, 0], [1, 1, 1, 0], [0, 0, 0, 0], [0, 0, 0, 1]], bool))
     for seed in range(20):
-        tour = draw_tour(edges, reach, np.ones(4), 500.0, np.random.default_rng(seed))
+        tour = draw_tour(edges, find_middles(edges), reach, np.ones(4), 500.0, np.random.default_rng(seed))
         assert tour[0] != "c"  # nobody starts where nothing follows
         assert "d" not in tour or set(tour) == {"d"}
         assert all(reach["abcd".index(one), "abcd".index(other)] for one, other in pairwise(tour))
