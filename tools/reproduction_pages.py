@@ -18,6 +18,8 @@ from flcav.experiments.arms.run import ArmsResult
 from flcav.experiments.attacks import tables as attack_tables
 from flcav.experiments.attacks.faults import FaultsResult
 from flcav.experiments.attacks.leakage import LeakageResult
+from flcav.experiments.corner_cases.run import CornerCaseResult
+from flcav.experiments.corner_cases.tables import corner_case_tables
 from flcav.experiments.distillation import tables as distillation_tables
 from flcav.experiments.distillation.run import DistillationResult
 from flcav.experiments.exchanges import tables as exchange_tables
@@ -28,6 +30,8 @@ from flcav.experiments.fig3b import tables as fig3b_tables
 from flcav.experiments.fig3b.run import Fig3b
 from flcav.experiments.fig6a import tables as fig6a_tables
 from flcav.experiments.fig6a.results import AllocationResult
+from flcav.experiments.gap.run import GapResult
+from flcav.experiments.gap.tables import gap_tables
 from flcav.experiments.networks.run import NetworksResult
 from flcav.experiments.networks.tables import networks_tables
 from flcav.experiments.placement import tables as placement_tables
@@ -65,7 +69,9 @@ def _of_study(
 
 
 TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of (content of its result.json, path)
+    "corner-cases": _told(CornerCaseResult, corner_case_tables),
     "demo": _told(ArmsResult, arms_tables.tables),
+    "gap": _told(GapResult, gap_tables),
     "distillation": _told(DistillationResult, distillation_tables.tables),
     "exchange": _told(ExchangeResult, exchange_tables.tables),
     "exchange-objects": _told(ExchangeResult, exchange_tables.tables),

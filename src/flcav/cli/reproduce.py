@@ -31,6 +31,7 @@ IMPORTED = "quarter"  # map of the package, imported into the folder of the proo
 class Target(StrEnum):
     """Targets other than the tasks' studies."""
 
+    corner_cases = "corner-cases"
     demo_arms = "demo-arms"
     distillation = "distillation"
     federation_exchange = "federation-exchange"
@@ -82,7 +83,7 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.sim_to_real: (*RUN, "kitti", "weights"),
 }
 SEEDS: Mapping[str, int] = {
-    **dict.fromkeys((Target.demo_arms, *EXCHANGES, *ATTACKS), 5),
+    **dict.fromkeys((Target.corner_cases, Target.demo_arms, *EXCHANGES, *ATTACKS), 5),
     **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
 }
 
@@ -108,8 +109,8 @@ def reproduce(
         None,
         "--seeds",
         min=1,
-        help="Number of seeds, from 1: 8 of federation-exchange and placement, 5 of demo-arms and the other "
-        "federation-*, 3 of the others if not given.",
+        help="Number of seeds, from 1: 8 of federation-exchange and placement, 5 of corner-cases, demo-arms and the "
+        "other federation-*, 3 of the others if not given.",
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
@@ -312,7 +313,22 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName,
     _write_figures(out, results.as_json(), draw_proof(results), [*results.sentences(), *describe_claims(results)])
 
 
+def _corner_cases(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
+    from flcav.experiments.corner_cases.run import compare_corner_cases, draw_corner_cases
+    from flcav.experiments.scales import shrink_recipe
+    from flcav.interface import progress
+    from flcav.pipeline.running import WORK
+
+    how: Any = (seeds, scale, jobs, engine, stale, shrink_recipe)
+    recipe, runs = _run_seeds(Target.corner_cases, "corner_cases", out, *how)
+    works = [out / f"seed{run.recipe.seed}" / WORK for run in runs]
+    with progress.show_progress("rare kinds") as report:
+        results = compare_corner_cases(recipe, runs, works, report)
+    _write_figures(out, results.as_json(), {"arms.png": draw_corner_cases(results)}, results.sentences())
+
+
 COMPARISONS: Mapping[str, Callable[[Path, int, str, int, EngineName, Stale], None]] = {
+    Target.corner_cases: _corner_cases,
     Target.demo_arms: _demo_arms,
     Target.distillation: _distillation,
     **{target: partial(_federation_exchange, Target(target)) for target in EXCHANGES},
