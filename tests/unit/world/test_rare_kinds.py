@@ -8,7 +8,7 @@ import shapely
 
 from flcav.config import InputError, parse_config
 from flcav.pipeline.frames import make_recording_recipe
-from flcav.pipeline.recipe import RunRecipe
+from flcav.pipeline.recipe import RunRecipe, SplitName
 from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import stream
 from flcav.world.map.parameters import TownParameters
@@ -115,9 +115,10 @@ def test_a_region_has_them_in_the_splits_that_it_names() -> None:
             "budgets_mb": {"wireless": 9, "wireline": 9},
         }
     )
+    pairs: list[tuple[str, SplitName]] = [("suburb", "test"), ("grid", "edge"), ("grid", "test"), ("ring", "edge")]
     asked = {
         (region, split): make_recording_recipe(recipe, region, split, "objects", "recording").rare
-        for region, split in (("suburb", "test"), ("grid", "edge"), ("grid", "test"), ("ring", "edge"))
+        for region, split in pairs
     }
     assert {pair for pair, rare in asked.items() if rare == {"box_van": 0.2}} == {("grid", "test"), ("ring", "edge")}
     assert [pair for pair, rare in asked.items() if not rare] == [("suburb", "test"), ("grid", "edge")]

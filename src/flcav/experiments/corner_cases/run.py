@@ -23,11 +23,12 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_frames
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import CARS, FrameTruth
+from flcav.perception.weights import load_network
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import Run
-from flcav.pipeline.training.learning import load_stage_network
+from flcav.pipeline.results.saved import WEIGHTS
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
@@ -122,7 +123,7 @@ def compare_corner_cases(
 def score_arm(run: Run, work: Path, arm: str, town: str) -> RareScore:
     """Return the scores of an arm's network on a town's test frames."""
     name, stage = ARMS[arm]
-    network = load_stage_network(OBJECTS, work / run.steps.stage(name, stage, town, TASK))
+    network = load_network(OBJECTS, work / run.steps.stage(name, stage, town, TASK) / WEIGHTS)
     return score_rare(network, Frames.open(work / run.steps.recording(town, "test", TASK)))
 
 
