@@ -26,6 +26,7 @@ from flcav.pipeline.recipe import (
     MORE_EDGE,
     PRETRAIN,
     Arm,
+    Fault,
     Federation,
     PlacementSettings,
     RunRecipe,
@@ -49,6 +50,7 @@ LEARNED = (  # those that decide a federation
     "repeat",
     "placement",
     "labels",
+    "fault",
     "distillation",
     "federation",
 )
@@ -66,6 +68,7 @@ class Setting:
     plan: PlanRule
     placement: PlacementSettings
     labels: Mapping[str, str]  # kind of labels, by task
+    fault: Fault | None  # of the labels, the rest of which are ground truth
     distillation: Distillation  # where the labels are the road average
     federation: Federation
     training: Mapping[str, Training]  # by task
@@ -117,6 +120,7 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         arm.plan,
         PlacementSettings.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
         dict(labels) | dict(arm.labels),
+        arm.fault,
         Distillation.model_validate((recipe.distillation or Distillation()).model_dump() | dict(arm.distillation)),
         Federation.model_validate(recipe.federation.model_dump() | dict(arm.federation)),
         {
@@ -184,6 +188,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
         )
     if how.replay and (how.personal or isinstance(edge, FedMD)):
         raise InputError("federation.replay: the cloud's own training goes with whole networks, not personal or fedmd")
+    if setting.fault is not None and not all(LABEL_SOURCES[kind].tracked for kind in setting.labels.values()):
+        raise InputError(f"fault: '{setting.fault}' is one of labels by tracks; choose 'tracks' or 'road+tracks'")
     _check_numbers(recipe, setting, edge)
     _check_bare_labels(setting)
     if isinstance(edge, FedMD) and setting.central is None:

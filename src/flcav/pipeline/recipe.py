@@ -31,6 +31,7 @@ MORE_EDGE = "more_edge"  # after stage II: as many further edge rounds as stage 
 
 Role = Literal["pretrain", "federate", "unseen"]
 SplitName = Literal["pool", "validation", "registry", "edge", "test"]
+Fault = Literal["missed", "unsure", "false", "boxes"]  # see `flcav.pipeline.labels.faults`
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_]*$")]
 Count = Annotated[int, Field(ge=0, le=10**6)]
 Positive = Annotated[float, Field(gt=0)]
@@ -262,6 +263,7 @@ class Arm(Config):
     placement: Mapping[str, Any] = {}  # fields of `PlacementSettings` that differ from the run
     federation: Mapping[str, Any] = {}  # fields of `Federation` that differ from the run
     labels: Mapping[str, str] = {}  # kinds of labels that differ from the run, by task
+    fault: Fault | None = None  # learn from ground truth with this one fault of the labels, which come from tracks
     distillation: Mapping[str, Any] = {}  # fields of `Distillation` that differ from the run
     training: Mapping[str, Any] = {}  # fields of `Training` that differ from the run, for every task
     central: Literal["pretrain", "federate"] | None = (

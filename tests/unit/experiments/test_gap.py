@@ -7,16 +7,21 @@ import pytest
 
 from flcav.experiments.gap.run import (
     ARMS,
+    BOXES,
+    FALSE,
+    FOURFOLD,
     GLOBAL,
     HOME,
     JOINED,
+    MISSED,
     MORE,
     ORACLE,
     PRETRAINED,
     ROAD,
-    SLOW,
     TRACKS,
     TRUTH,
+    TWICE,
+    UNSURE,
     GapResult,
     compare_gap,
     draw_gap,
@@ -30,11 +35,16 @@ RECIPE = load_run_recipe(recipe_path("runs/gap"))
 AP50 = {
     PRETRAINED: 0.5,
     MORE: 0.53,
-    SLOW: 0.6,
     ROAD: 0.66,
     TRACKS: 0.7,
     JOINED: 0.72,
+    MISSED: 0.75,
+    UNSURE: 0.77,
+    FALSE: 0.79,
+    BOXES: 0.72,
     TRUTH: 0.8,
+    TWICE: 0.83,
+    FOURFOLD: 0.85,
     GLOBAL: 0.68,
     ORACLE: 0.9,
 }
@@ -62,9 +72,10 @@ def test_the_arms_are_those_of_the_recipe() -> None:
 def test_shares_of_the_gap_and_costs_at_home() -> None:
     found = compare_gap(RECIPE, cast(Any, [run_of(1, 0.0), run_of(2, 0.02)]))
     assert found.closed50[PRETRAINED].mean == 0
-    assert found.closed50[ORACLE].mean == pytest.approx(1)
-    assert found.closed50[TRACKS].mean == pytest.approx(0.5)  # (.7 - .5) / (.9 - .5)
-    assert found.closed70[TRUTH].mean == pytest.approx(0.75)
+    assert found.closed50[TRUTH].mean == pytest.approx(1)
+    assert found.closed50[TRACKS].mean == pytest.approx(2 / 3)  # (.7 - .5) / (.8 - .5)
+    assert found.closed70[ORACLE].mean == pytest.approx(4 / 3)
+    assert found.differences[f"{TRUTH} - {BOXES}"].mean == pytest.approx(0.08)
     assert found.differences[f"{TRACKS} - {ROAD}"].mean == pytest.approx(0.04)
     assert {name: mean.mean for name, mean in found.cost_at_home.items()} == pytest.approx(
         {"AP50": -0.02, "AP70": -0.01}
@@ -73,7 +84,7 @@ def test_shares_of_the_gap_and_costs_at_home() -> None:
     assert GapResult.from_json(found.as_json(), "x") == found
     shown = gap_tables(found)
     assert f"| {TRACKS} | 0.710" in shown["arms"]
-    assert shown["arms"].splitlines()[6].endswith("| 0.900 | 0.800 |")
+    assert next(row for row in shown["arms"].splitlines() if f"| {TRACKS} |" in row).endswith("| 0.900 | 0.800 |")
     assert "AP50 0.880, AP70 0.440" in shown["home"]
     assert f"| {ORACLE} | 0.900, 0.450 | 0.920, 0.460 |" in shown["seeds"]
     assert any(line.startswith("at home, AP50: -0.020") for line in found.sentences())

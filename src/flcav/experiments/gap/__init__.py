@@ -1,1 +1,1 @@
-"""Comparison of federations and label sources by the share of the oracle's gain that they reach."""
+"""The comparison of federations and label sources by the share of what ground truth gains."""

@@ -1,9 +1,10 @@
-"""Comparison of federations and label sources by their share of the oracle's gain: the arms of recipes/runs/gap.yaml.
+"""Comparison of federations and label sources by their share of what ground truth gains: recipes/runs/gap.yaml.
 
-Centralised training on ground truth (*oracle*) bounds what any stage II can reach on these frames; stage II on ground
-truth tells what the federation itself costs, with its rates and steps; the others tell what labels cost. Beside the
-town that federates stands the town of pretraining, where boxes may get worse. Over seeds, which have recordings of
-their own, intervals cover training and traffic. The verdicts on all differences are corrected together.
+Centralised training on ground truth (*oracle*) is what stage II on ground truth is compared with, which tells what the
+federation itself costs, with its rates and steps; ground truth with one fault of the tracks at a time tells what each
+fault costs. Beside the town that federates stands the town of pretraining, where boxes may get worse. Over seeds, which
+have recordings of their own, intervals cover training and traffic. The verdicts on all differences are corrected
+together.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,30 +23,44 @@ from flcav.storage.records import Record
 
 TASK, TOWN, HOME = "objects", "grid", "suburb"
 PRETRAINED, MORE, ORACLE = "pretrained", "more pretraining", "centralised on ground truth"
-TRUTH, SLOW = "edge FL on ground truth", "edge FL on ground truth, few steps"
+TRUTH, TWICE, FOURFOLD = (
+    f"edge FL on ground truth{how}" for how in ("", ", twice the steps", ", four times the steps")
+)
+MISSED, UNSURE = "ground truth, missed objects background", "ground truth, missed objects neutral"
+FALSE, BOXES = "ground truth, and false boxes", "ground truth, boxes of tracks"
 ROAD, TRACKS, JOINED = "edge FL on road labels", "edge FL on tracks", "edge FL on road labels and tracks"
 GLOBAL = "edge + cloud FL on tracks, with replay"
 ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     PRETRAINED: (MAIN, PRETRAIN),
     MORE: ("more", CENTRAL),
-    SLOW: ("slow", EDGE),
     ROAD: ("road", EDGE),
     TRACKS: (MAIN, EDGE),
     JOINED: ("joined", EDGE),
+    MISSED: ("missed", EDGE),
+    UNSURE: ("unsure", EDGE),
+    FALSE: ("false", EDGE),
+    BOXES: ("boxes", EDGE),
     TRUTH: ("truth", EDGE),
+    TWICE: ("twice", EDGE),
+    FOURFOLD: ("fourfold", EDGE),
     GLOBAL: (MAIN, CLOUD),
     ORACLE: ("oracle", CENTRAL),
 }
 AT_HOME = (PRETRAINED, GLOBAL)  # scored in the town of pretraining, too
 COMPARED = (  # (after, before): claims that the difference in AP50 is positive
-    (TRUTH, SLOW),
     (TRUTH, PRETRAINED),
-    (ORACLE, TRUTH),
     (TRACKS, PRETRAINED),
     (TRACKS, MORE),
     (TRACKS, ROAD),
     (JOINED, TRACKS),
     (TRUTH, TRACKS),
+    (TRUTH, MISSED),
+    (UNSURE, MISSED),
+    (TRUTH, FALSE),
+    (TRUTH, BOXES),
+    (TWICE, TRUTH),
+    (FOURFOLD, TWICE),
+    (ORACLE, TRUTH),
 )
 
 
@@ -67,7 +82,7 @@ class GapResult(Record):
     home: Mapping[str, Mapping[str, GapArm]]  # in the town of pretraining
     ap50: Mapping[str, MeanOverSeeds]  # by arm
     ap70: Mapping[str, MeanOverSeeds]
-    closed50: Mapping[str, MeanOverSeeds]  # share of the gap in AP50 from pretrained to centralised on ground truth
+    closed50: Mapping[str, MeanOverSeeds]  # share of what edge FL on ground truth gains in AP50
     closed70: Mapping[str, MeanOverSeeds]
     differences: Mapping[str, MeanOverSeeds]  # "after - before", in AP50
     cost_at_home: Mapping[str, MeanOverSeeds]  # of edge + cloud FL against pretrained, in AP50 and AP70
@@ -77,8 +92,8 @@ class GapResult(Record):
     def sentences(self) -> list[str]:
         """Return AP and share of the gap by arm, the verdicts on differences, and the change at home, in words."""
         reached = [
-            f"{arm}: AP50 {mean.describe()}, of the gap {self.closed50[arm].describe()}; "
-            f"AP70 {self.ap70[arm].describe()}, of the gap {self.closed70[arm].describe()}"
+            f"{arm}: AP50 {mean.describe()}, of its gain on truth {self.closed50[arm].describe()}; "
+            f"AP70 {self.ap70[arm].describe()}, of its gain on truth {self.closed70[arm].describe()}"
             for arm, mean in self.ap50.items()
         ]
         home = [f"at home, {name}: {mean.describe(sign=True)}" for name, mean in self.cost_at_home.items()]
@@ -95,7 +110,7 @@ def compare_gap(recipe: RunRecipe, runs: Sequence[Run]) -> GapResult:
         return mean_over_seeds([getattr(seed[arm], field) for seed in each], share=True)
 
     def closed(arm: str, field: str) -> MeanOverSeeds:
-        of = [[getattr(seed[name], field) for name in (PRETRAINED, arm, ORACLE)] for seed in each]
+        of = [[getattr(seed[name], field) for name in (PRETRAINED, arm, TRUTH)] for seed in each]
         return mean_over_seeds([gap_closed(*values) for values in of])
 
     def gain(seeds: Sequence[Mapping[str, GapArm]], after: str, before: str, field: str) -> MeanOverSeeds:

@@ -24,7 +24,8 @@ def _arms(results: GapResult) -> str:
         labels = (_mean([getattr(each, field) for each in own]) for field in ("precision", "recall"))
         numbers = (results.ap50, results.closed50, results.ap70, results.closed70)
         rows.append([name, *(each[name].describe() for each in numbers), *labels])
-    titles = ("arm", "AP50", "share of its gap", "AP70", "share of its gap", "labels' precision", "labels' recall")
+    share = "share of the gain of truth"
+    titles = ("arm", "AP50", share, "AP70", share, "labels' precision", "labels' recall")
     return format_table(titles, rows)
 
 

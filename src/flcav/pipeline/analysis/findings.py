@@ -104,7 +104,7 @@ def _name_claim(each: Difference) -> str:
 
 def _is_bound(own: Setting, other: Setting, task: str) -> bool:
     """Return whether an arm is an upper bound of the run: it learns from truth that the run does not have."""
-    first, second = (LABEL_SOURCES[setting.labels[task]].bound for setting in (own, other))
+    first, second = (LABEL_SOURCES[each.labels[task]].bound or each.fault is not None for each in (own, other))
     return other.central == "federate" or (second and not first)
 
 

@@ -165,6 +165,7 @@ class Outline:
             "budgets_mb": recipe.budgets_mb,
             "vehicles": self.vehicles,
             "labels": arm.labels[task],
+            "fault": arm.fault,
             "distillation": arm.distillation if LABEL_SOURCES[arm.labels[task]].averaged else None,
             "navigation": recipe.navigation if LABEL_SOURCES[arm.labels[task]].placed else NavigationErrors(),
             "train_s": recipe.tasks[task].train_s if timed else 0.0,

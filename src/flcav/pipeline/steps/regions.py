@@ -17,6 +17,7 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.label_sources import LABEL_SOURCES, LabelSource
+from flcav.pipeline.labels.faults import give_fault
 from flcav.pipeline.labels.pseudo_labels import (
     annotated_samples,
     label_frames,
@@ -93,7 +94,11 @@ def label_samples(
     where = (split, frames, poles, inputs.region, work.report, first, kind.trained, settings.navigation)
     if inputs.tracks is not None:
         tracks = load_tracks(work.inputs[inputs.tracks])
-        return LabelledSamples(label_frames(label_tracked(tracks, threshold, frozen.config), *where), poles)
+        samples = label_frames(label_tracked(tracks, threshold, frozen.config), *where)
+        if settings.fault is not None:
+            truth = annotated_samples(task, frozen.config, split, frames, inputs.region)
+            samples = give_fault(truth, samples, settings.fault)
+        return LabelledSamples(samples, poles)
     return LabelledSamples(pseudo_label_samples(frozen, threshold, *where), poles)
 
 

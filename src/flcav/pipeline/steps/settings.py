@@ -10,7 +10,7 @@ from flcav.fusion.navigation import NavigationErrors
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.perception.tasks import task_named
 from flcav.pipeline.engine import Step, Work
-from flcav.pipeline.recipe import Budgets, Federation, Training
+from flcav.pipeline.recipe import Budgets, Fault, Federation, Training
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.training.learning import Learning
@@ -69,6 +69,7 @@ class FederationSettings(StepSettings):
     budgets_mb: Budgets  # of the run
     vehicles: Mapping[str, int]  # of each federating region
     labels: str  # kind of labels, see `LABEL_SOURCES`
+    fault: Fault | None = None  # of the labels, the rest of which are ground truth
     distillation: Distillation | None = None  # of the labels "road-average"
     navigation: NavigationErrors = NavigationErrors()  # of the vehicles
     train_s: float = 0.0  # time that a vehicle of speed 1 trains in a round [s], on a network
