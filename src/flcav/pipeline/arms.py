@@ -73,6 +73,7 @@ class Setting:
     federation: Federation
     training: Mapping[str, Training]  # by task
     central: Literal["pretrain", "federate"] | None
+    uploads: int | None  # frames of each region that centralised training has; None: all
     regions: tuple[str, ...]  # that federate
     stages: tuple[str, ...]  # after pretraining
     replanned: bool  # whether the rest is planned again after stages I and II, from what the run itself reached
@@ -128,6 +129,7 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
             for task in recipe.tasks
         },
         arm.central,
+        arm.uploads,
         arm.regions or recipe.with_role("federate"),
         (CENTRAL,) if arm.central else arm.stages,
         learned and recipe.replan != "none",

@@ -269,11 +269,20 @@ class Arm(Config):
     central: Literal["pretrain", "federate"] | None = (
         None  # train centrally on the ground truth of the regions of this role
     )
+    uploads: int | None = Field(
+        default=None, ge=1
+    )  # with `central: federate`: train on so many frames that vehicles upload with their annotations; None: on all
     stages: tuple[Literal["edge", "cloud", "more_edge"], ...] = (
         "edge",
         "cloud",
     )  # stages of federated learning to run; more_edge: further edge rounds instead of the cloud rounds
     regions: tuple[str, ...] | None = None  # federating regions that take part; default: all
+
+    @model_validator(mode="after")
+    def _uploads_are_learned_from(self) -> "Arm":
+        if self.uploads is not None and self.central != "federate":
+            raise ValueError("uploads: of centralised training alone; it goes with 'central: federate'")
+        return self
 
     @field_validator("stages")
     @classmethod

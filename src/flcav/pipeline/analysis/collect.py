@@ -75,6 +75,8 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
         names.stage(arm.name, stage, region, task) for task in tasks for stage in arm.stages for region in arm.regions
     )
     books = [Ledger.load(work / names.pretrain(arm.name, task) / LEDGER) for task in tasks]
+    if arm.uploads is not None:
+        books += [Ledger.load(work / step / LEDGER) for step in trained]
     if arm.stages != (CENTRAL,):
         last = names.more_edge if MORE_EDGE in arm.stages else names.edge
         books += [Ledger.load(work / last(arm.name, region, task) / LEDGER) for task in tasks for region in arm.regions]

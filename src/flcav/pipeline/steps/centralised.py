@@ -23,14 +23,21 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold
 from flcav.pipeline.labels.tracks import fit_track_threshold
-from flcav.pipeline.recipe import CENTRAL, PRETRAIN, Budgets
+from flcav.pipeline.recipe import CENTRAL, EDGE, PRETRAIN, Budgets
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.training import Pretrained, StageResult, Validated
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.planning import list_frames
 from flcav.pipeline.steps.regions import load_uploads, select_group
-from flcav.pipeline.steps.settings import LearningSettings, RegionInputs, StepSettings, make_step, share_plan_budget
+from flcav.pipeline.steps.settings import (
+    LearningSettings,
+    RegionInputs,
+    StepSettings,
+    make_step,
+    read_entries,
+    share_plan_budget,
+)
 from flcav.pipeline.training.checkpoints import LAST
 from flcav.pipeline.training.learning import Learning, load_stage_network
 from flcav.pipeline.training.messages import choose_planned_uploads, choose_uploads, upload_samples
@@ -193,6 +200,8 @@ class OracleSettings(StepSettings):
     learning: LearningSettings
     inputs: RegionInputs
     vehicles: int  # whose local steps it takes: those of the region
+    uploads: int | None = None  # frames that the vehicles upload; None: all are there, whatever that would cost
+    budgets_mb: Budgets  # of the run
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -215,7 +224,16 @@ def oracle_step(work: Work, settings: OracleSettings) -> None:
         load_stage_network(learning.task, work.inputs[inputs.pretrain]),
         Frames.open(work.inputs[inputs.frames]),
     )
-    held = learning.task.samples(split.data, trained.config, select_group(work, split, inputs))
+    frames = select_group(work, split, inputs)
+    if settings.uploads is None:
+        held = learning.task.samples(split.data, trained.config, frames)
+    else:
+        share = share_plan_budget(Plan.load(work.inputs[inputs.plan]), settings.budgets_mb, learning.task.name)
+        book = Ledger(share, read_entries(work, inputs.pretrain))
+        before = len(book.entries)
+        chosen = choose_uploads({inputs.region: frames}, settings.uploads, settings.learning.seed)[inputs.region]
+        held = upload_samples(book, learning.task, trained.config, inputs.region, split, chosen, EDGE)
+        Ledger(share, book.entries[before:]).save(work.folder / LEDGER)
     samples = [held[number] for number in range(len(held))]  # in memory: each is drawn many times
     _train_on(work, learning, trained, samples, inputs.plan, settings.vehicles, inputs.region)
 
@@ -246,5 +264,11 @@ def list_central_steps(outline: Outline, arm: Setting, task: str) -> Iterator[St
         return
     for region in arm.regions:
         inputs = outline.inputs(arm, region, task, CENTRAL)
-        settings = OracleSettings(learning=learning, inputs=inputs, vehicles=outline.vehicles[region])
+        settings = OracleSettings(
+            learning=learning,
+            inputs=inputs,
+            vehicles=outline.vehicles[region],
+            uploads=arm.uploads,
+            budgets_mb=outline.recipe.budgets_mb,
+        )
         yield make_step(names.central(arm.name, region, task), oracle_step, settings)

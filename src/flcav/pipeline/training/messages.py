@@ -133,14 +133,16 @@ def choose_planned_uploads(
 
 
 def upload_samples(
-    book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int]
+    book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int], stage: str = PRETRAIN
 ) -> Sequence[Any]:
     """Return the samples of frames as they reach the cloud: from vehicle to edge server (wireless), then by wireline.
+
+    Messages enter `book` under `stage`.
 
     Samples of a task without messages of its own are read from the recording, each on access.
     """
     shared, received = as_shared(task), []
-    about: Any = {"stage": PRETRAIN, "task": task.name, "direction": "up"}
+    about: Any = {"stage": stage, "task": task.name, "direction": "up"}
     for frame, message in zip(chosen, shared.pack_samples(pool.data, config, chosen), strict=True):
         key = pool.data.keys[frame]
         at_edge = send(book, message, **about, link="wireless", client=f"{key.scene}/{key.agent}")
