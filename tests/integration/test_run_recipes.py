@@ -11,6 +11,7 @@ from performed_steps import in_mb, perform, uplinks
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
+from flcav.experiments.gap.megabytes import UPLOADED, trace_bytes
 from flcav.federation.privacy import Privacy
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.trajectory.config import CONFIGURATIONS
@@ -114,7 +115,7 @@ def test_a_forecast_refuses_what_the_run_would(tmp_path: Path) -> None:
 def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(tmp_path: Path) -> None:
     """Both stages take the tracks of one step; the cloud's own training crosses no link."""
     recipe = shrunk("gap")
-    arms = {name: arm for name, arm in recipe.arms.items() if name in ("joined", "truth")}
+    arms = {name: arm for name, arm in recipe.arms.items() if name in ("joined", "truth", "missed", "sweeps6")}
     found = run(recipe.model_copy(update={"arms": arms}), tmp_path)
     work = tmp_path / "work"
     assert {path.name for path in work.glob("*tracks*")} == {"grid-tracks-objects", "grid-tracks-objects-joined"}
@@ -124,15 +125,27 @@ def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(tmp_path:
     watched = Frames.open(work / "suburb-validation-objects")
     assert (len(watched.data), len(watched.vehicles)) == (11, 1)
     assert 0 < (Pretrained.load(work / "pretrain-objects").track_threshold or 0) <= 1
-    for name in (MAIN, *arms):
+    for name in (MAIN, "joined", "truth", "missed"):
         labels = next(each.labels for each in found.arms[name].stages if each.stage == EDGE)
         assert labels is not None
         assert labels[0].recall == (1 if name == "truth" else labels[0].recall)
+        assert name not in ("truth", "missed") or labels[0].precision in (1, None)
     sent = Ledger.load(work / "cloud-fl-objects" / LEDGER).entries
     assert {entry.client for entry in sent if entry.stage == CLOUD} == {"grid", "grid/cav0"}
     (cloud,) = (each for each in found.arms[MAIN].stages if each.stage == CLOUD)
     assert cloud.records
     assert cloud.records[0].clients == ("grid", "cloud-replay")
+
+    book = Ledger.load(work / "grid-central-objects-sweeps6" / LEDGER)
+    (upload,) = (row.bytes / 1e6 for row in book.entries if row.link == "wireless")  # of the one frame there is
+    curves = trace_bytes(found, work, "grid")
+    assert [point.mb for point in curves[UPLOADED]] == [0, upload]
+    spent = {row.stage: row.mb for row in found.arms["sweeps6"].spent if row.link == "wireless"}
+    assert spent == {"pretrain": found.arms[MAIN].spent[0].mb, "edge": upload, "cloud": 0}
+    up = [row for row in sent if (row.stage, row.link, row.direction) == (EDGE, "wireless", "up")]
+    assert {row.round for row in up} == {0, 1}  # errors, and weights
+    assert [point.mb for point in curves["edge FL on tracks"]] == [0, sum(row.bytes for row in up) / 1e6]
+    assert len({point.ap50 for points in curves.values() for point in points[:1]}) == 1  # all begin with one network
 
 
 def test_three_tasks_share_a_plan_and_a_ledger(three_tasks: tuple[Path, Run]) -> None:

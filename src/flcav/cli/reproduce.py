@@ -265,11 +265,16 @@ def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: EngineNa
 
 
 def _gap(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
-    from flcav.experiments.gap.run import compare_gap, draw_gap
+    from flcav.experiments.gap.megabytes import trace_bytes
+    from flcav.experiments.gap.run import TOWN, compare_gap, draw_gap, draw_megabytes
     from flcav.experiments.scales import shrink_recipe
+    from flcav.pipeline.running import WORK
 
-    results = compare_gap(*_run_seeds(Target.gap, "gap", out, seeds, scale, jobs, engine, stale, shrink_recipe))
-    _write_figures(out, results.as_json(), {"arms.png": draw_gap(results)}, results.sentences())
+    recipe, runs = _run_seeds(Target.gap, "gap", out, seeds, scale, jobs, engine, stale, shrink_recipe)
+    curves = [trace_bytes(run, out / f"seed{run.recipe.seed}" / WORK, TOWN) for run in runs]
+    results = compare_gap(recipe, runs, curves)
+    pictures = {"arms.png": draw_gap(results), "megabytes.png": draw_megabytes(results)}
+    _write_figures(out, results.as_json(), pictures, results.sentences())
 
 
 @when_interrupted()

@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import pytest
 
+from flcav.experiments.gap.megabytes import FEDERATED, ROUNDS, AtBytes, list_uploads
 from flcav.experiments.gap.run import (
     ARMS,
     BOXES,
@@ -25,6 +26,7 @@ from flcav.experiments.gap.run import (
     GapResult,
     compare_gap,
     draw_gap,
+    draw_megabytes,
 )
 from flcav.experiments.gap.tables import gap_tables
 from flcav.pipeline.recipe import MAIN, load_run_recipe
@@ -65,12 +67,19 @@ def run_of(seed: int, more: float) -> Any:
 
 
 def test_the_arms_are_those_of_the_recipe() -> None:
-    assert {arm for arm, _ in ARMS.values()} == {MAIN, *RECIPE.arms}
+    assert {arm for arm, _ in ARMS.values()} == {MAIN, *RECIPE.arms} - {arm for arm, _ in list_uploads(RECIPE)}
     assert set(AP50) == set(ARMS)
+    assert {*FEDERATED.values()} <= {MAIN, *RECIPE.arms}
+    assert [number for _, number in list_uploads(RECIPE)] == [6, 15, 30, 59]
+    assert RECIPE.tasks["objects"].plan is not None
+    assert RECIPE.tasks["objects"].plan.edge_rounds == ROUNDS[-1]
 
 
 def test_shares_of_the_gap_and_costs_at_home() -> None:
-    found = compare_gap(RECIPE, cast(Any, [run_of(1, 0.0), run_of(2, 0.02)]))
+    curves = [{"edge FL on tracks": (AtBytes("3 rounds", 8.0, 0.6 + more),)} for more in (0.0, 0.02)]
+    found = compare_gap(RECIPE, cast(Any, [run_of(1, 0.0), run_of(2, 0.02)]), curves)
+    (point,) = found.megabytes["edge FL on tracks"]
+    assert (point.mb, point.ap50.mean) == (8.0, pytest.approx(0.61))
     assert found.closed50[PRETRAINED].mean == 0
     assert found.closed50[TRUTH].mean == pytest.approx(1)
     assert found.closed50[TRACKS].mean == pytest.approx(2 / 3)  # (.7 - .5) / (.8 - .5)
@@ -88,4 +97,5 @@ def test_shares_of_the_gap_and_costs_at_home() -> None:
     assert "AP50 0.880, AP70 0.440" in shown["home"]
     assert f"| {ORACLE} | 0.900, 0.450 | 0.920, 0.460 |" in shown["seeds"]
     assert any(line.startswith("at home, AP50: -0.020") for line in found.sentences())
-    assert draw_gap(found).startswith(b"\x89PNG")
+    assert "| edge FL on tracks | 3 rounds | 8.0 | 0.610" in shown["megabytes"]
+    assert all(draw(found).startswith(b"\x89PNG") for draw in (draw_gap, draw_megabytes))

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from flcav.config import Json
+from flcav.experiments.gap.megabytes import Curves, MeanAtBytes, average_curves
 from flcav.pipeline.analysis.histories import gap_closed
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
@@ -86,6 +87,7 @@ class GapResult(Record):
     closed70: Mapping[str, MeanOverSeeds]
     differences: Mapping[str, MeanOverSeeds]  # "after - before", in AP50
     cost_at_home: Mapping[str, MeanOverSeeds]  # of edge + cloud FL against pretrained, in AP50 and AP70
+    megabytes: Mapping[str, tuple[MeanAtBytes, ...]]  # AP50 against uplink megabytes, by curve
     recipe: Mapping[str, Json]
     provenance: Provenance
 
@@ -97,11 +99,16 @@ class GapResult(Record):
             for arm, mean in self.ap50.items()
         ]
         home = [f"at home, {name}: {mean.describe(sign=True)}" for name, mean in self.cost_at_home.items()]
-        return [*reached, *describe_means(self.differences), *home]
+        at_bytes = [
+            f"{name}, {point.label}, {point.mb:.1f} MB: AP50 {point.ap50.describe()}"
+            for name, points in self.megabytes.items()
+            for point in points
+        ]
+        return [*reached, *describe_means(self.differences), *home, *at_bytes]
 
 
-def compare_gap(recipe: RunRecipe, runs: Sequence[Run]) -> GapResult:
-    """Return the results of the arms of `recipe`, from a run of each seed."""
+def compare_gap(recipe: RunRecipe, runs: Sequence[Run], curves: Sequence[Curves]) -> GapResult:
+    """Return the results of the arms of `recipe`, from a run of each seed and its `curves` of accuracy by bytes."""
     seeds = {str(run.recipe.seed): {name: _reached(run, name, TOWN) for name in ARMS} for run in runs}
     home = {str(run.recipe.seed): {name: _reached(run, name, HOME) for name in AT_HOME} for run in runs}
     each, at_home = [*seeds.values()], [*home.values()]
@@ -125,6 +132,7 @@ def compare_gap(recipe: RunRecipe, runs: Sequence[Run]) -> GapResult:
         closed70={arm: closed(arm, "ap70") for arm in ARMS},
         differences={f"{after} - {before}": gain(each, after, before, "ap50") for after, before in COMPARED},
         cost_at_home={name: gain(at_home, GLOBAL, PRETRAINED, name.lower()) for name in ("AP50", "AP70")},
+        megabytes=average_curves(curves),
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
         provenance=provenance(),
     )
@@ -139,6 +147,12 @@ def _reached(run: Run, name: str, town: str) -> GapArm:
     labels = stages[0].labels if stages and stage == EDGE else None
     quality = (labels[0].precision, labels[0].recall) if labels else (None, None)
     return GapArm(test.estimate.mean, ap70, *quality)
+
+
+def draw_megabytes(results: GapResult) -> bytes:
+    """Return AP50 against uplink megabytes, a line per curve, as a PNG."""
+    lines = {name: [(point.mb, point.ap50) for point in points] for name, points in results.megabytes.items()}
+    return style.png(figures.by_megabytes(lines))
 
 
 def draw_gap(results: GapResult) -> bytes:

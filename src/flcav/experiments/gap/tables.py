@@ -13,6 +13,7 @@ def gap_tables(results: GapResult) -> dict[str, str]:
         "arms": _arms(results),
         "differences": tabulate_means("difference in AP50", results.differences),
         "home": _home(results),
+        "megabytes": _megabytes(results),
         "seeds": _seeds(results),
     }
 
@@ -35,6 +36,15 @@ def _home(results: GapResult) -> str:
         own = [seed[name] for seed in results.home.values()]
         rows.append([name, f"AP50 {_mean([each.ap50 for each in own])}, AP70 {_mean([each.ap70 for each in own])}"])
     return format_table((f"in {HOME}", "mean over seeds"), rows)
+
+
+def _megabytes(results: GapResult) -> str:
+    rows = [
+        [name, point.label, f"{point.mb:.1f}", point.ap50.describe()]
+        for name, points in results.megabytes.items()
+        for point in points
+    ]
+    return format_table(("training", "after", "uplink MB", "AP50"), rows)
 
 
 def _seeds(results: GapResult) -> str:

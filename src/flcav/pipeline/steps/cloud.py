@@ -101,13 +101,13 @@ class CloudFederation:
     def open_replay(self) -> dict[str, Trainable]:
         """Return the cloud's own training by its name, if there is any.
 
-        It counts for so many samples that its share is right where all vehicles take part in a round.
+        It counts for so many samples, one at least, that its share is right where all vehicles take part in a round.
         """
         if self.replay is None:
             return {}
         steps = self.learning.training.local_steps
         samples = sum(each.count_samples(steps) for own in self.regions.values() for each in own.clients.values())
-        return {REPLAY: Replay(self.replay, round(samples * self.replay_share / (1 - self.replay_share)))}
+        return {REPLAY: Replay(self.replay, max(round(samples * self.replay_share / (1 - self.replay_share)), 1))}
 
     def vehicles(self, region: str) -> Mapping[str, Trainable]:
         """Return the clients of a region's edge server, by name."""

@@ -84,6 +84,14 @@ def arms(towns: Mapping[str, Mapping[str, Estimate]], label: str = "AP50 (95 % i
 
 
 @style.styled
+def by_megabytes(lines: Mapping[str, Sequence[tuple[float, Estimate]]]) -> Figure:
+    """Return AP50 against uplink megabytes, with intervals: a line per name."""
+    figure = style.canvas(1.6 * WIDTH, 0.9 * WIDTH)
+    runs.draw_by_megabytes(figure.add_subplot(), lines)
+    return figure
+
+
+@style.styled
 def overview(
     scene: maps.ErrorMap, sweep: clouds.ComparedSweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
 ) -> Figure:

@@ -169,6 +169,20 @@ def draw_gains(axes: Axes, rows: Sequence[Row]) -> None:
     axes.grid(axis="y")
 
 
+def draw_by_megabytes(axes: Axes, lines: Mapping[str, Sequence[tuple[float, Estimate]]]) -> None:
+    """Draw AP50 against uplink megabytes: a line per name, with the interval of each point."""
+    colours = (style.BLUE, *style.OTHER_COLOURS)
+    for number, (name, points) in enumerate(lines.items()):
+        colour = colours[number % len(colours)]
+        axes.plot([x for x, _ in points], [ap.mean for _, ap in points], "o-", color=colour, label=name, markersize=4)
+        for x, ap in points:
+            if ap.low is not None and ap.high is not None:
+                axes.plot([x, x], [ap.low, ap.high], color=colour, linewidth=0.8)
+    axes.set(xlabel="wireless uplink [MB]", ylabel="AP50 (95 % interval)", xlim=(0, None))
+    axes.legend(loc="lower right", frameon=False)
+    axes.grid(axis="y")
+
+
 def draw_arms(axes: Axes, town: str, rows: Mapping[str, Estimate]) -> None:
     """Draw the forest plot of a town: mean and interval of each arm, with the numbers."""
     colour = _colour(town, [town])
