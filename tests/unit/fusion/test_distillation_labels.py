@@ -238,9 +238,15 @@ def test_precision_and_recall_of_labels_count_targets_once_and_neutral_ones_not(
     found = measure_labels(3, split, (0, 1), "grid", {"grid/cav0": [first], "grid/cav1": [second]}, CONFIG)
     assert (found.round, found.labels, found.targets) == (3, 5, 6)
     assert (found.precision, found.recall) == (pytest.approx(3 / 5), pytest.approx(3 / 6))
+    assert (found.tight, found.size_m) == (pytest.approx(3 / 3), 0)  # .3 m along 4 m or more: IoU above .7
+    assert found.offset_m == 0  # the median of 0, 0 and .3
+    low = Sample(points, replace(boxes((10.5, 0), z=-1.0), size=boxes((10.5, 0)).size - (0, 0, 0.4)))
+    worse = measure_labels(3, split, (0, 1), "grid", {"grid/cav0": [low], "grid/cav1": [low]}, CONFIG)
+    assert (worse.tight, worse.offset_m, worse.size_m) == (0, pytest.approx(0.5), pytest.approx(0.4))
     nothing = Sample(points, Boxes.empty())
     none = measure_labels(1, split, (0, 1), "grid", {"grid/cav0": [nothing], "grid/cav1": [nothing]}, CONFIG)
     assert (none.precision, none.recall) == (None, 0.0)
+    assert none.tight is none.offset_m is none.size_m is None
 
 
 def test_navigation_is_off_by_what_it_states() -> None:

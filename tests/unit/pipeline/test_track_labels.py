@@ -3,12 +3,15 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from flcav.config import InputError
 from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes
@@ -21,6 +24,7 @@ from flcav.perception.weights import find_shipped, load_network
 from flcav.pipeline.frames import Frames, list_window, record_frames
 from flcav.pipeline.labels.pseudo_labels import label_frames
 from flcav.pipeline.labels.tracks import label_tracked, load_tracks, save_tracks, track_frame
+from flcav.pipeline.steps.tracking import check_windows
 from flcav.sources.recipe import Recipe
 
 DRIVE = {"town": "suburb", "seed": 5, "scenes": 2, "spins_per_scene": 1, "cavs": 2, "warmup_s": 40.0, "window_s": 0.6}
@@ -134,3 +138,15 @@ def test_boxes_of_a_pole_join_the_tracks_by_its_classes(folder: Path, network) -
     assert joined.score.max() == pytest.approx(1.0)  # what the road tells of is sure
     assert 0 <= len(joined) - len(alone) <= 1  # the truck is none of the network's classes
     assert replace(joined, score=None).label.tolist().count("truck") == 0
+
+
+def test_sweeps_that_stand_alone_are_refused_in_a_sentence() -> None:
+    def split(*times: tuple[str, float]) -> Frames:
+        keys = [SimpleNamespace(scene=scene, agent="ego", time_s=time_s) for scene, time_s in times]
+        return Frames(cast(Any, SimpleNamespace(keys=keys)), tuple(range(len(keys))), {})
+
+    check_windows(split(("a", 0.0), ("a", 0.5), ("b", 0.0)), (0, 1, 2), "real")  # one of three stands alone
+    check_windows(split(), (), "real")
+    for times in ((("a", 0.0), ("b", 0.0)), (("a", 0.0), ("a", 1.5))):
+        with pytest.raises(InputError, match=r"^real: labels by tracks need sweeps within 1 s of one another"):
+            check_windows(split(*times), (0, 1), "real")

@@ -99,11 +99,13 @@ def test_rounds_are_a_table_curves_and_rows_of_the_page(tmp_path: Path) -> None:
 
 def test_the_page_has_precision_and_recall_of_labels_where_they_were_measured() -> None:
     run = made_up_run()
-    labels = (LabelQuality(1, 8, 10, 0.75, 0.6), LabelQuality(2, 0, 10, None, 0.0))
+    labels = (LabelQuality(1, 8, 10, 0.75, 0.6, 0.5, 0.21, 0.3), LabelQuality(2, 0, 10, None, 0.0))
     stage = StageResult(EDGE, "objects", "grid", 2, 9, 2, (), (0.5, 0.25), labels=labels)
     measured = replace(run, arms={MAIN: replace(run.arms[MAIN], stages=(stage,))})
     text = html.render(page(measured), {})
-    assert "<td>grid</td><td>1</td><td>8</td><td>10</td><td>0.750</td><td>0.600</td>" in text
+    numbers = "<td>0.750</td><td>0.600</td><td>0.500</td><td>0.210</td><td>0.300</td>"
+    assert f"<td>grid</td><td>1</td><td>8</td><td>10</td>{numbers}" in text
+    assert "<td>–</td><td>0.000</td><td>–</td><td>–</td><td>–</td>" in text
     assert Run.from_json(measured.as_json(), "run").arms[MAIN].stages == (stage,)
     assert "Labels that vehicles learn from" not in html.render(page(run), {})
 

@@ -82,7 +82,7 @@ class StatisticsScore(Record):
 
 @dataclass(frozen=True)
 class LabelQuality(Record):
-    """Precision and recall of the labels that vehicles train on, against ground truth that they do not know.
+    """Precision, recall and boxes of the labels that vehicles train on, against ground truth that they do not know.
 
     A label is right that matches a target at IoU 0.5 in 3D; labels on neutral objects do not count.
     """
@@ -92,6 +92,9 @@ class LabelQuality(Record):
     targets: int
     precision: float | None  # None: no labels
     recall: float | None  # None: no targets
+    tight: Annotated[float | None, LEFT_OUT] = None  # share of right labels with an IoU of 0.7 or more; None: none
+    offset_m: Annotated[float | None, LEFT_OUT] = None  # median distance of their centres from the objects', in 3D [m]
+    size_m: Annotated[float | None, LEFT_OUT] = None  # median of their largest error in length, width or height [m]
 
 
 @dataclass(frozen=True)

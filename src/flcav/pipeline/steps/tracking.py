@@ -1,15 +1,16 @@
 """The step in which a region's vehicles track objects through the sweeps around their training frames, for labels."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+from flcav.config import InputError
 from flcav.fusion.navigation import NavigationErrors
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.engine import Step, Work
-from flcav.pipeline.frames import Frames
+from flcav.pipeline.frames import Frames, list_window
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.labels.pseudo_labels import road_views
-from flcav.pipeline.labels.tracks import save_tracks, track_frame
+from flcav.pipeline.labels.tracks import WINDOW_S, save_tracks, track_frame
 from flcav.pipeline.recipe import TRACKING
 from flcav.pipeline.results.training import TrackedFrames
 from flcav.pipeline.steps.outline import Outline
@@ -38,6 +39,7 @@ def track_step(work: Work, settings: TrackSettings) -> None:
     split = Frames.open(work.inputs[inputs.frames])
     network = load_stage_network(task_named(settings.task), work.inputs[inputs.pretrain])
     frames, poles = select_group(work, split, inputs), choose_poles(work, split, inputs, kind)
+    check_windows(split, frames, inputs.region)
     spins = {i: (split.data.keys[i].scene, split.data.keys[i].index) for i in frames}
     views = road_views(split, poles, kind.trained, set(spins.values()))
     tracks = {}
@@ -47,6 +49,18 @@ def track_step(work: Work, settings: TrackSettings) -> None:
         work.report(done, len(frames), "tracks")
     save_tracks(tracks, work.folder)
     TrackedFrames(inputs.region, len(tracks), sum(map(len, tracks.values()))).save(work.folder)
+
+
+def check_windows(split: Frames, frames: Sequence[int], region: str) -> None:
+    """Raise `InputError` where no vehicle recorded a second sweep around any of a region's `frames`, to track through.
+
+    Frames of a simulated town have them; a recorded or imported dataset has where its sweeps follow one another.
+    """
+    if frames and all(len(list_window(split, (i,), WINDOW_S)) == 1 for i in frames):
+        raise InputError(
+            f"{region}: labels by tracks need sweeps within {WINDOW_S:g} s of one another, with the vehicle's poses, "
+            "and all sweeps of this dataset stand alone; take a sequence, or other labels"
+        )
 
 
 def list_tracks(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
