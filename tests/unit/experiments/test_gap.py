@@ -9,6 +9,7 @@ from flcav.experiments.gap.megabytes import FEDERATED, ROUNDS, AtBytes, list_upl
 from flcav.experiments.gap.run import (
     ARMS,
     BOXES,
+    DENSEST,
     FALSE,
     FOURFOLD,
     GLOBAL,
@@ -40,6 +41,7 @@ AP50 = {
     ROAD: 0.66,
     TRACKS: 0.7,
     JOINED: 0.72,
+    DENSEST: 0.7,
     MISSED: 0.75,
     UNSURE: 0.77,
     FALSE: 0.79,

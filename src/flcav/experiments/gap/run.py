@@ -29,7 +29,8 @@ TRUTH, TWICE, FOURFOLD = (
 )
 MISSED, UNSURE = "ground truth, missed objects background", "ground truth, missed objects neutral"
 FALSE, BOXES = "ground truth, and false boxes", "ground truth, boxes of tracks"
-ROAD, TRACKS, JOINED = "edge FL on road labels", "edge FL on tracks", "edge FL on road labels and tracks"
+ROAD, TRACKS = "edge FL on road labels", "edge FL on tracks"
+JOINED, DENSEST = "edge FL on road labels and tracks", "edge FL on road labels and tracks, densest pole"
 GLOBAL = "edge + cloud FL on tracks, with replay"
 ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     PRETRAINED: (MAIN, PRETRAIN),
@@ -37,6 +38,7 @@ ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     ROAD: ("road", EDGE),
     TRACKS: (MAIN, EDGE),
     JOINED: ("joined", EDGE),
+    DENSEST: ("densest", EDGE),
     MISSED: ("missed", EDGE),
     UNSURE: ("unsure", EDGE),
     FALSE: ("false", EDGE),
@@ -54,6 +56,7 @@ COMPARED = (  # (after, before): claims that the difference in AP50 is positive
     (TRACKS, MORE),
     (TRACKS, ROAD),
     (JOINED, TRACKS),
+    (JOINED, DENSEST),
     (TRUTH, TRACKS),
     (TRUTH, MISSED),
     (UNSURE, MISSED),
