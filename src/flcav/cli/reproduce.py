@@ -400,7 +400,8 @@ def _sim_to_real(
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "clouds.png", draw_clouds(results))
     for story in results.frames:
-        write_bytes(out / f"{story.frame}.png", draw_frame(kitti, story))
+        if (picture := draw_frame(kitti, story)) is not None:
+            write_bytes(out / f"{story.frame}.png", picture)
     for row in results.scores:
         if row.targets:
             found = f"{row.found} of {row.targets} found, {row.false_positives} false"

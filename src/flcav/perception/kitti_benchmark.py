@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from flcav.geometry import Boxes, pose, transform_points
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.perception.errors import THRESHOLD
+from flcav.perception.metrics.average_precision import interval_words
 from flcav.perception.metrics.kitti import (
     COUNTS,
     LEVELS,
@@ -29,15 +30,17 @@ from flcav.perception.metrics.kitti import (
     detection_states,
     label_states,
 )
+from flcav.perception.metrics.operating_point import FoundAtDistance, describe_counts
 from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.evaluate import Score, count_objects, score_detections
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import LOWEST_SCORE, detect_moved
 from flcav.perception.objects.samples import describe_rig
-from flcav.perception.objects.truth import level_mount
+from flcav.perception.objects.truth import FrameTruth, level_mount
 from flcav.perception.ops.rotated import iou
 from flcav.perception.task import Evaluated, KnownLidar
 from flcav.sensors.labels.outlines import NEAR_M, clip_in_front
-from flcav.storage.records import Class
+from flcav.storage.records import LEFT_OUT, Class
 
 Array = NDArray[np.float64]
 BenchmarkKind = Literal["image", "bev", "3d"]  # rectangles in the image, footprints, boxes
@@ -52,6 +55,7 @@ COMPARED: tuple[tuple[Mapping[str, float], BenchmarkKind], ...] = (
     (LOOSE, "3d"),
 )
 MOUNT = pose(0.0, 0.0, HEIGHT_M)  # of KITTI's LiDAR
+NEUTRAL = {"Van": "Car", "Truck": "Car", "Tram": "Car", "Misc": "Car", "Person_sitting": "Pedestrian"}  # -> class
 VALIDATION = "val"  # list of the frames that are evaluated, where there is one
 
 
@@ -78,6 +82,8 @@ class BenchmarkEvaluation(Evaluated):
     false_positives: Mapping[str, int]  # class -> detections of no object, in space at `LOOSE` and the level hard
     threshold: float  # lowest score of those detections
     bare: int  # frames without an image: it is taken to be as large as most
+    labelled: Annotated[tuple[Score, ...] | None, LEFT_OUT] = None  # of every labelled object, whatever its height
+    counts: Annotated[tuple[FoundAtDistance, ...] | None, LEFT_OUT] = None  # of the same; None in earlier results
 
     @property
     def score(self) -> float:
@@ -102,6 +108,13 @@ class BenchmarkEvaluation(Evaluated):
         for name, wrong in self.false_positives.items():
             where = f"in 3d at IoU {LOOSE[name]:g}, scores of {self.threshold:g} or more"
             lines.append(f"{name:<11}{wrong / self.frames:.2f} false positives a frame ({wrong}; {where})")
+        if self.labelled is not None and self.counts is not None:
+            lines.append("every labelled object in the image, AP R40 with its interval over frames:")
+            for row in self.labelled:
+                if row.ap is not None:
+                    interval = interval_words(row.low, row.high)
+                    lines.append(f"{row.label:<12}{row.kind:>4} IoU {row.iou:.1f}  AP {row.ap:.3f} {interval}")
+            lines += describe_counts(self.counts)
         return lines
 
 
@@ -141,6 +154,7 @@ def evaluate_kitti(network: Second, path: Path, progress: Report = ignore_progre
         raise InputError(f"{path}: no frames to evaluate")
     found = list(_detect(network, folder, progress))
     classes = [name for name in network.config.classes if name in LIMITS]
+    inside, truths = [in_image(one.boxes, one.frame) for one in found], [truth_of(one.frame) for one in found]
     return BenchmarkEvaluation(
         frames=len(found),
         split=split,
@@ -149,6 +163,8 @@ def evaluate_kitti(network: Second, path: Path, progress: Report = ignore_progre
         false_positives={name: _count_wrong(found, name) for name in classes},
         threshold=THRESHOLD,
         bare=folder.count_bare(),
+        labelled=score_detections(inside, truths, tuple(classes)),
+        counts=count_objects(inside, truths, classes),
     )
 
 
@@ -159,6 +175,24 @@ def _detect(network: Second, folder: KittiFolder, progress: Report) -> Iterator[
         (boxes,) = detect_moved(network, [frame.points], [move], score_threshold=LOWEST_SCORE)
         yield _compare(boxes, replace(frame, points=frame.points[:0], image=frame.image[:0]), frame.size)
         progress(number + 1, len(folder), "")
+
+
+def in_image(boxes: Boxes, frame: KittiFrame) -> Boxes:
+    """Return the boxes whose centre is inside the frame's image: outside it, objects have no labels."""
+    calibration = frame.calibration
+    center = np.c_[transform_points(calibration.camera_from_lidar, boxes.center), np.ones(len(boxes))]
+    pixels = center @ calibration.image_from_camera.T
+    at = pixels[:, :2] / np.where(pixels[:, 2:] == 0, np.inf, pixels[:, 2:]) + 0.5
+    height, width = frame.size
+    return boxes[(pixels[:, 2] > 0) & (at >= 0).all(axis=1) & (at < (width, height)).all(axis=1)]
+
+
+def truth_of(frame: KittiFrame) -> FrameTruth:
+    """Return every labelled object of a frame as a target, or as neutral where it is of a similar class."""
+    boxes = frame.objects.boxes
+    similar = np.array([NEUTRAL.get(str(name), "") for name in boxes.label], dtype=np.str_)
+    neutral = replace(boxes, label=similar)[similar != ""]
+    return FrameTruth(frame.name, boxes[similar == ""], neutral, boxes[:0])
 
 
 def _compare(boxes: Boxes, frame: KittiFrame, size: tuple[int, ...]) -> _Found:

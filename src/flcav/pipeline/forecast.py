@@ -212,7 +212,8 @@ def _forecast_arm(
     for task, own in plans[arm.name].items():
         cloud = own.cloud_rounds if CLOUD in arm.stages else 0
         edge = 0 if arm.central else own.edge_rounds + (own.cloud_rounds * k if MORE_EDGE in arm.stages else 0)
-        sent = price(StagePlan(own.samples, edge, cloud, groups, k), _size_messages(settings, task, measured[task]))
+        samples = own.samples + (arm.uploads or 0) * len(groups)
+        sent = price(StagePlan(samples, edge, cloud, groups, k), _size_messages(settings, task, measured[task]))
         uplink_mb += (sent.wireless_mb, sent.wireline_mb)
     trainings = [
         PrivateTraining(region, graph.vehicles[region], own.edge_rounds + own.cloud_rounds * k, own.noise)

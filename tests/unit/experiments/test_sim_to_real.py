@@ -7,6 +7,7 @@ from flcav.dataset.formats.kitti.files import KittiCalibration, KittiFrame, Obje
 from flcav.experiments.sim_to_real import run as sim_to_real
 from flcav.experiments.sim_to_real.clouds import summarise_clouds
 from flcav.geometry import Boxes
+from flcav.perception.kitti_benchmark import in_image, truth_of
 from flcav.perception.objects.model import second, small_config
 
 LIDAR_TO_CAMERA = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=float)
@@ -44,7 +45,17 @@ def test_numbers_of_a_cloud_are_counts():
 
 def test_what_the_image_does_not_show_does_not_count():
     everything = boxes((20, 0), (-20, 0), (10, 12))
-    np.testing.assert_array_equal(sim_to_real.shown(everything, frame(boxes())).center[:, 0], [20])
+    np.testing.assert_array_equal(in_image(everything, frame(boxes())).center[:, 0], [20])
+
+
+def test_similar_classes_are_neutral_for_the_one_that_they_resemble():
+    objects = boxes((20, 0), (30, 0), (40, 0), label=np.array(["Car", "Truck", "Person_sitting"]))
+    truth = truth_of(frame(objects))
+    assert truth.targets.center[:, 0].tolist() == [20]
+    assert list(zip(truth.neutral.label.tolist(), truth.neutral.center[:, 0].tolist(), strict=True)) == [
+        ("Car", 30),
+        ("Pedestrian", 40),
+    ]
 
 
 def test_real_frames_are_judged_as_kitti_does(monkeypatch):

@@ -17,6 +17,7 @@ from flcav.experiments.sim_to_real.clouds import CloudNumbers, Labelled, summari
 from flcav.experiments.splits import open_split, record_split
 from flcav.geometry import Boxes, inverse
 from flcav.perception.images import kitti_view
+from flcav.perception.kitti_benchmark import in_image, truth_of
 from flcav.perception.metrics import average_precision, match, round_or_none
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.evaluate import OVERLAPS
@@ -47,7 +48,6 @@ RIGS: dict[str, Any] = {
 REAL = "KITTI"
 LIDAR = "velodyne"
 SHOWN = 0.3  # lowest score of the detections that are counted and listed by frame
-NEUTRAL = {"Van": "Car", "Truck": "Car", "Tram": "Car", "Misc": "Car", "Person_sitting": "Pedestrian"}  # -> class
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def run_sim_to_real(
 
     Simulated frames are recorded in `out` by `run_steps`. Raises `InputError` where `kitti` is no KITTI folder.
     """
-    folder = KittiFolder.open(kitti)
+    folder = KittiFolder.open(kitti, pictures=False)
     real = [folder.frame(number) for number in range(len(folder))]
     steps = [
         Step(name.replace(" ", "-"), record_split, {"recipe": {**RECIPE, "vehicle_rig": rig}})
@@ -128,14 +128,16 @@ def labelled(data: Dataset, number: int) -> Labelled:
 def detections(network: Second, frames: Sequence[KittiFrame]) -> tuple[tuple[RealScore, ...], tuple[FrameResult, ...]]:
     """Return AP by class, kind and limit of IoU over real frames, and the detections and misses of each frame.
 
-    As in KITTI's evaluation, similar classes (`NEUTRAL`) are neutral. Detections outside the image are left out.
+    As in KITTI's evaluation, similar classes are neutral. Detections outside the image are left out.
     """
-    found = [shown(detect(network, frame.points, score_threshold=LOWEST_SCORE), frame) for frame in frames]
-    scores = []
+    found = [in_image(detect(network, frame.points, score_threshold=LOWEST_SCORE), frame) for frame in frames]
+    truths, scores = [truth_of(frame) for frame in frames], []
     for name in network.config.classes:
         own = [select_class(boxes, name) for boxes in found]
-        targets = [select_class(frame.objects.boxes, name) for frame in frames]
-        neutral = [_neutral(frame, name) for frame in frames]
+        targets, neutral = (
+            [select_class(boxes, name) for boxes in side]
+            for side in ([truth.targets for truth in truths], [truth.neutral for truth in truths])
+        )
         for kind, overlap in OVERLAPS:
             matches = match(own, targets, neutral, overlap, kind)
             hits = int(matches.hit[matches.score >= SHOWN].sum())
@@ -145,20 +147,20 @@ def detections(network: Second, frames: Sequence[KittiFrame]) -> tuple[tuple[Rea
     return tuple(scores), tuple(map(_story, frames, found))
 
 
-def shown(boxes: Boxes, frame: KittiFrame) -> Boxes:
-    """Return the boxes whose centre is inside the frame's image."""
-    return boxes[kitti_view(frame.image, frame.calibration).shows(boxes.center)]
-
-
 def draw_clouds(results: SimToReal) -> bytes:
     """Return a PNG of the statistics of all clouds."""
     return style.png(cloud_statistics({name: _series(numbers) for name, numbers in results.clouds.items()}))
 
 
-def draw_frame(kitti: Path, story: FrameResult) -> bytes:
-    """Return a PNG of one frame of the results: cloud from above and image, with labelled cars and detections."""
-    folder = KittiFolder.open(kitti)
+def draw_frame(kitti: Path, story: FrameResult) -> bytes | None:
+    """Return a PNG of one frame of the results: cloud from above and image, with labelled cars and detections.
+
+    None of a frame without an image.
+    """
+    folder = KittiFolder.open(kitti, pictures=False)
     frame = folder.frame(folder.names.index(story.frame))
+    if not frame.image.size:
+        return None
     view = kitti_view(frame.image, frame.calibration)
     cars, hit = (
         select_class(frame.objects.boxes, "Car"),
@@ -171,11 +173,6 @@ def _series(numbers: CloudNumbers) -> CloudSeries:
     street = [(float(np.mean([float(m) for m in row.ahead_m.split("-")])), row.intensity) for row in numbers.ground]
     cars = [(car.distance_m, car.returns) for car in numbers.cars]
     return CloudSeries(numbers.returns_per_range, numbers.intensity_quantiles, street, cars)
-
-
-def _neutral(frame: KittiFrame, name: str) -> Boxes:
-    boxes = frame.objects.boxes
-    return boxes[np.array([NEUTRAL.get(str(label)) == name for label in boxes.label], dtype=bool)]
 
 
 def _story(frame: KittiFrame, found: Boxes) -> FrameResult:

@@ -24,6 +24,7 @@ from flcav.perception.metrics import (
     right_headings,
     round_or_none,
 )
+from flcav.perception.metrics.operating_point import DISTANCES_M, FoundAtDistance, count_by_distance, describe_counts
 from flcav.perception.metrics.tracks import TracksEvaluation
 from flcav.perception.objects.calibrate import OVERLAP, Reliability
 from flcav.perception.objects.truth import QUARTERS, FrameTruth, TargetCriteria, select_class
@@ -34,7 +35,6 @@ from flcav.storage.records import LEFT_OUT, Class
 from flcav.world.weather import WEATHER_CLASSES
 
 OVERLAPS: tuple[tuple[Kind, float], ...] = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
-DISTANCES_M = ((0, 20), (20, 40), (40, 80))  # from, to: in the plane from the LiDAR to the centre of the box
 OCCLUSIONS = ((0.0, 0.2), (0.2, 0.6), (0.6, 1.01))  # from, to: occluded share
 BORDER_M = 2.0  # detections up to this far outside a range of distances are kept: they may be of objects in it
 
@@ -77,6 +77,7 @@ class ObjectsEvaluation(Evaluated):
     scores: tuple[Score, ...]  # class by class
     rules: Annotated[TargetCriteria | None, LEFT_OUT] = None  # target criteria; None in results of earlier versions
     near: Annotated[FoundCars | None, LEFT_OUT] = None  # None of a network that knows no cars, and in earlier results
+    counts: Annotated[tuple[FoundAtDistance, ...] | None, LEFT_OUT] = None  # None in earlier results
     slices: tuple[BreakdownRow, ...]  # breakdown of AP
     trust: tuple[Reliability, ...]  # calibration of scores and variances, one per class
     tracks: Annotated[TracksEvaluation | None, LEFT_OUT] = None  # None unless asked for
@@ -127,6 +128,7 @@ class ObjectsEvaluation(Evaluated):
             counts = f"objects: {row.targets}, and {row.hidden} without a return"
             lines.append(f"{row.label:<12}{row.kind:>4} IoU {row.iou:.1f}  {found}  ({counts})")
         lines += [] if self.near is None else [str(self.near)]
+        lines += [] if self.counts is None else describe_counts(self.counts)
         lines += [f"at IoU {OVERLAP:g} by distance, occlusion and weather:", *format_breakdown(self.slices, OVERLAP)]
         for row in self.trust:
             if row.ece is not None:
@@ -175,6 +177,19 @@ def count_cars(
         [select_class(truth.neutral, "Car") for truth in truths],
         looks=QUARTERS if around else 1,
     )
+
+
+def count_objects(
+    detections: Sequence[Boxes], truths: Sequence[FrameTruth], classes: Sequence[str], *, seed: int = 0
+) -> tuple[FoundAtDistance, ...]:
+    """Return the objects of each class that were found and invented, by distance, see `count_by_distance`."""
+    rows: list[FoundAtDistance] = []
+    for label in classes:
+        sides = (detections, [truth.targets for truth in truths], [truth.neutral for truth in truths])
+        own = ([select_class(boxes, label) for boxes in side] for side in sides)
+        rng = stream(seed, "counts", label)
+        rows += count_by_distance(*own, [truth.scene for truth in truths], label, rng)
+    return tuple(rows)
 
 
 class BreakdownPart(NamedTuple):

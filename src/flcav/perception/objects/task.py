@@ -16,7 +16,7 @@ from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, 
 from flcav.perception.objects.calibrate import calibrate, measure_reliability
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.errors import find_errors
-from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, count_cars, score_detections
+from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, count_cars, count_objects, score_detections
 from flcav.perception.objects.infer import detect_objects
 from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.messages import pack_sweep, unpack_sweep
@@ -123,6 +123,7 @@ class ObjectsTask(ObjectsOutcomes):
             scores=score_detections(found, truths, classes),
             rules=target_criteria(asked or network.config),
             near=count_cars(found, truths, classes, around=network.config.around),
+            counts=count_objects(found, truths, classes),
             slices=break_down(found, truths, classes),
             trust=measure_reliability(found, truths, classes),
         )

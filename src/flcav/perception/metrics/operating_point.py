@@ -1,0 +1,97 @@
+"""Objects that a detector finds and invents at one score, by distance: the count of an operating point.
+
+Intervals are bootstrap ones over scenes or, where all frames are of one scene, over frames; these are too narrow where
+frames follow one another.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flcav.geometry import Boxes
+from flcav.perception.metrics.matching import assign_targets, on_neutral
+from flcav.statistics.bootstrap import bootstrap_over_scenes
+from flcav.storage.records import Class
+
+DISTANCES_M = ((0, 20), (20, 40), (40, 80))  # from, to: in the plane from the LiDAR to the centre of the box
+SCORE = 0.3  # lowest of a detection that counts
+OVERLAP = 0.5  # IoU in 3D from which a detection finds an object
+
+
+@dataclass(frozen=True)
+class FoundAtDistance:
+    """The targets of one class in a range of distance, those found of them, and false detections there."""
+
+    label: Class
+    distance_m: tuple[int, int]  # from, to
+    targets: int
+    found: int  # of these
+    recall: tuple[float, float] | None  # 95 % interval of their share; None where resamples have no targets
+    false_a_frame: float
+    false: tuple[float, float]  # its 95 % interval
+
+    def describe(self) -> str:
+        """Return the counts in words."""
+        low, high = self.distance_m
+        share = "" if self.recall is None else f" [{self.recall[0]:.2f}, {self.recall[1]:.2f}]"
+        found = f"{self.found} of {self.targets} found{share}"
+        false = f"{self.false_a_frame:.2f} false a frame [{self.false[0]:.2f}, {self.false[1]:.2f}]"
+        return f"{self.label:<12}{f'{low}-{high} m':<9}{found}, {false}"
+
+
+def count_by_distance(
+    detections: Sequence[Boxes],
+    targets: Sequence[Boxes],
+    neutral: Sequence[Boxes],
+    scene_of_frame: Sequence[str],
+    label: str,
+    rng: np.random.Generator,
+) -> Iterator[FoundAtDistance]:
+    """Yield how many objects of a class were found and invented over F frames, by distance and in all.
+
+    All boxes are of that class, in the LiDAR's frame. In each frame a detection of `SCORE` or more, in order of score,
+    finds the target that it overlaps most, as in `match`; one on a neutral object is neither true nor false. A target
+    and a false detection count at their own distances. Raises ValueError where detections have no scores.
+    """
+    unit = np.arange(len(targets)) if len(set(scene_of_frame)) < 2 else np.asarray(scene_of_frame)
+    frames = [_count_frame(*frame) for frame in zip(detections, targets, neutral, strict=True)]
+    for span in (*DISTANCES_M, (DISTANCES_M[0][0], DISTANCES_M[-1][1])):
+        counts = np.array([[_within(part, span) for part in frame] for frame in frames]).reshape(-1, 3)
+        asked, found, false = counts.sum(axis=0).tolist()
+        if asked or false:
+            recall = _interval(counts[:, 1], counts[:, 0], unit, rng) if asked else None
+            wrong = _interval(counts[:, 2], np.ones(len(counts)), unit, rng)
+            assert wrong is not None  # every resample has frames
+            yield FoundAtDistance(label, span, asked, found, recall, round(false / len(counts), 6), wrong)
+
+
+def describe_counts(counts: Sequence[FoundAtDistance]) -> list[str]:
+    """Return objects found and invented in words: a line per class and range of distance."""
+    return [f"at a score of {SCORE:g} and 3D IoU {OVERLAP:g}, by distance:", *(row.describe() for row in counts)]
+
+
+def _count_frame(seen: Boxes, wanted: Boxes, others: Boxes) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the distances [m] of a frame's targets, of those found, and of false detections."""
+    if seen.score is None and len(seen):
+        raise ValueError("detections without scores cannot be counted")
+    kept = seen if seen.score is None else seen[seen.score >= SCORE]
+    matched = assign_targets(kept, wanted, OVERLAP)
+    away, far = (np.hypot(boxes.center[:, 0], boxes.center[:, 1]) for boxes in (wanted, kept))
+    return away, away[matched[matched >= 0]], far[(matched < 0) & ~on_neutral(kept, others)]
+
+
+def _within(distance: NDArray, span: tuple[int, int]) -> int:
+    return int(((distance >= span[0]) & (distance < span[1])).sum())
+
+
+def _interval(part: NDArray, whole: NDArray, unit: ArrayLike, rng: np.random.Generator) -> tuple[float, float] | None:
+    """Return the 95 % interval of the ratio of two sums over frames; None where no resample has any of the `whole`."""
+
+    def ratio(times: NDArray[np.int64]) -> NDArray[np.float64]:
+        below = times @ whole
+        return np.where(below > 0, (times @ part) / np.maximum(below, 1), np.nan)
+
+    low, high = bootstrap_over_scenes(ratio, unit, rng=rng)
+    return None if np.isnan(low) else (round(low, 6), round(high, 6))
