@@ -33,7 +33,7 @@ def register(target: NDArray, source: NDArray, target_from_source: Array) -> Arr
     target (N, >= 3) and source (M, >= 3): x, y, z [m], each in its own frame. target_from_source: where to start, by
     calibration. Raises `InputError` where small_gicp is not installed, or the clouds have no points in common.
     """
-    library = _import_small_gicp()
+    library = import_small_gicp()
     clouds = [np.ascontiguousarray(cloud[:, :3], dtype=np.float64) for cloud in (target, source)]
     found = target_from_source
     for far_m in PAIR_M:
@@ -58,7 +58,8 @@ def measure_offset(one: Array, other: Array) -> Offset:
     return Offset(100 * float(np.linalg.norm(between[:3, 3])), float(np.degrees(angle)))
 
 
-def _import_small_gicp() -> Any:
+def import_small_gicp() -> Any:
+    """Return the library small_gicp; raises `InputError` where it is not installed."""
     try:
         import small_gicp
     except ImportError:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration, KittiFolder, KittiFrame
-from flcav.dataset.formats.kitti.files import ASSUMED_SIZE
+from flcav.dataset.formats.kitti.files import ASSUMED_SIZE, is_drive
 from flcav.dataset.formats.kitti.read import BEAMS, HEIGHT_M, RANGE_M
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import EDGES
@@ -131,7 +131,7 @@ class _Found:
 
 def is_kitti(path: Path) -> bool:
     """Return whether `path` is a folder in KITTI's layout and no dataset of flcav's."""
-    return (path / "training" / "velodyne").is_dir()
+    return (path / "training" / "velodyne").is_dir() or (is_drive(path) and not (path / "manifest.json").exists())
 
 
 def compare_kitti_rig(path: Path, config: SecondConfig, trained: KnownLidar) -> str:

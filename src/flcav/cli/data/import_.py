@@ -1,6 +1,7 @@
 """`flcav import`: a dataset of another format as one of flcav's."""
 
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -19,6 +20,9 @@ def import_(
     folder: Path = typer.Argument(metavar="DIR", help="A folder of that format, as it is distributed."),
     out: Path = typer.Option(..., "--out", help="New or empty folder for the dataset."),
     split: str | None = typer.Option(None, "--split", help="One split of it alone, such as val; by default all."),
+    estimate_poses: bool = typer.Option(
+        False, "--estimate-poses", help="Vehicles' poses by LiDAR odometry, for drives that come without."
+    ),
 ) -> None:
     """Make a dataset of recordings in another format: docs/formats.md says what of it is kept.
 
@@ -31,7 +35,12 @@ def import_(
     from flcav.interface import progress
 
     with progress.show_progress(f"import {out}") as report:
-        notes = import_dataset(format, folder, out, split=split, progress=report)
+        how: Any = {}
+        if estimate_poses:
+            from flcav.fusion.odometry import DrivenSource
+
+            how = {"posed": DrivenSource}
+        notes = import_dataset(format, folder, out, split=split, progress=report, **how)
     manifest = read_manifest(out)
     counts = manifest.counts
     typer.echo(

@@ -1,17 +1,26 @@
 """Import of datasets of other formats, by reading them as a source of frames and recording that."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from flcav.config import InputError
 from flcav.dataset.formats.formats import IMPORTS, import_format
+from flcav.dataset.formats.reading import LogSource
 from flcav.dataset.layout import WORK
 from flcav.dataset.recording.recorder import drop_unbegun, record
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.locks import only_writer
+from flcav.sources.source import Source
 
 
 def import_dataset(
-    name: str, folder: Path, out: Path, *, split: str | None = None, progress: Report = ignore_progress
+    name: str,
+    folder: Path,
+    out: Path,
+    *,
+    split: str | None = None,
+    posed: Callable[[LogSource], Source] = lambda source: source,
+    progress: Report = ignore_progress,
 ) -> tuple[str, ...]:
     """Record the dataset of the format `name` in `folder` as one of flcav's in `out`.
 
@@ -24,6 +33,7 @@ def import_dataset(
         folder: folder of that format, as it is distributed.
         out: new or empty folder for the dataset.
         split: split whose scenes are taken; None: all.
+        posed: what gives the frames other poses, such as `flcav.fusion.odometry.DrivenSource`.
         progress: callback for the frames recorded so far and in total.
     """
     chosen = import_format(name)
@@ -37,7 +47,7 @@ def import_dataset(
         begun = (out / WORK).exists()  # by an earlier call
         try:
             source = chosen.read(folder, split)
-            record(source, out, progress=progress)
+            record(posed(source), out, progress=progress)
         except (ValueError, OSError) as error:
             if not begun:
                 drop_unbegun(out)

@@ -21,7 +21,7 @@ from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Weights
 from flcav.interface.progress import DAMAGED, Report
 from flcav.network.ledger import BudgetExceeded, Ledger
-from flcav.perception.task import Task
+from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 from flcav.perception.weights import from_arrays, save_network, to_arrays
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.training import PrivacySpent, diverges
@@ -181,8 +181,13 @@ def round_path(folder: Path, round_: int) -> Path:
 
 
 def load_round_network(
-    task: Task, start: Any, folder: Path, round_: int, averaged: int, start_share: float = 0.0
-) -> Any:
+    task: Task[ConfigT, NetworkT, SampleT],
+    start: NetworkT,
+    folder: Path,
+    round_: int,
+    averaged: int,
+    start_share: float = 0.0,
+) -> NetworkT:
     """Return the network of a federation that ends with a round: the mean of the last `averaged` rounds' weights.
 
     `start_share` of it are the weights of the network `start` that the federation began with, as in Wortsman et al.,
@@ -191,7 +196,8 @@ def load_round_network(
     last = range(max(round_ - averaged, 0) + 1, round_ + 1)
     first, rounds = to_arrays(start), [load_file(round_path(folder, number)) for number in last]
     parts = [first, *({name: own[name] for name in first} for own in rounds)]  # files order names otherwise
-    network = task.build(start.config)
+    config: Any = start.config
+    network = task.build(config)
     from_arrays(network, average(parts, [start_share, *((1 - start_share) / len(last) for _ in last)]))
     return network.eval()
 

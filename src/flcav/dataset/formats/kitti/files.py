@@ -27,6 +27,8 @@ MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
 CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
 PICTURES = "image_2"
 SUFFIXES = {"calib": "txt", "velodyne": "bin", PICTURES: "png", "label_2": "txt"}
+FOLDERS = ("training", "testing")
+TRUNCATION = np.array([0.0, 0.25, 0.75])  # share outside the image that stands for a level of the tracking benchmark
 LEVELS = (0, 1, 2, 3)  # of occlusion
 ASSUMED_SIZE = (375, 1242)  # height, width [px] of most of KITTI's images: of those that are missing
 MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
@@ -106,11 +108,12 @@ class Objects:
         return cls(Boxes.empty(), np.zeros(0), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 4)))
 
 
-def read_objects(path: Path, calibration: KittiCalibration) -> Objects:
+def read_objects(path: Path, calibration: KittiCalibration, *, levels: bool = False) -> Objects:
     """Return the labelled objects of a frame from its label file.
 
     Boxes are upright in the LiDAR frame: the tilt of about a degree between camera and LiDAR is neglected in their
-    orientation, but not in their position. Scores are kept where every row has one. Raises `InputError` where the file
+    orientation, but not in their position. Scores are kept where every row has one. levels: truncation is given by the
+    levels of KITTI's tracking benchmark, for which shares stand. Raises `InputError` where the file
     is missing or a line is not a label.
     """
     label, rows, unlabelled = [], [], []
@@ -139,12 +142,18 @@ def read_objects(path: Path, calibration: KittiCalibration) -> Objects:
     size = np.stack((length, width, height), axis=1)
     return Objects(
         Boxes(center, size, yaw, np.array(label, dtype=np.str_), scores),
-        truncation=numbers[:, 0],
+        truncation=_read_levels(numbers[:, 0]) if levels else numbers[:, 0],
         occlusion=np.where(np.isin(numbers[:, 1], LEVELS), numbers[:, 1], -1).astype(np.int64),
         alpha=numbers[:, 2],
         rectangle=numbers[:, 3:7],
         unlabelled=np.array(unlabelled).reshape(-1, 4),
     )
+
+
+def _read_levels(truncation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the shares that stand for the levels of truncation 0, 1 and 2; other numbers as they are."""
+    known = np.isin(truncation, range(len(TRUNCATION)))
+    return np.where(known, TRUNCATION[np.where(known, truncation, 0).astype(int)], truncation)
 
 
 def _lines(path: Path) -> list[str]:
@@ -154,6 +163,22 @@ def _lines(path: Path) -> list[str]:
         raise InputError(f"{path}: no such file") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
+
+
+def is_drive(folder: Path) -> bool:
+    """Return whether a folder is a drive of KITTI: it has the sweeps itself, and no `training` or `testing`.
+
+    Its labels have levels of truncation, as those of the tracking benchmark do, and one calibration may be for all.
+    """
+    return (folder / "velodyne").is_dir() and folder.name not in FOLDERS
+
+
+def find_part(folder: Path, part: str, number: str) -> Path:
+    """Return the file of a part of a frame, a key of `SUFFIXES`, in `training`, `testing` or a drive."""
+    common = folder / "calib.txt"
+    if part == "calib" and is_drive(folder) and common.is_file():
+        return common
+    return folder / part / f"{number}.{SUFFIXES[part]}"
 
 
 @dataclass(frozen=True)
@@ -183,7 +208,7 @@ class KittiFolder:
         list or a file of a frame is missing; without `pictures`, images may be.
         """
         root, part_of = Path(path), "testing" if split == "test" else "training"
-        folder = root / part_of
+        folder = root if is_drive(root) and split is None else root / part_of
         if not folder.is_dir():
             raise InputError(f"{root}: no KITTI folder; it holds no '{part_of}'")
         if split is None:
@@ -191,9 +216,10 @@ class KittiFolder:
         else:
             names = read_split(root / "ImageSets" / f"{split}.txt")
         for name in names:
-            for part, suffix in SUFFIXES.items():
-                if (pictures or part != PICTURES) and not (folder / part / f"{name}.{suffix}").is_file():
-                    raise InputError(f"{folder / part / f'{name}.{suffix}'}: missing; every frame needs one")
+            for part in SUFFIXES:
+                path = find_part(folder, part, name)
+                if (pictures or part != PICTURES) and not path.is_file():
+                    raise InputError(f"{path}: missing; every frame needs one")
         return cls(folder, names)
 
     def __len__(self) -> int:
@@ -205,10 +231,10 @@ class KittiFolder:
 
     def frame(self, i: int) -> KittiFrame:
         """Return frame `i`; raises `InputError` for a malformed file, or a label that does not fit the image."""
-        paths = {part: self.folder / part / f"{self.names[i]}.{suffix}" for part, suffix in SUFFIXES.items()}
+        paths = {part: find_part(self.folder, part, self.names[i]) for part in SUFFIXES}
         calibration = read_calibration(paths["calib"])
         image = _read_image(paths[PICTURES]) if paths[PICTURES].is_file() else np.zeros((0, 0, 3), np.uint8)
-        objects = read_objects(paths["label_2"], calibration)
+        objects = read_objects(paths["label_2"], calibration, levels=is_drive(self.folder))
         height, width = image.shape[:2] if image.size else (None, None)
         check_objects(objects, width, height, paths["label_2"])
         size = ASSUMED_SIZE if height is None or width is None else (height, width)

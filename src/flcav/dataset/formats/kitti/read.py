@@ -1,9 +1,11 @@
 """Reading of KITTI's object detection benchmark as a source of frames.
 
 Its frames are of no sequence: each is a scene of its own, at time 0 and at the world's origin. Only an export of
-flcav's says more, in `frames.csv`. The LiDAR stands where KITTI's does, HEIGHT_M above the ground, and but for an
-export's has the BEAMS and RANGE_M of an HDL-64E (Geiger et al., IJRR 32(11), 2013, section 2 and fig. 3); a label's
-rectangle is of the whole object as far as it lies in the image.
+flcav's says more, in `frames.csv`. A drive is a folder that itself has `velodyne` and `calib`, or one `calib.txt`: its
+sweeps follow one another in one scene, its poses are not known, and its labels have levels of truncation, as those of
+KITTI's tracking benchmark do. The LiDAR stands where KITTI's does, HEIGHT_M above the ground, and but for an export's
+has the BEAMS and RANGE_M of an HDL-64E (Geiger et al., IJRR 32(11), 2013, section 2 and fig. 3); a label's rectangle is
+of the whole object as far as it lies in the image.
 """
 
 import csv
@@ -16,11 +18,14 @@ import numpy as np
 
 from flcav.config import InputError
 from flcav.dataset.formats.kitti.files import (
+    FOLDERS,
     PICTURES,
     SUFFIXES,
     KittiCalibration,
     Objects,
     check_objects,
+    find_part,
+    is_drive,
     read_calibration,
     read_objects,
     read_points,
@@ -52,7 +57,7 @@ CATEGORIES = {  # KITTI's other classes (Person_sitting, Tram, Misc) keep their 
 OCCLUSION = np.array([0.0, 0.3, 0.75, np.nan])  # share that stands for the levels 0 fully visible, 1, 2, 3 unknown
 HEIGHT_M, BEAMS, RANGE_M = 1.73, 64, 120.0
 LIDAR, CAMERA = "velodyne", PICTURES
-FOLDERS = ("training", "testing")
+DRIVE_HZ = 10.0  # sweeps of a drive follow one another at this rate
 LISTS = ("train", "val", "test")
 
 
@@ -115,7 +120,7 @@ class KittiSource(LogSource):
             yield _read_frame(shot, agent, self._calibration[agent])
 
 
-IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne"))
+IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne", "velodyne"))
 
 
 def _calibrate(calibrated: KittiCalibration) -> Calibration:
@@ -135,7 +140,9 @@ def _read_frame(shot: KittiShot, agent: str, calibration: Calibration) -> Linked
     points, calibrated = read_points(files[LIDAR]), read_calibration(_path(shot, "calib"))
     size = measure_picture(path) if pictures else (None, None)
     label = _path(shot, "label_2")
-    objects = read_objects(label, calibrated) if label.is_file() else Objects.none()
+    objects = (
+        read_objects(label, calibrated, levels=shot.folder.name not in FOLDERS) if label.is_file() else Objects.none()
+    )
     check_objects(objects, *size, label)
     agent_from_lidar, mount = calibration.agent_from_sensor[LIDAR], calibration.agent_from_sensor[CAMERA]
     then = _calibrate(calibrated).agent_from_sensor[CAMERA] @ inverse(mount)
@@ -186,6 +193,9 @@ def _find_shots(folder: Path) -> list[KittiShot]:
             split = listed.get((part, number), "test" if part == "testing" else None)
             where = origin.get(number, (f"kitti-{part}-{number}", 0, "ego", 0.0))
             shots.append(KittiShot(folder / part, number, split, *where, number in origin))
+    numbers = sorted(path.stem for path in (folder / "velodyne").glob("*.bin")) if is_drive(folder) else []
+    scene = f"kitti-{folder.resolve().name}"
+    shots += [KittiShot(folder, name, None, scene, i, "ego", i / DRIVE_HZ, False) for i, name in enumerate(numbers)]
     if not shots:
         raise InputError(f"{folder}: no KITTI folder; it holds no 'training/velodyne' with point clouds")
     return shots
@@ -220,4 +230,4 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
 
 
 def _path(shot: KittiShot, part: str) -> Path:
-    return shot.folder / part / f"{shot.number}.{SUFFIXES[part]}"
+    return find_part(shot.folder, part, shot.number)
