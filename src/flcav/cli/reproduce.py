@@ -11,6 +11,7 @@ import typer
 
 from flcav.cli.options import ENGINE, JOBS, STALE, EngineName, Stale, join_choices, refuse_unused
 from flcav.cli.terminal import only_writer_of, when_interrupted
+from flcav.config import InputError
 from flcav.experiments.studies import STUDIES
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 RUN = ("jobs", "engine", "stale")  # options of targets that run as steps
 STUDY = ("seeds", "scale", *RUN)  # options of targets that run over seeds
+REAL = ("kitti", "data", "around", "weights")  # options of sim-to-real
 TASK = "task-"  # before the name of a task's study
 OWN = "a task of your own that says how it is studied, as module:NAME"
 COMMON_SEEDS = 3
@@ -80,7 +82,7 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig3a: (),
     **dict.fromkeys(RECORDED, ()),
     **dict.fromkeys(ATTACKS, ("seeds",)),
-    Target.sim_to_real: (*RUN, "kitti", "weights"),
+    Target.sim_to_real: (*RUN, *REAL),
 }
 SEEDS: Mapping[str, int] = {
     **dict.fromkeys((Target.corner_cases, Target.demo_arms, *EXCHANGES, *ATTACKS), 5),
@@ -119,13 +121,17 @@ def reproduce(
     engine: EngineName = ENGINE,
     stale: Stale = STALE,
     kitti: Path | None = typer.Option(None, "--kitti", help="sim-to-real: a folder of real frames in KITTI's layout."),
+    data: Path | None = typer.Option(
+        None, "--data", help="sim-to-real: a dataset of real frames, such as an imported one, instead."
+    ),
+    around: bool = typer.Option(False, "--around", help="sim-to-real, with --data: look in all directions."),
     weights: Path | None = typer.Option(
         None, "--weights", help="sim-to-real: the detector's; by default those of the package."
     ),
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""
     use_threads(1)
-    refuse_unused(f"reproduce {target}", *{*STUDY, "kitti", "weights"}.difference(TAKEN.get(target, STUDY)))
+    refuse_unused(f"reproduce {target}", *{*STUDY, *REAL}.difference(TAKEN.get(target, STUDY)))
     if target in (Target.fig1b, Target.fig3a):
         draw = _fig1b if target == Target.fig1b else _fig3a
         draw(out)
@@ -134,7 +140,9 @@ def reproduce(
         _record_and_draw(Target(target), out)
         return
     if target == Target.sim_to_real:
-        _sim_to_real(out, kitti, weights, jobs, engine, stale)
+        if (kitti is None) == (data is None):
+            raise InputError("sim-to-real needs real frames: --kitti, a folder in KITTI's layout, or --data, a dataset")
+        _sim_to_real(out, kitti or data or Path(), weights, around, jobs, engine, stale)
         return
     count = seeds or SEEDS.get(target, COMMON_SEEDS)
     if target in ATTACKS:
@@ -383,29 +391,32 @@ def _load_sized(name: str, scale: str, shrink: "Callable[[RunRecipe], RunRecipe]
 
 @when_interrupted()
 def _sim_to_real(
-    out: Path, kitti: Path | None, weights: Path | None, jobs: int, engine: EngineName, stale: Stale
+    out: Path, real: Path, weights: Path | None, around: bool, jobs: int, engine: EngineName, stale: Stale
 ) -> None:
     from flcav.cli.steps import live_steps
-    from flcav.config import InputError
     from flcav.experiments.sim_to_real.run import draw_clouds, draw_frame, run_sim_to_real
+    from flcav.perception.metrics import interval_words
+    from flcav.perception.metrics.operating_point import describe_counts
     from flcav.perception.networks import resolve_network
     from flcav.perception.objects.task import OBJECTS
     from flcav.storage.files import write_bytes, write_json
 
-    if kitti is None:
-        raise InputError("--kitti is missing: sim-to-real needs a folder of real frames in KITTI's layout")
     with live_steps(Target.sim_to_real.value) as notify:
         network = resolve_network(OBJECTS, weights)
-        results = run_sim_to_real(network, kitti, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
+        how: Any = {"jobs": jobs, "notify": notify, "stale": stale, "engine": engine}
+        results = run_sim_to_real(network, real, out, around=around, **how)
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "clouds.png", draw_clouds(results))
     for story in results.frames:
-        if (picture := draw_frame(kitti, story)) is not None:
+        if (picture := draw_frame(real, story)) is not None:
             write_bytes(out / f"{story.frame}.png", picture)
     for row in results.scores:
         if row.targets:
             found = f"{row.found} of {row.targets} found, {row.false_positives} false"
-            typer.echo(f"{row.label} {row.kind} at IoU {row.iou}: {found}, AP {row.ap:.3f}")
+            ap = f"AP {row.ap:.3f} {interval_words(row.low, row.high)}"
+            typer.echo(f"{row.label} {row.kind} at IoU {row.iou}: {found}, {ap}")
+    for line in describe_counts(results.counts or ()):
+        typer.echo(line)
 
 
 @when_interrupted()

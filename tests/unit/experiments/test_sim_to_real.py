@@ -1,14 +1,21 @@
 """Clouds in numbers, and detections in a real frame, against what can be counted by hand."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from flcav.config import InputError
 from flcav.dataset.formats.kitti.files import KittiCalibration, KittiFrame, Objects
+from flcav.dataset.recording.recorder import record
 from flcav.experiments.sim_to_real import run as sim_to_real
 from flcav.experiments.sim_to_real.clouds import summarise_clouds
 from flcav.geometry import Boxes
 from flcav.perception.kitti_benchmark import in_image, truth_of
 from flcav.perception.objects.model import second, small_config
+from flcav.sensors.rig import RIGS
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import Recipe
 
 LIDAR_TO_CAMERA = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=float)
 PROJECTION = np.array([[700, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]], dtype=float)
@@ -58,17 +65,32 @@ def test_similar_classes_are_neutral_for_the_one_that_they_resemble():
     ]
 
 
-def test_real_frames_are_judged_as_kitti_does(monkeypatch):
+def test_real_frames_are_judged_as_kitti_does() -> None:
     found = boxes((20, 0), (40, 0), (30, 5), (60, 0), score=np.array([0.9, 0.8, 0.7, 0.6]))
-    monkeypatch.setattr(sim_to_real, "detect", lambda network, points, score_threshold: found)
     van = Boxes.from_array(np.array([(30, 5, -1.0, 5, 2, 2, 0.0)]), "Van")
     cars = boxes((20, 0), (40.9, 0))
     labelled = Boxes.from_array(np.concatenate((cars.array(), van.array())), np.array(["Car", "Car", "Van"]))
-    scores, (story,) = sim_to_real.detections(second(small_config()), [frame(labelled)])
-    row = {(score.label, score.kind, score.iou): score for score in scores}
+    sweep = sim_to_real.RealSweep("000001", np.ones((5, 4), np.float32), found, truth_of(frame(labelled)))
+    row = {(row.label, row.kind, row.iou): row for row in sim_to_real.score_sweeps(second(small_config()), [sweep])}
     assert row["Car", "3d", 0.5] == sim_to_real.RealScore(
         "Car", "3d", 0.5, targets=2, found=2, false_positives=1, ap=1.0
     )
     assert (row["Car", "3d", 0.7].found, row["Car", "3d", 0.7].false_positives) == (1, 2)
     assert row["Pedestrian", "3d", 0.5].ap is None
-    assert [car.found_at for car in story.cars] == [(0.5, 0.7), (0.5,)]
+    several = sim_to_real.score_sweeps(second(small_config()), [sweep, sweep, sweep])
+    assert next(row for row in several if (row.label, row.kind, row.iou) == ("Car", "3d", 0.5)).low == 1
+    assert [car.found_at for car in sim_to_real.tell_frame(sweep).cars] == [(0.5, 0.7), (0.5,)]
+
+
+def test_a_folder_of_kitti_and_a_dataset_are_read_with_the_same_sweeps(tmp_path: Path) -> None:
+    recipe = Recipe(town="suburb", seed=5, cavs=1, warmup_s=30.0, spins_per_scene=2, vehicle_rig=RIGS["kitti_lidar"])
+    record(EmbeddedSource(recipe), tmp_path / "data")
+    network = second(small_config()).eval()
+    sweeps = list(sim_to_real.read_sweeps(network, tmp_path / "data"))
+    ahead, around = sweeps[0], next(iter(sim_to_real.read_sweeps(network, tmp_path / "data", around=True)))
+    assert len(sweeps) == 2
+    assert len(around.truth.targets) >= len(ahead.truth.targets) > 0
+    np.testing.assert_array_equal(around.points, ahead.points)
+    (tmp_path / "kitti" / "training" / "velodyne").mkdir(parents=True)
+    with pytest.raises(InputError, match="labels lie ahead, in the image; leave --around out"):
+        next(sim_to_real.read_sweeps(network, tmp_path / "kitti", around=True))

@@ -1,36 +1,50 @@
-"""Sim-to-real gap: statistics of simulated and KITTI's clouds, and AP on KITTI of a detector trained in simulation.
+"""Sim-to-real gap: statistics of simulated and real clouds, and AP on real sweeps of a detector trained in simulation.
 
-KITTI's frames are compared with two recordings of the same simulated scenes: with the LiDAR of the `kitti` rig, and
-with one that has only its beams, on Lambertian surfaces. The detector is the package's own.
+Real frames, of KITTI or of an imported dataset, are compared with two recordings of the same simulated scenes: with the
+LiDAR of the `kitti` rig, and with one that has only its beams, on Lambertian surfaces. The detector is the package's
+own.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from flcav.dataset.formats.kitti.files import KittiFolder, KittiFrame
+from flcav.config import InputError
+from flcav.dataset.formats.kitti.files import KittiFolder
 from flcav.dataset.store import Dataset
 from flcav.experiments.sim_to_real.clouds import CloudNumbers, Labelled, summarise_clouds
 from flcav.experiments.splits import open_split, record_split
 from flcav.geometry import Boxes, inverse
+from flcav.perception.agents import POLE, kind_of
 from flcav.perception.images import kitti_view
-from flcav.perception.kitti_benchmark import in_image, truth_of
-from flcav.perception.metrics import average_precision, match, round_or_none
+from flcav.perception.kitti_benchmark import in_image, is_kitti, truth_of
+from flcav.perception.metrics import match
 from flcav.perception.metrics.matching import assign_targets
-from flcav.perception.objects.evaluate import OVERLAPS
+from flcav.perception.metrics.operating_point import FoundAtDistance
+from flcav.perception.objects.evaluate import count_objects, score_detections
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.predict import LOWEST_SCORE, ObjectFound, boxes_to_rows, detect, rows_to_boxes
-from flcav.perception.objects.truth import CARS, select_class
+from flcav.perception.objects.predict import (
+    LOWEST_SCORE,
+    ObjectFound,
+    boxes_to_rows,
+    detect,
+    detect_in,
+    look_around,
+    rows_to_boxes,
+)
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.truth import CARS, FrameTruth, asked_of, choose_lidar, select_class
 from flcav.perception.ops.rotated import Kind
 from flcav.pipeline.engine import Notify, Step, run_steps
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.clouds import CloudSeries, cloud_statistics
 from flcav.report.pictures.clouds import real_frame
-from flcav.storage.records import Class, Record
+from flcav.storage.records import LEFT_OUT, Class, Record
 
 RECIPE: dict[str, Any] = {  # of the simulated scenes
     "town": "suburb",
@@ -61,6 +75,8 @@ class RealScore:
     found: int  # with a score of `SHOWN` or more, as `false_positives`
     false_positives: int
     ap: float | None  # None without targets
+    low: Annotated[float | None, LEFT_OUT] = None  # 95 % interval of AP over sweeps; None of one sweep
+    high: Annotated[float | None, LEFT_OUT] = None
 
 
 @dataclass(frozen=True)
@@ -84,38 +100,75 @@ class FrameResult:
 class SimToReal(Record):
     """Results of the experiment: statistics of clouds, detections by class, and by real frame."""
 
-    clouds: Mapping[str, CloudNumbers]  # by origin: `REAL`, or a name in `RIGS`
+    clouds: Mapping[str, CloudNumbers]  # by origin: `REAL`, a dataset, or a name in `RIGS`
     scores: tuple[RealScore, ...]
     frames: tuple[FrameResult, ...]
     provenance: Provenance
+    counts: Annotated[tuple[FoundAtDistance, ...] | None, LEFT_OUT] = None  # found and invented, by distance
+
+
+@dataclass(frozen=True)
+class RealSweep:
+    """A real sweep with what a network detects in it and what is labelled, LiDAR frame."""
+
+    name: str
+    points: NDArray[np.float32]  # (N, 4)
+    found: Boxes  # scores of `LOWEST_SCORE` or more
+    truth: FrameTruth
 
 
 def run_sim_to_real(
     network: Second,
-    kitti: Path,
+    real: Path,
     out: Path,
     *,
+    around: bool = False,
     jobs: int,
     notify: Notify,
     stale: str = "refuse",
     engine: str = "processes",
 ) -> SimToReal:
-    """Compare simulated clouds with those of the folder `kitti`, and evaluate `network` on its frames.
+    """Compare simulated clouds with those of the folder `real`, and evaluate `network` on its frames.
 
-    Simulated frames are recorded in `out` by `run_steps`. Raises `InputError` where `kitti` is no KITTI folder.
+    That is a folder in KITTI's layout, where detections outside the image do not count, or a dataset, such as an
+    imported one; `around`: in all directions. Simulated frames are recorded in `out` by `run_steps`. Raises
+    `InputError` where `real` is neither, and for a look around in KITTI, whose labels lie ahead.
     """
-    folder = KittiFolder.open(kitti, pictures=False)
-    real = [folder.frame(number) for number in range(len(folder))]
+    sweeps = [*read_sweeps(network, real, around)]
     steps = [
         Step(name.replace(" ", "-"), record_split, {"recipe": {**RECIPE, "vehicle_rig": rig}})
         for name, rig in RIGS.items()
     ]
     run_steps(steps, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
-    clouds = {REAL: summarise_clouds((frame.points, select_class(frame.objects.boxes, "Car")) for frame in real)}
+    origin = REAL if is_kitti(real) else real.resolve().name
+    clouds = {origin: summarise_clouds((each.points, select_class(each.truth.targets, "Car")) for each in sweeps)}
     for name, step in zip(RIGS, steps, strict=True):
         data = open_split(out / step.name)
         clouds[name] = summarise_clouds(labelled(data, number) for number in range(len(data)))
-    return SimToReal(clouds, *detections(network, real), provenance(RECIPE["seed"]))
+    found, truths = [each.found for each in sweeps], [each.truth for each in sweeps]
+    counts = count_objects(found, truths, network.config.classes)
+    stories = tuple(map(tell_frame, sweeps))
+    return SimToReal(clouds, score_sweeps(network, sweeps), stories, provenance(RECIPE["seed"]), counts)
+
+
+def read_sweeps(network: Second, real: Path, around: bool = False) -> Iterator[RealSweep]:
+    """Yield the sweeps of a folder of `run_sim_to_real`, with the detections of `network`."""
+    if is_kitti(real):
+        if around:
+            raise InputError(f"{real}: KITTI's labels lie ahead, in the image; leave --around out")
+        folder = KittiFolder.open(real, pictures=False)
+        for number in range(len(folder)):
+            frame = folder.frame(number)
+            found = in_image(detect(network, frame.points, score_threshold=LOWEST_SCORE), frame)
+            yield RealSweep(frame.name, frame.points, found, truth_of(frame))
+        return
+    data = Dataset.open(real)
+    data.check_labelled(OBJECTS.name)
+    looking = look_around(network) if around else network
+    for number in data.select(agents={key.agent for key in data.keys if kind_of(key.agent) != POLE}):
+        frame = data.frame(number)
+        (found,) = detect_in(looking, [frame], score_threshold=LOWEST_SCORE)
+        yield RealSweep(frame.key, frame.lidar[choose_lidar(frame)], found, asked_of(frame, looking.config))
 
 
 def labelled(data: Dataset, number: int) -> Labelled:
@@ -125,26 +178,21 @@ def labelled(data: Dataset, number: int) -> Labelled:
     return frame.lidar[LIDAR], boxes[np.isin(boxes.label, CARS)]
 
 
-def detections(network: Second, frames: Sequence[KittiFrame]) -> tuple[tuple[RealScore, ...], tuple[FrameResult, ...]]:
-    """Return AP by class, kind and limit of IoU over real frames, and the detections and misses of each frame.
-
-    As in KITTI's evaluation, similar classes are neutral. Detections outside the image are left out.
-    """
-    found = [in_image(detect(network, frame.points, score_threshold=LOWEST_SCORE), frame) for frame in frames]
-    truths, scores = [truth_of(frame) for frame in frames], []
-    for name in network.config.classes:
-        own = [select_class(boxes, name) for boxes in found]
-        targets, neutral = (
-            [select_class(boxes, name) for boxes in side]
-            for side in ([truth.targets for truth in truths], [truth.neutral for truth in truths])
+def score_sweeps(network: Second, sweeps: Sequence[RealSweep]) -> tuple[RealScore, ...]:
+    """Return AP by class, kind and limit of IoU over real sweeps, with its interval over them."""
+    found, truths, classes = [each.found for each in sweeps], [each.truth for each in sweeps], network.config.classes
+    alone = [replace(truth, scene=str(number)) for number, truth in enumerate(truths)]  # intervals are over sweeps
+    scores = []
+    for row in score_detections(found, alone, classes):
+        own, targets, neutral = (
+            [select_class(boxes, row.label) for boxes in side]
+            for side in (found, [truth.targets for truth in truths], [truth.neutral for truth in truths])
         )
-        for kind, overlap in OVERLAPS:
-            matches = match(own, targets, neutral, overlap, kind)
-            hits = int(matches.hit[matches.score >= SHOWN].sum())
-            wrong = int((~matches.hit[matches.score >= SHOWN]).sum())
-            ap = round_or_none(average_precision(matches))
-            scores.append(RealScore(name, kind, overlap, int(matches.targets.sum()), hits, wrong, ap))
-    return tuple(scores), tuple(map(_story, frames, found))
+        matches = match(own, targets, neutral, row.iou, row.kind)
+        counted = matches.hit[matches.score >= SHOWN]
+        hits, wrong = int(counted.sum()), int((~counted).sum())
+        scores.append(RealScore(row.label, row.kind, row.iou, row.targets, hits, wrong, row.ap, row.low, row.high))
+    return tuple(scores)
 
 
 def draw_clouds(results: SimToReal) -> bytes:
@@ -152,12 +200,14 @@ def draw_clouds(results: SimToReal) -> bytes:
     return style.png(cloud_statistics({name: _series(numbers) for name, numbers in results.clouds.items()}))
 
 
-def draw_frame(kitti: Path, story: FrameResult) -> bytes | None:
+def draw_frame(real: Path, story: FrameResult) -> bytes | None:
     """Return a PNG of one frame of the results: cloud from above and image, with labelled cars and detections.
 
-    None of a frame without an image.
+    None of a frame of KITTI without an image, and of other data.
     """
-    folder = KittiFolder.open(kitti, pictures=False)
+    if not is_kitti(real):
+        return None
+    folder = KittiFolder.open(real, pictures=False)
     frame = folder.frame(folder.names.index(story.frame))
     if not frame.image.size:
         return None
@@ -175,10 +225,9 @@ def _series(numbers: CloudNumbers) -> CloudSeries:
     return CloudSeries(numbers.returns_per_range, numbers.intensity_quantiles, street, cars)
 
 
-def _story(frame: KittiFrame, found: Boxes) -> FrameResult:
-    """Return the frame's detections, and each labelled car's distance and the limits of IoU it was found at."""
-    boxes = frame.objects.boxes
-    cars = select_class(boxes, "Car")
+def tell_frame(sweep: RealSweep) -> FrameResult:
+    """Return the sweep's detections, and each labelled car's distance and the limits of IoU it was found at."""
+    found, cars = sweep.found, select_class(sweep.truth.targets, "Car")
     score = found.score if found.score is not None else np.ones(len(found))
     found = found[score >= SHOWN]
     distances = np.hypot(cars.center[:, 0], cars.center[:, 1]).round(1).tolist()
@@ -187,4 +236,4 @@ def _story(frame: KittiFrame, found: Boxes) -> FrameResult:
         LabelledCar(distance, tuple(overlap for overlap, targets in hit.items() if number in targets))
         for number, distance in enumerate(distances)
     )
-    return FrameResult(frame.name, boxes_to_rows(found), labelled)
+    return FrameResult(sweep.name, boxes_to_rows(found), labelled)
