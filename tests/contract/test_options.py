@@ -41,7 +41,7 @@ RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads",
 # command -> option -> what of CHOICES takes it; `--out` and `--json` are always taken
 TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "run": dict.fromkeys(("--dry", "--jobs", "--seeds", "--engine", "--stale"), ALWAYS),
-    "demo": dict.fromkeys(("--seed", "--recipe", "--jobs", "--engine", "--stale"), ALWAYS),
+    "demo": dict.fromkeys(("--seed", "--recipe", "--seeds", "--jobs", "--engine", "--stale"), ALWAYS),
     "compare": dict.fromkeys(("--data", "--task", "--agents"), ALWAYS),
     "federate": dict.fromkeys(("--arm", "--jobs", "--runtime", "--stale"), ALWAYS),
     "towns list": {},
@@ -59,7 +59,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--min-points": ALWAYS,
         "--calibration": ALWAYS,
     },
-    "import": {"--split": ALWAYS},
+    "import": {"--split": ALWAYS, "--estimate-poses": ALWAYS},
     "train": {
         "--data": ALWAYS,
         "--validation": ALWAYS,
@@ -125,8 +125,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--scale": STUDIES,
         "--jobs": (*STUDIES, "sim-to-real"),
         **dict.fromkeys(("--engine", "--stale"), (*STUDIES, "sim-to-real")),
-        "--kitti": ("sim-to-real",),
-        "--weights": ("sim-to-real",),
+        **dict.fromkeys(("--kitti", "--data", "--around", "--weights"), ("sim-to-real",)),
     },
 }
 LATER = {("place", "range_m"), ("export", "validation")}  # are refused by what takes them
@@ -138,6 +137,7 @@ VALUES = {
     "--scale": "quick",
     "--tracks": None,
     "--around": None,
+    "--estimate-poses": None,
 }  # else 0.5 or 1
 
 

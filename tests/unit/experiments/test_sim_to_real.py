@@ -56,7 +56,8 @@ def test_what_the_image_does_not_show_does_not_count():
 
 
 def test_similar_classes_are_neutral_for_the_one_that_they_resemble():
-    objects = boxes((20, 0), (30, 0), (40, 0), label=np.array(["Car", "Truck", "Person_sitting"]))
+    places = boxes((20, 0), (30, 0), (40, 0))
+    objects = Boxes.from_array(places.array(), np.array(["Car", "Truck", "Person_sitting"]))
     truth = truth_of(frame(objects))
     assert truth.targets.center[:, 0].tolist() == [20]
     assert list(zip(truth.neutral.label.tolist(), truth.neutral.center[:, 0].tolist(), strict=True)) == [

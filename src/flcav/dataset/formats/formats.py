@@ -22,6 +22,8 @@ IMPORTS: Mapping[str, str] = {
     "nuscenes": "flcav.dataset.formats.nuscenes.read:IMPORT",
     "argoverse2": "flcav.dataset.formats.argoverse2.read:IMPORT",
     "opv2v": "flcav.dataset.formats.opv2v.read:IMPORT",
+    "dair-v2x": "flcav.dataset.formats.roadside:DAIR",
+    "tumtraf": "flcav.dataset.formats.roadside:TUMTRAF",
 }
 
 

@@ -1,0 +1,263 @@
+"""Reading of roadside LiDAR datasets, DAIR-V2X and TUMTraf: sweeps of sensors at junctions, with boxes.
+
+DAIR-V2X-I (Yu et al., CVPR 2022) has its sweeps in `velodyne` and boxes in `label/virtuallidar`, in the frame of a
+level LiDAR; of the cooperative dataset it is the folder `infrastructure-side`. TUMTraf Intersection (Zimmer et al.,
+ITSC 2023) has `point_clouds/<lidar>` and, as ASAM OpenLABEL, `labels_point_clouds/<lidar>`. Each LiDAR is a pole. The
+world is the LiDAR's frame: where a sensor stands is not read, nor are pictures.
+"""
+
+import math
+import re
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from flcav.config import InputError, read_json
+from flcav.dataset.formats.layout import BRIGHTEST
+from flcav.dataset.formats.pcd import read_pcd
+from flcav.dataset.formats.reading import (
+    ImportFormat,
+    LogSource,
+    annotate,
+    check_cloud,
+    check_sizes,
+    choose_split,
+    turned_boxes,
+)
+from flcav.geometry import Boxes, wrap_angle
+from flcav.interface.wording import plural
+from flcav.sensors.frame import Calibration, Frame
+
+Array = NDArray[np.float64]
+
+LIDAR = "lidar"
+CATEGORIES = {  # of both datasets, without regard to case; others keep their names
+    "car": "car",
+    "van": "van",
+    "truck": "truck",
+    "trailer": "truck",
+    "bus": "bus",
+    "pedestrian": "pedestrian",
+    "cyclist": "bicycle",
+    "bicycle": "bicycle",
+    "motorcyclist": "motorcycle",
+    "motorcycle": "motorcycle",
+}
+OCCLUSION = (0.0, 0.3, 0.75)  # share that stands for DAIR-V2X's levels 0 not, 1 partly and 2 largely occluded
+STAMP = re.compile(r"(\d+)_(\d{9})_")  # seconds and nanoseconds in the names of TUMTraf's files
+
+
+class Sweep(NamedTuple):
+    """A sweep of a roadside LiDAR, its labels, and where it belongs in a dataset."""
+
+    cloud: Path
+    label: Path
+    pole: str
+    spin: int
+    time_s: float  # since the first of its scene
+
+
+class Labelled(NamedTuple):
+    """The M labelled objects of a sweep, LiDAR frame."""
+
+    track: tuple[str, ...]
+    boxes: Boxes
+    occlusion: Array  # (M,)
+
+
+class RoadsideSource(LogSource):
+    """The sweeps of roadside LiDARs in a folder."""
+
+    def __init__(self, folder: Path, split: str | None = None) -> None:
+        """Raises `InputError` where there is no sweep with labels, none of `split`, or a table is malformed."""
+        self.folder, self.split = folder, split
+        found, bare = self._list_sweeps(folder)
+        if not found:
+            raise InputError(f"{folder}: no sweep that has labels")
+        self.split_of = dict.fromkeys(choose_split(folder, dict.fromkeys(found), split))
+        self._sweeps = {scene: sorted(found[scene], key=lambda each: (each.spin, each.pole)) for scene in self.split_of}
+        self.notes = (f"left out {plural(bare, 'sweep')} without labels",) if bare else ()
+
+    def frame_count(self, scene: str) -> int:
+        """Return the number of sweeps of a scene."""
+        return len(self._sweeps[scene])
+
+    def frames(self, scene: str) -> Iterator[Frame]:
+        """Yield the sweeps of a scene; raises `InputError` where a file is missing, truncated or malformed."""
+        calibration, here = Calibration({LIDAR: np.eye(4)}), np.eye(4)
+        for sweep in self._sweeps[scene]:
+            points, found = read_sweep(sweep.cloud), self._read_labels(sweep.label)
+            check_sizes(found.boxes.size, sweep.label)
+            yield Frame(
+                scene=scene,
+                index=sweep.spin,
+                time_s=sweep.time_s,
+                agent=sweep.pole,
+                world_from_agent=here,
+                calibration=calibration,
+                assumed=calibration,
+                lidar={LIDAR: points},
+                annotations=annotate(found.track, found.boxes, {LIDAR: (points, here)}, {}, occlusion=found.occlusion),
+            )
+
+    @abstractmethod
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], int]:
+        """Return the labelled sweeps by scene, and how many have no labels."""
+
+    @abstractmethod
+    def _read_labels(self, path: Path) -> Labelled:
+        """Return the objects in a file of labels; raises `InputError` for another file."""
+
+
+class DairSource(RoadsideSource):
+    """The sweeps of DAIR-V2X-I: by the sequences of `data_info.json` where it has some, else scenes of one sweep."""
+
+    FORMAT = "dair-v2x"
+
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], int]:
+        about, labels = _read_infos(folder / "data_info.json"), folder / "label" / "virtuallidar"
+        places = {place: number for number, place in enumerate(sorted({row.place for row in about.values()} | {""}))}
+        scenes: dict[str, list[Sweep]] = {}
+        bare = 0
+        for cloud in sorted((folder / "velodyne").glob("*.pcd")):
+            label, own = labels / f"{cloud.stem}.json", about.get(cloud.stem, Info("", "", 0.0))
+            if not label.is_file():
+                bare += 1
+                continue
+            scene = f"dair-{own.sequence or cloud.stem}"
+            scenes.setdefault(scene, []).append(Sweep(cloud, label, f"pole{places[own.place]}", 0, own.time_s))
+        return {scene: _number(sweeps) for scene, sweeps in scenes.items()}, bare
+
+    def _read_labels(self, path: Path) -> Labelled:
+        rows: Any = read_json(path)
+        track, category, numbers, occlusion = [], [], [], []
+        try:
+            for number, row in enumerate(rows):
+                size, place = row["3d_dimensions"], row["3d_location"]
+                values = [place[axis] for axis in "xyz"] + [size[axis] for axis in "lwh"] + [row["rotation"]]
+                numbers.append([float(value) for value in values])
+                category.append(str(row["type"]))
+                track.append(str(row.get("track_id", f"{path.stem}-{number}")))
+                level = int(float(row.get("occluded_state", 0)))
+                occlusion.append(OCCLUSION[level] if 0 <= level < len(OCCLUSION) else math.nan)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise InputError(f"{path}: object {len(track) + 1} is none of DAIR-V2X's labels") from None
+        array = _check_numbers(np.array(numbers).reshape(-1, 7), path)
+        boxes = Boxes(array[:, :3], array[:, 3:6], wrap_angle(array[:, 6]), _name(category))
+        return Labelled(tuple(track), boxes, np.array(occlusion))
+
+
+class TumTrafSource(RoadsideSource):
+    """The sequences of TUMTraf Intersection in a folder, or the folder of one."""
+
+    FORMAT = "tumtraf"
+
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], int]:
+        roots = [folder] if (folder / "point_clouds").is_dir() else sorted(folder.iterdir())
+        scenes: dict[str, list[Sweep]] = {}
+        bare = 0
+        for root in (each for each in roots if (each / "point_clouds").is_dir()):
+            for number, lidar in enumerate(sorted(path for path in (root / "point_clouds").iterdir() if path.is_dir())):
+                for cloud in sorted(lidar.glob("*.pcd")):
+                    label = root / "labels_point_clouds" / lidar.name / f"{cloud.stem}.json"
+                    stamp = STAMP.match(cloud.stem)
+                    time_s = int(stamp[1]) + int(stamp[2]) / 1e9 if stamp else 0.0
+                    if not label.is_file():
+                        bare += 1
+                        continue
+                    sweep = Sweep(cloud, label, f"pole{number}", 0, time_s)
+                    scenes.setdefault(root.resolve().name, []).append(sweep)
+        return {scene: _number(sweeps) for scene, sweeps in scenes.items()}, bare
+
+    def _read_labels(self, path: Path) -> Labelled:
+        values: Any = read_json(path)
+        track, category, numbers = [], [], []
+        try:
+            (frame,) = values["openlabel"]["frames"].values()
+            for name, row in frame["objects"].items():
+                own = row["object_data"]
+                numbers.append([float(value) for value in own["cuboid"]["val"]])
+                category.append(str(own["type"]))
+                track.append(str(name))
+            array = np.array(numbers, np.float64).reshape(-1, 10)
+            turned = Rotation.from_quat(array[:, 3:7]).as_matrix() if len(array) else np.zeros((0, 3, 3))
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise InputError(f"{path}: object {len(track) + 1} is no cuboid of OpenLABEL") from None
+        array = _check_numbers(array, path)
+        boxes = turned_boxes(array[:, :3], array[:, 7:], turned, _name(category))
+        return Labelled(tuple(track), boxes, np.full(len(boxes), np.nan))
+
+
+def read_sweep(path: Path) -> NDArray[np.float32]:
+    """Return (N, 4) x, y, z [m], intensity [0, 1] of a PCD file; points that are not finite are left out.
+
+    Intensities may reach 255, or 65535. Raises `InputError` for other files.
+    """
+    rows = read_pcd(path)
+    try:
+        columns = [rows[name] for name in ("x", "y", "z", "intensity")]
+    except ValueError:
+        raise InputError(f"{path}: not a sweep, which has the fields x, y, z, intensity") from None
+    points = np.stack([column.astype(np.float32) for column in columns], axis=1)
+    points = points[np.isfinite(points).all(axis=1)]
+    brightest = float(points[:, 3].max(initial=0.0))
+    for limit in (BRIGHTEST, 2**16 - 1):
+        if 1 < brightest <= limit:
+            points[:, 3] /= np.float32(limit)
+            break
+    return check_cloud(points, path)
+
+
+class Info(NamedTuple):
+    """What `data_info.json` says of a sweep."""
+
+    sequence: str  # "" where it is of none
+    place: str  # junction
+    time_s: float
+
+
+def _read_infos(path: Path) -> Mapping[str, Info]:
+    """Return what is said of each sweep, by the name of its file; nothing where there is no table."""
+    if not path.is_file():
+        return {}
+    rows: Any = read_json(path)
+    try:
+        return {
+            Path(str(row["pointcloud_path"])).stem: Info(
+                str(row.get("sequence_id", "")),
+                str(row.get("intersection_loc", "")),
+                float(row.get("pointcloud_timestamp", 0)) / 1e6,
+            )
+            for row in rows
+        }
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise InputError(f"{path}: not the list of sweeps of DAIR-V2X") from None
+
+
+def _number(sweeps: Sequence[Sweep]) -> list[Sweep]:
+    """Return a scene's sweeps with their spins, each LiDAR's in the order of time, and times since the first."""
+    first, spins, numbered = min(sweep.time_s for sweep in sweeps), dict[str, int](), []
+    for sweep in sorted(sweeps, key=lambda each: (each.time_s, each.cloud)):
+        spin = spins.get(sweep.pole, 0)
+        spins[sweep.pole] = spin + 1
+        numbered.append(sweep._replace(spin=spin, time_s=round(sweep.time_s - first, 6)))
+    return numbered
+
+
+def _name(category: Sequence[str]) -> NDArray[np.str_]:
+    return np.array([CATEGORIES.get(name.lower(), name) for name in category], np.str_).reshape(len(category))
+
+
+def _check_numbers(numbers: Array, path: Path) -> Array:
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{path}: object {int(np.isfinite(numbers).all(axis=1).argmin()) + 1} is not finite")
+    return numbers
+
+
+DAIR = ImportFormat(DairSource, ("label/virtuallidar",))
+TUMTRAF = ImportFormat(TumTrafSource, ("labels_point_clouds", "*/labels_point_clouds"))
