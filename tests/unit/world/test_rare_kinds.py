@@ -19,7 +19,14 @@ from flcav.world.shapes import ANGLED, RARE, SHAPES
 from flcav.world.traffic.demand import park
 from flcav.world.traffic.traffic import simulate
 
-EVERY = {"trailer_car": 0.1, "ladder_van": 0.4, "box_van": 0.3, "cargo_bike": 0.5, "overturned": 0.2, "angled": 0.4}
+EVERY: dict[str, float] = {
+    "trailer_car": 0.1,
+    "ladder_van": 0.4,
+    "box_van": 0.3,
+    "cargo_bike": 0.5,
+    "overturned": 0.2,
+    "angled": 0.4,
+}
 
 
 def town_with(rare: dict[str, float], name: str = "grid") -> Town:
@@ -78,7 +85,7 @@ def test_parked_ones_do_not_overlap_and_stand_at_their_angles() -> None:
 
 
 def test_traffic_has_them_but_for_those_that_are_parked_only() -> None:
-    rare = dict.fromkeys(("trailer_car", "overturned", "ladder_van", "box_van", "cargo_bike"), 0.45)
+    rare = {kind: 0.45 for kind in EVERY if kind != ANGLED}
     trace = simulate(town_with(rare), seed=4, cavs=1, times_s=np.array([40.0]))
     moving = np.char.startswith(trace.actor, "veh")
     kinds = {name_of(str(c), s) for c, s in zip(trace.category[moving], trace.shape[moving], strict=True)}

@@ -186,9 +186,9 @@ def count_objects(
     rows: list[FoundAtDistance] = []
     for label in classes:
         sides = (detections, [truth.targets for truth in truths], [truth.neutral for truth in truths])
-        own = ([select_class(boxes, label) for boxes in side] for side in sides)
+        found, targets, neutral = ([select_class(boxes, label) for boxes in side] for side in sides)
         rng = stream(seed, "counts", label)
-        rows += count_by_distance(*own, [truth.scene for truth in truths], label, rng)
+        rows += count_by_distance(found, targets, neutral, [truth.scene for truth in truths], label, rng)
     return tuple(rows)
 
 
