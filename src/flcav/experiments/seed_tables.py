@@ -6,7 +6,6 @@ import numpy as np
 
 from flcav.experiments.run_tables import judge_anew
 from flcav.pipeline.analysis.costs import list_home_costs
-from flcav.pipeline.analysis.summary import count_claims
 from flcav.pipeline.recipe import MAIN, PRETRAIN
 from flcav.pipeline.results.run import Run, Summary
 from flcav.pipeline.results.tests import Difference
@@ -18,13 +17,13 @@ from flcav.storage.markdown import format_table
 
 def tables(runs: Sequence[Run], summary: Summary) -> dict[str, str]:
     """Return Markdown by name: claims with the numbers of seeds that decide them, seeds, means over seeds."""
-    return {"claims": _claims(runs), "seeds": _seeds(runs), "means": _means(summary)}
+    return {"claims": _claims(summary), "seeds": _seeds(runs), "means": _means(summary)}
 
 
-def _claims(runs: Sequence[Run]) -> str:
+def _claims(summary: Summary) -> str:
     rows = [
         [each.question, each.place, each.kind or "", each.held, each.did_not_hold, each.undecided]
-        for each in count_claims(runs)
+        for each in summary.claims
     ]
     return format_table(("claim", "region, task", "kind", "held", "did not hold", "undecided"), rows)
 

@@ -16,10 +16,12 @@ from flcav.dataset.formats.kitti.files import ASSUMED_SIZE, is_drive
 from flcav.dataset.formats.kitti.read import BEAMS, HEIGHT_M, RANGE_M
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import EDGES
+from flcav.dataset.layout import MANIFEST
 from flcav.geometry import Boxes, pose, transform_points
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.perception.errors import THRESHOLD
+from flcav.perception.images import kitti_view
 from flcav.perception.metrics.average_precision import interval_words
 from flcav.perception.metrics.kitti import (
     COUNTS,
@@ -131,7 +133,7 @@ class _Found:
 
 def is_kitti(path: Path) -> bool:
     """Return whether `path` is a folder in KITTI's layout and no dataset of flcav's."""
-    return (path / "training" / "velodyne").is_dir() or (is_drive(path) and not (path / "manifest.json").exists())
+    return (path / "training" / "velodyne").is_dir() or (is_drive(path) and not (path / MANIFEST).exists())
 
 
 def compare_kitti_rig(path: Path, config: SecondConfig, trained: KnownLidar) -> str:
@@ -179,12 +181,8 @@ def _detect(network: Second, folder: KittiFolder, progress: Report) -> Iterator[
 
 def in_image(boxes: Boxes, frame: KittiFrame) -> Boxes:
     """Return the boxes whose centre is inside the frame's image: outside it, objects have no labels."""
-    calibration = frame.calibration
-    center = np.c_[transform_points(calibration.camera_from_lidar, boxes.center), np.ones(len(boxes))]
-    pixels = center @ calibration.image_from_camera.T
-    at = pixels[:, :2] / np.where(pixels[:, 2:] == 0, np.inf, pixels[:, 2:]) + 0.5
-    height, width = frame.size
-    return boxes[(pixels[:, 2] > 0) & (at >= 0).all(axis=1) & (at < (width, height)).all(axis=1)]
+    blank = np.broadcast_to(np.uint8(0), (*frame.size, 3))
+    return boxes[kitti_view(blank, frame.calibration).shows(boxes.center)]
 
 
 def truth_of(frame: KittiFrame) -> FrameTruth:

@@ -214,7 +214,7 @@ def read_sweep(path: Path) -> NDArray[np.float32]:
 
 
 class Info(NamedTuple):
-    """What `data_info.json` says of a sweep."""
+    """The entry of a sweep in `data_info.json`."""
 
     sequence: str  # "" where it is of none
     place: str  # junction

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flcav.geometry import Boxes
+from flcav.perception.metrics.found_cars import SCORE
 from flcav.perception.metrics.matching import assign_targets, on_neutral
 from flcav.statistics.bootstrap import bootstrap_over_scenes
 from flcav.storage.records import Class
 
 DISTANCES_M = ((0, 20), (20, 40), (40, 80))  # from, to: in the plane from the LiDAR to the centre of the box
-SCORE = 0.3  # lowest of a detection that counts
 OVERLAP = 0.5  # IoU in 3D from which a detection finds an object
 
 

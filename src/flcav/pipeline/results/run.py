@@ -126,7 +126,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class ClaimCount:
-    """How the runs of several seeds decide one claim, each by itself."""
+    """Verdicts on one claim over the runs of several seeds: how many runs come to each."""
 
     question: str
     place: str  # region, or regions, and task

@@ -120,7 +120,7 @@ class KittiSource(LogSource):
             yield _read_frame(shot, agent, self._calibration[agent])
 
 
-IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne", "velodyne"))
+IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne", "velodyne/*.bin"))
 
 
 def _calibrate(calibrated: KittiCalibration) -> Calibration:
@@ -140,9 +140,7 @@ def _read_frame(shot: KittiShot, agent: str, calibration: Calibration) -> Linked
     points, calibrated = read_points(files[LIDAR]), read_calibration(_path(shot, "calib"))
     size = measure_picture(path) if pictures else (None, None)
     label = _path(shot, "label_2")
-    objects = (
-        read_objects(label, calibrated, levels=shot.folder.name not in FOLDERS) if label.is_file() else Objects.none()
-    )
+    objects = read_objects(label, calibrated, levels=is_drive(shot.folder)) if label.is_file() else Objects.none()
     check_objects(objects, *size, label)
     agent_from_lidar, mount = calibration.agent_from_sensor[LIDAR], calibration.agent_from_sensor[CAMERA]
     then = _calibrate(calibrated).agent_from_sensor[CAMERA] @ inverse(mount)
