@@ -12,7 +12,7 @@ from flcav.config import InputError, Json, shorten
 from flcav.sensors.frame import LONGEST_NAME, Frame, format_key
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
-from flcav.sources.randomisation import randomise_rig, randomise_sizes, randomise_town, town_files
+from flcav.sources.randomisation import randomise_bodies, randomise_rig, randomise_town, town_files
 from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import derive_seed, stream
 from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, check_town_name, load_town
@@ -147,7 +147,7 @@ class EmbeddedSource:
             times_s, scenarios = self.recipe.times_s(int(warmup)), self.recipe.scenarios
             trace = simulate(self.town, seed=seed, cavs=self.recipe.cavs, times_s=times_s, scenarios=scenarios)
             if self.recipe.randomise is not None:
-                trace = randomise_sizes(trace, stream(self.recipe.seed, scene, "sizes"))
+                trace = randomise_bodies(trace, stream(self.recipe.seed, scene, "sizes"))
             self._last_trace = scene, trace
         return self._last_trace[1]
 

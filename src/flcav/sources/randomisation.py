@@ -31,6 +31,7 @@ Draw = np.random.Generator
 
 CELL_M, FAR_CELL_M = 5.0, 50.0  # of the terrain within the town's bounds, and beyond them
 STEEPEST = 0.035  # slope of one of three long waves of the terrain
+BOW_M = (0.1, 0.5)  # least and most of a car's ends; on KITTI's cars about .25 m at the rear, .35 m at the front
 LARGEST = 1.06  # factor of a car's length: parked cars keep apart
 PATTERNS = ("hdl64e", "vlp32c twice", "vls128", "os1_128", "even")  # of beams; "twice": two LiDARs, one on the other
 EVEN_BEAMS = (40, 96)  # fewest and most of the pattern "even"
@@ -184,9 +185,10 @@ def _draw_beams(pattern: str, draw: Draw) -> tuple[tuple[float, ...], int]:
     return tuple(float(elevation) for elevation in off.round(3)), steps
 
 
-def randomise_sizes(trace: Trace, draw: Draw) -> Trace:
-    """Return the trace with the length, width and height of cars and vans drawn around those of their shapes."""
-    cars = np.isin(trace.category, ("car", "van"))[:, None]
+def randomise_bodies(trace: Trace, draw: Draw) -> Trace:
+    """Return the trace with the sizes of cars and vans drawn around those of their shapes, and their ends bowed."""
+    cars = np.isin(trace.category, ("car", "van"))
     low, high = np.transpose(((0.85, LARGEST), (0.92, 1.08), (0.9, 1.12)))
     factor = draw.uniform(low, high, size=trace.size.shape)
-    return replace(trace, size=np.where(cars, (trace.size * factor).round(3), trace.size))
+    size = np.where(cars[:, None], (trace.size * factor).round(3), trace.size)
+    return replace(trace, size=size, bow=np.where(cars, draw.uniform(*BOW_M, size=len(cars)).round(3), 0.0))

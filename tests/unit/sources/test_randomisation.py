@@ -14,8 +14,8 @@ from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.randomisation import (
     DRAWN_BEAMS,
     draw_terrain,
+    randomise_bodies,
     randomise_rig,
-    randomise_sizes,
     randomise_town,
     town_files,
 )
@@ -117,7 +117,10 @@ def test_cars_alone_change_their_sizes(source: EmbeddedSource):
     assert (factor >= (0.849, 0.919, 0.899)).all()
     assert (factor <= (1.061, 1.081, 1.121)).all()
     assert np.std(factor[:, 0]) > 0.03
-    again = randomise_sizes(trace, stream(0, "sizes"))
+    assert trace.bow is not None
+    assert (trace.bow[~cars] == 0).all()
+    assert 0.1 <= trace.bow[cars].min() < trace.bow[cars].max() <= 0.5
+    again = randomise_bodies(trace, stream(0, "sizes"))
     assert again.model(0)[:2] == trace.model(0)[:2]
 
 
