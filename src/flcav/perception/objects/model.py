@@ -249,7 +249,7 @@ def small_config(
             shift_m=1.5,
             resize=((0.7, 1.05), (0.8, 1.05), (0.9, 1.15)),
             resized=0.8,
-            margin_m=(("Car", 0.12, -0.06, 0.0), ("Pedestrian", 0.2, 0.1, 0.0)),
+            margin_m=(("Car", 0.12, -0.06, 0.0), ("Pedestrian", 0.08, 0.08, 0.0)),
             tilt_rad=0.02,
             lift_m=0.2,
             drop=0.3,
