@@ -55,6 +55,9 @@ class Settings:
     dt_s: float = 0.05  # length of a step
 
 
+DEFAULT = Settings()
+
+
 @dataclass(frozen=True)
 class Step:
     """A step in the history of a live world."""
@@ -74,7 +77,7 @@ class LiveWorld:
     0.05
     """
 
-    def __init__(self, town: Town, settings: Settings = Settings()) -> None:
+    def __init__(self, town: Town, settings: Settings = DEFAULT) -> None:
         """Start at time 0, with SUMO's traffic under way.
 
         Raises `InputError` for settings that do not fit the town, `RuntimeError` where SUMO fails.

@@ -26,7 +26,7 @@ class LiveTraffic:
     """A SUMO run with vehicles that are controlled from outside."""
 
     def __init__(self, sumo: Any, job: dict[str, Any]) -> None:
-        """Start SUMO with the net, routes and seed of the `job`, and make its `steps` without vehicles under control."""
+        """Start SUMO with the net, routes and seed of the `job`, and make its `steps` with its own traffic alone."""
         options = {
             "net-file": job["net"],
             "route-files": job["routes"],
