@@ -56,6 +56,13 @@ def speed(snapshot: Snapshot, name: str) -> float:
     return float(np.linalg.norm(snapshot.trace.velocity[0, snapshot.row(name)]))
 
 
+def run(world: LiveWorld, steps: int, controls: Controls | None = None, dt_s: float | None = None) -> Snapshot:
+    """Return a world after so many steps, in which "ego" has these controls."""
+    for _ in range(steps):
+        world.step({} if controls is None else {"ego": controls}, dt_s=dt_s)
+    return world.snapshot
+
+
 @pytest.fixture
 def road(small_town: Callable[..., Town]) -> Iterator[LiveWorld]:
     """A straight road along x with a wall across it at x = 40 m, and one lamp."""
@@ -68,8 +75,7 @@ def test_a_vehicle_drives_and_keeps_its_controls(road: LiveWorld):
     road.apply(Spawn("ego", "car", 3, 0.0, 0.0))
     assert place(road.snapshot, "ego").tolist() == [0, 0, 0]
     first = road.step({"ego": Controls(throttle=1.0)})
-    for _ in range(19):
-        last = road.step()
+    last = run(road, 19)
     assert last.controls["ego"] == Controls(throttle=1.0)
     assert (last.step, last.time_s) == (20, 1.0)
     pull = road.bodies.find("ego").blueprint
@@ -124,8 +130,7 @@ def test_a_car_pushes_another_one(road: LiveWorld):
 def test_walkers_walk_and_turn(road: LiveWorld):
     road.apply(Spawn("walker", "pedestrian", 0, 0.0, 5.0))
     road.apply(Walk("walker", (0.0, 1.5)))
-    for _ in range(40):
-        snapshot = road.step()
+    snapshot = run(road, 40)
     np.testing.assert_allclose(place(snapshot, "walker"), (0.0, 7.925, 0.12), atol=1e-6)  # up on the sidewalk
     assert snapshot.trace.yaw[0, 0] == pytest.approx(np.pi / 2)
     assert speed(snapshot, "walker") == pytest.approx(1.5)
@@ -202,7 +207,8 @@ def test_no_two_boxes_interpenetrate(small_town: Callable[..., Town]):
     kinds = ("car", "truck", "motorcycle", "pedestrian", "van", "bicycle", "prop")
     with LiveWorld(small_town(buildings=walls), EMPTY) as world:
         for number in range(60):
-            spawn = Spawn(f"a{number}", kinds[number % 7], 0, *random.uniform(-18, 18, 2), random.uniform(-3, 3))
+            x, y, yaw = random.uniform((-18, -18, -3), (18, 18, 3)).tolist()
+            spawn = Spawn(f"a{number}", kinds[number % 7], 0, x, y, yaw)
             if not world.find_obstruction(spawn):
                 world.apply(spawn)
         for step in range(300):
@@ -224,16 +230,14 @@ def test_no_two_boxes_interpenetrate(small_town: Callable[..., Town]):
             assert (
                 not rows.any() or shapely.area(shapely.intersection(shapes[first], shapes[second]))[rows].max() < 1e-9
             )
-        assert len(trace.actor) > 30
+        assert len(world.bodies.members) > 30
 
 
 def test_a_longer_step_is_several_short_ones(road: LiveWorld, small_town: Callable[..., Town]):
     with LiveWorld(road.town, EMPTY) as other:
         for world, dt_s, steps in ((road, 0.05, 20), (other, 0.5, 2)):
             world.apply(Spawn("ego", "car", 3, 0.0, 0.0))
-            for _ in range(steps):
-                snapshot = world.step({"ego": Controls(0.5, 0.1)}, dt_s=dt_s)
-            assert snapshot.time_s == 1.0
+            assert run(world, steps, Controls(0.5, 0.1), dt_s).time_s == 1.0
         np.testing.assert_allclose(place(other.snapshot, "ego"), place(road.snapshot, "ego"), atol=1e-9)
 
 
@@ -277,7 +281,7 @@ def test_the_same_commands_give_the_same_bytes_and_a_fork_goes_on_alike():
 
 def test_traffic_brakes_for_what_stands_in_its_way():
     with LiveWorld(load_town("grid"), Settings(seed=3, traffic=40)) as world:
-        found = np.zeros(0, np.int64)
+        trace, found = world.snapshot.trace, np.zeros(0, np.int64)
         while not len(found):
             trace = world.step().trace
             fast = np.linalg.norm(trace.velocity[0], axis=1) > 8
@@ -291,12 +295,10 @@ def test_traffic_brakes_for_what_stands_in_its_way():
             snapshot = world.step()
             distances.append((place(snapshot, "walker") - place(snapshot, name))[:2] @ ahead)
             assert not snapshot.collisions
-        assert speed(snapshot, name) < 0.3
+        assert speed(world.snapshot, name) < 0.3
         assert 2.3 < min(distances) < 12
         world.apply(Remove("walker"))
-        for _ in range(60):
-            snapshot = world.step()
-        assert speed(snapshot, name) > 2
+        assert speed(run(world, 60), name) > 2
 
 
 def test_lights_are_those_of_sumo():
@@ -317,8 +319,7 @@ def test_lights_can_be_set_and_frozen():
         count = sum(str(name).startswith(f"{junction}:") for name in before.light)
         world.apply(SetLight(junction, "y" * count))
         world.apply(FreezeLights(True))
-        for _ in range(100):
-            after = world.step(dt_s=1.0).trace
+        after = run(world, 100, dt_s=1.0).trace
         rest = [not str(name).startswith(f"{junction}:") for name in before.light]
         assert (after.light_state[0, rest] == before.light_state[0, rest]).all()
         assert after.light_state[0, np.invert(rest)].tolist() == ["y"] * count

@@ -26,7 +26,9 @@ def moving(speed: float, yaw: float = 0.0) -> Motion:
 
 
 def pedals(throttle=0.0, steer=0.0, brake=0.0, hand_brake=False, reverse=False) -> Pedals:
-    return Pedals(*(np.array([value]) for value in (throttle, steer, brake, hand_brake, reverse)))
+    return Pedals(
+        np.array([throttle]), np.array([steer]), np.array([brake]), np.array([hand_brake]), np.array([reverse])
+    )
 
 
 def run(motion: Motion, steps: int, pressed: Pedals, pitch=0.0, dt_s=0.05, cars: Vehicles = CARS) -> list[Motion]:
@@ -108,7 +110,8 @@ def test_shorter_steps_give_the_same_way():
 def test_vehicles_in_one_call_do_not_affect_each_other():
     two = [SEDAN, blueprint("bus", 0)]
     both = Motion(*(np.repeat(array, 2, axis=0) for array in moving(7.0)))
-    pressed = Pedals(*(np.repeat(array, 2) for array in pedals(throttle=0.7, steer=0.2)))
+    one = pedals(throttle=0.7, steer=0.2)
+    pressed = one._replace(**{name: np.repeat(array, 2) for name, array in one._asdict().items()})
     together = drive(both, stack_blueprints(two), pressed, np.zeros(2), 0.05)
     for row, each in enumerate(two):
         alone = drive(moving(7.0), stack_blueprints([each]), pedals(throttle=0.7, steer=0.2), np.zeros(1), 0.05)
