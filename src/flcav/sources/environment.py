@@ -2,12 +2,12 @@
 
     gymnasium.make("flcav.sources.environment:flcav/Driving-v0", town="grid", traffic=30)
 
-It needs the extra `gym`. An action is the pedals, from full brake (-1) to full throttle (1), and the steering, from right
-(-1) to left (1). The reward is the progress along the route [m], less `COLLISION` for a collision; the episode ends with
-one, `OFF_M` beside the route, and at its end. Observations are in the car's frame, x forward and y left:
+It needs the extra `gym`. An action is the pedals, from full brake (-1) to full throttle (1), and the steering, from
+right (-1) to left (1). The reward is the progress along the route [m], less `COLLISION` for a collision; the episode
+ends with one, `OFF_M` beside the route, and at its end. Observations are in the car's frame, x forward and y left:
 
-- `ego` (5,): speed [m/s], yaw rate [rad/s], angle of the front wheels [rad], offset to the left of the route [m], heading
-  less the route's [rad]
+- `ego` (5,): speed [m/s], yaw rate [rad/s], angle of the front wheels [rad], offset to the left of the route [m],
+  heading less the route's [rad]
 - `route` (`AHEAD`, 2): the route every `SPACING_M` from here on [m]
 - `limit` (1,): the speed limit [m/s]
 - `light` (2,): distance to the next traffic light on the route [m], at most `SIGHT_M`, and 1 where it is green
@@ -68,7 +68,7 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         dt_s: float = 0.1,
         lidar: Lidar | None = None,
     ) -> None:
-        """Take a town or the name of one, the number of SUMO's vehicles and pedestrians, and the time between actions."""
+        """Take a town or its name, the number of SUMO's vehicles and pedestrians, and the time between actions."""
         self.town = load_town(town) if isinstance(town, str) else town
         self._net = read_net(self.town.net)
         self._settings = {"traffic": traffic, "pedestrians": pedestrians, "dt_s": dt_s}
@@ -180,9 +180,7 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if self._scene is None:
             self._scene = Scene(self.town, snapshot.trace)
         self._scene.follow(snapshot.trace)
-        frame = observe(
-            self._scene, self._rig, EGO, 0, scene_name="driving", seed=self._seed, number=snapshot.step
-        )
+        frame = observe(self._scene, self._rig, EGO, 0, scene_name="driving", seed=self._seed, number=snapshot.step)
         lidar = self._rig.lidars["lidar"].settings
         points = np.zeros((lidar.channels * lidar.azimuth_steps, 4), np.float32)
         points[: len(frame.lidar["lidar"])] = frame.lidar["lidar"]

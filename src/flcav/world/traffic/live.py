@@ -36,6 +36,7 @@ WARM_UP_S = 30.0  # time of SUMO at the start of a live world
 TOUR_S = 900.0  # length of a vehicle's tour, at least; it then sets out again
 SLOW_MPS = 1.0  # traffic brakes for a slower vehicle wherever it stands, and for a faster one in its lane
 DANGERS = (-0.4, 0.0, 0.4)  # places to brake for, over a body's length from its middle
+SOON_S = 0.7  # so far ahead traffic looks at who crosses its way
 BERTH_M = 1.0  # half the width of a vehicle that passes
 
 _idle: list[tuple[int, subprocess.Popen[bytes]]] = []  # processes without a world, with the id of their parent
@@ -220,13 +221,21 @@ def _list_vehicles(bodies: Actors) -> list[tuple[str | float, ...]]:
 
 
 def _list_dangers(bodies: Actors) -> list[list[float]]:
-    """Return x, y, half width [m] of places to brake for: walkers, props, and vehicles that hardly move."""
-    slow = np.linalg.norm(bodies.velocity[:, :2], axis=1) < SLOW_MPS
-    rows = np.flatnonzero(slow | ~np.isin(bodies.category, VEHICLES))
-    along = bodies.size[rows, :1] * heading_vectors(bodies.yaw[rows])
-    places = [bodies.position[rows, :2] + share * along for share in DANGERS]
-    half = np.tile(BERTH_M + bodies.size[rows, 1] / 2, len(DANGERS))
-    return np.column_stack((np.concatenate(places), half)).tolist()
+    """Return x, y, half width [m], cosine and sine of the heading, of places to brake for, now and `SOON_S` later.
+
+    The heading of walkers, props and vehicles that hardly move is 0, 0: all brake for them, and for others only those
+    whose way they cross.
+    """
+    moves = np.isin(bodies.category, VEHICLES) & (np.linalg.norm(bodies.velocity[:, :2], axis=1) >= SLOW_MPS)
+    heading = heading_vectors(bodies.yaw)
+    along = bodies.size[:, :1] * heading
+    places = [
+        bodies.position[:, :2] + share * along + time_s * bodies.velocity[:, :2]
+        for share in DANGERS
+        for time_s in (0.0, SOON_S)
+    ]
+    row = np.column_stack((BERTH_M + bodies.size[:, 1] / 2, moves[:, None] * heading))
+    return np.column_stack((np.concatenate(places), np.tile(row, (len(places), 1)))).tolist()
 
 
 def _take_process() -> subprocess.Popen[bytes]:

@@ -3,8 +3,9 @@
 `serve` reads requests and writes answers, a JSON object on a line each. The first request of a world starts SUMO in a
 fork of this process, since libsumo holds one simulation per process and is slow to load; an empty line ends it. Each
 further request has the vehicles under control (`bodies`: name, type, length and width [m], SUMO's front x, y [m], angle
-[deg] and speed [m/s]), the places to brake for (`dangers`: x, y, half width [m]), the `lights` that changed, and the
-vehicles that a collision has stopped (`halted`). SUMO then makes a step of `STEP_S`.
+[deg] and speed [m/s]), the places to brake for (`dangers`: x, y, half width [m], cosine and sine of the heading of what
+crosses, 0 and 0 for what anyone brakes for), the `lights` that changed, and the vehicles that a collision has stopped
+(`halted`). SUMO then makes a step of `STEP_S`.
 """
 
 import json
@@ -20,6 +21,7 @@ from flcav.world.traffic.sumo_process import STEP_S, Walkers
 
 OWN = "own:"  # begins the names of vehicles under control
 NEAR_LANE_M = 5.0  # a vehicle under control is on a lane whose middle is so near, else off the road
+CROSSING = 0.5  # sine of the angle from which on somebody's way is crossed
 HALT_STEPS = round(5.0 / STEP_S)  # for so long a vehicle stands after a collision
 
 
@@ -114,18 +116,19 @@ class LiveTraffic:
         )
 
     def _brake(self, dangers: list[list[float]]) -> None:
-        """Let vehicles brake for the places x, y, half width [m] ahead, and let those go that need not any more."""
+        """Let vehicles brake for the `dangers` ahead, and let those go that need not any more."""
         vehicle = self.sumo.vehicle
         names = [name for name in vehicle.getIDList() if name not in self._own and name not in self._halted]
         if names and (dangers or self._braking):
             x, y = np.array([vehicle.getPosition(name) for name in names]).T
             turned = np.pi / 2 - np.radians([vehicle.getAngle(name) for name in names])
             reach = np.array([braking_m(vehicle.getSpeed(name)) for name in names])[:, None]
-            at_x, at_y, half = np.array(dangers, np.float64).reshape(-1, 3).T
+            at_x, at_y, half, heading_x, heading_y = np.array(dangers, np.float64).reshape(-1, 5).T
             dx, dy = at_x - x[:, None], at_y - y[:, None]
             cos, sin = np.cos(turned)[:, None], np.sin(turned)[:, None]
             ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
-            brakes = ((ahead > -1.0) & (ahead < reach) & (np.abs(left) < half)).any(axis=1)
+            crosses = (np.abs(heading_y * cos - heading_x * sin) > CROSSING) | (heading_x**2 + heading_y**2 < 0.5)
+            brakes = (crosses & (ahead > -1.0) & (ahead < reach) & (np.abs(left) < half)).any(axis=1)
             for name, brake in zip(names, brakes.tolist()):
                 if brake:
                     vehicle.setActionStepLength(name, STEP_S)
