@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from flcav.config import Config
 from flcav.interface.wording import suggest
-from flcav.world.shapes import ANGLED, PARKED_ONLY, RARE, SHAPES
+from flcav.world.shapes import ANGLED, PARKED_ONLY, RARE, SHAPES, Shape
 
 LARGEST_M = 1000.0
 MOST = 10_000  # vehicles, or pedestrians
@@ -32,6 +32,7 @@ CLUTTER: dict[str, tuple[float, float, float]] = {  # kind -> length, width, hei
     "trailer": (3.4, 1.7, 1.5),
     "guard_rail": (4.0, 0.3, 0.75),
 }
+PROPS: tuple[Shape, ...] = tuple(Shape(kind, *size) for kind, size in CLUTTER.items())  # of the category "prop"
 BOUNDARIES = ("hedge", "hedgerow", "wall", "fence", "railing", "guard_rail")  # of `CLUTTER`: they enclose plots
 KERBSIDE = ("bin", "bollard", "cabinet", "post", "bicycle", "motorbike")  # kinds that stand between kerb and walkers
 Height = Annotated[float, Field(ge=0.1, le=100)]
