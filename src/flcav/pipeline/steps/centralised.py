@@ -5,6 +5,7 @@ The latter is a control that takes as many optimiser steps as stage II.
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ from flcav.pipeline.training.starting_weights import StartingWeights, load_start
 from flcav.statistics.streams import derive_seed
 
 CHECKPOINT, ROUND = "checkpoint.pt", LAST
+COUNTED_MB = 1e9  # budget of a link that is counted and never full
 VALIDATIONS, APART = 10, 5  # during pretraining; at least so many steps apart
 
 
@@ -241,6 +243,7 @@ def oracle_step(work: Work, settings: OracleSettings) -> None:
         held = learning.task.samples(split.data, trained.config, frames)
     else:
         share = share_plan_budget(Plan.load(work.inputs[inputs.plan]), settings.budgets_mb, learning.task.name)
+        share = replace(share, wireline_mb=COUNTED_MB)  # the cloud rounds that it was planned for do not take place
         book = Ledger(share, read_entries(work, inputs.pretrain))
         before = len(book.entries)
         chosen = choose_uploads({inputs.region: frames}, settings.uploads, settings.learning.seed)[inputs.region]

@@ -124,7 +124,7 @@ def _draw(axes: Axes, slices: Mapping[str, Sequence[Bar]]) -> None:
 def costs(
     panels: Mapping[str, Mapping[str, tuple[float, MeanOverSeeds]]], cost: str, measure: str, front: Sequence[str]
 ) -> Figure:
-    """Return a panel per title with a measure against its cost, a point with its interval and name; `front` joins some."""
+    """Return a panel per title with a measure against its cost, named points with intervals; `front` joins some."""
     figure = style.canvas(PANEL_IN * len(panels), 3.6)
     for axes, (title, points) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         best = sorted((points[name][0], points[name][1].mean) for name in front)
