@@ -5,7 +5,6 @@ vehicles are numbered in one list. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `tran
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -30,10 +29,10 @@ from flcav.dataset.formats.exporter import (
 from flcav.dataset.formats.mounts import agent_velocities, assign_channels, optical_yaw
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import yaw_of
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
+from flcav.sources.carla.frames import carla_pose
 
 Array = NDArray[np.float64]
 
@@ -46,7 +45,6 @@ CAMERAS = {  # yaw, counter-clockwise from ahead [rad]
     "camera3": np.pi,
 }
 FIRST_CAR, FIRST_POLE, FIRST_TRACK = 1001, 2001, 10001  # OpenCOOD takes the agent whose number sorts first as the ego
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 KMH = 3.6
 FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built without libyaml has only the slow one
 
@@ -125,35 +123,6 @@ def agent_numbers(agents: list[str]) -> dict[str, int]:
         **{agent: FIRST_CAR + i for i, agent in enumerate(cars)},
         **{agent: FIRST_POLE + i for i, agent in enumerate(poles)},
     }
-
-
-def carla_pose(world_from_body: Array) -> list[float]:
-    """Return [x, y, z [m], roll, yaw, pitch [degrees]] in CARLA's left-handed world of a (4, 4) `world_from_body`.
-
-    The body's axes are x ahead, y left, z up.
-    """
-    matrix = MIRROR @ world_from_body @ MIRROR
-    roll = np.arctan2(-matrix[2, 1], matrix[2, 2])
-    pitch = np.arcsin(np.clip(matrix[2, 0], -1, 1))
-    return [*matrix[:3, 3].tolist(), *np.degrees((roll, yaw_of(matrix), pitch)).tolist()]
-
-
-def from_carla(values: Sequence[float]) -> Array:
-    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`.
-
-    OpenCOOD's `x_to_world`, mirrored.
-    """
-    x, y, z, *angles = values
-    (cr, cy, cp), (sr, sy, sp) = np.cos(np.radians(angles)), np.sin(np.radians(angles))
-    matrix = np.array(
-        [
-            [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr, x],
-            [sy * cp, sy * sp * sr + cy * cr, -sy * sp * cr + cy * sr, y],
-            [sp, -cp * sr, cp * cr, z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
-    return MIRROR @ matrix @ MIRROR
 
 
 def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], speed_m_s: float) -> set[str]:
