@@ -32,7 +32,7 @@ from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
-from flcav.sources.carla.frames import carla_pose
+from flcav.sources.carla.frames import MIRROR, carla_pose
 
 Array = NDArray[np.float64]
 
