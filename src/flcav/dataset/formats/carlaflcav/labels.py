@@ -18,7 +18,7 @@ import pickletools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,6 +141,7 @@ def _evaluate(data: bytes) -> Value:
     stack: list[Value] = []
     marks: list[int] = []  # lengths of the stack
     memo: dict[int, Value] = {}
+    argument: Any  # None only of operations without one
     for code, argument, _ in pickletools.genops(data):
         match code.name:
             case "PROTO" | "FRAME":
