@@ -29,8 +29,8 @@ from flcav.world.opendrive.furnishing import furnish
 from flcav.world.opendrive.georeference import locate_origin
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.mending import mend_map
-from flcav.world.opendrive.netconvert import run_netconvert
 from flcav.world.opendrive.mirror import mirror_map, mirror_parts
+from flcav.world.opendrive.netconvert import run_netconvert
 from flcav.world.opendrive.objects.crossings import take_crosswalks
 from flcav.world.opendrive.objects.crosswalks import Crosswalk, find_crosswalks
 from flcav.world.opendrive.objects.taken import take_objects, tell

@@ -10,7 +10,14 @@ from flcav.sources.carla.server.catalogue import BOOL, COLOUR, FLOAT, INT, STRIN
 from flcav.world.map.parameters import CLUTTER
 from flcav.world.shapes import SHAPES
 
-BASE_TYPES = {"car": "car", "van": "van", "truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "bicycle": "bicycle"}
+BASE_TYPES = {
+    "car": "car",
+    "van": "van",
+    "truck": "truck",
+    "bus": "bus",
+    "motorcycle": "motorcycle",
+    "bicycle": "bicycle",
+}
 COLOURS = ("17,37,103", "107,18,14", "180,180,180", "25,25,25", "230,230,230")
 LARGEST_INT = 2**31
 

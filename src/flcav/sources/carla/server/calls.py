@@ -16,7 +16,7 @@ from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.actors import Actor
 from flcav.sources.carla.server.blueprints import Refused, list_blueprints
 from flcav.sources.carla.server.episode import Counters, Episode
-from flcav.sources.carla.server.maps import OPENDRIVE_MAP, Maps
+from flcav.sources.carla.server.maps import Maps
 from flcav.sources.carla.server.physics import describe_physics, describe_telemetry
 from flcav.sources.carla.server.scenery import find_boxes, find_objects, project
 from flcav.sources.carla.server.wire import BoundingBox, Transform, Vector
@@ -429,7 +429,7 @@ class Calls:
         """Set the acceleration that an IMU measures at rest, which is not served."""
         raise Refused("set_imui_sensor_gravity is not served: gravity is 9.81 m/s^2")
 
-    def get_all_level_BBs(self, tag: int) -> Any:  # noqa: N802 - CARLA's name
+    def get_all_level_BBs(self, tag: int) -> Any:
         """Return the boxes of the town's things with a semantic tag."""
         return find_boxes(self.episode, tag)
 

@@ -160,7 +160,7 @@ class Episode:
 
     def destroy(self, actor: Actor) -> None:
         """Remove an actor; sensors that it carries stay where they are."""
-        if actor is self.spectator or actor.light is not None or actor.name and not self.is_own(actor):
+        if actor is self.spectator or actor.light is not None or (actor.name and not self.is_own(actor)):
             raise Refused(f"actor {actor.id} is a {actor.description.id} of the town, which cannot be destroyed")
         del self.actors[actor.id]
         self._strolls.pop(actor.id, None)
@@ -317,9 +317,7 @@ class Episode:
         actor.pose[:3, :3] = rotations(yaw, *(tilt[row] if tilt is not None else (0.0, 0.0)))
         actor.pose[:3, 3] = position
         actor.pose[2, 3] += actor.lift
-        actor.transform = Transform(
-            self.served.frame.to_location(actor.pose[:3, 3]), find_rotation(yaw, tilt, row)
-        )
+        actor.transform = Transform(self.served.frame.to_location(actor.pose[:3, 3]), find_rotation(yaw, tilt, row))
         vx, vy, vz = trace.velocity[0, row].tolist()
         ax, ay, az = trace.acceleration[0, row].tolist()
         spin = float(np.degrees(trace.yaw_rate[0, row]))
@@ -329,7 +327,9 @@ class Episode:
 
     def describe_world(self, dt_s: float) -> bytes:
         """Return the payload of the world's state."""
-        header = wire.pack_header(wire.Stream.WORLD, self.counters.frame, self.time_s, Transform((0.0,) * 3, (0.0,) * 3))
+        header = wire.pack_header(
+            wire.Stream.WORLD, self.counters.frame, self.time_s, Transform((0.0,) * 3, (0.0,) * 3)
+        )
         vehicles = [actor for actor in self.actors.values() if actor.kind == "vehicle"]
         limits, at = self._look_up(vehicles)
         states = dict(zip((actor.id for actor in vehicles), zip(limits, at)))

@@ -23,7 +23,18 @@ from flcav.world.opendrive.reference_line import ReferenceLine
 Array = NDArray[np.float64]
 
 RED, YELLOW, GREEN, OFF, UNKNOWN = 0, 1, 2, 3, 4
-STATES = {"G": GREEN, "g": GREEN, "y": YELLOW, "Y": YELLOW, "u": YELLOW, "r": RED, "R": RED, "s": RED, "o": OFF, "O": OFF}
+STATES = {
+    "G": GREEN,
+    "g": GREEN,
+    "y": YELLOW,
+    "Y": YELLOW,
+    "u": YELLOW,
+    "r": RED,
+    "R": RED,
+    "s": RED,
+    "o": OFF,
+    "O": OFF,
+}
 LETTERS = {RED: "r", YELLOW: "y", GREEN: "G", OFF: "O"}
 TIMES_S = (10.0, 3.0, 2.0)  # CARLA's of green, yellow and red
 BEFORE_M, BEYOND_M = 8.0, 1.0  # a vehicle is at a light where its front is so near to the stop line
@@ -60,7 +71,9 @@ def find_approaches(served: ServedMap) -> list[Approach]:
         edge = net.edges[name]
         x, y, heading, half_width = _find_stop(edge)
         lanes = {lane.id for lane in edge.lanes}
-        links = sorted({int(way.light.rpartition(":")[2]) for way in net.connections if way.light and way.start in lanes})
+        links = sorted(
+            {int(way.light.rpartition(":")[2]) for way in net.connections if way.light and way.start in lanes}
+        )
         foot = signals.foot[place[link]] if link in place else (x, y)
         sign = name_signal(link)
         if signs:

@@ -35,7 +35,9 @@ class Footpaths:
                 count = max(2, int(line.length // STEP_M) + 1)
                 first = len(points)
                 points += [np.array(line.interpolate(i / (count - 1), normalized=True).coords[0]) for i in range(count)]
-                self._next += [[i + d for d in (-1, 1) if first <= i + d < first + count] for i in range(first, first + count)]
+                self._next += [
+                    [i + d for d in (-1, 1) if first <= i + d < first + count] for i in range(first, first + count)
+                ]
                 ends += [first, first + count - 1]
         self.points = np.array(points).reshape(-1, 2)
         if ends:

@@ -404,7 +404,9 @@ def pack_world(episode: int, platform_s: float, dt_s: float, actors: Sequence[by
 
 def pack_actor(actor: int, transform: Transform, motion: Sequence[Vector], union: bytes = b"") -> bytes:
     """Return the state of one actor; `motion` is velocity [m/s], angular velocity [deg/s] and acceleration [m/s^2]."""
-    return ACTOR.pack(actor, ACTIVE, *transform.location, *transform.rotation, *motion[0], *motion[1], *motion[2], union)
+    return ACTOR.pack(
+        actor, ACTIVE, *transform.location, *transform.rotation, *motion[0], *motion[1], *motion[2], union
+    )
 
 
 def pack_vehicle(control: VehicleControl, gear: int, limit_kmh: float, light: int, at_light: bool, by: int) -> bytes:
@@ -417,7 +419,9 @@ def pack_walker(control: WalkerControl) -> bytes:
     return WALKER.pack(*control.direction, control.speed, control.jump)
 
 
-def pack_light(sign: str, times_s: tuple[float, float, float], elapsed_s: float, pole: int, frozen: bool, state: int) -> bytes:
+def pack_light(
+    sign: str, times_s: tuple[float, float, float], elapsed_s: float, pole: int, frozen: bool, state: int
+) -> bytes:
     """Return the state of a traffic light: its id in OpenDRIVE, the times of green, yellow and red, its colour."""
     return LIGHT.pack(sign.encode()[:31], *times_s, elapsed_s, pole, frozen, state)
 

@@ -7,9 +7,8 @@ import numpy as np
 from flcav.sensors.frame import SEMANTICS
 from flcav.sources.carla.frames import mirror
 from flcav.sources.carla.server.sensing.sight import Sensor, Sight
-from flcav.sources.carla.server.wire import Actor, BoundingBox, Description
+from flcav.sources.carla.server.wire import Actor, BoundingBox, Description, Obstacle, pack_record
 from flcav.sources.carla.server.wire import Collision as CollisionRecord
-from flcav.sources.carla.server.wire import Obstacle, pack_record
 from flcav.world.snapshot import Collision
 
 RING = 8  # rays around the middle one, on the circle of the radius
@@ -49,7 +48,7 @@ def find_obstacle(sight: Sight, sensor: Sensor, carrier: Actor, describe: Callab
         pose[:3, 3] += pose[:3, :3] @ (0.0, left, up)
         hits = sight.scene.cast(pose, AHEAD, far_m=far, hidden=hidden)
         instance, distance = int(hits.instance[0]), float(hits.distance[0])
-        if instance < 0 or best is not None and distance >= best[0]:
+        if instance < 0 or (best is not None and distance >= best[0]):
             continue
         if instance == 0:
             tag = int(sight.tags(hits)[0])

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from flcav.geometry import yaw_of
 from flcav.sources.carla.frames import mirror, mirror_spin, to_rotation
 from flcav.sources.carla.server.sensing.sight import Sensor, Sight
 from flcav.sources.carla.server.wire import pack_record
-from flcav.geometry import yaw_of
 from flcav.world.geodesy import convert_to_geodetic
 
 GRAVITY = np.array((0.0, 0.0, 9.81))  # CARLA's [m/s^2]

@@ -53,7 +53,9 @@ def sense_radar(sight: Sight, sensor: Sensor) -> bytes:
     """Return the detections of a radar: range rate [m/s], azimuth, altitude [rad] and depth [m]."""
     rng = sight.draw(sensor)
     count = min(max(1, round(sensor.number_of("points_per_second") * sensor.elapsed_s)), MOST_RAYS)
-    wide, high = (np.tan(np.radians(min(sensor.number_of(name), 179.0)) / 2) for name in ("horizontal_fov", "vertical_fov"))
+    wide, high = (
+        np.tan(np.radians(min(sensor.number_of(name), 179.0)) / 2) for name in ("horizontal_fov", "vertical_fov")
+    )
     radius, angle = np.sqrt(rng.random(count)), rng.random(count) * 2 * np.pi
     azimuth = np.arctan(radius * np.cos(angle) * wide)  # to the right
     altitude = np.arctan(radius * np.sin(angle) * high)
