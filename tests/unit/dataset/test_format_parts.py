@@ -16,12 +16,11 @@ from flcav.dataset.formats.coco import encode_run_lengths
 from flcav.dataset.formats.mounts import assign_channels, find_front_camera, quaternion
 from flcav.dataset.formats.nuscenes.files import RADAR, RESOLUTION_M, encode_lidar, encode_radar, map_mask
 from flcav.dataset.formats.nuscenes.tables import CAMERAS, Row, attributes, link_rows, token, visibility
-from flcav.dataset.formats.opv2v.write import agent_numbers, encode_pcd
+from flcav.dataset.formats.opv2v.write import agent_numbers, carla_pose, encode_pcd
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
 from flcav.sensors.lens import BODY_FROM_OPTICAL
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
-from flcav.sources.carla.frames import carla_pose
 from flcav.world.map.town import load_town
 
 angles = st.floats(-3.1, 3.1)

@@ -1,45 +1,67 @@
-"""CARLA's coordinates and ours, which are right-handed: y points to the other side.
+"""Conversion between the town's frame and CARLA's: the only place that knows a left-handed frame.
 
-CARLA has Unreal's left-handed frames: x ahead, y right, z up; a positive yaw turns right, a positive pitch lifts the
-nose, a positive roll leans to the right.
+CARLA's x is that of the map, its y is mirrored, its yaw turns clockwise seen from above, and a positive pitch is upwards
+(Unreal Engine). The town may be moved from the map by an offset. Angular velocities are in degrees per second.
 """
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import yaw_of
+from flcav.geometry import angles_of, pose
 
 Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
 
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
-
-
-def carla_pose(world_from_body: Array) -> list[float]:
-    """Return [x, y, z [m], roll, yaw, pitch [degrees]] in CARLA's world of a (4, 4) `world_from_body`.
-
-    The body's axes are x ahead, y left, z up.
-    """
-    matrix = MIRROR @ world_from_body @ MIRROR
-    roll = np.arctan2(-matrix[2, 1], matrix[2, 2])
-    pitch = np.arcsin(np.clip(matrix[2, 0], -1, 1))
-    return [*matrix[:3, 3].tolist(), *np.degrees((roll, yaw_of(matrix), pitch)).tolist()]
+MIRROR = np.array((1.0, -1.0, 1.0))
 
 
-def from_carla(values: Sequence[float]) -> Array:
-    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`.
+def mirror(vectors: Array) -> Array:
+    """Return vectors (..., 3), directions or points, of one frame in the other."""
+    return vectors * MIRROR
 
-    OpenCOOD's `x_to_world`, mirrored.
-    """
-    x, y, z, *angles = values
-    (cr, cy, cp), (sr, sy, sp) = np.cos(np.radians(angles)), np.sin(np.radians(angles))
-    matrix = np.array(
-        [
-            [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr, x],
-            [sy * cp, sy * sp * sr + cy * cr, -sy * sp * cr + cy * sr, y],
-            [sp, -cp * sr, cp * cr, z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
-    return MIRROR @ matrix @ MIRROR
+
+def mirror_spin(rates: Array) -> Array:
+    """Return angular velocities (..., 3) [rad/s], an axial vector, of one frame in the other."""
+    return -rates * MIRROR
+
+
+def to_rotation(yaw: float, pitch: float, roll: float) -> Vector:
+    """Return CARLA's pitch, yaw and roll [deg] of angles [rad] as in `geometry.pose`; yaw within -180 and 180."""
+    turned = -np.degrees(yaw)
+    return (float(-np.degrees(pitch)), float((turned + 180.0) % 360.0 - 180.0), float(np.degrees(roll)))
+
+
+@dataclass(frozen=True)
+class MapFrame:
+    """The frame of a map that clients see, beside that of its town: town = map + offset."""
+
+    offset_m: tuple[float, float] = (0.0, 0.0)
+
+    def to_location(self, point: Array) -> Vector:
+        """Return CARLA's location of a point (3,) of the town."""
+        return (float(point[0] - self.offset_m[0]), float(self.offset_m[1] - point[1]), float(point[2]))
+
+    def from_location(self, location: Vector) -> Array:
+        """Return the point (3,) of the town at CARLA's location."""
+        return np.array((location[0] + self.offset_m[0], self.offset_m[1] - location[1], location[2]))
+
+    def to_transform(self, world_from_body: Array) -> tuple[Vector, Vector]:
+        """Return CARLA's location and rotation of a pose (4, 4) in the town."""
+        yaw, pitch, roll = angles_of(world_from_body[:3, :3])
+        return self.to_location(world_from_body[:3, 3]), to_rotation(float(yaw), float(pitch), float(roll))
+
+    def from_transform(self, location: Vector, rotation: Vector) -> Array:
+        """Return the pose (4, 4) in the town of CARLA's location and rotation."""
+        return _pose(self.from_location(location), rotation)
+
+
+def from_mount(location: Vector, rotation: Vector) -> Array:
+    """Return the pose (4, 4) of an attached actor in its parent's frame."""
+    return _pose(mirror(np.array(location)), rotation)
+
+
+def _pose(point: Array, rotation: Vector) -> Array:
+    pitch, yaw, roll = np.radians(rotation)
+    return pose(*point.tolist(), -yaw, -pitch, roll)

@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from flcav.config import Config
 from flcav.interface.wording import suggest
-from flcav.world.shapes import ANGLED, PARKED_ONLY, RARE, SHAPES
+from flcav.world.shapes import ANGLED, PARKED_ONLY, RARE, SHAPES, Shape
 
 LARGEST_M = 1000.0
 MOST = 10_000  # vehicles, or pedestrians
@@ -27,6 +27,7 @@ CLUTTER: dict[str, tuple[float, float, float]] = {  # kind -> length, width, hei
     "bollard": (0.15, 0.15, 0.95),
     "post": (0.09, 0.09, 2.6),
 }
+PROPS: tuple[Shape, ...] = tuple(Shape(kind, *size) for kind, size in CLUTTER.items())  # of the category "prop"
 BOUNDARIES = ("hedge", "hedgerow", "wall", "fence", "railing")  # kinds of `CLUTTER` that enclose plots
 KERBSIDE = ("bin", "bollard", "cabinet", "post")  # kinds that stand between kerb and walkers
 Height = Annotated[float, Field(ge=0.1, le=100)]

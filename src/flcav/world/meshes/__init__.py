@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from functools import lru_cache
 
+from flcav.world.map.parameters import PROPS
+from flcav.world.meshes.furniture import make_clutter
 from flcav.world.meshes.mesh import Mesh, fit_to_size
 from flcav.world.meshes.people import bicycle, motorcycle, pedestrian
 from flcav.world.meshes.vehicles import bus, car, truck
@@ -25,8 +27,11 @@ MAKERS: dict[str, Callable[[Shape], Mesh]] = {
 def actor_mesh(category: str, shape: int, size: tuple[float, ...] | None = None) -> Mesh:
     """Return the mesh of `SHAPES[category][shape]` in its body frame: ground centre at the origin, x forward.
 
-    It has exactly the outer dimensions `size` (3,) [m], None: those of the shape. Raises `KeyError` and `IndexError`
-    for an unknown shape.
+    That of a "prop" is the piece of street furniture `PROPS[shape]`. It has exactly the outer dimensions `size` (3,)
+    [m], None: those of the shape. Raises `KeyError` and `IndexError` for an unknown shape.
     """
+    if category == "prop":
+        kind, *usual = PROPS[shape]
+        return make_clutter(kind, *(size or usual))
     wanted = SHAPES[category][shape]
     return fit_to_size(MAKERS[category](wanted), *(size or wanted[1:]))

@@ -18,7 +18,7 @@ from flcav.config import InputError, read_yaml
 from flcav.dataset.formats.kitti.files import read_points
 from flcav.dataset.formats.layout import BRIGHTEST, has_kitti_layout
 from flcav.dataset.formats.opv2v.about import CAMERAS, EGO, About, read_about
-from flcav.dataset.formats.opv2v.write import FOLDERS, KMH
+from flcav.dataset.formats.opv2v.write import FOLDERS, KMH, from_carla
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
     AgentNames,
@@ -41,7 +41,6 @@ from flcav.geometry import Boxes, heading_vectors, inverse
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
-from flcav.sources.carla.frames import from_carla
 
 Array = NDArray[np.float64]
 

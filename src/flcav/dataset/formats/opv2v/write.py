@@ -5,6 +5,7 @@ vehicles are numbered in one list. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `tran
 """
 
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -32,7 +33,7 @@ from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
-from flcav.sources.carla.frames import MIRROR, carla_pose
+from flcav.sources.carla.frames import MIRROR, MapFrame
 
 Array = NDArray[np.float64]
 
@@ -125,6 +126,21 @@ def agent_numbers(agents: list[str]) -> dict[str, int]:
     }
 
 
+def carla_pose(world_from_body: Array) -> list[float]:
+    """Return OPV2V's [x, y, z [m], roll, yaw, pitch [degrees]], in CARLA's frame, of a (4, 4) `world_from_body`.
+
+    The body's axes are x ahead, y left, z up.
+    """
+    location, (pitch, yaw, roll) = MapFrame().to_transform(world_from_body)
+    return [*location, roll, yaw, pitch]
+
+
+def from_carla(values: Sequence[float]) -> Array:
+    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`."""
+    x, y, z, roll, yaw, pitch = values
+    return MapFrame().from_transform((x, y, z), (pitch, yaw, roll))
+
+
 def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], speed_m_s: float) -> set[str]:
     """Write the files of a frame; return the sensors whose measurements they hold."""
     lidar, points = next(iter(frame.lidar.items()))
@@ -135,13 +151,14 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], 
     mounts = frame.calibration.agent_from_sensor
     cameras = assign_channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
     about: dict[str, Any] = {}
+    mirrored = np.diag((*MIRROR, 1.0))
     for name, camera in sorted(cameras.items(), key=lambda pair: pair[1]):
         check_rectified(frame, name, "OPV2V")
         (folder / f"{time}_{camera}.png").write_bytes(encode_png(frame.images[name].rgb))
         world_from_camera = frame.world_from_sensor(name) @ BODY_FROM_OPTICAL.T
         about[camera] = {
             "cords": carla_pose(world_from_camera),
-            "extrinsic": (MIRROR @ np.linalg.inv(world_from_camera) @ world_from_lidar @ MIRROR).tolist(),
+            "extrinsic": (mirrored @ np.linalg.inv(world_from_camera) @ world_from_lidar @ mirrored).tolist(),
             "intrinsic": frame.calibration.intrinsics[name].tolist(),
         }
     ego = carla_pose(frame.world_from_agent)

@@ -1,0 +1,202 @@
+"""The server: remote procedure calls at one port, streams at the next, one loop, no threads.
+
+In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends the world's state at once and
+then measures, sensor after sensor; meanwhile clients' calls wait. A reader who does not keep up is waited for, and
+dropped after `STUCK_S`.
+"""
+
+import asyncio
+import errno
+import logging
+import os
+import struct
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from flcav.config import InputError
+from flcav.sources.carla.server import wire
+from flcav.sources.carla.server.blueprints import Refused
+from flcav.sources.carla.server.calls import Calls, invoke
+
+STUCK_S = 10.0
+LISTENER_S = 0.3  # a tick waits so long for the connection of a stream whose token a client has just asked for
+MOST_CONNECTIONS = 512
+CHUNK = 1 << 16
+BACKLOG = 1 << 20  # bytes in a connection's buffer from which its reader is waited for
+
+log = logging.getLogger("flcav.carla")
+
+
+class Server:
+    """Serves the clients of one `Calls`."""
+
+    def __init__(self, calls: Calls) -> None:
+        """Take the calls to be served."""
+        self._calls = calls
+        self._streams: dict[int, set[asyncio.StreamWriter]] = {}
+        self._connections: set[asyncio.StreamWriter] = set()
+        self._cue = asyncio.Event()
+        self._refused: set[str] = set()  # told in the log once
+
+    async def run(self, host: str, port: int, ready: Callable[[], None]) -> None:
+        """Serve until cancelled; raises `InputError` where a port is in use."""
+        servers = []
+        for number, connected in ((port, self._serve_calls), (port + 1, self._serve_stream)):
+            try:
+                servers.append(await asyncio.start_server(connected, host, number))
+            except OSError as error:
+                if error.errno not in (errno.EADDRINUSE, errno.EACCES, errno.EADDRNOTAVAIL):
+                    raise
+                why = os.strerror(error.errno).lower()
+                raise InputError(f"port {number} of {host}: {why}; a server takes --port and the next one") from None
+        ready()
+        try:
+            await self._tick_forever()
+        finally:
+            for server in servers:
+                server.close()
+            self._calls.episode.close()
+
+    # ---- ticks
+
+    async def _tick_forever(self) -> None:
+        due = time.monotonic()
+        while True:
+            if self._calls.settings.synchronous:
+                await self._cue.wait()
+                self._cue.clear()
+                while self._calls.ticks and self._calls.settings.synchronous:
+                    self._calls.ticks -= 1
+                    await self._tick()
+                due = time.monotonic()
+                continue
+            self._calls.ticks = 0
+            due = max(due + self._calls.dt_s, time.monotonic())
+            await self._sleep_until(due)
+            if not self._calls.settings.synchronous:
+                await self._tick()
+
+    async def _sleep_until(self, due: float) -> None:
+        """Wait for a time, or for the change to synchronous mode."""
+        with suppress(TimeoutError):
+            await asyncio.wait_for(self._cue.wait(), max(due - time.monotonic(), 0.0))
+
+    async def _tick(self) -> None:
+        await self._await_listeners()
+        episode, dt_s = self._calls.episode, self._calls.dt_s
+        episode.step(dt_s)
+        self._publish(wire.WORLD_STREAM, episode.describe_world(dt_s))
+        for stream, payload in episode.measure(dt_s, self._is_heard):
+            self._publish(stream, payload)
+            await self._await_readers(self._streams.get(stream, set()))
+            if episode is not self._calls.episode:  # another map was loaded meanwhile
+                return
+        await self._await_readers(self._connections)
+
+    def _is_heard(self, stream: int) -> bool:
+        return bool(self._streams.get(stream))
+
+    async def _await_listeners(self) -> None:
+        """Wait for the streams that clients are about to listen to, so that these miss no tick."""
+        expected, until = self._calls.expected, time.monotonic() + LISTENER_S
+        while expected and time.monotonic() < until:
+            await asyncio.sleep(0.001)
+        expected.clear()
+
+    async def _await_readers(self, writers: set[asyncio.StreamWriter]) -> None:
+        for writer in list(writers):
+            if writer.transport.get_write_buffer_size() <= BACKLOG:
+                continue
+            try:
+                await asyncio.wait_for(writer.drain(), STUCK_S)
+            except (TimeoutError, ConnectionError):
+                log.warning("a client reads no more: its connection is closed")
+                writer.transport.abort()
+                self._forget(writer)
+
+    def _publish(self, stream: int, payload: bytes) -> None:
+        for writer in list(self._streams.get(stream, ())):
+            with suppress(ConnectionError, RuntimeError):
+                writer.write(struct.pack("<I", len(payload)))
+                writer.write(payload)
+
+    # ---- connections
+
+    def _admit(self, writer: asyncio.StreamWriter) -> bool:
+        if len(self._connections) >= MOST_CONNECTIONS:
+            log.warning("more than %d connections: one is refused", MOST_CONNECTIONS)
+            writer.close()
+            return False
+        self._connections.add(writer)
+        return True
+
+    def _forget(self, writer: asyncio.StreamWriter) -> None:
+        self._connections.discard(writer)
+        for stream in [stream for stream, writers in self._streams.items() if writer in writers]:
+            self._streams[stream].discard(writer)
+            if not self._streams[stream]:
+                del self._streams[stream]
+        writer.close()
+
+    async def _serve_calls(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if not self._admit(writer):
+            return
+        unpacker = wire.make_unpacker()
+        try:
+            while data := await reader.read(CHUNK):
+                unpacker.feed(data)
+                for message in unpacker:
+                    call = wire.read_call(message)
+                    response = self._answer(call)
+                    if call.number is not None:
+                        writer.write(wire.pack_reply(call.number, response))
+                await self._await_readers({writer})
+        except ConnectionError:
+            pass
+        except (ValueError, TypeError, RecursionError, OverflowError, KeyError) as error:
+            what = str(error) or type(error).__name__
+            log.warning("a connection is closed: %s; clients of CARLA %s are served here", what[:200], wire.VERSION)
+        finally:
+            self._forget(writer)
+
+    def _answer(self, call: wire.Call) -> list[Any]:
+        """Return the response to a call."""
+        try:
+            value = invoke(self._calls, call.method, call.arguments)
+        except (Refused, InputError, wire.WireError) as error:
+            self._tell(call.method, str(error))
+            return wire.fail(str(error))
+        except Exception as error:  # a server that fails one call serves the others
+            log.exception("the call %s failed", call.method[:60])
+            return wire.fail(f"{call.method[:60]} failed on the server: {type(error).__name__}")
+        if self._calls.ticks or call.method == "set_episode_settings":
+            self._cue.set()
+        if call.method == "apply_batch":
+            return value
+        return wire.DONE if value is None else wire.succeed(value)
+
+    def _tell(self, method: str, message: str) -> None:
+        if method not in self._refused and len(self._refused) < 1000:
+            self._refused.add(method)
+            log.warning("refused: %s", message[:300])
+
+    async def _serve_stream(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if not self._admit(writer):
+            return
+        try:
+            (stream,) = struct.unpack("<I", await reader.readexactly(4))
+            self._streams.setdefault(stream, set()).add(writer)
+            self._calls.expected.discard(stream)
+            while await reader.read(1024):
+                pass
+        except (asyncio.IncompleteReadError, ConnectionError):
+            pass
+        finally:
+            self._forget(writer)
+
+
+def serve(calls: Calls, host: str, port: int, ready: Callable[[], None]) -> None:
+    """Serve clients until interrupted."""
+    asyncio.run(Server(calls).run(host, port, ready))

@@ -1,0 +1,268 @@
+"""Client of the SUMO process of a live world: its traffic between the steps of SUMO."""
+
+import atexit
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.geometry import heading_vectors, left_vectors, wrap_angle
+from flcav.statistics.streams import derive_seed, stream
+from flcav.world.actors import NOBODY, Actors
+from flcav.world.dynamics.standing import Ground
+from flcav.world.map.roads import read_net
+from flcav.world.map.town import Town
+from flcav.world.shapes import SHAPES
+from flcav.world.traffic.bridges import find_footing
+from flcav.world.traffic.demand import list_vehicle_types, park, write_demand
+from flcav.world.traffic.sumo_process import STEP_S
+
+Array = NDArray[np.float64]
+
+SERVE = "flcav.world.traffic.live_process:serve"
+ROOT = str(Path(__file__).parents[3])
+FILL_S = 20.0  # all actors have departed by then
+WARM_UP_S = 30.0  # time of SUMO at the start of a live world
+TOUR_S = 900.0  # length of a vehicle's tour, at least; it then sets out again
+
+_idle: list[tuple[int, subprocess.Popen[bytes]]] = []  # processes without a world, with the id of their parent
+
+
+class Mirrored(NamedTuple):
+    """A vehicle under control, as SUMO's traffic sees it."""
+
+    name: str
+    category: str
+    shape: int
+    length: float  # [m]
+    width: float  # [m]
+    x: float  # middle [m]
+    y: float
+    yaw: float  # [rad]
+    speed: float  # [m/s]
+
+
+class SumoTraffic:
+    """SUMO's traffic in a town, one SUMO process of its own; a context manager."""
+
+    def __init__(self, town: Town, ground: Ground, *, seed: int, vehicles: int, pedestrians: int) -> None:
+        """Start with the traffic under way; raises `InputError` as `write_demand`, `RuntimeError` where SUMO fails."""
+        parameters = town.parameters.model_copy(update={"vehicles": vehicles, "pedestrians": pedestrians})
+        try:
+            demand = write_demand(
+                read_net(town.net), parameters, seed=seed, cavs=0, from_s=0.0, until_s=TOUR_S, fill_s=FILL_S
+            )
+        except InputError as error:
+            raise InputError(f"{town.name}: {error}") from None
+        self.ticks = 0  # steps of SUMO since the start
+        self._actors = NOBODY  # those present before and after the step of SUMO under way, at their last places
+        self._ground, self._town = ground, town
+        self._kinds = {name: (category, shape) for name, category, shape in list_vehicle_types()}
+        self._lights: dict[str, str] = {}
+        self._process = _take_process()
+        with tempfile.TemporaryDirectory(prefix="flcav_live_") as folder:
+            net, routes = (
+                Path(folder) / "town.net.xml",
+                Path(folder) / "town.rou.xml",
+            )  # names that SUMO takes as they are
+            net.symlink_to(town.net.absolute())
+            routes.write_text(demand.routes, encoding="utf-8")
+            job = {
+                "net": str(net),
+                "routes": str(routes),
+                "followers": demand.followers,
+                "next": vehicles + len(demand.followers),
+                "seed": derive_seed(seed, "sumo"),
+                "steps": round(WARM_UP_S / STEP_S),
+            }
+            self._after = self._before = self._ask(job)
+        self.advance([], [], {}, [])
+
+    def advance(
+        self,
+        bodies: Sequence[Mirrored],
+        dangers: Sequence[tuple[float, float, float]],
+        lights: Mapping[str, str],
+        halted: Sequence[str],
+    ) -> None:
+        """Let SUMO make its next step, in which it sees what is there now.
+
+        `dangers` are places to brake for: x, y, half width [m]. `lights` are the letters of each junction's links.
+        Vehicles that are `halted` stand for a while. Raises `RuntimeError` where SUMO fails.
+        """
+        changed = {name: state for name, state in lights.items() if self._lights.get(name) != state}
+        self._lights |= changed
+        request = {
+            "bodies": [_as_sumo(body) for body in bodies],
+            "dangers": list(dangers),
+            "lights": changed,
+            "halted": list(halted),
+        }
+        self._before, self._after = self._after, self._ask(request)
+        self.ticks += 1
+        names = sorted((name for name in self._before if name in self._after), key=_natural)
+        self._ends = tuple(
+            np.array([state[name][1:] for name in names], np.float64).reshape(-1, 4)
+            for state in (self._before, self._after)
+        )
+        if tuple(names) != self._actors.name:
+            self._recast(names)
+
+    def at(self, time_s: float) -> Actors:
+        """Return those present at a time since the start, within the step of SUMO under way: linear in it.
+
+        Times must ascend, since who is on a bridge stays on it.
+        """
+        share = time_s / STEP_S - (self.ticks - 1)
+        first, last = self._ends
+        turn = wrap_angle(np.radians(first[:, 2] - last[:, 2]))
+        yaw = np.pi / 2 - np.radians(first[:, 2]) + share * turn
+        speed = first[:, 3] + share * (last[:, 3] - first[:, 3])
+        ahead = heading_vectors(yaw)
+        middle = first[:, :2] + share * (last[:, :2] - first[:, :2]) - self._actors.size[:, :1] / 2 * ahead
+        yaw_rate = turn / STEP_S
+        walks = self._walks[:, None]
+        velocity = np.where(walks, (last[:, :2] - first[:, :2]) / STEP_S, speed[:, None] * ahead)
+        gain = (last[:, 3] - first[:, 3])[:, None] / STEP_S * ahead + (speed * yaw_rate)[:, None] * left_vectors(yaw)
+        position = np.column_stack((middle, self._actors.position[:, 2]))
+        z, tilt = self._ground.stand(position, yaw, self._actors.size, self._walks)
+        climb = -speed * np.tan(tilt[:, 0])
+        self._actors = self._actors._replace(
+            position=np.column_stack((middle, z)),
+            yaw=wrap_angle(yaw),
+            velocity=np.column_stack((velocity, climb)),
+            acceleration=np.column_stack((np.where(walks, 0.0, gain), np.zeros(len(z)))),
+            yaw_rate=yaw_rate,
+            tilt=tilt,
+        )
+        return self._actors
+
+    def _recast(self, names: Sequence[str]) -> None:
+        """Take over these actors; those who come are on the ground, or on the bridge that their lane leads over."""
+        kinds = [self._kinds[self._after[name][0]] for name in names]
+        size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], np.float64).reshape(-1, 3)
+        count = len(names)
+        front, turned = self._ends[0][:, :2], np.pi / 2 - np.radians(self._ends[0][:, 2])
+        position = np.column_stack((front - size[:, :1] / 2 * heading_vectors(turned), np.full(count, np.nan)))
+        known = dict(zip(self._actors.name, self._actors.position[:, 2].tolist()))
+        position[:, 2] = [known.get(name, np.nan) for name in names]
+        if (
+            self._town.relief is not None
+            and self._town.relief.decks
+            and len(new := np.flatnonzero(np.isnan(position[:, 2])))
+        ):
+            centre, yaw = position[None, new, :2], turned[None, new]
+            footing = find_footing(self._town.relief, self._town.net, centre, yaw)
+            position[new, 2] = footing(centre[..., 0], centre[..., 1])[0]
+        self._actors = Actors(
+            name=tuple(names),
+            category=tuple(category for category, _ in kinds),
+            shape=np.array([shape for _, shape in kinds], np.int64),
+            size=size,
+            position=position,
+            yaw=turned,
+            velocity=np.zeros((count, 3)),
+            acceleration=np.zeros((count, 3)),
+            yaw_rate=np.zeros(count),
+            tilt=np.zeros((count, 2)),
+        )
+        self._walks = np.array([category == "pedestrian" for category, _ in kinds], np.bool_)
+
+    def close(self) -> None:
+        """End the world's SUMO; its process is kept for the next world."""
+        if self._process is None:
+            return
+        process, self._process = self._process, None
+        with contextlib.suppress(BrokenPipeError):
+            assert process.stdin is not None
+            process.stdin.write(b"\n")
+            process.stdin.flush()
+            _idle.append((os.getpid(), process))
+
+    def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the answer to a request: type and state by name."""
+        if self._process is None:
+            raise RuntimeError("the live world is closed")
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.write(json.dumps(request).encode() + b"\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline()
+        except BrokenPipeError:
+            line = b""
+        except BaseException:
+            self._kill()  # or its answer would be taken for that to the next request
+            raise
+        answer = json.loads(line) if line else {"error": "its process has ended"}
+        if "error" in answer:
+            self._kill()
+            raise RuntimeError(f"SUMO failed: {answer['error']}")
+        return answer
+
+    def _kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+            self._process = None
+
+
+def _as_sumo(body: Mirrored) -> list[str | float]:
+    """Return the row of a vehicle in a request."""
+    x, y = (body.x, body.y) + body.length / 2 * heading_vectors(body.yaw)
+    kind = f"{body.category}.{SHAPES[body.category][body.shape].name}"
+    angle = float(90.0 - np.degrees(body.yaw)) % 360.0
+    return [body.name, kind, body.length, body.width, float(x), float(y), angle, body.speed]
+
+
+def _take_process() -> subprocess.Popen[bytes]:
+    """Return a SUMO process without a world, started where there is none."""
+    while _idle:
+        parent, process = _idle.pop()
+        if parent == os.getpid() and process.poll() is None:
+            return process
+    module, name = SERVE.split(":")
+    code = f"import sys; sys.path.append({ROOT!r}); from {module} import {name}; {name}()"
+    return subprocess.Popen([sys.executable, "-P", "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+
+@atexit.register
+def _stop() -> None:
+    """Kill the idle processes that this process started."""
+    for parent, process in _idle:
+        if parent == os.getpid():
+            process.kill()
+            process.communicate()
+    _idle.clear()
+
+
+def _natural(name: str) -> tuple[str, int]:
+    """Return the key that sorts names by their number: "veh2" before "veh10"."""
+    kind = name.rstrip("0123456789")
+    return kind, int(name[len(kind) :])
+
+
+def stand_parked(town: Town, ground: Ground, seed: int) -> Actors:
+    """Return the vehicles parked along a town's streets, the same as in a recording with this seed."""
+    cars = park(read_net(town.net), town.parameters, stream(seed, "parked")) if town.net.exists() else []
+    if not cars:
+        return NOBODY
+    count = len(cars)
+    size = np.array([SHAPES[car.category][car.shape][1:] for car in cars], np.float64)
+    position = np.array([(car.x, car.y, np.nan) for car in cars])
+    yaw = np.array([car.yaw for car in cars])
+    position[:, 2], tilt = ground.stand(position, yaw, size, np.zeros(count, np.bool_))
+    still = np.zeros((count, 3))
+    return Actors(
+        *(tuple(f"parked{i}" for i in range(count)), tuple(car.category for car in cars)),
+        *(np.array([car.shape for car in cars], np.int64), size, position, yaw, still, still, np.zeros(count), tilt),
+    )
