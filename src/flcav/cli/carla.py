@@ -38,6 +38,7 @@ def serve(
     if not _is_loopback(host):
         typer.echo(f"flcav: {host} is open to the network, and CARLA's protocol asks nobody for a password", err=True)
     calls = Calls(Maps(maps), town, seed=seed, traffic=traffic, port=port)
+    calls.episode.warm_up()
     name = calls.episode.served.name
     serve_calls(calls, host, port, lambda: typer.echo(f"{name}: ready for clients of CARLA {VERSION} at {host}:{port}"))
 

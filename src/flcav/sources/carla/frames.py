@@ -1,7 +1,7 @@
 """Conversion between the town's frame and CARLA's: the only place that knows a left-handed frame.
 
-CARLA's x is that of the map, its y is mirrored, its yaw turns clockwise seen from above, and a positive pitch is upwards
-(Unreal Engine). The town may be moved from the map by an offset. Angular velocities are in degrees per second.
+CARLA's x is that of the map, its y is mirrored, its yaw turns clockwise seen from above, and a positive pitch is
+upwards (Unreal Engine). The town may be moved from the map by an offset. Angular velocities are in degrees per second.
 """
 
 from dataclasses import dataclass

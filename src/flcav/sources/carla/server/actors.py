@@ -15,6 +15,7 @@ from flcav.sources.carla.server.wire import BoundingBox, Transform
 Array = NDArray[np.float64]
 
 STILL = ((0.0, 0.0, 0.0),) * 3
+STANDING, WAITING = wire.VehicleControl(), wire.WalkerControl()
 
 
 @dataclass
@@ -36,8 +37,8 @@ class Actor:
     light: int | None = None  # row of its approach, of a traffic light
     box: BoundingBox | None = None  # of a traffic light
     motion: tuple[wire.Vector, wire.Vector, wire.Vector] = STILL  # CARLA's velocity, angular velocity, acceleration
-    control: wire.VehicleControl = wire.VehicleControl()
-    walk: wire.WalkerControl = wire.WalkerControl()
+    control: wire.VehicleControl = STANDING
+    walk: wire.WalkerControl = WAITING
     ackermann: wire.AckermannControl | None = None
     lamps: int = 0  # flags of a vehicle's lamps
     simulated: bool = True

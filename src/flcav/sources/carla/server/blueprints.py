@@ -10,14 +10,6 @@ from flcav.sources.carla.server.catalogue import BOOL, COLOUR, FLOAT, INT, STRIN
 from flcav.world.map.parameters import CLUTTER
 from flcav.world.shapes import SHAPES
 
-BASE_TYPES = {
-    "car": "car",
-    "van": "van",
-    "truck": "truck",
-    "bus": "bus",
-    "motorcycle": "motorcycle",
-    "bicycle": "bicycle",
-}
 COLOURS = ("17,37,103", "107,18,14", "180,180,180", "25,25,25", "230,230,230")
 LARGEST_INT = 2**31
 
@@ -131,7 +123,7 @@ def _vehicle(name: str, body: catalogue.Body) -> list[wire.Variation]:
         _free("sticky_control", BOOL, "true"),
         _free("terramechanics", BOOL, "false"),
         _fixed("object_type", STRING, ""),
-        _fixed("base_type", STRING, BASE_TYPES[body.category]),
+        _fixed("base_type", STRING, body.category),
         _fixed("special_type", STRING, body.special),
         _fixed("generation", INT, str(body.generation)),
         _fixed("number_of_wheels", INT, "2" if two else "4"),

@@ -40,7 +40,7 @@ TRAFFIC_OF = {  # category -> blueprint by which clients know SUMO's traffic
     "pedestrian": "walker.pedestrian.0001",
 }
 PARKED = "parked"  # begins the names of parked vehicles, which are no actors to clients
-BACKWARDS_MPS = -0.1
+NOWHERE = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 class Counters:
@@ -87,6 +87,14 @@ class Episode:
             light.light, light.box = row, approach.box()
         self.lights.follow(self.world, 0.0)
         self._follow(self.world.snapshot, 0.0)
+
+    def warm_up(self) -> None:
+        """Build the scene, and load the compiled code of the vehicles and of a camera, so that no client waits for it."""
+        with LiveWorld(self.served.town, Settings(parked=False)) as world:
+            world.apply(Spawn("car", "car", 0, *self.spectator.pose[:2, 3].tolist(), anywhere=True))
+            world.step({"car": Controls(throttle=1.0)})
+        told = {"image_size_x": "32", "image_size_y": "32", "fov": "90"}
+        self.look().photograph(Sensor("sensor.camera.rgb", told, 0, self.spectator.pose))
 
     def close(self) -> None:
         """End the world."""
@@ -256,7 +264,7 @@ class Episode:
             if actor.constant is not None:
                 self.push(actor, actor.pose[:3, :3] @ actor.constant)
             if actor.ackermann is not None:
-                limit, wheels = self.steering(actor)
+                limit, _ = self.steering(actor)
                 self.drive(actor, steer_towards(actor.ackermann, actor.control, self.speed(actor), limit, dt_s))
         snapshot = self.world.step(dt_s=dt_s)
         self.tick += 1
@@ -327,9 +335,7 @@ class Episode:
 
     def describe_world(self, dt_s: float) -> bytes:
         """Return the payload of the world's state."""
-        header = wire.pack_header(
-            wire.Stream.WORLD, self.counters.frame, self.time_s, Transform((0.0,) * 3, (0.0,) * 3)
-        )
+        header = wire.pack_header(wire.Stream.WORLD, self.counters.frame, self.time_s, NOWHERE)
         vehicles = [actor for actor in self.actors.values() if actor.kind == "vehicle"]
         limits, at = self._look_up(vehicles)
         states = dict(zip((actor.id for actor in vehicles), zip(limits, at)))

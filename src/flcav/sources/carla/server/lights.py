@@ -23,19 +23,8 @@ from flcav.world.opendrive.reference_line import ReferenceLine
 Array = NDArray[np.float64]
 
 RED, YELLOW, GREEN, OFF, UNKNOWN = 0, 1, 2, 3, 4
-STATES = {
-    "G": GREEN,
-    "g": GREEN,
-    "y": YELLOW,
-    "Y": YELLOW,
-    "u": YELLOW,
-    "r": RED,
-    "R": RED,
-    "s": RED,
-    "o": OFF,
-    "O": OFF,
-}
-LETTERS = {RED: "r", YELLOW: "y", GREEN: "G", OFF: "O"}
+LETTERS_OF = {GREEN: "Gg", YELLOW: "yYu", RED: "rRs", OFF: "oO"}
+STATES = {letter: state for state, letters in LETTERS_OF.items() for letter in letters}
 TIMES_S = (10.0, 3.0, 2.0)  # CARLA's of green, yellow and red
 BEFORE_M, BEYOND_M = 8.0, 1.0  # a vehicle is at a light where its front is so near to the stop line
 ALIGNED_RAD = 1.0
@@ -71,9 +60,7 @@ def find_approaches(served: ServedMap) -> list[Approach]:
         edge = net.edges[name]
         x, y, heading, half_width = _find_stop(edge)
         lanes = {lane.id for lane in edge.lanes}
-        links = sorted(
-            {int(way.light.rpartition(":")[2]) for way in net.connections if way.light and way.start in lanes}
-        )
+        ruled = {way.light for way in net.connections if way.light and way.start in lanes}
         foot = signals.foot[place[link]] if link in place else (x, y)
         sign = name_signal(link)
         if signs:
@@ -84,7 +71,7 @@ def find_approaches(served: ServedMap) -> list[Approach]:
             Approach(
                 junction=link.rpartition(":")[0],
                 link=link,
-                links=tuple(links),
+                links=tuple(sorted(int(each.rpartition(":")[2]) for each in ruled)),
                 sign=sign,
                 pose=pose(float(foot[0]), float(foot[1]), ground, heading - np.pi / 2),
                 stop=np.array((x, y, heading)),
@@ -161,7 +148,7 @@ class Lights:
         letters = list(world.lights.states()[approach.junction])
         for other, (shown, _) in held.items():
             for link in self.approaches[other].links:
-                letters[link] = LETTERS.get(shown, "O")
+                letters[link] = LETTERS_OF.get(shown, "O")[0]
         world.apply(SetLight(approach.junction, "".join(letters)))
         self.state[row], self.elapsed_s[row] = state, 0.0
 

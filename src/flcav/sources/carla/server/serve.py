@@ -39,6 +39,7 @@ class Server:
         self._connections: set[asyncio.StreamWriter] = set()
         self._cue = asyncio.Event()
         self._refused: set[str] = set()  # told in the log once
+        self._state = b""  # the last one of the world, for clients that come between two ticks
 
     async def run(self, host: str, port: int, ready: Callable[[], None]) -> None:
         """Serve until cancelled; raises `InputError` where a port is in use."""
@@ -87,7 +88,8 @@ class Server:
         await self._await_listeners()
         episode, dt_s = self._calls.episode, self._calls.dt_s
         episode.step(dt_s)
-        self._publish(wire.WORLD_STREAM, episode.describe_world(dt_s))
+        self._state = episode.describe_world(dt_s)
+        self._publish(wire.WORLD_STREAM, self._state)
         for stream, payload in episode.measure(dt_s, self._is_heard):
             self._publish(stream, payload)
             await self._await_readers(self._streams.get(stream, set()))
@@ -118,9 +120,13 @@ class Server:
 
     def _publish(self, stream: int, payload: bytes) -> None:
         for writer in list(self._streams.get(stream, ())):
-            with suppress(ConnectionError, RuntimeError):
-                writer.write(struct.pack("<I", len(payload)))
-                writer.write(payload)
+            self._send(writer, payload)
+
+    @staticmethod
+    def _send(writer: asyncio.StreamWriter, payload: bytes) -> None:
+        with suppress(ConnectionError, RuntimeError):
+            writer.write(struct.pack("<I", len(payload)))
+            writer.write(payload)
 
     # ---- connections
 
@@ -189,6 +195,8 @@ class Server:
             (stream,) = struct.unpack("<I", await reader.readexactly(4))
             self._streams.setdefault(stream, set()).add(writer)
             self._calls.expected.discard(stream)
+            if stream == wire.WORLD_STREAM:
+                self._send(writer, self._state or self._calls.episode.describe_world(0.0))
             while await reader.read(1024):
                 pass
         except (asyncio.IncompleteReadError, ConnectionError):
