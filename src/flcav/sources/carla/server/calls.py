@@ -58,7 +58,7 @@ class Calls:
 
     def get_episode_info(self) -> Any:
         """Return the episode's number and the token of the world's state."""
-        return [self.episode.id, [wire.pack_token(wire.WORLD_STREAM, self._port + 1)]]
+        return [self.episode.id, [wire.pack_token(self.episode.stream, self._port + 1)]]
 
     def get_sensor_token(self, stream: int) -> Any:
         """Return the token of a stream."""
@@ -500,19 +500,20 @@ class Calls:
 
     # ---- batches
 
-    def apply_batch(self, commands: tuple[tuple[int, Any], ...], tick: bool) -> Any:
+    def apply_batch(self, commands: Any, tick: bool) -> Any:
         """Carry out commands; return an actor's number or an error for each."""
-        answers = [self._carry_out(number, fields) for number, fields in commands]
-        self.ticks += bool(tick)
+        answers = [self._carry_out(command) for command in commands] if isinstance(commands, list) else []
+        self.ticks += tick
         return answers
 
-    def _carry_out(self, number: int, fields: Any) -> list[Any]:
+    def _carry_out(self, command: Any) -> list[Any]:
+        """Return the response to a command of a batch, [[number, fields]]."""
         try:
-            if not 0 <= number < len(wire.COMMANDS):
-                raise wire.WireError(f"no command has the number {number}")
-            name = wire.COMMANDS[number]
-            if not isinstance(fields, list) or not fields:
-                raise wire.WireError(f"{name}: fields are missing")
+            match command:
+                case [[int(number), [int() | list(), *_] as fields]] if 0 <= number < len(wire.COMMANDS):
+                    name = wire.COMMANDS[number]
+                case _:
+                    raise wire.WireError(f"no command of CARLA {wire.VERSION}")
             if name == "spawn":
                 return wire.succeed(self._spawn(*_read_spawn(fields)))
             if name == "console_command":
@@ -523,18 +524,20 @@ class Calls:
             return wire.fail(str(error))
 
     def _spawn(
-        self, description: wire.Description, transform: Transform, parent: int | None, then: tuple[tuple[int, Any], ...]
+        self, description: wire.Description, transform: Transform, parent: int | None, then: tuple[Any, ...]
     ) -> int:
         actor = self.episode.spawn(description, transform, parent)
-        for number, fields in then:
-            self._carry_out(number, [actor.id, *fields[1:]] if isinstance(fields, list) else fields)
+        for command in then:
+            match command:
+                case [[number, [_, *fields]]]:
+                    self._carry_out([[number, [actor.id, *fields]]])
         return actor.id
 
 
-def _read_spawn(fields: list[Any]) -> tuple[wire.Description, Transform, int | None, tuple[tuple[int, Any], ...]]:
+def _read_spawn(fields: list[Any]) -> tuple[wire.Description, Transform, int | None, tuple[Any, ...]]:
     if len(fields) != 6:
         raise wire.WireError(f"{len(fields)} fields where 6 belong")
-    kinds = (wire.Description, Transform, int | None, tuple[tuple[int, Any], ...])
+    kinds = (wire.Description, Transform, int | None, tuple[Any, ...])
     return tuple(map(wire.read, kinds, (*fields[:3], fields[5])))  # type: ignore[return-value]
 
 

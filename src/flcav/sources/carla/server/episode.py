@@ -47,8 +47,7 @@ class Counters:
     """The numbers of actors, streams, frames and episodes, which a server never uses twice."""
 
     def __init__(self) -> None:
-        self.actor = self.episode = self.frame = 0
-        self.stream = 1  # that of the world's state
+        self.actor = self.episode = self.frame = self.stream = 0
 
     def next_actor(self) -> int:
         """Return a number for an actor."""
@@ -69,11 +68,13 @@ class Episode:
         self.served, self.counters, self.seed, self.port = served, counters, seed, port
         counters.episode += 1
         self.id = counters.episode
+        self.stream = counters.next_stream()  # of the world's state
         self.world = LiveWorld(served.town, Settings(seed=seed, traffic=traffic))
         self.weather = wire.WeatherParameters(cloudiness=10.0, sun_azimuth_angle=160.0, sun_altitude_angle=45.0)
         self.lights = Lights(find_approaches(served))
         self.actors: dict[int, Actor] = {}
         self.tick, self.time_s = 0, 0.0
+        self._begun_s = time.monotonic()
         self._bodies: dict[str, Actor] = {}  # by name in the live world
         self._strolls: dict[int, Stroll] = {}  # by the number of the walker
         self._paths: Footpaths | None = None
@@ -95,6 +96,11 @@ class Episode:
             world.step({"car": Controls(throttle=1.0)})
         told = {"image_size_x": "32", "image_size_y": "32", "fov": "90"}
         self.look().photograph(Sensor("sensor.camera.rgb", told, 0, self.spectator.pose))
+
+    @property
+    def age_s(self) -> float:
+        """The time since the map was loaded [s], by the clock."""
+        return time.monotonic() - self._begun_s
 
     def close(self) -> None:
         """End the world."""

@@ -19,8 +19,10 @@ from flcav.config import InputError
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.blueprints import Refused
 from flcav.sources.carla.server.calls import Calls, invoke
+from flcav.sources.carla.server.episode import Episode
 
 STUCK_S = 10.0
+LEARNT_S = 3.0  # clients have learnt of a new map by then
 LISTENER_S = 0.3  # a tick waits so long for the connection of a stream whose token a client has just asked for
 MOST_CONNECTIONS = 512
 CHUNK = 1 << 16
@@ -39,6 +41,7 @@ class Server:
         self._connections: set[asyncio.StreamWriter] = set()
         self._cue = asyncio.Event()
         self._refused: set[str] = set()  # told in the log once
+        self._worlds: set[int] = set()  # streams of the world's state, of earlier episodes too
         self._state = b""  # the last one of the world, for clients that come between two ticks
 
     async def run(self, host: str, port: int, ready: Callable[[], None]) -> None:
@@ -81,6 +84,7 @@ class Server:
 
     async def _sleep_until(self, due: float) -> None:
         """Wait for a time, or for the change to synchronous mode."""
+        self._cue.clear()
         with suppress(TimeoutError):
             await asyncio.wait_for(self._cue.wait(), max(due - time.monotonic(), 0.0))
 
@@ -89,13 +93,23 @@ class Server:
         episode, dt_s = self._calls.episode, self._calls.dt_s
         episode.step(dt_s)
         self._state = episode.describe_world(dt_s)
-        self._publish(wire.WORLD_STREAM, self._state)
+        self._publish_state(episode)
         for stream, payload in episode.measure(dt_s, self._is_heard):
             self._publish(stream, payload)
             await self._await_readers(self._streams.get(stream, set()))
             if episode is not self._calls.episode:  # another map was loaded meanwhile
                 return
         await self._await_readers(self._connections)
+
+    def _publish_state(self, episode: Episode) -> None:
+        """Send the world's state; after a map was loaded, at first only to those who have learnt of it.
+
+        A client that loads a map closes the stream of the one before, and crashes if something arrives meanwhile.
+        """
+        self._worlds = {stream for stream in self._worlds if stream in self._streams}
+        for stream in self._worlds:
+            if stream == episode.stream or episode.age_s > LEARNT_S:
+                self._publish(stream, self._state)
 
     def _is_heard(self, stream: int) -> bool:
         return bool(self._streams.get(stream))
@@ -169,11 +183,12 @@ class Server:
 
     def _answer(self, call: wire.Call) -> list[Any]:
         """Return the response to a call."""
+        if os.environ.get("TRACE"): print(f"{time.monotonic():.3f} {call.method} {str(call.arguments)[:100]}", flush=True)
         try:
             value = invoke(self._calls, call.method, call.arguments)
         except (Refused, InputError, wire.WireError) as error:
             self._tell(call.method, str(error))
-            return wire.fail(str(error))
+            return [] if call.method == "apply_batch" else wire.fail(str(error))
         except Exception as error:  # a server that fails one call serves the others
             log.exception("the call %s failed", call.method[:60])
             return wire.fail(f"{call.method[:60]} failed on the server: {type(error).__name__}")
@@ -195,7 +210,8 @@ class Server:
             (stream,) = struct.unpack("<I", await reader.readexactly(4))
             self._streams.setdefault(stream, set()).add(writer)
             self._calls.expected.discard(stream)
-            if stream == wire.WORLD_STREAM:
+            if stream == self._calls.episode.stream:
+                self._worlds.add(stream)
                 self._send(writer, self._state or self._calls.episode.describe_world(0.0))
             while await reader.read(1024):
                 pass

@@ -29,7 +29,6 @@ LIGHT = struct.Struct("<32s4fI?B")
 TOKEN = struct.Struct("<IHBB16s")
 ACTOR = struct.Struct("<IB6f3f3f3f54s")  # the last are of its kind: `VEHICLE`, `WALKER` or `LIGHT`
 SEMANTIC_POINT = np.dtype([("xyz", "<f4", 3), ("cosine", "<f4"), ("actor", "<u4"), ("tag", "<u4")])
-WORLD_STREAM = 1  # number of the stream of the world state
 FARTHEST = 1e9  # numbers beyond are refused
 ACTIVE, TCP = 1, 1
 
