@@ -18,7 +18,7 @@ from flcav.perception.client import as_shared
 from flcav.perception.tasks import task_named
 from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName, find_path
 from flcav.pipeline.results.saved import Saved
-from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.opening import open_source
 from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import derive_seed, stream
 from flcav.storage.files import sha256
@@ -105,7 +105,7 @@ def list_window(split: Frames, frames: Sequence[int], window_s: float) -> tuple[
 
 def record_frames(recipe: Recipe, beside: Path, folder: Path, report: Report) -> Recorded:
     """Record a split below `folder`; resumes an interrupted recording."""
-    record(EmbeddedSource(recipe, beside), folder / DATA, progress=report)
+    record(open_source(recipe, beside), folder / DATA, progress=report)
     return group_frames(Dataset.open(folder / DATA), DATA, spins=recipe.middle_spins)
 
 

@@ -16,7 +16,7 @@ from flcav.sources.division import Division
 from flcav.sources.randomisation import randomise_rig, randomise_sizes, randomise_town, town_files
 from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import derive_seed, stream
-from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, check_town_name, load_town
+from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, Town, check_town_name, load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
 from flcav.world.traffic.traffic import simulate
@@ -153,13 +153,18 @@ class EmbeddedSource:
         """Return the contents of the files of the town, as drawn, by name."""
         if self.recipe.randomise is not None:
             return town_files(self.town)
-        heights = HILLS if self.recipe.town in HILLY else HEIGHTS
-        names = ("town.yaml", *([] if self.town.relief is None else [heights]))
-        paths = [self.town.net, *(self.town.net.parent / name for name in names)]
-        return {path.name: path.read_bytes() for path in paths}
+        return read_town_files(self.town, self.recipe.town)
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_last_trace": None, "_last_scene": None}
+
+
+def read_town_files(town: Town, name: str) -> Mapping[str, bytes]:
+    """Return the contents of a town's files by name; the recipe calls it `name`."""
+    heights = HILLS if name in HILLY else HEIGHTS
+    names = ("town.yaml", *([] if town.relief is None else [heights]))
+    paths = [town.net, *(town.net.parent / own for own in names)]
+    return {path.name: path.read_bytes() for path in paths}
 
 
 def _check_mounts(field: str, rig: Rig, carrier: str, mount_m: float) -> None:

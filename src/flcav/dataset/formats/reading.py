@@ -20,7 +20,7 @@ from flcav.config import InputError, Json, parse_config, shorten
 from flcav.dataset.payloads import open_image, read_image
 from flcav.dataset.store import LazyMapping
 from flcav.dataset.upright import measure_upright
-from flcav.geometry import Boxes, angles_of, count_points_in_boxes
+from flcav.geometry import Boxes, count_points_in_boxes
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, Frame, SignViews, Views
 from flcav.sensors.labels.outlines import outline_boxes
 from flcav.sensors.lens import Lens
@@ -29,7 +29,6 @@ Array = NDArray[np.float64]
 
 LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track whose difference is a velocity, as nuscenes-devkit's
 FARTHEST = 1e9  # largest number that a measurement is taken to have
-LEVEL_RAD = 1e-6  # pitch and roll of a box that is upright
 
 
 class LogSource(ABC):
@@ -96,13 +95,6 @@ class LogPicture:
     world_from_camera: Array  # (4, 4), optical frame
 
 
-def turned_boxes(center: Array, size: Array, rotation: Array, label: NDArray[np.str_]) -> Boxes:
-    """Return boxes with (M, 3, 3) rotations of their own frames: upright where none leans by more than `LEVEL_RAD`."""
-    yaw, *tilts = angles_of(rotation)
-    tilt = np.stack(tilts, axis=1)
-    return Boxes(center, size, yaw, label, tilt=tilt if (np.abs(tilt) > LEVEL_RAD).any() else None)
-
-
 def annotate(
     track: Iterable[str],
     boxes: Boxes,
@@ -136,13 +128,8 @@ def annotate(
         occlusion=np.full(count, np.nan) if occlusion is None else occlusion,
         points=points,
         views=views,
-        signs={name: _no_signs() for name in views},
+        signs={name: SignViews.none() for name in views},
     )
-
-
-def _no_signs() -> SignViews:
-    none, number = np.zeros(0, np.str_), np.zeros(0, np.int64)
-    return SignViews(none, none, np.zeros((0, 4)), number, np.zeros(0), number)
 
 
 def difference_tracks(track: NDArray[np.str_], time_s: Array, center: Array) -> Array:

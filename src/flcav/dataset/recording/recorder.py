@@ -45,7 +45,7 @@ from flcav.dataset.recording.workers import start_actors, start_processes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, write_table
 from flcav.interface.progress import DAMAGED, Report, print_progress
 from flcav.machine.locks import LOCK, only_writer
-from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.opening import open_source
 from flcav.sources.recipe import Recipe, load_recipe
 from flcav.sources.source import Source, TownSource
 from flcav.storage.files import flush_all, sha256, write_bytes, write_json
@@ -90,7 +90,7 @@ def record(
     if isinstance(source, Path | str):
         source = load_recipe(source)
     if isinstance(source, Recipe):
-        source = EmbeddedSource(source)
+        source = open_source(source)
     out = Path(out)
     check_scenes(source.scenes())
     header: Header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))

@@ -31,11 +31,10 @@ from flcav.dataset.formats.reading import (
     difference_tracks,
     name_folders,
     pinhole,
-    turned_boxes,
     view_boxes,
 )
 from flcav.dataset.payloads import check_image, read_image
-from flcav.geometry import angles_of, inverse, pose, rotations
+from flcav.geometry import angles_of, inverse, pose, rotations, turned_boxes
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, CameraImage, Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
