@@ -188,7 +188,7 @@ class CarlaRecipe(Recipe):
     timeout_s: float = Field(default=60.0, ge=1, le=3600)  # longest wait for an answer, and for a sensor's data
     map: str | None = Field(default=None, min_length=1, max_length=100)  # map of the server; None: the town's name
     vehicles: int = Field(default=30, ge=0, le=1000)  # vehicles of the Traffic Manager, beside those that record
-    pedestrians: int = Field(default=10, ge=0, le=1000)  # walkers of CARLA's own, on its navigation mesh
+    pedestrians: int = Field(default=0, ge=0, le=1000)  # walkers of CARLA's own, where a map has a navigation mesh
 
     @model_validator(mode="after")
     def _has_what_carla_has(self) -> "CarlaRecipe":
@@ -249,7 +249,7 @@ def find_recipe(path: Path) -> Path:
 
 
 def parse_recipe(values: object, origin: str) -> Recipe:
-    """Return validated fields of a recipe, a `CarlaRecipe` if it has a `source`; `origin` is named in an `InputError`."""
+    """Return the fields `values` as a recipe, a `CarlaRecipe` if they have a `source`: see `parse_config`."""
     return parse_config(CarlaRecipe if isinstance(values, dict) and "source" in values else Recipe, values, origin)
 
 

@@ -47,7 +47,7 @@ from flcav.interface.progress import DAMAGED, Report, print_progress
 from flcav.machine.locks import LOCK, only_writer
 from flcav.sources.opening import open_source
 from flcav.sources.recipe import Recipe, load_recipe
-from flcav.sources.source import Source, TownSource
+from flcav.sources.source import Isolated, Source, TownSource
 from flcav.storage.files import flush_all, sha256, write_bytes, write_json
 
 Header = Mapping[str, Mapping[str, Json]]  # "recipe" -> description of the source, "versions" -> of packages
@@ -91,6 +91,8 @@ def record(
         source = load_recipe(source)
     if isinstance(source, Recipe):
         source = open_source(source)
+    if isinstance(source, Isolated) and (jobs, engine) != (1, "processes"):
+        raise InputError(f"jobs = {jobs}, engine '{engine}': this source has one world, which one process records")
     out = Path(out)
     check_scenes(source.scenes())
     header: Header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))

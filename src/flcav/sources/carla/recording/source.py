@@ -242,6 +242,13 @@ class CarlaSource:
             weather=weather,
         )
 
+    def explain_end(self) -> str:
+        """Return why the process of CARLA's client has ended: a thread of the Traffic Manager's lost the server."""
+        return (
+            f"CARLA at {self.recipe.host}:{self.recipe.port} was lost, and its Traffic Manager ended the recording; "
+            "scenes before are kept, and the same command goes on"
+        )
+
     def town_files(self) -> Mapping[str, bytes]:
         """Return the contents of the town's files by name; empty for a town that comes with flcav, or none."""
         kept = self.town is not None and self.recipe.town not in PACKAGED

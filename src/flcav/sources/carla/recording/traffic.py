@@ -93,7 +93,9 @@ def spawn_walkers(session: Session, recipe: CarlaRecipe, rng: np.random.Generato
     for number in range(recipe.pedestrians if kinds else 0):
         place = session.world.get_random_location_from_navigation()
         if place is None:
-            break
+            raise InputError(
+                f"CARLA at {session.address} has no navigation mesh for walkers here: set 'pedestrians' to 0"
+            )
         kind = kinds[int(rng.integers(len(kinds)))]
         kind.set_attribute("role_name", f"ped{number}")
         walker = session.world.try_spawn_actor(kind, carla.Transform(place))

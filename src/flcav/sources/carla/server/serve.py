@@ -183,7 +183,8 @@ class Server:
 
     def _answer(self, call: wire.Call) -> list[Any]:
         """Return the response to a call."""
-        if os.environ.get("TRACE"): print(f"{time.monotonic():.3f} {call.method} {str(call.arguments)[:100]}", flush=True)
+        if os.environ.get("TRACE"):
+            print(f"{time.monotonic():.3f} {call.method} {str(call.arguments)[:100]}", flush=True)
         try:
             value = invoke(self._calls, call.method, call.arguments)
         except (Refused, InputError, wire.WireError) as error:
