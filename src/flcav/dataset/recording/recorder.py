@@ -100,7 +100,11 @@ def record(
         with only_writer(out):
             write = partial(_write, source, out / WORK, jobs, engine, progress)
             if begun := _claim(out, header):
-                write()
+                try:
+                    write()
+                except InputError:
+                    drop_unbegun(out)
+                    raise
                 _assemble(source, out, header)
             if damaged := find_damage(out):
                 more = f" (and {len(damaged) - 1} more)" if len(damaged) > 1 else ""

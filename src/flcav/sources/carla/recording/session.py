@@ -113,9 +113,14 @@ def _leave(client: "carla.Client", world: "carla.World", manager: "carla.Traffic
     import carla
 
     with suppress(RuntimeError):
-        manager.set_synchronous_mode(False)
+        actors = world.get_actors()
+        for vehicle in actors.filter("vehicle.*"):  # the Traffic Manager's thread may not meet one that is gone
+            vehicle.set_autopilot(False, manager.get_port())
+        manager.shut_down()
+        for sensor in actors.filter("sensor.*"):
+            sensor.stop()
+        kinds = ("sensor.", "controller.", "vehicle.", "walker.")
+        client.apply_batch([carla.command.DestroyActor(actor) for actor in actors if actor.type_id.startswith(kinds)])
         settings = world.get_settings()
         settings.synchronous_mode, settings.fixed_delta_seconds = False, None
         world.apply_settings(settings)
-        actors = [actor for actor in world.get_actors() if actor.type_id.startswith(("sensor", "vehicle", "walker"))]
-        client.apply_batch([carla.command.DestroyActor(actor) for actor in actors])

@@ -125,11 +125,13 @@ def list_bodies(session: Session, spawned: dict[str, "carla.Actor"], frame: MapF
         if category and (actor.type_id.startswith(("walker.", "vehicle."))):
             middle, size = _read_box(actor.bounding_box, MapFrame(), category)
             bodies.append(Body(actor.id, track.get(actor.id, f"other{actor.id}"), category, size, middle))
+    parked: list[tuple[tuple[float, ...], str, tuple[Array, tuple[float, float, float]]]] = []
     for category in ("car", "truck", "bus", "motorcycle", "bicycle"):
-        parked = session.world.get_environment_objects(getattr(carla.CityObjectLabel, category.capitalize()))
-        for thing in parked:
-            middle, size = _read_box(thing.bounding_box, frame, category)
-            bodies.append(Body(0, f"parked{thing.id}", category, size, middle))
+        things = session.world.get_environment_objects(getattr(carla.CityObjectLabel, category.capitalize()))
+        for middle, size in (_read_box(thing.bounding_box, frame, category) for thing in things):
+            parked.append((tuple(middle[:3, 3].tolist()), category, (middle, size)))
+    parked.sort(key=lambda each: each[:2])  # their numbers may differ when the map is loaded anew
+    bodies += [Body(0, f"parked{i}", kind, size, middle) for i, (_, kind, (middle, size)) in enumerate(parked)]
     return bodies
 
 
