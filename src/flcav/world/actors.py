@@ -36,8 +36,8 @@ NOBODY = Actors(
 
 def join_actors(*parts: Actors) -> Actors:
     """Return the actors of all parts, in order."""
-    columns = list(zip(*parts))
     return Actors(
-        *(tuple(name for names in column for name in names) for column in columns[:2]),
-        *(np.concatenate(column) for column in columns[2:]),
+        tuple(name for part in parts for name in part.name),
+        tuple(category for part in parts for category in part.category),
+        *(np.concatenate(column) for column in zip(*(part[2:] for part in parts))),
     )

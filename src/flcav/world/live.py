@@ -26,7 +26,7 @@ from flcav.world.map.town import Town
 from flcav.world.snapshot import Collision, Snapshot
 from flcav.world.trace import Trace
 from flcav.world.traffic.lights import Lights, read_light_programs
-from flcav.world.traffic.live import WARM_UP_S, Mirrored, SumoTraffic, stand_parked
+from flcav.world.traffic.live import WARM_UP_S, SumoTraffic, stand_parked
 from flcav.world.traffic.sumo_process import STEP_S
 
 Array = NDArray[np.float64]
@@ -34,7 +34,6 @@ Array = NDArray[np.float64]
 SUBSTEP_S = 0.05  # longest step of the vehicle model: nobody passes through a box in it
 LONGEST_S = 10.0  # of a step
 NEAR_M = 2.0  # obstacles so far from a body are looked at
-SLOW_MPS = 1.0  # traffic brakes for a vehicle under control that is slower wherever it stands, and in its lane for all
 RESERVED = ("veh", "ped", "parked")  # begin the names of other actors
 FARTHEST = 1e7  # greatest coordinate, and speed
 NOTHING: Mapping[str, Controls] = MappingProxyType({})
@@ -53,6 +52,9 @@ class Settings:
     pedestrians: int = 0  # of SUMO
     parked: bool = True  # with the vehicles parked along the streets
     dt_s: float = 0.05  # length of a step
+
+
+DEFAULT = Settings()
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class LiveWorld:
     0.05
     """
 
-    def __init__(self, town: Town, settings: Settings = Settings()) -> None:
+    def __init__(self, town: Town, settings: Settings = DEFAULT) -> None:
         """Start at time 0, with SUMO's traffic under way.
 
         Raises `InputError` for settings that do not fit the town, `RuntimeError` where SUMO fails.
@@ -211,22 +213,7 @@ class LiveWorld:
         if self._traffic is None:
             return
         while self._traffic.ticks * STEP_S < self._time_s - 1e-6:
-            now = self.bodies.actors()
-            speed = np.linalg.norm(now.velocity[:, :2], axis=1).tolist()
-            mirrored, dangers = [], []
-            for row, body in enumerate(self.bodies.members):
-                (x, y, _), yaw = now.position[row].tolist(), float(now.yaw[row])
-                length, width, _ = body.blueprint.size
-                if body.category in VEHICLES:
-                    mirrored.append(
-                        Mirrored(body.name, body.category, body.blueprint.shape, length, width, x, y, yaw, speed[row])
-                    )
-                if body.category not in VEHICLES or speed[row] < SLOW_MPS:
-                    dangers += [
-                        (x + share * length * math.cos(yaw), y + share * length * math.sin(yaw), 1.0 + width / 2)
-                        for share in (-0.4, 0.0, 0.4)
-                    ]
-            self._traffic.advance(mirrored, dangers, self.lights.states(), sorted(self._hit))
+            self._traffic.advance(self.bodies.actors(), self.lights.states(), sorted(self._hit))
             self._hit.clear()
         self._flow = self._traffic.at(self._time_s)
 
@@ -261,11 +248,13 @@ class LiveWorld:
 
     def _report(self, contacts: Contacts, names: Sequence[str], found: dict[tuple[str, str], Collision]) -> None:
         """Add the contacts to those `found` during a step: impulses of the same two add up."""
-        for first, second, normal, point, size in zip(*(array.tolist() for array in contacts)):
-            pair = names[first], names[second]
+        impulses = contacts.impulse[:, None] * contacts.normal
+        for row in range(len(impulses)):
+            pair = names[int(contacts.first[row])], names[int(contacts.second[row])]
             known = found[pair].impulse if pair in found else (0.0, 0.0)
-            impulse = known[0] + size * normal[0], known[1] + size * normal[1]
-            found[pair] = Collision(*pair, impulse, tuple(point))
+            x, y = impulses[row].tolist()
+            at_x, at_y = contacts.point[row].tolist()
+            found[pair] = Collision(*pair, (known[0] + x, known[1] + y), (at_x, at_y))
 
     def _build_snapshot(self) -> Snapshot:
         actors = join_actors(self.bodies.actors(), self._flow, self._parked)

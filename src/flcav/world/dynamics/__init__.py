@@ -1,1 +1,1 @@
-"""Dynamics of vehicles and walkers under control: the vehicle model, contacts between boxes, and the town's obstacles."""
+"""Dynamics of vehicles and walkers under control: vehicle model, contacts of boxes, the ground and its obstacles."""

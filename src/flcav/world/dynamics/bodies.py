@@ -15,6 +15,9 @@ from flcav.world.dynamics.vehicle import Motion, Pedals, Vehicles, drive, stack_
 
 Array = NDArray[np.float64]
 
+AT_REST = Controls()
+WALK_MPS2 = 10.0  # by which walkers change their velocity, also after they were hit
+
 
 @dataclass
 class Body:
@@ -22,13 +25,14 @@ class Body:
 
     name: str
     blueprint: Blueprint
-    controls: Controls = Controls()
+    controls: Controls = AT_REST
     walk: tuple[float, float] = (0.0, 0.0)  # wanted velocity [m/s]
     physics: bool = True
     gravity: bool = True
 
     @property
     def category(self) -> str:
+        """Return that of the blueprint."""
         return self.blueprint.category
 
 
@@ -145,10 +149,12 @@ class Bodies:
         self.yaw_rate[rows], self.steer[rows] = after.yaw_rate, after.steer
 
     def _walk(self, rows: NDArray[np.int64], dt_s: float) -> None:
-        velocity = np.array([self.members[row].walk for row in rows])
-        turned = velocity.any(axis=1)
-        yaw = np.where(turned, np.arctan2(velocity[:, 1], velocity[:, 0]), self.yaw[rows])
+        wanted = np.array([self.members[row].walk for row in rows])
+        yaw = np.where(wanted.any(axis=1), np.arctan2(wanted[:, 1], wanted[:, 0]), self.yaw[rows])
         self.yaw_rate[rows] = wrap_angle(yaw - self.yaw[rows]) / dt_s
+        change = wanted - self.velocity[rows, :2]
+        needed = np.linalg.norm(change, axis=1, keepdims=True)
+        velocity = self.velocity[rows, :2] + change * np.minimum(1.0, WALK_MPS2 * dt_s / np.maximum(needed, 1e-12))
         self.position[rows, :2] += velocity * dt_s
         self.velocity[rows, :2], self.yaw[rows] = velocity, yaw
 

@@ -1,7 +1,8 @@
 """Contacts of upright boxes: the separating axis test, and impulses between those that touch (rigid bodies in plan).
 
 Where two boxes overlap, they are moved apart along the axis of least overlap, and those that approach exchange an
-impulse at the contact (Baraff, An Introduction to Physically Based Modeling, 1997, part II section 8, without friction).
+impulse at the contact, without friction (Baraff, An Introduction to Physically Based Modeling, 1997, part II,
+section 8).
 """
 
 from typing import NamedTuple

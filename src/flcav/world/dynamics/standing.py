@@ -27,7 +27,7 @@ class Ground:
             shapely.prepare(area)
 
     def heights(self, x: Array, y: Array, z: Array) -> Array:
-        """Return the height (N,) [m] of the ground, or of the deck there that is nearer to `z` (N,), NaN: the ground."""
+        """Return the height (N,) [m] of the ground, or of a deck there that is nearer to `z` (N,); NaN: the ground."""
         ground = self._town.grounds(x, y)
         for deck, area in self._decks:
             inside = np.flatnonzero(shapely.contains_xy(area, x, y))

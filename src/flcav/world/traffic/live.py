@@ -9,7 +9,7 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from flcav.config import InputError
 from flcav.geometry import heading_vectors, left_vectors, wrap_angle
 from flcav.statistics.streams import derive_seed, stream
 from flcav.world.actors import NOBODY, Actors
+from flcav.world.dynamics.blueprints import VEHICLES
 from flcav.world.dynamics.standing import Ground
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import Town
@@ -33,22 +34,37 @@ ROOT = str(Path(__file__).parents[3])
 FILL_S = 20.0  # all actors have departed by then
 WARM_UP_S = 30.0  # time of SUMO at the start of a live world
 TOUR_S = 900.0  # length of a vehicle's tour, at least; it then sets out again
+SLOW_MPS = 1.0  # traffic brakes for a slower vehicle wherever it stands, and for a faster one in its lane
+DANGERS = (-0.4, 0.0, 0.4)  # places to brake for, over a body's length from its middle
+SOON_S = 0.7  # so far ahead traffic looks at who crosses its way
+BERTH_M = 1.0  # half the width of a vehicle that passes
 
 _idle: list[tuple[int, subprocess.Popen[bytes]]] = []  # processes without a world, with the id of their parent
 
 
-class Mirrored(NamedTuple):
-    """A vehicle under control, as SUMO's traffic sees it."""
+def write_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians: int) -> dict[str, Any]:
+    """Return the first request for a live world, see `live_process`, whose files are in `folder`.
 
-    name: str
-    category: str
-    shape: int
-    length: float  # [m]
-    width: float  # [m]
-    x: float  # middle [m]
-    y: float
-    yaw: float  # [rad]
-    speed: float  # [m/s]
+    Raises `InputError` as `write_demand`.
+    """
+    parameters = town.parameters.model_copy(update={"vehicles": vehicles, "pedestrians": pedestrians})
+    net = read_net(town.net)
+    try:
+        demand = write_demand(net, parameters, seed=seed, cavs=0, from_s=0.0, until_s=TOUR_S, fill_s=FILL_S)
+    except InputError as error:
+        raise InputError(f"{town.name}: {error}") from None
+    linked, routes = folder / "town.net.xml", folder / "town.rou.xml"  # SUMO takes no commas or ${...} in paths
+    linked.symlink_to(town.net.absolute())
+    routes.write_text(demand.routes, encoding="utf-8")
+    return {
+        "net": str(linked),
+        "routes": str(routes),
+        "followers": demand.followers,
+        "next": vehicles + len(demand.followers),
+        "seed": derive_seed(seed, "sumo"),
+        "edge": next(edge.id for edge in net.streets if edge.lanes_of("driving")),  # a route of those under control
+        "steps": round(WARM_UP_S / STEP_S),
+    }
 
 
 class SumoTraffic:
@@ -56,13 +72,6 @@ class SumoTraffic:
 
     def __init__(self, town: Town, ground: Ground, *, seed: int, vehicles: int, pedestrians: int) -> None:
         """Start with the traffic under way; raises `InputError` as `write_demand`, `RuntimeError` where SUMO fails."""
-        parameters = town.parameters.model_copy(update={"vehicles": vehicles, "pedestrians": pedestrians})
-        try:
-            demand = write_demand(
-                read_net(town.net), parameters, seed=seed, cavs=0, from_s=0.0, until_s=TOUR_S, fill_s=FILL_S
-            )
-        except InputError as error:
-            raise InputError(f"{town.name}: {error}") from None
         self.ticks = 0  # steps of SUMO since the start
         self._actors = NOBODY  # those present before and after the step of SUMO under way, at their last places
         self._ground, self._town = ground, town
@@ -70,40 +79,21 @@ class SumoTraffic:
         self._lights: dict[str, str] = {}
         self._process = _take_process()
         with tempfile.TemporaryDirectory(prefix="flcav_live_") as folder:
-            net, routes = (
-                Path(folder) / "town.net.xml",
-                Path(folder) / "town.rou.xml",
-            )  # names that SUMO takes as they are
-            net.symlink_to(town.net.absolute())
-            routes.write_text(demand.routes, encoding="utf-8")
-            job = {
-                "net": str(net),
-                "routes": str(routes),
-                "followers": demand.followers,
-                "next": vehicles + len(demand.followers),
-                "seed": derive_seed(seed, "sumo"),
-                "steps": round(WARM_UP_S / STEP_S),
-            }
+            job = write_job(town, Path(folder), seed=seed, vehicles=vehicles, pedestrians=pedestrians)
             self._after = self._before = self._ask(job)
-        self.advance([], [], {}, [])
+        self.advance(NOBODY, {}, [])
 
-    def advance(
-        self,
-        bodies: Sequence[Mirrored],
-        dangers: Sequence[tuple[float, float, float]],
-        lights: Mapping[str, str],
-        halted: Sequence[str],
-    ) -> None:
-        """Let SUMO make its next step, in which it sees what is there now.
+    def advance(self, bodies: Actors, lights: Mapping[str, str], halted: Sequence[str]) -> None:
+        """Let SUMO make its next step, in which its traffic sees the `bodies` under control.
 
-        `dangers` are places to brake for: x, y, half width [m]. `lights` are the letters of each junction's links.
-        Vehicles that are `halted` stand for a while. Raises `RuntimeError` where SUMO fails.
+        `lights` are the letters of each junction's links. Vehicles that are `halted` stand for a while. Raises
+        `RuntimeError` where SUMO fails.
         """
         changed = {name: state for name, state in lights.items() if self._lights.get(name) != state}
         self._lights |= changed
         request = {
-            "bodies": [_as_sumo(body) for body in bodies],
-            "dangers": list(dangers),
+            "bodies": _list_vehicles(bodies),
+            "dangers": _list_dangers(bodies),
             "lights": changed,
             "halted": list(halted),
         }
@@ -216,12 +206,36 @@ class SumoTraffic:
             self._process = None
 
 
-def _as_sumo(body: Mirrored) -> list[str | float]:
-    """Return the row of a vehicle in a request."""
-    x, y = (body.x, body.y) + body.length / 2 * heading_vectors(body.yaw)
-    kind = f"{body.category}.{SHAPES[body.category][body.shape].name}"
-    angle = float(90.0 - np.degrees(body.yaw)) % 360.0
-    return [body.name, kind, body.length, body.width, float(x), float(y), angle, body.speed]
+def _list_vehicles(bodies: Actors) -> list[tuple[str | float, ...]]:
+    """Return the rows of `bodies` in a request."""
+    front = bodies.position[:, :2] + bodies.size[:, :1] / 2 * heading_vectors(bodies.yaw)
+    angle = (90.0 - np.degrees(bodies.yaw)) % 360.0
+    speed = np.linalg.norm(bodies.velocity[:, :2], axis=1)
+    numbers = np.column_stack((bodies.size[:, :2], front, angle, speed)).tolist()
+    kinds = zip(bodies.name, bodies.category, bodies.shape.tolist(), numbers)
+    return [
+        (name, f"{category}.{SHAPES[category][shape].name}", *row)
+        for name, category, shape, row in kinds
+        if category in VEHICLES
+    ]
+
+
+def _list_dangers(bodies: Actors) -> list[list[float]]:
+    """Return x, y, half width [m], cosine and sine of the heading, of places to brake for, now and `SOON_S` later.
+
+    The heading of walkers, props and vehicles that hardly move is 0, 0: all brake for them, and for others only those
+    whose way they cross.
+    """
+    moves = np.isin(bodies.category, VEHICLES) & (np.linalg.norm(bodies.velocity[:, :2], axis=1) >= SLOW_MPS)
+    heading = heading_vectors(bodies.yaw)
+    along = bodies.size[:, :1] * heading
+    places = [
+        bodies.position[:, :2] + share * along + time_s * bodies.velocity[:, :2]
+        for share in DANGERS
+        for time_s in (0.0, SOON_S)
+    ]
+    row = np.column_stack((BERTH_M + bodies.size[:, 1] / 2, moves[:, None] * heading))
+    return np.column_stack((np.concatenate(places), np.tile(row, (len(places), 1)))).tolist()
 
 
 def _take_process() -> subprocess.Popen[bytes]:

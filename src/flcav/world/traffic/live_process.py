@@ -3,22 +3,25 @@
 `serve` reads requests and writes answers, a JSON object on a line each. The first request of a world starts SUMO in a
 fork of this process, since libsumo holds one simulation per process and is slow to load; an empty line ends it. Each
 further request has the vehicles under control (`bodies`: name, type, length and width [m], SUMO's front x, y [m], angle
-[deg] and speed [m/s]), the places to brake for (`dangers`: x, y, half width [m]), the `lights` that changed, and the
-vehicles that a collision has stopped (`halted`). SUMO then makes a step of `STEP_S`.
+[deg] and speed [m/s]), the places to brake for (`dangers`: x, y, half width [m], cosine and sine of the heading of what
+crosses, 0 and 0 for what anyone brakes for), the `lights` that changed, and the vehicles that a collision has stopped
+(`halted`). SUMO then makes a step of `STEP_S`.
 """
 
 import json
 import os
 import signal
 import sys
-from pathlib import Path
 from typing import Any, NoReturn
 
-from flcav.world.map.roads import read_net
-from flcav.world.scenarios.stage import Stage, State
+import numpy as np
+
+from flcav.world.scenarios.stage import State, braking_m
 from flcav.world.traffic.sumo_process import STEP_S, Walkers
 
 OWN = "own:"  # begins the names of vehicles under control
+NEAR_LANE_M = 5.0  # a vehicle under control is on a lane whose middle is so near, else off the road
+CROSSING = 0.5  # sine of the angle from which on somebody's way is crossed
 HALT_STEPS = round(5.0 / STEP_S)  # for so long a vehicle stands after a collision
 
 
@@ -26,7 +29,7 @@ class LiveTraffic:
     """A SUMO run with vehicles that are controlled from outside."""
 
     def __init__(self, sumo: Any, job: dict[str, Any]) -> None:
-        """Start SUMO with the net, routes and seed of the `job`, and make its `steps` without vehicles under control."""
+        """Start SUMO with the net, routes and seed of the `job`, and make its `steps` with its own traffic alone."""
         options = {
             "net-file": job["net"],
             "route-files": job["routes"],
@@ -42,15 +45,14 @@ class LiveTraffic:
         }
         sumo.start(["sumo", *(part for name, value in options.items() for part in (f"--{name}", str(value)))])
         self.sumo = sumo
-        self.stage = Stage(sumo, read_net(Path(job["net"])))
         self.walkers = Walkers(STEP_S)
         self._followers: dict[str, tuple[str, str, list[str]]] = job["followers"]
         self._next = job["next"]  # number of the next vehicle that enters
         self._tours: dict[str, tuple[str, list[str]]] = {}  # of SUMO's vehicles: type and edges
         self._own: set[str] = set()
         self._halted: dict[str, int] = {}  # vehicle -> steps that it still stands
-        self._first_edge = next(edge.id for edge in self.stage.net.streets if edge.lanes_of("driving"))
-        sumo.route.add("own", [self._first_edge])
+        self._braking: set[str] = set()
+        sumo.route.add("own", [job["edge"]])
         for _ in range(job["steps"]):
             self._step()
 
@@ -63,14 +65,9 @@ class LiveTraffic:
             if name in self._tours:
                 self.sumo.vehicle.setSpeed(name, 0.0)
                 self._halted[name] = HALT_STEPS
-        self.stage.brake_for([(x, y) for x, y, _ in request["dangers"]], 1.5)
-        if request["dangers"] or self._braking:
-            self.stage.react(careless=self._own | set(self._halted))
-        self._braking = bool(request["dangers"])
+        self._brake(request["dangers"])
         self._step()
         return self.states()
-
-    _braking = False
 
     def states(self) -> dict[str, Any]:
         """Return type, and front x, y [m], angle [deg] and speed [m/s], of SUMO's vehicles and pedestrians by name."""
@@ -118,6 +115,28 @@ class LiveTraffic:
             }
         )
 
+    def _brake(self, dangers: list[list[float]]) -> None:
+        """Let vehicles brake for the `dangers` ahead, and let those go that need not any more."""
+        vehicle = self.sumo.vehicle
+        names = [name for name in vehicle.getIDList() if name not in self._own and name not in self._halted]
+        if names and (dangers or self._braking):
+            x, y = np.array([vehicle.getPosition(name) for name in names]).T
+            turned = np.pi / 2 - np.radians([vehicle.getAngle(name) for name in names])
+            reach = np.array([braking_m(vehicle.getSpeed(name)) for name in names])[:, None]
+            at_x, at_y, half, heading_x, heading_y = np.array(dangers, np.float64).reshape(-1, 5).T
+            dx, dy = at_x - x[:, None], at_y - y[:, None]
+            cos, sin = np.cos(turned)[:, None], np.sin(turned)[:, None]
+            ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
+            crosses = (np.abs(heading_y * cos - heading_x * sin) > CROSSING) | (heading_x**2 + heading_y**2 < 0.5)
+            brakes = (crosses & (ahead > -1.0) & (ahead < reach) & (np.abs(left) < half)).any(axis=1)
+            for name, brake in zip(names, brakes.tolist()):
+                if brake:
+                    vehicle.setActionStepLength(name, STEP_S)
+                    vehicle.setSpeed(name, 0.0)
+                elif name in self._braking:
+                    vehicle.setSpeed(name, -1.0)
+            self._braking = {name for name, brake in zip(names, brakes.tolist()) if brake}
+
     def _mirror(self, bodies: list[list[Any]]) -> None:
         """Place the vehicles under control; those that are not among `bodies` any more leave."""
         vehicle = self.sumo.vehicle
@@ -133,7 +152,7 @@ class LiveTraffic:
                 vehicle.setWidth(name, width)
                 vehicle.setSpeedMode(name, 0)
                 self._own.add(name)
-            vehicle.moveToXY(name, "", -1, x, y, angle, keepRoute=2)
+            vehicle.moveToXY(name, "", -1, x, y, angle, keepRoute=2, matchThreshold=NEAR_LANE_M)
             vehicle.setPreviousSpeed(name, speed)
 
 

@@ -470,6 +470,14 @@ class Calls:
     def draw_debug_shape(self, shape: Any) -> None:
         """Draw into the view of the engine's window, which does not exist here."""
 
+    def start_recorder(self, name: str, additional: bool) -> str:
+        """Begin to record the traffic; return the file on the server."""
+        return self.episode.recorder.start(name)
+
+    def stop_recorder(self) -> None:
+        """Write the recording."""
+        self.episode.recorder.stop()
+
     def get_bones_transform(self, actor: int) -> Any:
         """Return a walker's bones: none."""
         self.episode.find(actor, "walker")

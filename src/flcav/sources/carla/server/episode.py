@@ -17,6 +17,7 @@ from flcav.sources.carla.server.blueprints import Blueprint, Refused, check, lis
 from flcav.sources.carla.server.driving import steer_towards
 from flcav.sources.carla.server.lights import Lights, find_approaches
 from flcav.sources.carla.server.maps import ServedMap
+from flcav.sources.carla.server.recorder import Recorder
 from flcav.sources.carla.server.sensing.events import describe_thing, find_collisions, find_obstacle
 from flcav.sources.carla.server.sensing.sight import Sensor, Sight
 from flcav.sources.carla.server.sensing.table import KINDS, Clock
@@ -79,6 +80,7 @@ class Episode:
         self._strolls: dict[int, Stroll] = {}  # by the number of the walker
         self._paths: Footpaths | None = None
         self._scene: Scene | None = None
+        self.recorder = Recorder()
         self._spawned = 0
         self.spectator = self._add(wire.Description(0, "spectator", ()), np.eye(4))
         centre = np.mean(np.reshape(served.town.bounds, (2, 2)), axis=0)
@@ -90,7 +92,7 @@ class Episode:
         self._follow(self.world.snapshot, 0.0)
 
     def warm_up(self) -> None:
-        """Build the scene, and load the compiled code of the vehicles and of a camera, so that no client waits for it."""
+        """Build the scene, and load the compiled code of vehicles and cameras, so that no client waits for it."""
         with LiveWorld(self.served.town, Settings(parked=False)) as world:
             world.apply(Spawn("car", "car", 0, *self.spectator.pose[:2, 3].tolist(), anywhere=True))
             world.step({"car": Controls(throttle=1.0)})
@@ -103,7 +105,8 @@ class Episode:
         return time.monotonic() - self._begun_s
 
     def close(self) -> None:
-        """End the world."""
+        """End the world, and write what is recorded."""
+        self.recorder.stop()
         self.world.close()
 
     # ---- actors
@@ -278,6 +281,7 @@ class Episode:
         self.time_s += dt_s
         self.lights.follow(self.world, dt_s)
         self._follow(snapshot, dt_s)
+        self.recorder.add(snapshot)
 
     def steering(self, actor: Actor) -> tuple[float, float]:
         """Return the greatest steering angle [rad] and the wheelbase [m] of a vehicle."""

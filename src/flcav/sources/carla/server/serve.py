@@ -183,8 +183,7 @@ class Server:
 
     def _answer(self, call: wire.Call) -> list[Any]:
         """Return the response to a call."""
-        if os.environ.get("TRACE"):
-            print(f"{time.monotonic():.3f} {call.method} {str(call.arguments)[:100]}", flush=True)
+        log.debug("%s %.200s", call.method, call.arguments)
         try:
             value = invoke(self._calls, call.method, call.arguments)
         except (Refused, InputError, wire.WireError) as error:
@@ -193,7 +192,9 @@ class Server:
         except Exception as error:  # a server that fails one call serves the others
             log.exception("the call %s failed", call.method[:60])
             return wire.fail(f"{call.method[:60]} failed on the server: {type(error).__name__}")
-        if self._calls.ticks or call.method == "set_episode_settings":
+        if call.method == "load_new_episode":
+            self._state = self._calls.episode.describe_world(0.0)
+        if self._calls.ticks or call.method in ("set_episode_settings", "load_new_episode"):
             self._cue.set()
         if call.method == "apply_batch":
             return value
