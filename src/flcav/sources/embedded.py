@@ -50,11 +50,11 @@ class EmbeddedSource:
         self.agents = [f"cav{i}" for i in range(recipe.cavs)] + [f"pole{pole}" for pole in self.poles]
         self.vehicle_rigs = [self._vehicle_rig(i) for i in range(recipe.cavs)]
         for rig in self.vehicle_rigs or [recipe.vehicle_rig]:
-            _check_mounts("vehicle_rig", rig, "a vehicle", 0.0)
+            check_mounts("vehicle_rig", rig, "a vehicle", 0.0)
         for pole in self.poles:
             x, y, z = self.town.poles.position[known.index(pole)].tolist()
             mount_m = z - self.town.ground(x, y)
-            _check_mounts("pole_rig", recipe.pole_rig, f"pole {pole}", mount_m)
+            check_mounts("pole_rig", recipe.pole_rig, f"pole {pole}", mount_m)
         self._division = Division(recipe, self.town.name, tuple(self.agents))
         self._last_trace: tuple[str, Trace] | None = None
         self._last_scene: tuple[str, Scene] | None = None
@@ -167,7 +167,7 @@ def read_town_files(town: Town, name: str) -> Mapping[str, bytes]:
     return {path.name: path.read_bytes() for path in paths}
 
 
-def _check_mounts(field: str, rig: Rig, carrier: str, mount_m: float) -> None:
+def check_mounts(field: str, rig: Rig, carrier: str, mount_m: float) -> None:
     """Raise `InputError` where a sensor of `rig` is not above the ground.
 
     The origin of the carrier's frame is `mount_m` above the ground. `field` is the recipe's field of the rig.

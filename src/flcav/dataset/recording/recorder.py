@@ -120,7 +120,7 @@ def record(
 def drop_unbegun(out: Path) -> None:
     """Remove what a failed recording left in `out` where no part of it was completed; otherwise it can be resumed."""
     work = out / WORK
-    if work.is_dir() and not any(path.is_dir() for path in work.glob("*/*")):
+    if work.is_dir() and not any(path.is_dir() and path.suffix != ".part" for path in work.glob("*/*")):
         shutil.rmtree(work)
         if not any(out.iterdir()):
             out.rmdir()

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from flcav.geometry import Boxes, count_points_in_boxes, inverse, points_in_boxes, transform_points
 from flcav.sensors.frame import SEMANTICS, Annotations, SignViews, Views
@@ -23,6 +24,7 @@ from flcav.sources.carla.recording.traffic import State
 Array = NDArray[np.float64]
 
 SLACK_M = 0.1  # by which a surface may stand out of its box
+SAME_M, SIGMAS = 0.02, 4.0  # two LiDARs' points by one ray are as near, and within so many deviations of the noise
 VEHICLES = tuple(SEMANTICS[name] for name in ("rider", "car", "truck", "bus", "motorcycle", "bicycle"))
 PEOPLE = (SEMANTICS["pedestrian"],)
 
@@ -62,10 +64,8 @@ def annotate(
     order[rows + 1] = np.arange(1, len(rows) + 1)
     images = {name: order[image] for name, image in instances.items()}
     boxes, bodies = state.boxes[rows], [state.bodies[row] for row in rows]
-    points = {
-        name: count_points_in_boxes(sweep.points, boxes, sweep.world_from_sensor) for name, sweep in sweeps.items()
-    }
     numbers = np.array([body.number for body in bodies], np.int64)
+    points = {name: _count_returns(boxes, numbers, sweep) for name, sweep in sweeps.items()}
     annotations = Annotations(
         track=np.array([body.track for body in bodies], np.str_).reshape(len(rows)),
         boxes=boxes,
@@ -90,6 +90,23 @@ def enter_box(origin: Array, directions: Array, half: Array) -> tuple[NDArray[np
         first, second = (-half - origin) / directions, (half - origin) / directions
     near, far = np.fmin(first, second).max(axis=1), np.fmax(first, second).min(axis=1)
     return (near <= far) & (far > 0), np.maximum(near, 0.0)
+
+
+def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: Sweep) -> NDArray[np.int64]:
+    """Return the number (M,) of a LiDAR's points from each body: those beside a point of it of the semantic LiDAR's.
+
+    A parked vehicle is no actor of CARLA's: points of its class in its box count.
+    """
+    if not len(sweep.points) or not len(sweep.met.points):
+        return np.zeros(len(boxes), np.int64)
+    away, nearest = cKDTree(sweep.met.points).query(sweep.points[:, :3])
+    same = away <= SAME_M + SIGMAS * sweep.lidar.noise_m
+    actor, vehicle = sweep.met.actor[nearest[same]], np.isin(sweep.met.tag[nearest[same]], VEHICLES)
+    counts = np.array([np.count_nonzero(actor == number) for number in numbers], np.int64)
+    parked = np.flatnonzero(numbers == 0)
+    ours = sweep.points[same][vehicle & (actor == 0)]
+    counts[parked] = count_points_in_boxes(ours, boxes[parked], sweep.world_from_sensor)
+    return counts
 
 
 def _hide_from_lidars(boxes: Boxes, numbers: NDArray[np.int64], sweeps: list[Sweep]) -> Array:

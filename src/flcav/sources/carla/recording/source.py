@@ -43,7 +43,7 @@ from flcav.sources.carla.recording.traffic import (
 )
 from flcav.sources.carla.recording.weather import make_weather
 from flcav.sources.division import Division
-from flcav.sources.embedded import read_town_files
+from flcav.sources.embedded import check_mounts, read_town_files
 from flcav.sources.recipe import STEP_S, CarlaRecipe
 from flcav.statistics.streams import derive_seed, stream
 from flcav.world.geodesy import convert_to_geodetic
@@ -93,6 +93,10 @@ class CarlaSource:
         self.poles = self._find_poles()
         self.agents = [f"cav{i}" for i in range(recipe.cavs)] + list(self.poles)
         self._division = Division(recipe, name, tuple(self.agents))
+        check_mounts("vehicle_rig", recipe.vehicle_rig, "a vehicle", 0.0)
+        for pole, world_from_pole in self.poles.items() if self.town else ():
+            x, y, z = world_from_pole[:3, 3].tolist()
+            check_mounts("pole_rig", recipe.pole_rig, pole, z - self.town.ground(x, y))
 
     def describe(self) -> Mapping[str, Json]:
         """Return the recipe as JSON values, without where the server is; equal where frames are, as far as CARLA goes.
