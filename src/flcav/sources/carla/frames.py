@@ -17,6 +17,12 @@ Vector = tuple[float, float, float]
 MIRROR = np.array((1.0, -1.0, 1.0))
 
 
+def to_vector(values: Array) -> Vector:
+    """Return three numbers (3,) as a tuple."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
 def mirror(vectors: Array) -> Array:
     """Return vectors (..., 3), directions or points, of one frame in the other."""
     return vectors * MIRROR
@@ -27,10 +33,13 @@ def mirror_spin(rates: Array) -> Array:
     return -rates * MIRROR
 
 
-def to_rotation(yaw: float, pitch: float, roll: float) -> Vector:
-    """Return CARLA's pitch, yaw and roll [deg] of angles [rad] as in `geometry.pose`; yaw within -180 and 180."""
-    turned = -np.degrees(yaw)
-    return (float(-np.degrees(pitch)), float((turned + 180.0) % 360.0 - 180.0), float(np.degrees(roll)))
+def to_rotation(angles: Array) -> Array:
+    """Return CARLA's pitch, yaw and roll (..., 3) [deg] of yaw, pitch and roll (..., 3) [rad] as in `geometry.pose`.
+
+    Yaws are within -180 and 180.
+    """
+    yaw, pitch, roll = np.moveaxis(np.degrees(angles), -1, 0)
+    return np.stack((0.0 - pitch, (180.0 - yaw) % 360.0 - 180.0, roll), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -39,9 +48,9 @@ class MapFrame:
 
     offset_m: tuple[float, float] = (0.0, 0.0)
 
-    def to_location(self, point: Array) -> Vector:
-        """Return CARLA's location of a point (3,) of the town."""
-        return (float(point[0] - self.offset_m[0]), float(self.offset_m[1] - point[1]), float(point[2]))
+    def to_location(self, points: Array) -> Array:
+        """Return CARLA's locations (..., 3) of points (..., 3) of the town."""
+        return mirror(points - (*self.offset_m, 0.0))
 
     def from_location(self, location: Vector) -> Array:
         """Return the point (3,) of the town at CARLA's location."""
@@ -49,8 +58,8 @@ class MapFrame:
 
     def to_transform(self, world_from_body: Array) -> tuple[Vector, Vector]:
         """Return CARLA's location and rotation of a pose (4, 4) in the town."""
-        yaw, pitch, roll = angles_of(world_from_body[:3, :3])
-        return self.to_location(world_from_body[:3, 3]), to_rotation(float(yaw), float(pitch), float(roll))
+        rotation = to_rotation(np.stack(angles_of(world_from_body[:3, :3])))
+        return to_vector(self.to_location(world_from_body[:3, 3])), to_vector(rotation)
 
     def from_transform(self, location: Vector, rotation: Vector) -> Array:
         """Return the pose (4, 4) in the town of CARLA's location and rotation."""

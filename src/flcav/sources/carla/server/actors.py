@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sensors.frame import SEMANTICS
-from flcav.sources.carla.frames import to_rotation
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.sensing.sight import Sensor
 from flcav.sources.carla.server.sensing.table import Clock
@@ -77,9 +76,3 @@ class Actor:
             return b""
         names = {"van": "car", "prop": "static"}
         return bytes([SEMANTICS[names.get(self.category, self.category)]])
-
-
-def find_rotation(yaw: float, tilt: Array | None, row: int) -> wire.Vector:
-    """Return CARLA's rotation of an actor of a trace."""
-    pitch, roll = (0.0, 0.0) if tilt is None else (float(tilt[row, 0]), float(tilt[row, 1]))
-    return to_rotation(yaw, pitch, roll)

@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from flcav.config import InputError, shorten
-from flcav.sources.carla.frames import mirror, mirror_spin
+from flcav.sources.carla.frames import mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.actors import Actor
 from flcav.sources.carla.server.blueprints import Refused, list_blueprints
@@ -390,7 +390,7 @@ class Calls:
         """Return the boxes of a light's heads."""
         actor_found = self.episode.find(actor)
         self._light(actor)
-        place = self.episode.served.frame.to_location(actor_found.pose[:3, 3] + (0.0, 0.0, 2.9))
+        place = to_vector(self.episode.served.frame.to_location(actor_found.pose[:3, 3] + (0.0, 0.0, 2.9)))
         return [BoundingBox(place, (0.15, 0.15, 0.45), actor_found.transform.rotation)]
 
     # ---- Traffic Manager

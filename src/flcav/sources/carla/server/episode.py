@@ -5,14 +5,16 @@ Every tick the world makes a step; then all actors take their places, and the se
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import rotations
-from flcav.sources.carla.frames import from_mount, mirror, mirror_spin
+from flcav.sources.carla.frames import MapFrame, from_mount, mirror, mirror_spin, to_rotation, to_vector
 from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.actors import Actor, find_rotation
+from flcav.sources.carla.server.actors import Actor
 from flcav.sources.carla.server.blueprints import Blueprint, Refused, check, list_blueprints
 from flcav.sources.carla.server.driving import steer_towards
 from flcav.sources.carla.server.lights import Lights, find_approaches
@@ -24,7 +26,8 @@ from flcav.sources.carla.server.sensing.table import KINDS, Clock
 from flcav.sources.carla.server.walking import Footpaths, Stroll
 from flcav.sources.carla.server.weather import to_weather
 from flcav.sources.carla.server.wire import Transform
-from flcav.world.commands import Controls, Drive, Place, Push, Remove, Simulate, Spawn, Walk
+from flcav.world import commands
+from flcav.world.commands import Controls, Drive, Push, Remove, Simulate, Spawn, Walk
 from flcav.world.live import LiveWorld, Obstructed, Settings
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
@@ -42,6 +45,15 @@ TRAFFIC_OF = {  # category -> blueprint by which clients know SUMO's traffic
 }
 PARKED = "parked"  # begins the names of parked vehicles, which are no actors to clients
 NOWHERE = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+class Measurement(NamedTuple):
+    """What a sensor sends at one tick."""
+
+    stream: int
+    header: bytes
+    body: bytes | Callable[[], bytes]  # or how it is measured
+    slow: bool = False  # it takes rays to measure
 
 
 class Counters:
@@ -79,12 +91,15 @@ class Episode:
         self._bodies: dict[str, Actor] = {}  # by name in the live world
         self._strolls: dict[int, Stroll] = {}  # by the number of the walker
         self._paths: Footpaths | None = None
-        self._scene: Scene | None = None
+        self._scene: Scene | None = None  # of the sensors
+        self._survey: Scene | None = None  # of the calls
         self.recorder = Recorder()
         self._spawned = 0
         self.spectator = self._add(wire.Description(0, "spectator", ()), np.eye(4))
         centre = np.mean(np.reshape(served.town.bounds, (2, 2)), axis=0)
-        self.place(self.spectator, Transform(served.frame.to_location(np.append(centre, 60.0)), (-60.0, 0.0, 0.0)))
+        self.place(
+            self.spectator, Transform(to_vector(served.frame.to_location(np.append(centre, 60.0))), (-60.0, 0.0, 0.0))
+        )
         for row, approach in enumerate(self.lights.approaches):
             light = self._add(wire.Description(0, "traffic.traffic_light", ()), approach.pose)
             light.light, light.box = row, approach.box()
@@ -169,11 +184,10 @@ class Episode:
         actor.name, actor.category, actor.size = name, blueprint.category, blueprint.size
         actor.parent = parent
         self._bodies[name] = actor
-        self._take_place(actor, self.world.snapshot, len(self._own()) - 1)
+        snapshot = self.world.snapshot
+        row = snapshot.row(name)
+        _take_place(actor, _list_places(snapshot, self.served.frame, row + 1)[row])
         return actor
-
-    def _own(self) -> list[Actor]:
-        return [actor for actor in self._bodies.values() if actor.name.startswith("c")]
 
     def destroy(self, actor: Actor) -> None:
         """Remove an actor; sensors that it carries stay where they are."""
@@ -217,7 +231,7 @@ class Episode:
         if self.is_own(actor):
             x, y, z = actor.pose[:3, 3].tolist()
             pitch, yaw, roll = np.radians(transform.rotation).tolist()
-            self.world.apply(Place(actor.name, x, y, -yaw, z - actor.lift, -pitch, roll))
+            self.world.apply(commands.Place(actor.name, x, y, -yaw, z - actor.lift, -pitch, roll))
 
     def drive(self, actor: Actor, control: wire.VehicleControl) -> None:
         """Set a vehicle's pedals and steering wheel."""
@@ -245,7 +259,7 @@ class Episode:
 
     def _turn(self, actor: Actor, yaw: float) -> None:
         x, y, z = actor.pose[:3, 3].tolist()
-        self.world.apply(Place(actor.name, x, y, yaw, z - actor.lift))
+        self.world.apply(commands.Place(actor.name, x, y, yaw, z - actor.lift))
 
     def push(self, actor: Actor, velocity: Array, yaw_rate: float | None = None) -> None:
         """Give an actor another velocity (3,) [m/s] in the town's frame."""
@@ -294,12 +308,11 @@ class Episode:
 
     def _follow(self, snapshot: Snapshot, dt_s: float) -> None:
         """Take the places of all actors from the world."""
-        names = snapshot.trace.actor.tolist()
+        names = [name for name in snapshot.trace.actor.tolist() if not name.startswith(PARKED)]
+        places = _list_places(snapshot, self.served.frame, len(names))
         for row, name in enumerate(names):
-            if name.startswith(PARKED):
-                break
             actor = self._bodies.get(name) or self._meet(snapshot, row)
-            self._take_place(actor, snapshot, row)
+            _take_place(actor, places[row])
         if len(self._bodies) > len(names):
             for name in set(self._bodies) - set(names):
                 del self.actors[self._bodies.pop(name).id]
@@ -326,20 +339,6 @@ class Episode:
         actor.size = (length, width, height)
         self._bodies[actor.name] = actor
         return actor
-
-    def _take_place(self, actor: Actor, snapshot: Snapshot, row: int) -> None:
-        trace = snapshot.trace
-        position, yaw = trace.position[0, row], float(trace.yaw[0, row])
-        tilt = None if trace.tilt is None else trace.tilt[0]
-        actor.pose = np.eye(4)
-        actor.pose[:3, :3] = rotations(yaw, *(tilt[row] if tilt is not None else (0.0, 0.0)))
-        actor.pose[:3, 3] = position
-        actor.pose[2, 3] += actor.lift
-        actor.transform = Transform(self.served.frame.to_location(actor.pose[:3, 3]), find_rotation(yaw, tilt, row))
-        vx, vy, vz = trace.velocity[0, row].tolist()
-        ax, ay, az = trace.acceleration[0, row].tolist()
-        spin = float(np.degrees(trace.yaw_rate[0, row]))
-        actor.motion = ((vx, -vy, vz), (0.0, 0.0, -spin), (ax, -ay, az))
 
     # ---- what is sent
 
@@ -385,8 +384,8 @@ class Episode:
         """Return the number of the actor of an approach; lights follow the spectator."""
         return self.spectator.id + 1 + row
 
-    def measure(self, dt_s: float, is_heard: Callable[[int], bool]) -> Iterator[tuple[int, bytes]]:
-        """Yield stream and payload of each sensor that is due and heard, in the order in which they were spawned."""
+    def measure(self, dt_s: float, is_heard: Callable[[int], bool]) -> Iterator[Measurement]:
+        """Yield what each sensor that is due and heard sends, in the order in which they were spawned."""
         sight: Sight | None = None
         collisions = find_collisions(self.world.snapshot.collisions, self._describe)
         for actor in list(self.actors.values()):
@@ -394,8 +393,9 @@ class Episode:
                 continue
             kind = KINDS[sensor.type]
             header = wire.pack_header(kind.stream, self.counters.frame, self.time_s, actor.transform)
-            for body in collisions.get(sensor.carrier, []) if kind.stream == wire.Stream.COLLISION else []:
-                yield actor.stream, header + body
+            if kind.stream == wire.Stream.COLLISION:
+                for body in collisions.get(sensor.carrier, []):
+                    yield Measurement(actor.stream, header, body)
             if kind.measure is None and kind.stream != wire.Stream.OBSTACLE:
                 continue
             if (elapsed := actor.clock.take(self.time_s, dt_s)) is None:
@@ -403,9 +403,9 @@ class Episode:
             sensor.elapsed_s = elapsed
             sight = sight or self.look()
             if kind.measure is not None:
-                yield actor.stream, header + kind.measure(sight, sensor)
+                yield Measurement(actor.stream, header, partial(kind.measure, sight, sensor), kind.rays)
             elif found := find_obstacle(sight, sensor, self._describe(sensor.carrier), self._describe):
-                yield actor.stream, header + found
+                yield Measurement(actor.stream, header, found)
 
     def _describe(self, name: str) -> wire.Actor:
         """Return the record of an actor, or of a thing of the town, such as "building:3", by its name in the world."""
@@ -415,10 +415,55 @@ class Episode:
 
     def look(self) -> Sight:
         """Return the town as sensors see it now."""
+        self._scene = self._follow_with(self._scene)
+        names = self.world.snapshot.trace.actor.tolist()
+        numbers = [self._bodies[name].id if name in self._bodies else 0 for name in names]
+        weather, frame = to_weather(self.weather), self.served.frame
+        return Sight(self._scene, weather, frame, self.seed, self.tick, np.array(numbers, np.uint32))
+
+    def survey(self) -> Scene:
+        """Return the town as calls see it now: a scene of its own, since sensors may be looking at theirs."""
+        self._survey = self._follow_with(self._survey)
+        return self._survey
+
+    def _follow_with(self, scene: Scene | None) -> Scene:
         trace = self.world.snapshot.trace
-        if self._scene is None:
-            self._scene = Scene(self.served.town, trace)
-        self._scene.follow(trace)
-        numbers = [self._bodies[name].id if name in self._bodies else 0 for name in trace.actor.tolist()]
-        actors = np.array(numbers, np.uint32)
-        return Sight(self._scene, to_weather(self.weather), self.served.frame, self.seed, self.tick, actors)
+        if scene is None:
+            return Scene(self.served.town, trace)
+        scene.follow(trace)
+        return scene
+
+
+class Place(NamedTuple):
+    """Where an actor is, and how it moves."""
+
+    pose: Array  # (4, 4) world from body
+    location: wire.Vector
+    rotation: wire.Vector
+    motion: tuple[wire.Vector, wire.Vector, wire.Vector]
+
+
+def _list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]:
+    """Return the places of the first `count` actors of a snapshot; the parked ones are its last."""
+    trace = snapshot.trace
+    tilt, yaw, position = trace.tilts(0)[:count], trace.yaw[0, :count], trace.position[0, :count]
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = rotations(yaw, *tilt.T)
+    poses[:, :3, 3] = position
+    spin = np.column_stack((np.zeros((count, 2)), trace.yaw_rate[0, :count]))
+    columns = (
+        frame.to_location(position),
+        to_rotation(np.column_stack((yaw, tilt))),
+        mirror(trace.velocity[0, :count]),
+        np.degrees(mirror_spin(spin)),
+        mirror(trace.acceleration[0, :count]),
+    )
+    rows = zip(*((map(tuple, column.tolist())) for column in columns))
+    return [Place(pose, *row[:2], row[2:]) for pose, row in zip(poses, rows)]
+
+
+def _take_place(actor: Actor, place: Place) -> None:
+    x, y, z = place.location
+    actor.pose, actor.motion = place.pose, place.motion
+    actor.pose[2, 3] += actor.lift
+    actor.transform = Transform((x, y, z + actor.lift), place.rotation)

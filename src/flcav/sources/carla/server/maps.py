@@ -13,7 +13,7 @@ from shapely.geometry import LineString
 
 from flcav.config import InputError, shorten
 from flcav.interface.wording import suggest
-from flcav.sources.carla.frames import MapFrame, to_rotation
+from flcav.sources.carla.frames import MapFrame, to_rotation, to_vector
 from flcav.sources.carla.server.wire import Transform
 from flcav.world.map.roads import Lane, RoadNet, read_net
 from flcav.world.map.town import NAME, PACKAGED, Town, load_town
@@ -47,7 +47,7 @@ class ServedMap:
     def spawn_points(self) -> list[Transform]:
         """Poses on driving lanes."""
         return [
-            Transform(self.frame.to_location(point), to_rotation(yaw, 0.0, 0.0))
+            Transform(to_vector(self.frame.to_location(point)), to_vector(to_rotation(np.array((yaw, 0.0, 0.0)))))
             for lane in _driving_lanes(self.net)
             for point, yaw in self._places(lane)
         ]

@@ -7,7 +7,7 @@ import numpy as np
 from flcav.geometry import rotations_about_z
 from flcav.sensors.frame import SEMANTICS
 from flcav.sensors.rendering.appearance import build_appearance
-from flcav.sources.carla.frames import mirror, to_rotation
+from flcav.sources.carla.frames import mirror, to_rotation, to_vector
 from flcav.sources.carla.server.wire import BoundingBox, Vector
 from flcav.world.static import find_lowest_ground
 
@@ -37,9 +37,9 @@ def _list_things(episode: "Episode") -> list[tuple[int, BoundingBox, str]]:
     town, found = episode.served.town, []
 
     def add(kind: str, x: float, y: float, z: float, size: tuple[float, float, float], yaw: float = 0.0) -> None:
-        place = episode.served.frame.to_location(np.array((x, y, z + size[2] / 2)))
+        place = to_vector(episode.served.frame.to_location(np.array((x, y, z + size[2] / 2))))
         length, width, height = size
-        box = BoundingBox(place, (length / 2, width / 2, height / 2), to_rotation(yaw, 0.0, 0.0))
+        box = BoundingBox(place, (length / 2, width / 2, height / 2), to_vector(to_rotation(np.array((yaw, 0.0, 0.0)))))
         found.append((SEMANTICS[kind], box, f"{kind}_{len(found)}"))
 
     ground = find_lowest_ground(town, town.buildings) if len(town.buildings) else []
@@ -72,11 +72,11 @@ def project(episode: "Episode", location: Vector, direction: Vector, distance: f
     pose = np.eye(4)
     pose[:3, :3] = rotations_about_z(np.array(0.0))
     pose[:3, 3] = episode.served.frame.from_location(location)
-    sight = episode.look()
-    hits = sight.scene.cast(pose, (way / length)[None].astype(np.float32), far_m=distance)
+    scene = episode.survey()
+    hits = scene.cast(pose, (way / length)[None].astype(np.float32), far_m=distance)
     if hits.instance[0] < 0:
         return []
-    row = sight.scene.surfaces.first[hits.instance[0]] + hits.face[0]
-    tag = int(build_appearance(sight.scene).semantic[row])
+    row = scene.surfaces.first[hits.instance[0]] + hits.face[0]
+    tag = int(build_appearance(scene).semantic[row])
     point = pose[:3, 3] + way / length * float(hits.distance[0])
-    return [[episode.served.frame.to_location(point), tag]]
+    return [[to_vector(episode.served.frame.to_location(point)), tag]]

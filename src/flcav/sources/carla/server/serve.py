@@ -1,7 +1,7 @@
-"""The server: remote procedure calls at one port, streams at the next, one loop, no threads.
+"""The server: remote procedure calls at one port, streams at the next, one loop.
 
 In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends the world's state at once and
-then measures, sensor after sensor; meanwhile clients' calls wait. A reader who does not keep up is waited for, and
+then measures, sensor after sensor, in a thread beside those calls. A reader who does not keep up is waited for, and
 dropped after `STUCK_S`.
 """
 
@@ -94,9 +94,12 @@ class Server:
         episode.step(dt_s)
         self._state = episode.describe_world(dt_s)
         self._publish_state(episode)
-        for stream, payload in episode.measure(dt_s, self._is_heard):
-            self._publish(stream, payload)
-            await self._await_readers(self._streams.get(stream, set()))
+        for each in episode.measure(dt_s, self._is_heard):
+            body = each.body
+            if not isinstance(body, bytes):  # rays are cast beside this thread, so that calls are answered meanwhile
+                body = await asyncio.to_thread(body) if each.slow else body()
+            self._publish(each.stream, each.header + body)
+            await self._await_readers(self._streams.get(each.stream, set()))
             if episode is not self._calls.episode:  # another map was loaded meanwhile
                 return
         await self._await_readers(self._connections)

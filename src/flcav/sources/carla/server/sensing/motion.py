@@ -3,7 +3,7 @@
 import numpy as np
 
 from flcav.geometry import yaw_of
-from flcav.sources.carla.frames import mirror, mirror_spin, to_rotation
+from flcav.sources.carla.frames import mirror, mirror_spin
 from flcav.sources.carla.server.sensing.sight import Sensor, Sight
 from flcav.sources.carla.server.wire import pack_record
 from flcav.world.geodesy import convert_to_geodetic
@@ -38,5 +38,5 @@ def sense_imu(sight: Sight, sensor: Sensor) -> bytes:
     bias = np.array([sensor.number_of(f"noise_gyro_bias_{axis}") for axis in "xyz"])
     force = mirror(turn @ (sensor.acceleration + GRAVITY)) + noise("accel")
     rate = mirror_spin(turn @ sensor.spin) + bias + noise("gyro")
-    yaw = np.radians(to_rotation(yaw_of(sensor.pose), 0.0, 0.0)[1])
+    yaw = -yaw_of(sensor.pose)
     return pack_record([force.tolist(), rate.tolist(), float((yaw + np.pi / 2) % (2 * np.pi))])

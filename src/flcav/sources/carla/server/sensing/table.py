@@ -13,18 +13,19 @@ class Kind(NamedTuple):
 
     stream: Stream
     measure: Callable[[Sight, Sensor], bytes] | None  # None: it sends what happens, not what it sees
+    rays: bool = False  # it casts rays, which takes its time
 
 
 KINDS: dict[str, Kind] = {
-    "sensor.camera.rgb": Kind(Stream.RGB, cameras.sense_rgb),
-    "sensor.camera.depth": Kind(Stream.DEPTH, cameras.sense_depth),
-    "sensor.camera.semantic_segmentation": Kind(Stream.SEMANTIC, cameras.sense_semantic),
-    "sensor.camera.instance_segmentation": Kind(Stream.INSTANCE, cameras.sense_instance),
-    "sensor.lidar.ray_cast": Kind(Stream.LIDAR, rays.sense_lidar),
-    "sensor.lidar.ray_cast_semantic": Kind(Stream.SEMANTIC_LIDAR, rays.sense_semantic_lidar),
+    "sensor.camera.rgb": Kind(Stream.RGB, cameras.sense_rgb, True),
+    "sensor.camera.depth": Kind(Stream.DEPTH, cameras.sense_depth, True),
+    "sensor.camera.semantic_segmentation": Kind(Stream.SEMANTIC, cameras.sense_semantic, True),
+    "sensor.camera.instance_segmentation": Kind(Stream.INSTANCE, cameras.sense_instance, True),
+    "sensor.lidar.ray_cast": Kind(Stream.LIDAR, rays.sense_lidar, True),
+    "sensor.lidar.ray_cast_semantic": Kind(Stream.SEMANTIC_LIDAR, rays.sense_semantic_lidar, True),
     "sensor.other.gnss": Kind(Stream.GNSS, motion.sense_gnss),
     "sensor.other.imu": Kind(Stream.IMU, motion.sense_imu),
-    "sensor.other.radar": Kind(Stream.RADAR, rays.sense_radar),
+    "sensor.other.radar": Kind(Stream.RADAR, rays.sense_radar, True),
     "sensor.other.collision": Kind(Stream.COLLISION, None),
     "sensor.other.lane_invasion": Kind(Stream.LANE_INVASION, None),  # clients find these themselves, from the map
     "sensor.other.obstacle": Kind(Stream.OBSTACLE, None),
