@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.config import InputError, parse_config, shorten
+from flcav.config import InputError, shorten
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
@@ -19,7 +19,7 @@ from flcav.perception.tasks import task_named
 from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName, find_path
 from flcav.pipeline.results.saved import Saved
 from flcav.sources.opening import open_source
-from flcav.sources.recipe import Recipe
+from flcav.sources.recipe import Recipe, parse_recipe
 from flcav.statistics.streams import derive_seed, stream
 from flcav.storage.files import sha256
 from flcav.world.map.town import PACKAGED
@@ -87,7 +87,7 @@ def make_recording_recipe(
         "cavs": recipe.vehicles(region) if split == "edge" else frames.cavs,
         **window,
     }
-    return parse_config(Recipe, fields, name)
+    return parse_recipe(fields, name)
 
 
 def list_window(split: Frames, frames: Sequence[int], window_s: float) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from flcav.geometry import Boxes, count_points_in_boxes, inverse, points_in_boxes, transform_points
 from flcav.sensors.frame import SEMANTICS, Annotations, SignViews, Views
@@ -99,7 +99,7 @@ def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: Sweep) -> ND
     """
     if not len(sweep.points) or not len(sweep.met.points):
         return np.zeros(len(boxes), np.int64)
-    away, nearest = cKDTree(sweep.met.points).query(sweep.points[:, :3])
+    away, nearest = (np.asarray(found) for found in KDTree(sweep.met.points).query(sweep.points[:, :3]))
     same = away <= SAME_M + SIGMAS * sweep.lidar.noise_m
     actor, vehicle = sweep.met.actor[nearest[same]], np.isin(sweep.met.tag[nearest[same]], VEHICLES)
     counts = np.array([np.count_nonzero(actor == number) for number in numbers], np.int64)

@@ -9,7 +9,7 @@ documentation, "Sensors reference".
 import queue
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,10 +82,6 @@ class Feed:
             if data.frame > frame:
                 raise OSError(f"CARLA's sensor '{self.name}' left out tick {frame}; the same command goes on")
 
-    def close(self) -> None:
-        """Listen no more."""
-        self.actor.stop()
-
 
 def spawn_feeds(
     session: Session, rig: Rig, agent: str, base: Array, parent: "carla.Actor | None", frame: MapFrame, seed: int
@@ -114,8 +110,8 @@ def spawn_feeds(
             if blueprint.has_attribute(attribute):
                 blueprint.set_attribute(attribute, value)
         place = make_transform(base @ mount, MapFrame() if parent is not None else frame)
-        actor = session.world.spawn_actor(blueprint, place, attach_to=parent)
-        feeds[name] = Feed(f"{name}' of '{agent}", actor)
+        sensor = cast("carla.Sensor", session.world.spawn_actor(blueprint, place, attach_to=parent))
+        feeds[name] = Feed(f"{name}' of '{agent}", sensor)
     return feeds
 
 

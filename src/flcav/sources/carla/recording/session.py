@@ -4,6 +4,7 @@ In synchronous mode CARLA waits for each tick, so that nothing passes unseen. Ti
 its ten default substeps in each. Source: CARLA's documentation, "Synchrony and time-step" and "Traffic Manager".
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 from flcav.config import InputError, shorten
 from flcav.interface.extras import format_install_command
 from flcav.interface.wording import suggest
+from flcav.machine.locks import take_turns
 from flcav.sources.recipe import STEP_S, CarlaRecipe
 
 if TYPE_CHECKING:
@@ -57,14 +59,15 @@ def check_installed() -> None:
 def open_session(recipe: CarlaRecipe, map_name: str, scene: str, seed: int) -> Iterator[Session]:
     """Yield a session with the map loaded anew; the server is left with its clock running and without our actors.
 
-    Raises `InputError` where the server has another version or lacks the map, and `OSError` where it is lost.
+    Recordings on this machine take turns at a server. Raises `InputError` where the server has another version or lacks
+    the map, and `OSError` where it is lost.
     """
     import carla
 
     address = f"{recipe.host}:{recipe.port}"
-    client = carla.Client(recipe.host, recipe.port)
-    client.set_timeout(recipe.timeout_s)
-    try:
+    with take_turns(f"carla-{re.sub('[^A-Za-z0-9]', '-', address)}"), _name_failures(address, scene):
+        client = carla.Client(recipe.host, recipe.port)
+        client.set_timeout(recipe.timeout_s)
         _check_version(client, address)
         world = _load_map(client, address, map_name)
         settings = world.get_settings()
@@ -82,7 +85,14 @@ def open_session(recipe: CarlaRecipe, map_name: str, scene: str, seed: int) -> I
             raise
         finally:
             _leave(client, world, manager)
-    except RuntimeError as error:  # of CARLA's client; what it raises for all that fails
+
+
+@contextmanager
+def _name_failures(address: str, scene: str) -> Iterator[None]:
+    """Raise the RuntimeError of CARLA's client, which it raises for all that fails, as an `OSError` that says where."""
+    try:
+        yield
+    except RuntimeError as error:
         said = " ".join(str(error).split()) or "it gave no reason"
         raise OSError(
             f"CARLA at {address} failed in the scene {scene} ({said}); scenes before it are kept, and the same command "

@@ -94,9 +94,10 @@ class CarlaSource:
         self.agents = [f"cav{i}" for i in range(recipe.cavs)] + list(self.poles)
         self._division = Division(recipe, name, tuple(self.agents))
         check_mounts("vehicle_rig", recipe.vehicle_rig, "a vehicle", 0.0)
-        for pole, world_from_pole in self.poles.items() if self.town else ():
+        for pole, world_from_pole in self.poles.items():
             x, y, z = world_from_pole[:3, 3].tolist()
-            check_mounts("pole_rig", recipe.pole_rig, pole, z - self.town.ground(x, y))
+            ground = self.town.ground(x, y) if self.town else 0.0
+            check_mounts("pole_rig", recipe.pole_rig, pole, z - ground)
 
     def describe(self) -> Mapping[str, Json]:
         """Return the recipe as JSON values, without where the server is; equal where frames are, as far as CARLA goes.
@@ -260,17 +261,17 @@ class CarlaSource:
 
     def _find_poles(self) -> dict[str, Array]:
         """Return pole -> (4, 4) pose in the world, of the poles that record; raises `InputError` for an unknown one."""
-        sites = [] if self.town is None else self.town.poles.id.tolist()
+        town = self.town
+        sites: list[int] = [] if town is None else town.poles.id.tolist()
         wanted = sites if self.recipe.poles == "all" else self.recipe.poles
         if unknown := [pole for pole in wanted if pole not in sites]:
-            where = f"the map {self.recipe.town}, of which no town is known," if self.town is None else self.town.name
+            where = f"the map {self.recipe.town}, of which no town is known," if town is None else town.name
             raise InputError(f"field 'poles' = {unknown[0]}: no pole of {where} which has {sites}")
-        found = {}
-        for site in wanted if self.town else ():
-            row = sites.index(site)
-            x, y, z = self.town.poles.position[row].tolist()
-            found[f"pole{site}"] = pose(x, y, z, float(self.town.poles.yaw[row]))
-        return found
+        if town is None:
+            return {}
+        placed = zip(town.poles.position.tolist(), town.poles.yaw.tolist())
+        poses = {site: pose(x, y, z, yaw) for site, ((x, y, z), yaw) in zip(sites, placed)}
+        return {f"pole{site}": poses[site] for site in wanted}
 
 
 def _find_town(name: str, beside: Path | None) -> Town | None:

@@ -1,7 +1,8 @@
 """Traffic of a scene in CARLA: vehicles of its Traffic Manager and its walkers, drawn by the recipe's seed."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,7 @@ class State:
     acceleration: Array  # (N, 3) world [m/s^2]
 
 
-def spawn_vehicles(session: Session, recipe: CarlaRecipe, rng: np.random.Generator) -> dict[str, "carla.Actor"]:
+def spawn_vehicles(session: Session, recipe: CarlaRecipe, rng: np.random.Generator) -> dict[str, "carla.Vehicle"]:
     """Return agent or track -> vehicle, of those that record and of the others, driven by the Traffic Manager.
 
     Raises `InputError` where the map has not enough spawn points for the vehicles that record.
@@ -62,7 +63,7 @@ def spawn_vehicles(session: Session, recipe: CarlaRecipe, rng: np.random.Generat
         raise InputError(f"CARLA at {session.address} has no blueprint {ALONE}, which records")
     places = [points[i] for i in rng.permutation(len(points))]
     names = [f"cav{i}" for i in range(recipe.cavs)] + [f"veh{i}" for i in range(recipe.vehicles)]
-    found: dict[str, carla.Actor] = {}
+    found: dict[str, carla.Vehicle] = {}
     for name in names:
         blueprint = own if name.startswith("cav") else every[int(rng.integers(len(every)))]
         if blueprint.has_attribute("color"):
@@ -71,7 +72,7 @@ def spawn_vehicles(session: Session, recipe: CarlaRecipe, rng: np.random.Generat
         blueprint.set_attribute("role_name", name)
         vehicle = None
         while places and vehicle is None:
-            vehicle = session.world.try_spawn_actor(blueprint, places.pop())
+            vehicle = cast("carla.Vehicle | None", session.world.try_spawn_actor(blueprint, places.pop()))
         if vehicle is not None:
             found[name] = vehicle
         elif name.startswith("cav"):
@@ -111,7 +112,7 @@ def spawn_walkers(session: Session, recipe: CarlaRecipe, rng: np.random.Generato
     return found
 
 
-def list_bodies(session: Session, spawned: dict[str, "carla.Actor"], frame: MapFrame) -> list[Body]:
+def list_bodies(session: Session, spawned: Mapping[str, "carla.Actor"], frame: MapFrame) -> list[Body]:
     """Return the bodies of a world: all its vehicles and walkers, and the vehicles that are parked in its map.
 
     Those that others than us have spawned are called `other` and CARLA's number.
