@@ -6,6 +6,7 @@ At PORT a CARLA server must run, such as `flcav carla serve grid --port PORT`; r
 import re
 import sys
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +90,7 @@ def draw(data: Mapping[str, Dataset], found: Mapping[str, Mapping[str, NDArray[n
 def tabulate(found: Mapping[str, Mapping[str, NDArray[np.float64]]]) -> str:
     """Return the table of the page."""
     rows = []
-    for low, high in zip(EDGES_M, EDGES_M[1:]):
+    for low, high in pairwise(EDGES_M):
         cells: list[str] = []
         for own in found.values():
             within = (own["away"] >= low) & (own["away"] < high) & (own["returns"] > 0)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from flcav.cli.main import run
 from flcav.dataset.recording.recorder import record
@@ -106,7 +106,7 @@ def test_the_town_is_where_the_built_in_simulator_has_it(recorded: Dataset, tmp_
     )
     own, frame = Dataset.open(tmp_path / "own").frame(0), recorded.frame(1)
     np.testing.assert_allclose(frame.world_from_agent, own.world_from_agent, atol=1e-6)
-    away, _ = cKDTree(own.lidar["lidar"][:, :3]).query(frame.lidar["lidar"][:, :3])
+    away, _ = KDTree(own.lidar["lidar"][:, :3]).query(frame.lidar["lidar"][:, :3])
     assert (away < 0.02).mean() > 0.9  # the others are on traffic, or behind that of the other recording
     assert np.median(away) < 1e-3
 
