@@ -15,6 +15,7 @@ from flcav.dataset.formats.kitti import KittiCalibration, KittiFolder, KittiFram
 from flcav.dataset.formats.kitti.files import ASSUMED_SIZE, is_drive
 from flcav.dataset.formats.kitti.read import BEAMS, HEIGHT_M, RANGE_M
 from flcav.dataset.formats.kitti.write import FRAMES
+from flcav.dataset.layout import MANIFEST
 from flcav.geometry import Boxes, pose, transform_points
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
