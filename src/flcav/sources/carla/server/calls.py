@@ -108,8 +108,7 @@ class Calls:
         """Show layers of the map: all always show."""
 
     def unload_map_layer(self, layers: int) -> None:
-        """Hide layers of the map, which is not served."""
-        raise Refused("unload_map_layer is not served: the town has one layer")
+        """Hide layers of the map: the town has one, which always shows."""
 
     def get_episode_settings(self) -> Any:
         """Return the settings."""
@@ -554,7 +553,7 @@ def _signature(name: str) -> tuple[Callable[..., Any], tuple[Any, ...], int]:
     """Return the method of a call, the types of its arguments, and how many it needs; `Refused` where there is none."""
     method = getattr(Calls, name, None)
     if name.startswith("_") or not callable(method) or "return" not in (hints := get_type_hints(method)):
-        raise Refused(f"'{shorten(name)}' is not served here")
+        raise Refused(f"{shorten(name)} is not served here")
     kinds = tuple(kind for argument, kind in hints.items() if argument != "return")
     return method, kinds, len(kinds) - len(method.__defaults__ or ())
 

@@ -6,9 +6,8 @@ dropped after `STUCK_S`.
 """
 
 import asyncio
-import errno
 import logging
-import os
+import socket
 import struct
 import time
 from collections.abc import Callable
@@ -44,17 +43,10 @@ class Server:
         self._worlds: set[int] = set()  # streams of the world's state, of earlier episodes too
         self._state = b""  # the last one of the world, for clients that come between two ticks
 
-    async def run(self, host: str, port: int, ready: Callable[[], None]) -> None:
-        """Serve until cancelled; raises `InputError` where a port is in use."""
-        servers = []
-        for number, connected in ((port, self._serve_calls), (port + 1, self._serve_stream)):
-            try:
-                servers.append(await asyncio.start_server(connected, host, number))
-            except OSError as error:
-                if error.errno not in (errno.EADDRINUSE, errno.EACCES, errno.EADDRNOTAVAIL):
-                    raise
-                why = os.strerror(error.errno).lower()
-                raise InputError(f"port {number} of {host}: {why}; a server takes --port and the next one") from None
+    async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
+        """Serve until cancelled, calls at the first of two bound sockets and streams at the second."""
+        connected = self._serve_calls, self._serve_stream
+        servers = [await asyncio.start_server(serve, sock=door) for serve, door in zip(connected, doors, strict=True)]
         ready()
         try:
             await self._tick_forever()
@@ -226,6 +218,20 @@ class Server:
             self._forget(writer)
 
 
-def serve(calls: Calls, host: str, port: int, ready: Callable[[], None]) -> None:
-    """Serve clients until interrupted."""
-    asyncio.run(Server(calls).run(host, port, ready))
+def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
+    """Return sockets at `port` and the next one; raises `InputError` where one is in use."""
+    doors = []
+    for number in (port, port + 1):
+        try:
+            doors.append(socket.create_server((host, number)))
+        except OSError as error:
+            for door in doors:
+                door.close()
+            why = (error.strerror or str(error)).partition(" (")[0].lower()
+            raise InputError(f"port {number} of {host}: {why}; a server takes --port and the next one") from None
+    return doors[0], doors[1]
+
+
+def serve(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
+    """Serve clients until interrupted, at the sockets of `open_doors`."""
+    asyncio.run(Server(calls).run(doors, ready))
