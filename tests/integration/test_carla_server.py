@@ -95,6 +95,6 @@ def test_a_port_in_use_is_one_sentence(port, capsys):
 )
 def test_bad_input_is_one_sentence(arguments, told, capsys):
     with pytest.raises(SystemExit) as left:
-        run(["carla", "serve", *arguments])
+        run(["carla", "serve", "--port", str(_find_port()), *arguments])
     assert left.value.code == 2
     assert told in capsys.readouterr().err

@@ -23,7 +23,7 @@ from flcav.sources.carla.server.wire import BoundingBox, Transform, Vector
 from flcav.world.commands import FreezeLights
 
 DEFAULT_DT_S = 0.05  # of a tick where the client sets none
-DT_RANGE_S = (0.001, 2.0)
+DT_RANGE_S = (0.001, 10.0)
 BODIES = ("vehicle", "walker", "static")
 TIMES = {"green": 0, "yellow": 1, "red": 2}
 

@@ -1,8 +1,8 @@
 """The server: remote procedure calls at one port, streams at the next, one loop.
 
-In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends the world's state at once and
-then measures, sensor after sensor, in a thread beside those calls. A reader who does not keep up is waited for, and
-dropped after `STUCK_S`.
+In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends what sensors measure, in order,
+then the world's state, upon which a client goes on, and then the cameras' images, which take longest. A reader who does
+not keep up is waited for, and dropped after `STUCK_S`.
 """
 
 import asyncio
@@ -18,7 +18,7 @@ from flcav.config import InputError
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.blueprints import Refused
 from flcav.sources.carla.server.calls import Calls, invoke
-from flcav.sources.carla.server.episode import Episode
+from flcav.sources.carla.server.episode import Episode, Measurement
 
 STUCK_S = 10.0
 LEARNT_S = 3.0  # clients have learnt of a new map by then
@@ -85,16 +85,26 @@ class Server:
         episode, dt_s = self._calls.episode, self._calls.dt_s
         episode.step(dt_s)
         self._state = episode.describe_world(dt_s)
+        measurements = list(episode.measure(dt_s, self._is_heard))
+        for each in measurements:
+            if not each.late:
+                await self._measure(each, episode)
+        if episode is not self._calls.episode:  # another map was loaded meanwhile
+            return
         self._publish_state(episode)
-        for each in episode.measure(dt_s, self._is_heard):
-            body = each.body
-            if not isinstance(body, bytes):  # rays are cast beside this thread, so that calls are answered meanwhile
-                body = await asyncio.to_thread(body) if each.slow else body()
+        for each in measurements:
+            if each.late:
+                await self._measure(each, episode)
+        await self._await_readers(self._connections)
+
+    async def _measure(self, each: Measurement, episode: Episode) -> None:
+        """Send what a sensor measures, beside this thread where it casts rays, so that calls are answered meanwhile."""
+        body = each.body
+        if not isinstance(body, bytes):
+            body = await asyncio.to_thread(body) if each.rays else body()
+        if episode is self._calls.episode:
             self._publish(each.stream, each.header + body)
             await self._await_readers(self._streams.get(each.stream, set()))
-            if episode is not self._calls.episode:  # another map was loaded meanwhile
-                return
-        await self._await_readers(self._connections)
 
     def _publish_state(self, episode: Episode) -> None:
         """Send the world's state; after a map was loaded, at first only to those who have learnt of it.
@@ -134,8 +144,7 @@ class Server:
     @staticmethod
     def _send(writer: asyncio.StreamWriter, payload: bytes) -> None:
         with suppress(ConnectionError, RuntimeError):
-            writer.write(struct.pack("<I", len(payload)))
-            writer.write(payload)
+            writer.write(struct.pack("<I", len(payload)) + payload)
 
     # ---- connections
 
@@ -145,6 +154,7 @@ class Server:
             writer.close()
             return False
         self._connections.add(writer)
+        writer.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # asyncio may not
         return True
 
     def _forget(self, writer: asyncio.StreamWriter) -> None:
