@@ -62,6 +62,9 @@ class Calls:
 
     def get_sensor_token(self, stream: int) -> Any:
         """Return the token of a stream."""
+        streams = {actor.stream for actor in self.episode.actors.values()} | {self.episode.stream}
+        if stream not in streams:
+            raise Refused(f"no sensor sends on stream {shorten(str(stream))}")
         self.expected.add(stream)
         return [wire.pack_token(stream, self._port + 1)]
 

@@ -82,6 +82,12 @@ class Server:
 
     async def _tick(self) -> None:
         await self._await_listeners()
+        try:
+            await self._step()
+        except Exception:  # a server that fails one tick serves the next
+            log.exception("a tick failed")
+
+    async def _step(self) -> None:
         episode, dt_s = self._calls.episode, self._calls.dt_s
         episode.step(dt_s)
         self._state = episode.describe_world(dt_s)
