@@ -156,6 +156,13 @@ def test_drive_in_live_traffic(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert int(re.findall(r": (\d+) m along the route", said[-1])[0]) > 30
 
 
+def test_the_program_in_the_page_of_live_traffic_runs(capsys: pytest.CaptureFixture[str]):
+    page = (EXAMPLES.parent / "docs" / "live.md").read_text(encoding="utf-8")
+    first, *_ = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
+    exec(first, {})
+    assert re.match(r"\d", capsys.readouterr().out)
+
+
 def test_the_loop_is_the_same_as_a_page_and_as_a_program():
     page = (EXAMPLES.parent / "docs" / "loop.md").read_text()
     program = (EXAMPLES / "07_the_loop.sh").read_text()

@@ -31,16 +31,18 @@ def serve(
     """Serve the clients of CARLA 0.9.16 until interrupted: their scripts run unchanged (docs/carla.md)."""
     from flcav.sources.carla.server.calls import Calls
     from flcav.sources.carla.server.maps import Maps
+    from flcav.sources.carla.server.serve import open_doors
     from flcav.sources.carla.server.serve import serve as serve_calls
     from flcav.sources.carla.server.wire import VERSION
 
     logging.basicConfig(format="flcav: %(message)s", level=logging.WARNING)
     if not _is_loopback(host):
         typer.echo(f"flcav: {host} is open to the network, and CARLA's protocol asks nobody for a password", err=True)
+    doors = open_doors(host, port)
     calls = Calls(Maps(maps), town, seed=seed, traffic=traffic, port=port)
     calls.episode.warm_up()
     name = calls.episode.served.name
-    serve_calls(calls, host, port, lambda: typer.echo(f"{name}: ready for clients of CARLA {VERSION} at {host}:{port}"))
+    serve_calls(calls, doors, lambda: typer.echo(f"{name}: ready for clients of CARLA {VERSION} at {host}:{port}"))
 
 
 def _is_loopback(host: str) -> bool:

@@ -37,7 +37,7 @@ from flcav.world.snapshot import Snapshot
 
 try:
     import gymnasium
-    from gymnasium.spaces import Box, Dict
+    from gymnasium.spaces import Box, Dict, Space
 except ImportError:
     raise InputError(f"the environment needs gymnasium, which is in: {format_install_command('gym')}") from None
 
@@ -77,7 +77,7 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._scene: Scene | None = None
         self._route: Route | None = None
         self._along, self._seed = 0.0, 0
-        spaces: dict[str, Box] = {
+        spaces: dict[str, Space[Any]] = {
             "ego": _box(5),
             "route": _box(AHEAD, 2),
             "limit": _box(1),
@@ -140,7 +140,7 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         position, yaw = trace.position[0, :, :2], trace.yaw[0]
         x, y, heading = *position[row].tolist(), float(yaw[row])
         self._along, offset = self._route.project(x, y, self._along)
-        ahead = rotate(*trace.velocity[0, row, :2], -heading)[0]
+        velocity = np.stack(rotate(trace.velocity[0, :, 0], trace.velocity[0, :, 1], -heading), axis=1)
         steer = self._world.bodies.steer[self._world.bodies.row(EGO)]
         turned = wrap_angle(heading - self._route.at(self._along)[2])
         points = self._route.at(self._along + SPACING_M * np.arange(AHEAD))
@@ -150,12 +150,13 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         near = np.argsort(away, kind="stable")[:ACTORS]
         near = near[away[near] <= SIGHT_M]
         actors = np.zeros((ACTORS, 8))
-        place = rotate(*(position[near] - (x, y)).T, -heading)
+        place = rotate(position[near, 0] - x, position[near, 1] - y, -heading)
         turn = yaw[near] - heading
-        velocity = rotate(*trace.velocity[0, near, :2].T, -heading)
-        actors[: len(near)] = np.column_stack((*place, np.cos(turn), np.sin(turn), *velocity, trace.size[near, :2]))
+        actors[: len(near)] = np.column_stack(
+            (*place, np.cos(turn), np.sin(turn), velocity[near], trace.size[near, :2])
+        )
         seen = {
-            "ego": np.array((ahead, trace.yaw_rate[0, row], steer, offset, turned)),
+            "ego": np.array((velocity[row, 0], trace.yaw_rate[0, row], steer, offset, turned)),
             "route": route,
             "limit": np.array((self._route.limit(self._along),)),
             "light": self._see_light(snapshot),
@@ -191,4 +192,4 @@ def _box(*shape: int) -> Box:
     return Box(-FAR, FAR, shape, np.float32)
 
 
-gymnasium.register("flcav/Driving-v0", entry_point=DrivingEnv, max_episode_steps=1000)
+gymnasium.register("flcav/Driving-v0", entry_point=f"{__name__}:DrivingEnv", max_episode_steps=1000)

@@ -52,6 +52,7 @@ class Settings:
     pedestrians: int = 0  # of SUMO
     parked: bool = True  # with the vehicles parked along the streets
     dt_s: float = 0.05  # length of a step
+    remembers: bool = True  # keeps its history, which grows by every step and command
 
 
 DEFAULT = Settings()
@@ -135,7 +136,7 @@ class LiveWorld:
         for name, told in controls.items():
             if self.bodies.find(name).controls != told:
                 self.apply(commands.Drive(name, told))
-        self.history.append(Step(dt_s))
+        self._note(Step(dt_s))
         begins, velocity = self._time_s, self.bodies.velocity.copy()
         found: dict[tuple[str, str], Collision] = {}
         parts = math.ceil(dt_s / SUBSTEP_S - 1e-9)
@@ -181,7 +182,7 @@ class LiveWorld:
                 self.lights.set(junction, state)
             case commands.FreezeLights(frozen):
                 self.lights.frozen = frozen
-        self.history.append(command)
+        self._note(command)
         self._snapshot = None
 
     def find_obstruction(self, command: commands.Spawn) -> str | None:
@@ -196,6 +197,10 @@ class LiveWorld:
     def height(self, x: float, y: float, z: float | None = None) -> float:
         """Return the height of the ground [m] at a place, or of the bridge there that is nearer to `z`."""
         return float(self._ground.heights(np.array([x]), np.array([y]), np.array([np.nan if z is None else z]))[0])
+
+    def _note(self, entry: Command | Step) -> None:
+        if self.settings.remembers:
+            self.history.append(entry)
 
     def _spawn(self, command: commands.Spawn) -> None:
         name, made = command.name, blueprint(command.category, command.shape, command.size)

@@ -43,15 +43,16 @@ def test_a_driver_who_follows_the_route_makes_progress(env: DrivingEnv):
     seen, _ = env.reset(seed=3)
     np.testing.assert_allclose(seen["route"][0], 0, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(np.diff(seen["route"], axis=0), axis=1).max(), 3.0, atol=1e-3)
-    earned = 0.0
+    rewards, places = [], []
     for _ in range(60):
         seen, reward, ended, truncated, info = env.step(follow(seen, 5.0))
-        earned += reward
+        rewards.append(reward)
+        places.append(info["progress_m"])
         assert abs(seen["ego"][3]) < 1.0
         assert not truncated
         assert not ended
-    assert 15 < earned < 31
-    assert info["progress_m"] == pytest.approx(earned, abs=16)
+    assert 15 < sum(rewards) < 31
+    np.testing.assert_allclose(np.diff(places), rewards[1:])
     others = np.linalg.norm(seen["actors"][:, :2], axis=1)
     assert (np.diff(others[others > 0]) >= 0).all()
 
@@ -74,11 +75,10 @@ def test_the_same_seed_and_actions_give_the_same_episode():
 
 def test_leaving_the_road_ends_the_episode_with_or_without_a_collision(env: DrivingEnv):
     env.reset(seed=1)
-    for _ in range(200):
+    ended, seen, reward, info = False, {}, 0.0, {}
+    while not ended:
         seen, reward, ended, _, info = env.step(np.array([1.0, 0.3], np.float32))
-        if ended:
-            break
-    assert ended
+        assert info["time_s"] < 20
     assert bool(info["collisions"]) == (reward < -COLLISION / 2)
     assert info["collisions"] or abs(seen["ego"][3]) > 6.0
 

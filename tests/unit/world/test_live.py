@@ -30,6 +30,7 @@ from flcav.world.commands import (
     Walk,
 )
 from flcav.world.live import LiveWorld, Obstructed, Settings, Step, replay
+from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import Town, load_town
 from flcav.world.scene import Scene
@@ -253,6 +254,30 @@ def test_a_vehicle_stands_on_slopes():
         rise = (town.ground(steep + 1.4, 0) - town.ground(steep - 1.4, 0)) / 2.8
         assert trace.tilt[0, 0, 0] == pytest.approx(-rise, abs=0.01)
         assert abs(trace.tilt[0, 0, 0]) > 0.02
+
+
+def test_a_world_may_have_no_history(small_town: Callable[..., Town]):
+    with LiveWorld(small_town(), Settings(remembers=False)) as world:
+        world.apply(Spawn("ego", "car", 3, 0.0, 0.0))
+        run(world, 5, Controls(0.5))
+        assert not world.history
+
+
+def test_a_vehicle_on_a_bridge_stays_on_it_and_one_below_below(small_town: Callable[..., Town]):
+    ground = np.array([(x, y, 0.0) for x in (-60, 60) for y in (-60, 60)], np.float64)
+    deck = Deck([np.array([(x, -4.0, 6.0), (x, 4.0, 6.0)]) for x in np.linspace(-30.0, 30.0, 7)])
+    with LiveWorld(small_town(relief=Relief(ground, [deck])), EMPTY) as world:
+        world.apply(Spawn("over", "car", 3, -20.0, 0.0, z=5.0))
+        world.apply(Spawn("under", "car", 3, 0.0, -10.0, np.pi / 2, z=0.0))
+        for name, velocity in (("over", (8.0, 0.0, 0.0)), ("under", (0.0, 8.0, 0.0))):
+            world.apply(Push(name, velocity))
+        for _ in range(40):
+            now = world.step({"over": Controls(0.2), "under": Controls(0.2)})
+            assert not now.collisions
+            assert place(now, "over")[2] == pytest.approx(6.0)
+            assert place(now, "under")[2] == pytest.approx(0.0)
+        assert place(world.snapshot, "under")[1] > 4.0
+        assert (world.height(0.0, 0.0), world.height(0.0, 0.0, 4.0)) == (0.0, pytest.approx(6.0))
 
 
 def drive_along(world: LiveWorld, steps: int, random: np.random.Generator) -> list[Snapshot]:

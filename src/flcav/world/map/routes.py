@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from flcav.config import InputError
 from flcav.world.map.roads import Connection, Edge, Lane, RoadNet
@@ -29,7 +29,7 @@ class Route:
         """Return the length [m]."""
         return float(self.along[-1])
 
-    def at(self, along: Array | float) -> Array:
+    def at(self, along: ArrayLike) -> Array:
         """Return x, y [m] and heading [rad] (..., 3) at these distances; straight on beyond the ends."""
         along = np.asarray(along, np.float64)
         piece = np.clip(np.searchsorted(self.along, along, side="right") - 1, 0, len(self.along) - 2)

@@ -62,7 +62,8 @@ def write_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians
         "followers": demand.followers,
         "next": vehicles + len(demand.followers),
         "seed": derive_seed(seed, "sumo"),
-        "edge": next(edge.id for edge in net.streets if edge.lanes_of("driving")),  # a route of those under control
+        # a route of those under control; SUMO does not see them where there is none
+        "edge": next((edge.id for edge in net.streets if edge.lanes_of("driving")), ""),
         "steps": round(WARM_UP_S / STEP_S),
     }
 

@@ -52,7 +52,9 @@ class LiveTraffic:
         self._own: set[str] = set()
         self._halted: dict[str, int] = {}  # vehicle -> steps that it still stands
         self._braking: set[str] = set()
-        sumo.route.add("own", [job["edge"]])
+        self._drives = bool(job["edge"])
+        if self._drives:
+            sumo.route.add("own", [job["edge"]])
         for _ in range(job["steps"]):
             self._step()
 
@@ -60,7 +62,7 @@ class LiveTraffic:
         """Make a step with what is under control, and return the states of SUMO's own vehicles and pedestrians."""
         for light, state in request["lights"].items():
             self.sumo.trafficlight.setRedYellowGreenState(light, state)
-        self._mirror(request["bodies"])
+        self._mirror(request["bodies"] if self._drives else [])
         for name in request["halted"]:
             if name in self._tours:
                 self.sumo.vehicle.setSpeed(name, 0.0)

@@ -94,7 +94,7 @@ def _check_value(name: str, variation: wire.Variation, field: Field | None, valu
     if variation.type in (INT, FLOAT):
         low, high = (field.low, field.high) if field else (-LARGEST_INT, LARGEST_INT)
         try:
-            number = int(value) if variation.type == INT else float(value)
+            number = float(value)  # of whole numbers too: CARLA takes "64.0" for 64
         except ValueError:
             raise Refused(f"{name}: attribute '{variation.id}' = {shorten(value)} is no number") from None
         if not low <= number <= high:

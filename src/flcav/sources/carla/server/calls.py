@@ -23,7 +23,7 @@ from flcav.sources.carla.server.wire import BoundingBox, Transform, Vector
 from flcav.world.commands import FreezeLights
 
 DEFAULT_DT_S = 0.05  # of a tick where the client sets none
-DT_RANGE_S = (0.001, 2.0)
+DT_RANGE_S = (0.001, 10.0)
 BODIES = ("vehicle", "walker", "static")
 TIMES = {"green": 0, "yellow": 1, "red": 2}
 
@@ -62,6 +62,9 @@ class Calls:
 
     def get_sensor_token(self, stream: int) -> Any:
         """Return the token of a stream."""
+        streams = {actor.stream for actor in self.episode.actors.values()} | {self.episode.stream}
+        if stream not in streams:
+            raise Refused(f"no sensor sends on stream {shorten(str(stream))}")
         self.expected.add(stream)
         return [wire.pack_token(stream, self._port + 1)]
 
@@ -108,8 +111,7 @@ class Calls:
         """Show layers of the map: all always show."""
 
     def unload_map_layer(self, layers: int) -> None:
-        """Hide layers of the map, which is not served."""
-        raise Refused("unload_map_layer is not served: the town has one layer")
+        """Hide layers of the map: the town has one, which always shows."""
 
     def get_episode_settings(self) -> Any:
         """Return the settings."""
@@ -554,7 +556,7 @@ def _signature(name: str) -> tuple[Callable[..., Any], tuple[Any, ...], int]:
     """Return the method of a call, the types of its arguments, and how many it needs; `Refused` where there is none."""
     method = getattr(Calls, name, None)
     if name.startswith("_") or not callable(method) or "return" not in (hints := get_type_hints(method)):
-        raise Refused(f"'{shorten(name)}' is not served here")
+        raise Refused(f"{shorten(name)} is not served here")
     kinds = tuple(kind for argument, kind in hints.items() if argument != "return")
     return method, kinds, len(kinds) - len(method.__defaults__ or ())
 

@@ -170,13 +170,15 @@ _RGB = {
 }
 _SPIN = {
     "channels": _whole(32, 1, 512),
-    "range": _number(10.0, 0.1, 2000.0),
+    "range": _number(10.0, 0.1, 1e5),
     "points_per_second": _whole(56000, 1, 20_000_000),
     "rotation_frequency": _number(10.0, 0.01, 1000.0),
     "upper_fov": _number(10.0, -90.0, 90.0),
     "lower_fov": _number(-30.0, -90.0, 90.0),
     "horizontal_fov": _number(360.0, 0.1, 360.0),
     "sensor_tick": _number(0.0, 0.0, 1e4),
+    "lidar_type": Field(STRING, "default"),  # this and the next one are those of builds of CARLA with more LiDARs
+    "name": Field(STRING, "lidar"),
 }
 SENSORS: dict[str, dict[str, Field]] = {
     "sensor.camera.rgb": _LENS | _RGB,
@@ -216,7 +218,7 @@ SENSORS: dict[str, dict[str, Field]] = {
         "horizontal_fov": _number(30.0, 0.0, 180.0),
         "vertical_fov": _number(30.0, 0.0, 180.0),
         "points_per_second": _whole(1500, 1, 1_000_000),
-        "range": _number(100.0, 0.1, 2000.0),
+        "range": _number(100.0, 0.1, 1e5),
     },
 }
 # Sensors of CARLA that are listed, so that scripts find them, and refused when one is to be spawned.

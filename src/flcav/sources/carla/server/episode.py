@@ -53,7 +53,8 @@ class Measurement(NamedTuple):
     stream: int
     header: bytes
     body: bytes | Callable[[], bytes]  # or how it is measured
-    slow: bool = False  # it takes rays to measure
+    rays: bool = False  # it takes rays to measure
+    late: bool = False  # it takes so long that the client need not wait
 
 
 class Counters:
@@ -403,7 +404,7 @@ class Episode:
             sensor.elapsed_s = elapsed
             sight = sight or self.look()
             if kind.measure is not None:
-                yield Measurement(actor.stream, header, partial(kind.measure, sight, sensor), kind.rays)
+                yield Measurement(actor.stream, header, partial(kind.measure, sight, sensor), kind.rays, kind.late)
             elif found := find_obstacle(sight, sensor, self._describe(sensor.carrier), self._describe):
                 yield Measurement(actor.stream, header, found)
 

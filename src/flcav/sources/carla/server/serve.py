@@ -1,14 +1,13 @@
 """The server: remote procedure calls at one port, streams at the next, one loop.
 
-In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends the world's state at once and
-then measures, sensor after sensor, in a thread beside those calls. A reader who does not keep up is waited for, and
-dropped after `STUCK_S`.
+In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends what sensors measure, in order,
+then the world's state, upon which a client goes on, and then the cameras' images, which take longest. A reader who does
+not keep up is waited for, and dropped after `STUCK_S`.
 """
 
 import asyncio
-import errno
 import logging
-import os
+import socket
 import struct
 import time
 from collections.abc import Callable
@@ -19,7 +18,7 @@ from flcav.config import InputError
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.blueprints import Refused
 from flcav.sources.carla.server.calls import Calls, invoke
-from flcav.sources.carla.server.episode import Episode
+from flcav.sources.carla.server.episode import Episode, Measurement
 
 STUCK_S = 10.0
 LEARNT_S = 3.0  # clients have learnt of a new map by then
@@ -44,17 +43,10 @@ class Server:
         self._worlds: set[int] = set()  # streams of the world's state, of earlier episodes too
         self._state = b""  # the last one of the world, for clients that come between two ticks
 
-    async def run(self, host: str, port: int, ready: Callable[[], None]) -> None:
-        """Serve until cancelled; raises `InputError` where a port is in use."""
-        servers = []
-        for number, connected in ((port, self._serve_calls), (port + 1, self._serve_stream)):
-            try:
-                servers.append(await asyncio.start_server(connected, host, number))
-            except OSError as error:
-                if error.errno not in (errno.EADDRINUSE, errno.EACCES, errno.EADDRNOTAVAIL):
-                    raise
-                why = os.strerror(error.errno).lower()
-                raise InputError(f"port {number} of {host}: {why}; a server takes --port and the next one") from None
+    async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
+        """Serve until cancelled, calls at the first of two bound sockets and streams at the second."""
+        connected = self._serve_calls, self._serve_stream
+        servers = [await asyncio.start_server(serve, sock=door) for serve, door in zip(connected, doors, strict=True)]
         ready()
         try:
             await self._tick_forever()
@@ -90,19 +82,35 @@ class Server:
 
     async def _tick(self) -> None:
         await self._await_listeners()
+        try:
+            await self._step()
+        except Exception:  # a server that fails one tick serves the next
+            log.exception("a tick failed")
+
+    async def _step(self) -> None:
         episode, dt_s = self._calls.episode, self._calls.dt_s
         episode.step(dt_s)
         self._state = episode.describe_world(dt_s)
+        measurements = list(episode.measure(dt_s, self._is_heard))
+        for each in measurements:
+            if not each.late:
+                await self._measure(each, episode)
+        if episode is not self._calls.episode:  # another map was loaded meanwhile
+            return
         self._publish_state(episode)
-        for each in episode.measure(dt_s, self._is_heard):
-            body = each.body
-            if not isinstance(body, bytes):  # rays are cast beside this thread, so that calls are answered meanwhile
-                body = await asyncio.to_thread(body) if each.slow else body()
+        for each in measurements:
+            if each.late:
+                await self._measure(each, episode)
+        await self._await_readers(self._connections)
+
+    async def _measure(self, each: Measurement, episode: Episode) -> None:
+        """Send what a sensor measures, beside this thread where it casts rays, so that calls are answered meanwhile."""
+        body = each.body
+        if not isinstance(body, bytes):
+            body = await asyncio.to_thread(body) if each.rays else body()
+        if episode is self._calls.episode:
             self._publish(each.stream, each.header + body)
             await self._await_readers(self._streams.get(each.stream, set()))
-            if episode is not self._calls.episode:  # another map was loaded meanwhile
-                return
-        await self._await_readers(self._connections)
 
     def _publish_state(self, episode: Episode) -> None:
         """Send the world's state; after a map was loaded, at first only to those who have learnt of it.
@@ -142,8 +150,7 @@ class Server:
     @staticmethod
     def _send(writer: asyncio.StreamWriter, payload: bytes) -> None:
         with suppress(ConnectionError, RuntimeError):
-            writer.write(struct.pack("<I", len(payload)))
-            writer.write(payload)
+            writer.write(struct.pack("<I", len(payload)) + payload)
 
     # ---- connections
 
@@ -153,6 +160,7 @@ class Server:
             writer.close()
             return False
         self._connections.add(writer)
+        writer.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # asyncio may not
         return True
 
     def _forget(self, writer: asyncio.StreamWriter) -> None:
@@ -226,6 +234,20 @@ class Server:
             self._forget(writer)
 
 
-def serve(calls: Calls, host: str, port: int, ready: Callable[[], None]) -> None:
-    """Serve clients until interrupted."""
-    asyncio.run(Server(calls).run(host, port, ready))
+def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
+    """Return sockets at `port` and the next one; raises `InputError` where one is in use."""
+    doors = []
+    for number in (port, port + 1):
+        try:
+            doors.append(socket.create_server((host, number)))
+        except OSError as error:
+            for door in doors:
+                door.close()
+            why = (error.strerror or str(error)).partition(" (")[0].lower()
+            raise InputError(f"port {number} of {host}: {why}; a server takes --port and the next one") from None
+    return doors[0], doors[1]
+
+
+def serve(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
+    """Serve clients until interrupted, at the sockets of `open_doors`."""
+    asyncio.run(Server(calls).run(doors, ready))

@@ -48,7 +48,7 @@ def sense_instance(sight: Sight, sensor: Sensor) -> bytes:
 
 
 def _lens(sensor: Sensor) -> Lens:
-    width, height = int(sensor.attributes["image_size_x"]), int(sensor.attributes["image_size_y"])
+    width, height = (int(sensor.number_of(f"image_size_{axis}")) for axis in "xy")
     return Lens(width=width, height=height, fov_deg=sensor.number_of("fov"))
 
 

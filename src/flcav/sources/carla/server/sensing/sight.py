@@ -82,7 +82,7 @@ class Sight:
 
     def photograph(self, sensor: Sensor) -> Exposure:
         """Return the image of a camera, taken once for all cameras of one pose and lens."""
-        width, height = int(sensor.attributes["image_size_x"]), int(sensor.attributes["image_size_y"])
+        width, height = (int(sensor.number_of(f"image_size_{axis}")) for axis in "xy")
         key = (sensor.pose.tobytes(), width, height, sensor.number_of("fov"))
         if key not in self._exposures:
             camera = Camera(width=width, height=height, fov_deg=key[3], noise=0.0)

@@ -14,13 +14,14 @@ class Kind(NamedTuple):
     stream: Stream
     measure: Callable[[Sight, Sensor], bytes] | None  # None: it sends what happens, not what it sees
     rays: bool = False  # it casts rays, which takes its time
+    late: bool = False  # it draws an image, which takes longer
 
 
 KINDS: dict[str, Kind] = {
-    "sensor.camera.rgb": Kind(Stream.RGB, cameras.sense_rgb, True),
-    "sensor.camera.depth": Kind(Stream.DEPTH, cameras.sense_depth, True),
-    "sensor.camera.semantic_segmentation": Kind(Stream.SEMANTIC, cameras.sense_semantic, True),
-    "sensor.camera.instance_segmentation": Kind(Stream.INSTANCE, cameras.sense_instance, True),
+    "sensor.camera.rgb": Kind(Stream.RGB, cameras.sense_rgb, True, True),
+    "sensor.camera.depth": Kind(Stream.DEPTH, cameras.sense_depth, True, True),
+    "sensor.camera.semantic_segmentation": Kind(Stream.SEMANTIC, cameras.sense_semantic, True, True),
+    "sensor.camera.instance_segmentation": Kind(Stream.INSTANCE, cameras.sense_instance, True, True),
     "sensor.lidar.ray_cast": Kind(Stream.LIDAR, rays.sense_lidar, True),
     "sensor.lidar.ray_cast_semantic": Kind(Stream.SEMANTIC_LIDAR, rays.sense_semantic_lidar, True),
     "sensor.other.gnss": Kind(Stream.GNSS, motion.sense_gnss),
