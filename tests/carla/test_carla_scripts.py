@@ -20,16 +20,8 @@ HERE = Path(__file__).parent
 ROOM = HERE.parents[1] / "out" / "carla"
 DATA = Path(os.environ.get("FLCAV_REAL_DATA", "missing"))
 API, OTHERS, MAPS = DATA / "carla_pythonapi", DATA / "carla_scripts", DATA / "carla_maps"
-PACKAGES = (
-    "carla==0.9.16",
-    "pygame",
-    "numpy==1.23.5",
-    "matplotlib==3.8.4",
-    "networkx",
-    "shapely",
-    "pytest",
-    "pandas<2.1",
-)
+PACKAGES = ("carla==0.9.16", "pygame", "numpy==1.23.5", "matplotlib==3.8.4", "pandas<2.1", "plyfile<1.1")
+TOOLS = ("networkx", "shapely", "pytest")
 ENDLESS_S = 25
 # script -> arguments, and how long it runs: None to its own end
 SCRIPTS: dict[str, tuple[tuple[str, ...], int | None]] = {
