@@ -71,7 +71,8 @@ def main() -> None:
         manager.set_random_device_seed(0)
         car = library.find("vehicle.tesla.model3")
         spawn = carla.command.SpawnActor
-        autopilot = carla.command.SetAutopilot(carla.command.FutureActor, True, manager.get_port())
+        future: Any = carla.command.FutureActor
+        autopilot = carla.command.SetAutopilot(future, True, manager.get_port())
         places = points[:: max(1, len(points) // VEHICLES)][:VEHICLES]
         answers = client.apply_batch_sync([spawn(car, place).then(autopilot) for place in places], True)
         figures["vehicles"] = sum(not answer.error for answer in answers)
@@ -88,7 +89,7 @@ def main() -> None:
             blueprint = library.find(kind)
             for key, value in (attributes | {"sensor_tick": "0.1"}).items():
                 blueprint.set_attribute(key, value)
-            sensor = world.spawn_actor(blueprint, carla.Transform(carla.Location(x=1.5, z=2.4)), attach_to=ego)
+            sensor: Any = world.spawn_actor(blueprint, carla.Transform(carla.Location(x=1.5, z=2.4)), attach_to=ego)
 
             def count(data: Any, name: str = name) -> None:
                 counts[name] += 1

@@ -12,8 +12,6 @@ import time
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-import msgpack
-
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.blueprints import list_blueprints
 from flcav.sources.carla.server.calls import Calls
@@ -97,7 +95,7 @@ def draw_message(rng: random.Random, methods: list[str]) -> bytes:
     method = rng.choice(methods)
     if method in SKIPPED and rng.random() > FEW:
         method = "apply_batch"
-    return msgpack.packb([0, rng.randrange(2**32), method, [[False], *draw_arguments(rng, method)]])
+    return wire.pack([0, rng.randrange(2**32), method, [[False], *draw_arguments(rng, method)]])
 
 
 def draw_noise(rng: random.Random, message: bytes) -> bytes:
@@ -114,7 +112,7 @@ def ask_version(port: int) -> bool:
     """Return whether the server answers."""
     try:
         with socket.create_connection(("127.0.0.1", port), timeout=60) as link:
-            link.sendall(msgpack.packb([0, 1, "version", [[False]]]))
+            link.sendall(wire.pack([0, 1, "version", [[False]]]))
             return wire.VERSION.encode() in link.recv(1000)
     except OSError:
         return False

@@ -60,7 +60,7 @@ def the_world(client: Any) -> None:
         library = world.get_blueprint_library()
         assert len(library.filter("vehicle.*")) == 41
         assert len(library.filter("walker.*")) == 51
-        for weather in (carla.WeatherParameters.HardRainSunset, carla.WeatherParameters.ClearNoon):
+        for weather in (carla.WeatherParameters(80.0, 60.0, fog_density=5.0), carla.WeatherParameters()):
             world.set_weather(weather)
             assert world.get_weather() == weather
         frame = world.tick()
@@ -208,7 +208,8 @@ def traffic(client: Any) -> None:
         manager.set_random_device_seed(0)
         car = library.find("vehicle.tesla.model3")
         command = carla.command
-        pilot = command.SetAutopilot(command.FutureActor, True, manager.get_port())
+        future: Any = command.FutureActor
+        pilot = command.SetAutopilot(future, True, manager.get_port())
         batch = [command.SpawnActor(car, point).then(pilot) for point in points[::20]]
         answers = client.apply_batch_sync(batch, True)
         cars = world.get_actors([answer.actor_id for answer in answers if not answer.error])

@@ -11,6 +11,7 @@ import msgpack
 import pytest
 
 from flcav.cli.main import run
+from flcav.sources.carla.server import wire
 
 SESSION = Path(__file__).with_name("carla_session.py")
 SESSIONS = ("the_world", "actors", "sensors", "events", "traffic", "loading")  # the last one loads other maps
@@ -67,7 +68,7 @@ def _ask(port: int, message: bytes) -> bytes:
 
 def test_messages_that_no_client_sends_leave_the_server_up(port):
     rng = random.Random(0)
-    version = msgpack.packb([0, 1, "version", [[False]]])
+    version = wire.pack([0, 1, "version", [[False]]])
     for _ in range(200):
         mutated = bytearray(version)
         mutated[rng.randrange(len(mutated))] = rng.randrange(256)

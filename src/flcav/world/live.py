@@ -99,8 +99,7 @@ class LiveWorld:
         self._flow = NOBODY  # SUMO's actors
         self._traffic: SumoTraffic | None = None
         self._snapshot: Snapshot | None = None
-        if count := settings.traffic + settings.pedestrians:
-            assert count > 0
+        if settings.traffic or settings.pedestrians:
             self._traffic = SumoTraffic(
                 town, ground, seed=settings.seed, vehicles=settings.traffic, pedestrians=settings.pedestrians
             )

@@ -52,8 +52,8 @@ class Trace:
     town: str  # name of the town
     time_s: Array  # (T,) ascending, from the start of the traffic
     actor: NDArray[np.str_]  # (A,) track ids, e.g. "cav0", "veh17", "parked3", "ped8"
-    category: NDArray[np.str_]  # (A,) one of CATEGORIES
-    shape: NDArray[np.int64]  # (A,) row of SHAPES[category]
+    category: NDArray[np.str_]  # (A,) one of CATEGORIES; "prop" of what a client has put into a live world
+    shape: NDArray[np.int64]  # (A,) row of SHAPES[category], of props of PROPS
     size: Array  # (A, 3) length, width, height [m]
     present: NDArray[np.bool_]  # (T, A) whether the actor is in the town
     position: Array  # (T, A, 3) ground centre [m]; NaN where absent

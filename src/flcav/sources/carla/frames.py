@@ -23,9 +23,9 @@ def to_vector(values: Array) -> Vector:
     return x, y, z
 
 
-def mirror(vectors: Array) -> Array:
+def mirror(vectors: NDArray[np.floating]) -> Array:
     """Return vectors (..., 3), directions or points, of one frame in the other."""
-    return vectors * MIRROR
+    return np.asarray(vectors, np.float64) * MIRROR
 
 
 def mirror_spin(rates: Array) -> Array:
@@ -73,4 +73,5 @@ def from_mount(location: Vector, rotation: Vector) -> Array:
 
 def _pose(point: Array, rotation: Vector) -> Array:
     pitch, yaw, roll = np.radians(rotation)
-    return pose(*point.tolist(), -yaw, -pitch, roll)
+    x, y, z = point.tolist()
+    return pose(x, y, z, -yaw, -pitch, roll)

@@ -5,7 +5,6 @@ import contextlib
 import json
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,12 +24,13 @@ from flcav.world.map.town import Town
 from flcav.world.shapes import SHAPES
 from flcav.world.traffic.bridges import find_footing
 from flcav.world.traffic.demand import list_vehicle_types, park, write_demand
+from flcav.world.traffic.sumo import start_server
 from flcav.world.traffic.sumo_process import STEP_S
+from flcav.world.traffic.traffic import number_of
 
 Array = NDArray[np.float64]
 
 SERVE = "flcav.world.traffic.live_process:serve"
-ROOT = str(Path(__file__).parents[3])
 FILL_S = 20.0  # all actors have departed by then
 WARM_UP_S = 30.0  # time of SUMO at the start of a live world
 TOUR_S = 900.0  # length of a vehicle's tour, at least; it then sets out again
@@ -39,7 +39,7 @@ DANGERS = (-0.4, 0.0, 0.4)  # places to brake for, over a body's length from its
 SOON_S = 0.7  # so far ahead traffic looks at who crosses its way
 BERTH_M = 1.0  # half the width of a vehicle that passes
 
-_idle: list[tuple[int, subprocess.Popen[bytes]]] = []  # processes without a world, with the id of their parent
+_idle: list[tuple[int, subprocess.Popen[str]]] = []  # processes without a world, with the id of their parent
 
 
 def write_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians: int) -> dict[str, Any]:
@@ -69,7 +69,7 @@ def write_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians
 
 
 class SumoTraffic:
-    """SUMO's traffic in a town, one SUMO process of its own; a context manager."""
+    """SUMO's traffic in a town, with a SUMO process of its own until it is closed."""
 
     def __init__(self, town: Town, ground: Ground, *, seed: int, vehicles: int, pedestrians: int) -> None:
         """Start with the traffic under way; raises `InputError` as `write_demand`, `RuntimeError` where SUMO fails."""
@@ -78,9 +78,10 @@ class SumoTraffic:
         self._ground, self._town = ground, town
         self._kinds = {name: (category, shape) for name, category, shape in list_vehicle_types()}
         self._lights: dict[str, str] = {}
-        self._process = _take_process()
+        self._process: subprocess.Popen[str] | None = None
         with tempfile.TemporaryDirectory(prefix="flcav_live_") as folder:
             job = write_job(town, Path(folder), seed=seed, vehicles=vehicles, pedestrians=pedestrians)
+            self._process = _take_process()
             self._after = self._before = self._ask(job)
         self.advance(NOBODY, {}, [])
 
@@ -100,7 +101,7 @@ class SumoTraffic:
         }
         self._before, self._after = self._after, self._ask(request)
         self.ticks += 1
-        names = sorted((name for name in self._before if name in self._after), key=_natural)
+        names = sorted((name for name in self._before if name in self._after), key=number_of)
         self._ends = tuple(
             np.array([state[name][1:] for name in names], np.float64).reshape(-1, 4)
             for state in (self._before, self._after)
@@ -146,13 +147,10 @@ class SumoTraffic:
         position = np.column_stack((front - size[:, :1] / 2 * heading_vectors(turned), np.full(count, np.nan)))
         known = dict(zip(self._actors.name, self._actors.position[:, 2].tolist()))
         position[:, 2] = [known.get(name, np.nan) for name in names]
-        if (
-            self._town.relief is not None
-            and self._town.relief.decks
-            and len(new := np.flatnonzero(np.isnan(position[:, 2])))
-        ):
+        relief, new = self._town.relief, np.flatnonzero(np.isnan(position[:, 2]))
+        if relief is not None and relief.decks and len(new):
             centre, yaw = position[None, new, :2], turned[None, new]
-            footing = find_footing(self._town.relief, self._town.net, centre, yaw)
+            footing = find_footing(relief, self._town.net, centre, yaw)
             position[new, 2] = footing(centre[..., 0], centre[..., 1])[0]
         self._actors = Actors(
             name=tuple(names),
@@ -175,7 +173,7 @@ class SumoTraffic:
         process, self._process = self._process, None
         with contextlib.suppress(BrokenPipeError):
             assert process.stdin is not None
-            process.stdin.write(b"\n")
+            process.stdin.write("\n")
             process.stdin.flush()
             _idle.append((os.getpid(), process))
 
@@ -186,11 +184,11 @@ class SumoTraffic:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         try:
-            self._process.stdin.write(json.dumps(request).encode() + b"\n")
+            self._process.stdin.write(json.dumps(request) + "\n")
             self._process.stdin.flush()
             line = self._process.stdout.readline()
         except BrokenPipeError:
-            line = b""
+            line = ""
         except BaseException:
             self._kill()  # or its answer would be taken for that to the next request
             raise
@@ -239,15 +237,13 @@ def _list_dangers(bodies: Actors) -> list[list[float]]:
     return np.column_stack((np.concatenate(places), np.tile(row, (len(places), 1)))).tolist()
 
 
-def _take_process() -> subprocess.Popen[bytes]:
+def _take_process() -> subprocess.Popen[str]:
     """Return a SUMO process without a world, started where there is none."""
     while _idle:
         parent, process = _idle.pop()
         if parent == os.getpid() and process.poll() is None:
             return process
-    module, name = SERVE.split(":")
-    code = f"import sys; sys.path.append({ROOT!r}); from {module} import {name}; {name}()"
-    return subprocess.Popen([sys.executable, "-P", "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    return start_server(SERVE)
 
 
 @atexit.register
@@ -258,12 +254,6 @@ def _stop() -> None:
             process.kill()
             process.communicate()
     _idle.clear()
-
-
-def _natural(name: str) -> tuple[str, int]:
-    """Return the key that sorts names by their number: "veh2" before "veh10"."""
-    kind = name.rstrip("0123456789")
-    return kind, int(name[len(kind) :])
 
 
 def stand_parked(town: Town, ground: Ground, seed: int) -> Actors:

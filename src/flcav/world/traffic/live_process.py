@@ -12,12 +12,13 @@ import json
 import os
 import signal
 import sys
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
 from flcav.world.scenarios.stage import State, braking_m
-from flcav.world.traffic.sumo_process import STEP_S, Walkers
+from flcav.world.traffic.sumo_process import STEP_S, Walkers, start_sumo
 
 OWN = "own:"  # begins the names of vehicles under control
 NEAR_LANE_M = 5.0  # a vehicle under control is on a lane whose middle is so near, else off the road
@@ -30,20 +31,7 @@ class LiveTraffic:
 
     def __init__(self, sumo: Any, job: dict[str, Any]) -> None:
         """Start SUMO with the net, routes and seed of the `job`, and make its `steps` with its own traffic alone."""
-        options = {
-            "net-file": job["net"],
-            "route-files": job["routes"],
-            "route-steps": 0,  # the file is read at once
-            "seed": job["seed"],
-            "step-length": STEP_S,
-            "default.action-step-length": 0.5,
-            "lanechange.duration": 2,
-            "time-to-teleport": -1,
-            "collision.action": "none",
-            "no-step-log": "true",
-            "no-warnings": "true",
-        }
-        sumo.start(["sumo", *(part for name, value in options.items() for part in (f"--{name}", str(value)))])
+        start_sumo(sumo, Path(job["net"]), Path(job["routes"]), job["seed"])
         self.sumo = sumo
         self.walkers = Walkers(STEP_S)
         self._followers: dict[str, tuple[str, str, list[str]]] = job["followers"]

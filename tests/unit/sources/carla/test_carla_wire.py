@@ -105,8 +105,8 @@ def test_settings_have_an_optional():
 
 
 def test_calls_are_read_one_after_another_and_in_parts():
-    message = msgpack.packb([0, 1, "version", [[False]]]) + msgpack.packb([2, "tick_cue", [[True], 4]])
-    unpacker = wire.make_unpacker()
+    message = wire.pack([0, 1, "version", [[False]]]) + wire.pack([2, "tick_cue", [[True], 4]])
+    unpacker = wire.Unpacker()
     unpacker.feed(message[:5])
     assert list(unpacker) == []
     unpacker.feed(message[5:])
@@ -123,7 +123,7 @@ def test_other_messages_are_no_calls(message):
 
 
 def test_a_call_of_very_many_arrays_is_refused():
-    unpacker = wire.make_unpacker()
+    unpacker = wire.Unpacker()
     unpacker.feed(b"\x91" + b"\xdd" + struct.pack(">I", wire.MOST_ARRAYS + 1) + b"\x90" * (wire.MOST_ARRAYS + 1))
     with pytest.raises(wire.WireError, match="arrays"):
         next(unpacker)

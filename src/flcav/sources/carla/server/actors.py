@@ -1,5 +1,6 @@
 """The actors that clients know, beside the bodies of the live world."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +14,8 @@ from flcav.sources.carla.server.wire import BoundingBox, Transform
 
 Array = NDArray[np.float64]
 
-STILL = ((0.0, 0.0, 0.0),) * 3
+NOTHING = (0.0, 0.0, 0.0)
+STILL = (NOTHING, NOTHING, NOTHING)
 STANDING, WAITING = wire.VehicleControl(), wire.WalkerControl()
 
 
@@ -35,7 +37,7 @@ class Actor:
     clock: Clock | None = None
     light: int | None = None  # row of its approach, of a traffic light
     box: BoundingBox | None = None  # of a traffic light
-    motion: tuple[wire.Vector, wire.Vector, wire.Vector] = STILL  # CARLA's velocity, angular velocity, acceleration
+    motion: Sequence[wire.Vector] = STILL  # CARLA's velocity, angular velocity, acceleration
     control: wire.VehicleControl = STANDING
     walk: wire.WalkerControl = WAITING
     ackermann: wire.AckermannControl | None = None

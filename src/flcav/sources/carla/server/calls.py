@@ -50,6 +50,11 @@ class Calls:
         """The length of a tick [s]."""
         return DEFAULT_DT_S if self.settings.fixed_dt_s is None else self.settings.fixed_dt_s
 
+    @property
+    def managed(self) -> bool:
+        """Whether a Traffic Manager of a client runs."""
+        return bool(self._managers)
+
     # ---- connection
 
     def version(self) -> str:
@@ -525,7 +530,7 @@ class Calls:
                 case _:
                     raise wire.WireError(f"no command of CARLA {wire.VERSION}")
             if name == "spawn":
-                return wire.succeed(self._spawn(*_read_spawn(fields)))
+                return wire.succeed(self._spawn(*_read_spawn(list(fields))))
             if name == "console_command":
                 raise Refused("console commands are not served")
             invoke(self, name, tuple(fields))

@@ -4,7 +4,7 @@ Every tick the world makes a step; then all actors take their places, and the se
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -441,7 +441,7 @@ class Place(NamedTuple):
     pose: Array  # (4, 4) world from body
     location: wire.Vector
     rotation: wire.Vector
-    motion: tuple[wire.Vector, wire.Vector, wire.Vector]
+    motion: Sequence[wire.Vector]  # velocity, angular velocity, acceleration
 
 
 def _list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]:
@@ -460,7 +460,7 @@ def _list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]
         mirror(trace.acceleration[0, :count]),
     )
     rows = zip(*((map(tuple, column.tolist())) for column in columns))
-    return [Place(pose, *row[:2], row[2:]) for pose, row in zip(poses, rows)]
+    return [Place(pose, location, rotation, motion) for pose, (location, rotation, *motion) in zip(poses, rows)]
 
 
 def _take_place(actor: Actor, place: Place) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from shapely.geometry import LineString
 
 from flcav.config import InputError, shorten
@@ -63,7 +63,7 @@ class ServedMap:
             yield np.array((x, y, self.town.ground(x, y) + ABOVE_M)), float(np.arctan2(v - y, u - x))
 
     @cached_property
-    def _limits(self) -> tuple[cKDTree, Array]:
+    def _limits(self) -> tuple[KDTree, Array]:
         points, speeds = [], []
         for edge in self.net.edges.values():
             for lane in edge.lanes_of("driving"):
@@ -71,7 +71,7 @@ class ServedMap:
                 steps = np.arange(0.0, line.length, LANE_STEP_M)
                 points += [line.interpolate(at).coords[0] for at in steps]
                 speeds += [lane.speed] * len(steps)
-        return cKDTree(np.array(points)), np.array(speeds)
+        return KDTree(np.array(points)), np.array(speeds)
 
     def speed_limits_kmh(self, points: Array) -> Array:
         """Return the limit (N,) [km/h] of the lane nearest to each of `points` (N, >=2)."""

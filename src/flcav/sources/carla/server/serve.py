@@ -21,6 +21,9 @@ from flcav.sources.carla.server.calls import Calls, invoke
 from flcav.sources.carla.server.episode import Episode, Measurement
 
 STUCK_S = 10.0
+# A client's Traffic Manager misses its wake-up, and waits for ever, where the next tick comes before its thread sleeps
+# (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are not closer than this while one runs.
+PACE_S = 0.008
 LEARNT_S = 3.0  # clients have learnt of a new map by then
 LISTENER_S = 0.3  # a tick waits so long for the connection of a stream whose token a client has just asked for
 MOST_CONNECTIONS = 512
@@ -41,6 +44,7 @@ class Server:
         self._cue = asyncio.Event()
         self._refused: set[str] = set()  # told in the log once
         self._worlds: set[int] = set()  # streams of the world's state, of earlier episodes too
+        self._published_s = 0.0  # when the world's state was last sent
         self._state = b""  # the last one of the world, for clients that come between two ticks
 
     async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
@@ -97,7 +101,10 @@ class Server:
                 await self._measure(each, episode)
         if episode is not self._calls.episode:  # another map was loaded meanwhile
             return
+        if self._calls.managed:
+            await asyncio.sleep(self._published_s + PACE_S - time.monotonic())
         self._publish_state(episode)
+        self._published_s = time.monotonic()
         for each in measurements:
             if each.late:
                 await self._measure(each, episode)
@@ -174,7 +181,7 @@ class Server:
     async def _serve_calls(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if not self._admit(writer):
             return
-        unpacker = wire.make_unpacker()
+        unpacker = wire.Unpacker()
         try:
             while data := await reader.read(CHUNK):
                 unpacker.feed(data)

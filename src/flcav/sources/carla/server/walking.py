@@ -5,7 +5,7 @@ CARLA's own walk over a navigation mesh, which a client gets from its server; th
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from shapely.geometry import LineString
 
 from flcav.statistics.streams import stream
@@ -41,11 +41,11 @@ class Footpaths:
                 ends += [first, first + count - 1]
         self.points = np.array(points).reshape(-1, 2)
         if ends:
-            tree = cKDTree(self.points[ends])
+            tree = KDTree(self.points[ends])
             for one, other in tree.query_pairs(JOINED_M):
                 self._next[ends[one]].append(ends[other])
                 self._next[ends[other]].append(ends[one])
-        self._tree = cKDTree(self.points) if len(points) else None
+        self._tree = KDTree(self.points) if len(points) else None
 
     def find_nearest(self, place: Array) -> int | None:
         """Return the point nearest to a place (2,); None without paths."""

@@ -244,13 +244,18 @@ class Call(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-def make_unpacker() -> msgpack.Unpacker:
-    """Return a reader of the calls of one connection: feed it bytes, iterate; `WireError` and `ValueError` end it."""
-    return _Unpacker()
+def pack(value: Any) -> bytes:
+    """Return a value as MessagePack."""
+    packed = msgpack.packb(value, unicode_errors="surrogateescape")
+    assert packed is not None, "it returns bytes; its types say that it may not"
+    return packed
 
 
-class _Unpacker:
-    """MessagePack with a bound on the memory that one message takes."""
+class Unpacker:
+    """Reads the calls of one connection: feed it bytes, and iterate; `WireError` and `ValueError` end it.
+
+    It bounds the memory that one message takes.
+    """
 
     def __init__(self) -> None:
         self._arrays = 0
@@ -276,7 +281,7 @@ class _Unpacker:
         except msgpack.BufferFull:
             raise WireError(f"a call of more than {LARGEST} bytes") from None
 
-    def __iter__(self) -> "_Unpacker":
+    def __iter__(self) -> "Unpacker":
         return self
 
     def __next__(self) -> Any:
@@ -309,7 +314,7 @@ def fail(message: str) -> list[Any]:
 
 def pack_reply(number: int, response: Any) -> bytes:
     """Return the bytes of a reply."""
-    return msgpack.packb([1, number, None, response], unicode_errors="surrogateescape")
+    return pack([1, number, None, response])
 
 
 def read(kind: Any, value: Any) -> Any:
@@ -437,4 +442,4 @@ def pack_sweep(angle_rad: float, per_channel: NDArray[np.integer], points: NDArr
 
 def pack_record(record: Any) -> bytes:
     """Return the body of what is sent as MessagePack: GNSS, IMU, collisions and obstacles."""
-    return msgpack.packb(record, unicode_errors="surrogateescape")
+    return pack(record)

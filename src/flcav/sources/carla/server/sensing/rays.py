@@ -32,7 +32,7 @@ def sense_lidar(sight: Sight, sensor: Sensor) -> bytes:
     noise = sensor.number_of("noise_stddev")
     error_m = np.float32(noise) * rng.standard_normal(len(directions), np.float32) if noise else np.zeros(1, np.float32)
     points, rays = carla_returns(settings, directions, hits.distance, np.broadcast_to(error_m, len(directions)), rng)
-    points[:, 1] = -points[:, 1]
+    points[:, :3] = mirror(points[:, :3])
     return _pack(sensor, channels, rays, points.astype("<f4"))
 
 
@@ -41,7 +41,7 @@ def sense_semantic_lidar(sight: Sight, sensor: Sensor) -> bytes:
     directions, channels = _fire(sensor)
     hits = sight.cast(sensor, directions, sensor.number_of("range"))
     rays = np.flatnonzero(np.isfinite(hits.distance))
-    met = Hits(*(values[rays] for values in hits))
+    met = Hits(hits.distance[rays], hits.instance[rays], hits.face[rays])
     points = np.empty(len(rays), SEMANTIC_POINT)
     points["xyz"] = mirror(directions[rays] * met.distance[:, None])
     points["cosine"] = _incidence(sight, sensor, directions[rays], met)
