@@ -141,7 +141,14 @@ class Boxes:
 
 
 def turned_boxes(center: Array, size: Array, rotation: Array, label: NDArray[np.str_]) -> Boxes:
-    """Return boxes with (M, 3, 3) rotations of their own frames: upright where none leans by more than `LEVEL_RAD`."""
+    """Return boxes by their rotations: upright where none leans by more than `LEVEL_RAD`.
+
+    Args:
+        center: (M, 3) centres [m].
+        size: (M, 3) length, width, height [m].
+        rotation: (M, 3, 3) from the boxes' own frames.
+        label: (M,) class names.
+    """
     yaw, *tilts = angles_of(rotation)
     tilt = np.stack(tilts, axis=1)
     return Boxes(center, size, yaw, label, tilt=tilt if (np.abs(tilt) > LEVEL_RAD).any() else None)

@@ -1,6 +1,7 @@
 """Recording recipes: validated YAML files that say what a dataset contains."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from flcav.config import Config, InputError, parse_config, read_yaml, shorten
+from flcav.config import Config, InputError, Json, parse_config, read_yaml, shorten
 from flcav.interface.wording import suggest
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.lens import Lens
@@ -248,9 +249,13 @@ def find_recipe(path: Path) -> Path:
         return path
 
 
-def parse_recipe(values: object, origin: str) -> Recipe:
+def parse_recipe(values: Mapping[str, Json], origin: str) -> Recipe:
     """Return the fields `values` as a recipe, a `CarlaRecipe` if they have a `source`: see `parse_config`."""
-    return parse_config(CarlaRecipe if isinstance(values, dict) and "source" in values else Recipe, values, origin)
+    return parse_config(_choose_model(values), values, origin)
+
+
+def _choose_model(values: object) -> type[Recipe]:
+    return CarlaRecipe if isinstance(values, dict) and "source" in values else Recipe
 
 
 def load_recipe(path: Path | str) -> Recipe:
@@ -263,7 +268,8 @@ def load_recipe(path: Path | str) -> Recipe:
     >>> load_recipe("recipes/suburb.yaml").town
     'suburb'
     """
-    recipe = parse_recipe(read_yaml(Path(path)), str(path))
+    values = read_yaml(Path(path))
+    recipe = parse_config(_choose_model(values), values, str(path))
     folder = Path(path).absolute().parent / recipe.town
     if recipe.town in PACKAGED or not os.path.isdir(folder):  # noqa: PTH112 - Path.is_dir raises for too long a name
         return recipe
