@@ -35,7 +35,6 @@ PINHOLE = {  # a camera without the lens that CARLA simulates by default
     **{"lens_k": "0.0", "lens_kcube": "0.0", "lens_circle_multiplier": "0.0", "chromatic_aberration_intensity": "0.0"},
     **{"lens_flare_intensity": "0.0", "motion_blur_intensity": "0.0"},
 }
-WHOLE_RAD = 1e-3  # by which a LiDAR may stand otherwise after a whole turn
 
 
 class SemanticSweep(NamedTuple):
@@ -86,7 +85,7 @@ class Feed:
 def spawn_feeds(
     session: Session, rig: Rig, agent: str, base: Array, parent: "carla.Actor | None", frame: MapFrame, seed: int
 ) -> dict[str, Feed]:
-    """Return name -> feed of the CARLA sensors of a rig; see `lidar_name` and others for their names.
+    """Return name -> feed of the CARLA sensors of a rig, also of those beside: see `semantic_name` and `depth_name`.
 
     `base` is the (4, 4) pose of the agent: in the frame of the actor `parent`, without it in the world's.
     """
