@@ -7,7 +7,7 @@ unexport PYTHONDONTWRITEBYTECODE # each of many processes would compile all modu
 STAMP := .venv/.installed
 BIN := .venv/bin
 
-.PHONY: demo test test-peers test-ray lint docs check bench bench-peers format clean
+.PHONY: demo test test-carla test-peers test-ray lint docs check bench bench-peers format clean
 demo: $(STAMP)
 	$(BIN)/flcav demo --out out/demo
 
@@ -17,6 +17,11 @@ test: $(STAMP)
 # Exports read by other software, in environments of their own below out/peers: docs/formats.md.
 test-peers: $(STAMP)
 	$(BIN)/python -m pytest -n 0 -rs tests/peers
+
+# CARLA's own scripts and those of others against `flcav carla serve`, in an environment of their own, out/carla; they and
+# the maps are in the folder of FLCAV_REAL_DATA, and without it these tests are skipped: docs/carla.md.
+test-carla: $(STAMP)
+	$(BIN)/python -m pytest -n 0 -rs tests/carla
 
 # What runs on Ray beside what runs without it, in an environment of its own with the extra 'ray', below out/ray.
 test-ray:

@@ -32,7 +32,7 @@ from flcav.sensors.rig import (
     MountedRadar,
     Rig,
 )
-from flcav.sources.recipe import Recipe
+from flcav.sources.recipe import CarlaRecipe, Recipe
 from flcav.storage.markdown import format_table
 from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import Scenario
@@ -66,7 +66,7 @@ LINKS: Mapping[type[Config], str] = {  # to the section on a model
     Scenario: "[corner cases](#corner-cases)",
 }
 EXPLAINED = (
-    *(Recipe, Rig, Mounted, Mount, Lidar, CarlaReturns, Lens, Camera, Infrared, Radar, Gnss, Imu),
+    *(Recipe, CarlaRecipe, Rig, Mounted, Mount, Lidar, CarlaReturns, Lens, Camera, Infrared, Radar, Gnss, Imu),
     *(Weather, WeatherSchedule, Keyframe, CalibrationError, Scenario),
 )
 

@@ -47,6 +47,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "towns list": {},
     "towns show": {"--poles": ALWAYS},
     "towns import": {},
+    "carla serve": dict.fromkeys(("--port", "--seed", "--traffic", "--maps", "--host"), ALWAYS),
     "record": {"--frames": ALWAYS, "--seed": ALWAYS, "--jobs": ALWAYS, "--engine": ALWAYS},
     "validate": {},
     "birdseye": {"--frame": ALWAYS, "--range": ALWAYS, "--tracks": ALWAYS},

@@ -72,8 +72,8 @@ class Manifest(StrictModel):
 
     @property
     def labels(self) -> Sequence[Json]:
-        """Return what is labelled: "objects" and "signs" of a recording, of an imported dataset what its files say."""
-        labels = self.recipe.get("labels") if self.imported else ("objects", "signs")
+        """Return what is labelled: "objects" and "signs" of a recording, unless its recipe says `labels`."""
+        labels = self.recipe.get("labels", () if self.imported else ("objects", "signs"))
         return labels if isinstance(labels, list | tuple) else ()
 
 

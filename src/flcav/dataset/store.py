@@ -201,7 +201,8 @@ class Dataset:
     def check_labelled(self, what: str) -> None:
         """Raise `InputError` where `what`, "objects" or "signs", is not labelled in an imported dataset."""
         if what not in self.manifest.labels:
-            raise InputError(f"{self.folder}: imported from {self.manifest.imported} without labels of {what}")
+            origin = f"imported from {self.manifest.imported}" if self.manifest.imported else "recorded"
+            raise InputError(f"{self.folder}: {origin} without labels of {what}")
 
     def select(
         self,

@@ -7,6 +7,7 @@ from flcav.geometry.boxes import (
     points_in_boxes,
     segments_meet_boxes,
     spread_over_footprints,
+    turned_boxes,
 )
 from flcav.geometry.poses import (
     angles_of,
@@ -41,6 +42,7 @@ __all__ = [
     "segments_meet_boxes",
     "spread_over_footprints",
     "transform_points",
+    "turned_boxes",
     "unit_vectors",
     "wrap_angle",
     "yaw_of",

@@ -21,6 +21,7 @@ from flcav.geometry.poses import (
 )
 
 REACH_SLACK_M = 0.01  # for rounding of points in single precision
+LEVEL_RAD = 1e-6  # pitch and roll of a box that is upright
 
 
 @dataclass(frozen=True)
@@ -137,6 +138,20 @@ class Boxes:
         x = local[..., 0] * cos - local[..., 1] * sin
         y = local[..., 0] * sin + local[..., 1] * cos
         return np.stack((x, y, local[..., 2]), axis=-1) + self.center[:, None]
+
+
+def turned_boxes(center: Array, size: Array, rotation: Array, label: NDArray[np.str_]) -> Boxes:
+    """Return boxes by their rotations: upright where none leans by more than `LEVEL_RAD`.
+
+    Args:
+        center: (M, 3) centres [m].
+        size: (M, 3) length, width, height [m].
+        rotation: (M, 3, 3) from the boxes' own frames.
+        label: (M,) class names.
+    """
+    yaw, *tilts = angles_of(rotation)
+    tilt = np.stack(tilts, axis=1)
+    return Boxes(center, size, yaw, label, tilt=tilt if (np.abs(tilt) > LEVEL_RAD).any() else None)
 
 
 def spread_over_footprints(boxes: Boxes, along: int, across: int) -> Array:

@@ -12,6 +12,7 @@ import os
 import platform
 import shlex
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextvars import ContextVar
@@ -57,6 +58,15 @@ def only_writer(path: Path) -> Iterator[None]:
         for parent in new:
             with contextlib.suppress(OSError):  # something was written there
                 parent.rmdir()
+
+
+@contextlib.contextmanager
+def take_turns(what: str) -> Iterator[None]:
+    """Hold what is called `what` (letters, digits, dashes) within the context; others on this machine wait for it."""
+    with (Path(tempfile.gettempdir()) / f"flcav-{what}{LOCK}").open("a") as file:
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def _lock_path(path: Path) -> Path:

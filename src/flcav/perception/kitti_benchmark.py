@@ -15,7 +15,6 @@ from flcav.dataset.formats.kitti import KittiCalibration, KittiFolder, KittiFram
 from flcav.dataset.formats.kitti.files import ASSUMED_SIZE, is_drive
 from flcav.dataset.formats.kitti.read import BEAMS, HEIGHT_M, RANGE_M
 from flcav.dataset.formats.kitti.write import FRAMES
-from flcav.dataset.formats.reading import EDGES
 from flcav.dataset.layout import MANIFEST
 from flcav.geometry import Boxes, pose, transform_points
 from flcav.interface.progress import Report, ignore_progress
@@ -41,7 +40,7 @@ from flcav.perception.objects.samples import describe_rig
 from flcav.perception.objects.truth import FrameTruth, level_mount
 from flcav.perception.ops.rotated import iou
 from flcav.perception.task import Evaluated, KnownLidar
-from flcav.sensors.labels.outlines import NEAR_M, clip_in_front
+from flcav.sensors.labels.outlines import BOX_EDGES, NEAR_M, clip_in_front
 from flcav.storage.records import LEFT_OUT, Class
 
 Array = NDArray[np.float64]
@@ -218,7 +217,7 @@ def project_boxes(boxes: Boxes, calibration: KittiCalibration, size: Sequence[in
     height, width = size
     rectangles = np.zeros((len(boxes), 4))
     for row, corners in enumerate(boxes.corners()):
-        seen = clip_in_front(transform_points(calibration.camera_from_lidar, corners), EDGES, NEAR_M)
+        seen = clip_in_front(transform_points(calibration.camera_from_lidar, corners), BOX_EDGES, NEAR_M)
         if len(seen):
             pixels = np.c_[seen, np.ones(len(seen))] @ calibration.image_from_camera.T
             pixels = pixels[:, :2] / pixels[:, 2:]

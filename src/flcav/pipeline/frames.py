@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.config import InputError, parse_config, shorten
+from flcav.config import InputError, shorten
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
@@ -18,8 +18,8 @@ from flcav.perception.client import as_shared
 from flcav.perception.tasks import task_named
 from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName, find_path
 from flcav.pipeline.results.saved import Saved
-from flcav.sources.embedded import EmbeddedSource
-from flcav.sources.recipe import Recipe
+from flcav.sources.opening import open_source
+from flcav.sources.recipe import Recipe, parse_recipe
 from flcav.statistics.streams import derive_seed, stream
 from flcav.storage.files import sha256
 from flcav.world.map.town import PACKAGED
@@ -87,7 +87,7 @@ def make_recording_recipe(
         "cavs": recipe.vehicles(region) if split == "edge" else frames.cavs,
         **window,
     }
-    return parse_config(Recipe, fields, name)
+    return parse_recipe(fields, name)
 
 
 def list_window(split: Frames, frames: Sequence[int], window_s: float) -> tuple[int, ...]:
@@ -105,7 +105,7 @@ def list_window(split: Frames, frames: Sequence[int], window_s: float) -> tuple[
 
 def record_frames(recipe: Recipe, beside: Path, folder: Path, report: Report) -> Recorded:
     """Record a split below `folder`; resumes an interrupted recording."""
-    record(EmbeddedSource(recipe, beside), folder / DATA, progress=report)
+    record(open_source(recipe, beside), folder / DATA, progress=report)
     return group_frames(Dataset.open(folder / DATA), DATA, spins=recipe.middle_spins)
 
 

@@ -148,6 +148,14 @@ class Recording(Config):
     scenarios: tuple[Scenario, ...] | None = None
     rare: RareKinds | None = None
     rare_splits: tuple[SplitName, ...] | None = None  # that `rare` is for; None: all
+    source: Literal["carla"] | None = None  # from CARLA, with the fields of `CarlaRecipe` below
+    host: str | None = None
+    port: int | None = None
+    traffic_port: int | None = None
+    timeout_s: float | None = None
+    map: str | None = None
+    vehicles: int | None = None
+    pedestrians: int | None = None
 
     def fields(self, split: SplitName) -> dict[str, Any]:
         """Return the fields of a split that are not None, as JSON values."""

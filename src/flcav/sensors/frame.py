@@ -103,6 +103,12 @@ class SignViews:
     def __len__(self) -> int:
         return len(self.kind)
 
+    @classmethod
+    def none(cls) -> "SignViews":
+        """Return the record of a camera without any."""
+        none, number = np.zeros(0, np.str_), np.zeros(0, np.int64)
+        return cls(none, none, np.zeros((0, 4)), number, np.zeros(0), number)
+
 
 @dataclass(frozen=True)
 class Annotations:

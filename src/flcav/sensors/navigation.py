@@ -77,9 +77,15 @@ def measure_position(
     rendered before.
     """
     time_s = float(scene.trace.time_s[scene.index]) + scene.offset_s
+    error = draw_position_error(gnss, time_s, rng, bias_rng)
+    return convert_to_geodetic(scene.town.geo, world_from_gnss[:3, 3] + error)
+
+
+def draw_position_error(gnss: Gnss, time_s: float, rng: np.random.Generator, bias_rng: np.random.Generator) -> Array:
+    """Return the error (3,) east, north, up [m] of a fix at `time_s`; generators as in `measure_position`."""
     noise = rng.standard_normal(3) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
-    bias = draw_gauss_markov(bias_rng, time_s, np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m)), gnss.bias_s)
-    return convert_to_geodetic(scene.town.geo, world_from_gnss[:3, 3] + noise + bias)
+    bias = np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m))
+    return noise + draw_gauss_markov(bias_rng, time_s, bias, gnss.bias_s)
 
 
 class Imu(Config):
@@ -112,10 +118,15 @@ def measure_inertia(
     turn = world_from_imu[:3, :3]
     acceleration, rate = _motion(scene, world_from_imu[:3, 3], carrier)
     true = np.concatenate((turn.T @ (acceleration - GRAVITY), turn.T @ rate))
+    return true + draw_inertia_error(imu, time_s, rng, bias_rng)
+
+
+def draw_inertia_error(imu: Imu, time_s: float, rng: np.random.Generator, bias_rng: np.random.Generator) -> Array:
+    """Return the error (6,) of a sample at `time_s`, in its units; generators as in `measure_inertia`."""
     noise = np.repeat((imu.force_noise, imu.rate_noise), 3) * np.sqrt(imu.rate_hz / 2)
     start = np.repeat((imu.force_bias, imu.rate_bias), 3)
     growth = np.repeat((imu.force_walk, imu.rate_walk), 3)
-    return true + noise * rng.standard_normal(6) + draw_random_walk(bias_rng, time_s, start, growth)
+    return noise * rng.standard_normal(6) + draw_random_walk(bias_rng, time_s, start, growth)
 
 
 def _motion(scene: Scene, at: Array, carrier: int | None) -> tuple[Array, Array]:

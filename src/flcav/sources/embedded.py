@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from flcav.config import InputError, Json, shorten
-from flcav.sensors.frame import LONGEST_NAME, Frame, format_key
+from flcav.config import InputError, Json
+from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
+from flcav.sources.division import Division
 from flcav.sources.randomisation import randomise_bodies, randomise_rig, randomise_town, town_files
 from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import derive_seed, stream
-from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, check_town_name, load_town
+from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, Town, check_town_name, load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
 from flcav.world.traffic.traffic import simulate
@@ -47,23 +48,14 @@ class EmbeddedSource:
         if unknown := [pole for pole in self.poles if pole not in known]:
             raise InputError(f"field 'poles' = {unknown[0]}: no pole of {self.town.name}, which has {known}")
         self.agents = [f"cav{i}" for i in range(recipe.cavs)] + [f"pole{pole}" for pole in self.poles]
-        if not self.agents:
-            raise InputError("fields 'cavs' = 0 and 'poles' = []: nobody observes; give at least one of them")
         self.vehicle_rigs = [self._vehicle_rig(i) for i in range(recipe.cavs)]
         for rig in self.vehicle_rigs or [recipe.vehicle_rig]:
-            _check_mounts("vehicle_rig", rig, "a vehicle", 0.0)
+            check_mounts("vehicle_rig", rig, "a vehicle", 0.0)
         for pole in self.poles:
             x, y, z = self.town.poles.position[known.index(pole)].tolist()
             mount_m = z - self.town.ground(x, y)
-            _check_mounts("pole_rig", recipe.pole_rig, f"pole {pole}", mount_m)
-        self._per_scene = recipe.spins * len(self.agents)
-        self._frames = recipe.frames or recipe.scenes * self._per_scene
-        longest = max((format_key(self.scenes()[-1], recipe.spins - 1, one) for one in self.agents), key=len)
-        if len(longest) > LONGEST_NAME:
-            raise InputError(
-                f"field 'town' = {shorten(recipe.town)}: a frame would be called {shorten(longest)}, {len(longest)} "
-                f"characters where {LONGEST_NAME} are allowed; give the town's folder a shorter name"
-            )
+            check_mounts("pole_rig", recipe.pole_rig, f"pole {pole}", mount_m)
+        self._division = Division(recipe, self.town.name, tuple(self.agents))
         self._last_trace: tuple[str, Trace] | None = None
         self._last_scene: tuple[str, Scene] | None = None
 
@@ -82,7 +74,7 @@ class EmbeddedSource:
             "town": self.town.name,
             "town_files": {name: hashlib.sha256(data).hexdigest() for name, data in self._files().items()},
             "scenes": len(self.scenes()),
-            "frames": self._frames,
+            "frames": self._division.frames,
             "poles": self.poles,
         }
 
@@ -93,15 +85,14 @@ class EmbeddedSource:
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, `<town>-<seed>-<number>`."""
-        count = -(-self._frames // self._per_scene)
-        return [f"{self.town.name}-{self.recipe.seed}-{scene:03d}" for scene in range(count)]
+        return self._division.scenes()
 
     def frame_count(self, scene: str) -> int:
         """Return the number of frames of a scene; the last scene has fewer where the recipe limits frames.
 
         With `window_range_m` it is the largest number: how many are recorded depends on the traffic.
         """
-        return min(self._per_scene, self._frames - self.scenes().index(scene) * self._per_scene)
+        return self._division.frame_count(scene)
 
     def frames(self, scene: str) -> Iterator[Frame]:
         """Yield the scene's frames by spin, and within a spin the vehicles' before the poles'."""
@@ -162,16 +153,21 @@ class EmbeddedSource:
         """Return the contents of the files of the town, as drawn, by name."""
         if self.recipe.randomise is not None:
             return town_files(self.town)
-        heights = HILLS if self.recipe.town in HILLY else HEIGHTS
-        names = ("town.yaml", *([] if self.town.relief is None else [heights]))
-        paths = [self.town.net, *(self.town.net.parent / name for name in names)]
-        return {path.name: path.read_bytes() for path in paths}
+        return read_town_files(self.town, self.recipe.town)
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_last_trace": None, "_last_scene": None}
 
 
-def _check_mounts(field: str, rig: Rig, carrier: str, mount_m: float) -> None:
+def read_town_files(town: Town, name: str) -> Mapping[str, bytes]:
+    """Return the contents of a town's files by name; the recipe calls it `name`."""
+    heights = HILLS if name in HILLY else HEIGHTS
+    names = ("town.yaml", *([] if town.relief is None else [heights]))
+    paths = [town.net, *(town.net.parent / own for own in names)]
+    return {path.name: path.read_bytes() for path in paths}
+
+
+def check_mounts(field: str, rig: Rig, carrier: str, mount_m: float) -> None:
     """Raise `InputError` where a sensor of `rig` is not above the ground.
 
     The origin of the carrier's frame is `mount_m` above the ground. `field` is the recipe's field of the rig.

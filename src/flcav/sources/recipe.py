@@ -1,6 +1,7 @@
 """Recording recipes: validated YAML files that say what a dataset contains."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -8,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from flcav.config import Config, InputError, read_config, shorten
+from flcav.config import Config, InputError, Json, parse_config, read_yaml, shorten
 from flcav.interface.wording import suggest
 from flcav.sensors.calibration import CalibrationError
-from flcav.sensors.rig import RIGS, Rig
+from flcav.sensors.lens import Lens
+from flcav.sensors.rig import RIGS, Mounted, MountedInfrared, MountedRadar, Rig
 from flcav.world.map.parameters import RareKinds
 from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
@@ -174,6 +176,53 @@ class Recipe(Config):
         return np.unique(self._middle_steps()[:, None] + around)
 
 
+class CarlaRecipe(Recipe):
+    """A recording recipe for CARLA: the fields of any other, with a server, its map and its traffic.
+
+    Refused are the fields that CARLA has nothing for. Of rigs they are refused, too: see `refuse_unknown_to_carla`.
+    """
+
+    source: Literal["carla"]  # record from CARLA, by its client (extra `carla`)
+    host: str = Field(default="127.0.0.1", min_length=1, max_length=255)  # the computer that CARLA's server runs on
+    port: int = Field(default=2000, ge=1, le=65_534)  # port of its calls; the next one is that of its streams
+    traffic_port: int = Field(default=8000, ge=1, le=65_535)  # port of the Traffic Manager, which runs in this process
+    timeout_s: float = Field(default=60.0, ge=1, le=3600)  # longest wait for an answer, and for a sensor's data
+    map: str | None = Field(default=None, min_length=1, max_length=100)  # map of the server; None: the town's name
+    vehicles: int = Field(default=30, ge=0, le=1000)  # vehicles of the Traffic Manager, beside those that record
+    pedestrians: int = Field(default=0, ge=0, le=1000)  # walkers of CARLA's own, where a map has a navigation mesh
+
+    @model_validator(mode="after")
+    def _has_what_carla_has(self) -> "CarlaRecipe":
+        for name in ("scenarios", "rare", "randomise", "window_range_m"):
+            if getattr(self, name):
+                raise ValueError(f"'{name}' is of the built-in simulator; source: carla has no such thing")
+        for name in ("vehicle_rig", "pole_rig"):
+            refuse_unknown_to_carla(name, getattr(self, name))
+        return self
+
+
+def refuse_unknown_to_carla(field: str, rig: Rig) -> None:
+    """Raise ValueError where a sensor of the `rig`, of the recipe's `field`, has something that CARLA's has not."""
+    for name, lidar in rig.lidars.items():
+        if lidar.settings.elevations_deg is not None or lidar.settings.rolling:
+            what = "uneven channels" if lidar.settings.elevations_deg is not None else "a rolling spin"
+            raise ValueError(f"{field}: '{name}' has {what}, and CARLA's LiDAR has not")
+    for name, camera in rig.cameras.items():
+        lens = camera.settings
+        centred = Lens(width=lens.width, height=lens.height, fov_deg=lens.fov_deg, fx=lens.fx)
+        if not np.allclose(lens.intrinsics(), centred.intrinsics()) or lens.distortion().any():
+            raise ValueError(
+                f"{field}: '{name}' has distortion, unequal focal lengths or a principal point off the image's centre, "
+                "and CARLA's camera has not"
+            )
+    for name, sensor in rig.sensors().items():
+        if isinstance(sensor, MountedInfrared | MountedRadar):
+            kind = "thermal camera" if isinstance(sensor, MountedInfrared) else "radar with cross-sections"
+            raise ValueError(f"{field}: '{name}' is a {kind}, and CARLA has none")
+        if isinstance(sensor, Mounted) and sensor.trigger_ms:
+            raise ValueError(f"{field}: '{name}' has a trigger time, and CARLA's sensors measure at its ticks")
+
+
 def recipe_path(name: str) -> Path:
     """Return the file of the recipe `name` that comes with flcav, e.g. "objects" or "allocation/three_tasks".
 
@@ -200,8 +249,17 @@ def find_recipe(path: Path) -> Path:
         return path
 
 
+def parse_recipe(values: Mapping[str, Json], origin: str) -> Recipe:
+    """Return the fields `values` as a recipe, a `CarlaRecipe` if they have a `source`: see `parse_config`."""
+    return parse_config(_choose_model(values), values, origin)
+
+
+def _choose_model(values: object) -> type[Recipe]:
+    return CarlaRecipe if isinstance(values, dict) and "source" in values else Recipe
+
+
 def load_recipe(path: Path | str) -> Recipe:
-    """Return the recipe in the YAML file at `path`; docs/recipes.md lists its fields.
+    """Return the recipe in the YAML file at `path`, a `CarlaRecipe` if it has a `source`: see docs/recipes.md.
 
     The field `town` becomes an absolute path where it names a folder beside the file. Raises `InputError` that names
     file, field, value and violated rule.
@@ -210,7 +268,8 @@ def load_recipe(path: Path | str) -> Recipe:
     >>> load_recipe("recipes/suburb.yaml").town
     'suburb'
     """
-    recipe = read_config(Recipe, Path(path))
+    values = read_yaml(Path(path))
+    recipe = parse_config(_choose_model(values), values, str(path))
     folder = Path(path).absolute().parent / recipe.town
     if recipe.town in PACKAGED or not os.path.isdir(folder):  # noqa: PTH112 - Path.is_dir raises for too long a name
         return recipe

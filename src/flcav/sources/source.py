@@ -55,3 +55,12 @@ class TownSource(Source, Protocol):
     def town_files(self) -> Mapping[str, bytes]:
         """Return the contents of the town's files by name; empty for a town that comes with flcav."""
         ...
+
+
+@runtime_checkable
+class Isolated(Source, Protocol):
+    """A source whose library may end the process that it runs in: one process of its own records it, in silence."""
+
+    def explain_end(self) -> str:
+        """Return why such a process has ended before its time, in a sentence."""
+        ...

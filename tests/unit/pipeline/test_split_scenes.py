@@ -11,7 +11,9 @@ from test_run_recipe import parsed
 from flcav.config import InputError
 from flcav.pipeline import frames
 from flcav.pipeline.frames import deal_frames, make_recording_recipe
-from flcav.pipeline.recipe import SPLITS_OF, Role, SplitName
+from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName
+from flcav.pipeline.steps.recording import RecordSettings
+from flcav.sources.recipe import CarlaRecipe
 
 
 class Recording:
@@ -87,3 +89,27 @@ def test_simulated_splits_have_traffic_of_their_own_and_another_draw_renews_the_
     assert {key[1] for key in first if first[key] != redrawn[key]} == {"test"}
     assert all(first[key] == redrawn[key] for key in first if key[1] != "test")
     assert all(first[key] != other[key] for key in first)
+
+
+def test_a_region_may_be_recorded_from_carla() -> None:
+    """Its step keeps the server through the JSON of its settings; another region's is of the built-in simulator."""
+    fields = {"source": "carla", "port": 2100, "vehicles": 5}
+    recipe = RunRecipe.model_validate(
+        {
+            "tasks": {"objects": {"plan": {"samples": 2, "edge_rounds": 1, "cloud_rounds": 0}}},
+            "regions": {
+                "suburb": {"role": "pretrain"},
+                "grid": {"role": "federate", "recording": {**fields, "vehicle_rig": "lidar32"}},
+            },
+            "budgets_mb": {"wireless": 3, "wireline": 3},
+        }
+    )
+    made = {name: make_recording_recipe(recipe, name, "test", "objects", "x") for name in ("suburb", "grid")}
+    assert [type(each).__name__ for each in made.values()] == ["Recipe", "CarlaRecipe"]
+    settings = RecordSettings(recipe=made["grid"], beside="", places=(), version={})
+    again = RecordSettings.model_validate_json(settings.model_dump_json()).recipe
+    assert isinstance(again, CarlaRecipe)
+    assert (again.port, again.vehicles, again.town) == (2100, 5, "grid")
+    assert (
+        "source" not in RecordSettings(recipe=made["suburb"], beside="", places=(), version={}).model_dump()["recipe"]
+    )

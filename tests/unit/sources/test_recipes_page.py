@@ -12,7 +12,7 @@ from flcav.config import Config, _models_in, parse_config
 from flcav.sensors.lidar.beams import BEAMS
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
-from flcav.sources.recipe import Recipe
+from flcav.sources.recipe import CarlaRecipe, Recipe
 from flcav.world.weather import WEATHERS
 
 ROOT = Path(__file__).parents[3]
@@ -29,7 +29,7 @@ def models(model: type[BaseModel], found: list[type[BaseModel]]) -> list[type[Ba
     return found
 
 
-MODELS = models(Recipe, [])
+MODELS = models(CarlaRecipe, models(Recipe, []))
 
 
 def test_the_page_is_of_today():

@@ -24,12 +24,11 @@ def record(
     engine: EngineName = ENGINE,
 ) -> None:
     """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
-    from flcav.config import parse_config
     from flcav.dataset.layout import read_manifest, trace_path
     from flcav.dataset.recording.recorder import record as write
     from flcav.interface import progress
-    from flcav.sources.embedded import EmbeddedSource
-    from flcav.sources.recipe import Recipe, find_recipe, load_recipe
+    from flcav.sources.opening import open_source
+    from flcav.sources.recipe import find_recipe, load_recipe, parse_recipe
     from flcav.storage.files import check_writable
     from flcav.world.trace import Trace
 
@@ -37,7 +36,8 @@ def record(
     recipe = find_recipe(recipe)
     changes = {name: value for name, value in (("frames", frames), ("seed", seed)) if value is not None}
     asked = load_recipe(recipe)
-    source = EmbeddedSource(parse_config(Recipe, asked.model_dump() | changes, str(recipe)), recipe.parent)
+    asked = parse_recipe(asked.model_dump() | changes, str(recipe))
+    source = open_source(asked, recipe.parent)
     with progress.show_progress(f"record {out}") as report:
         written = write(source, out, jobs=jobs, engine=engine, progress=report)
     manifest = read_manifest(out)
@@ -49,8 +49,8 @@ def record(
         f"{plural(counts.annotations, 'annotation')}, {plural(counts.points, 'point')}, "
         f"{plural(counts.images, 'image')}, {size_mb:.1f} MB"
     )
-    if source.recipe.scenarios:
+    if asked.scenarios:
         happened = [event.kind for scene in manifest.scenes for event in Trace.load(out / trace_path(scene)).events]
-        asked_for = counts.scenes * len(source.recipe.scenarios)
+        asked_for = counts.scenes * len(asked.scenarios)
         each = ", ".join(f"{happened.count(kind)} {kind}" for kind in sorted(set(happened)))
         typer.echo(f"corner cases: {len(happened)} of {asked_for} found their moment ({each or 'none'})")

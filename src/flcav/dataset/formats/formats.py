@@ -24,6 +24,7 @@ IMPORTS: Mapping[str, str] = {
     "opv2v": "flcav.dataset.formats.opv2v.read:IMPORT",
     "dair-v2x": "flcav.dataset.formats.roadside:DAIR",
     "tumtraf": "flcav.dataset.formats.roadside:TUMTRAF",
+    "carlaflcav": "flcav.dataset.formats.carlaflcav.read:IMPORT",
 }
 
 

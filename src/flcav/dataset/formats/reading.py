@@ -20,17 +20,15 @@ from flcav.config import InputError, Json, parse_config, shorten
 from flcav.dataset.payloads import open_image, read_image
 from flcav.dataset.store import LazyMapping
 from flcav.dataset.upright import measure_upright
-from flcav.geometry import Boxes, angles_of, count_points_in_boxes, inverse, transform_points
+from flcav.geometry import Boxes, count_points_in_boxes
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, Frame, SignViews, Views
-from flcav.sensors.labels.outlines import NEAR_M, clip_in_front, compute_truncation
-from flcav.sensors.lens import Lens, project
+from flcav.sensors.labels.outlines import outline_boxes
+from flcav.sensors.lens import Lens
 
 Array = NDArray[np.float64]
 
 LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track whose difference is a velocity, as nuscenes-devkit's
 FARTHEST = 1e9  # largest number that a measurement is taken to have
-LEVEL_RAD = 1e-6  # pitch and roll of a box that is upright
-EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 
 
 class LogSource(ABC):
@@ -97,13 +95,6 @@ class LogPicture:
     world_from_camera: Array  # (4, 4), optical frame
 
 
-def turned_boxes(center: Array, size: Array, rotation: Array, label: NDArray[np.str_]) -> Boxes:
-    """Return boxes with (M, 3, 3) rotations of their own frames: upright where none leans by more than `LEVEL_RAD`."""
-    yaw, *tilts = angles_of(rotation)
-    tilt = np.stack(tilts, axis=1)
-    return Boxes(center, size, yaw, label, tilt=tilt if (np.abs(tilt) > LEVEL_RAD).any() else None)
-
-
 def annotate(
     track: Iterable[str],
     boxes: Boxes,
@@ -137,13 +128,8 @@ def annotate(
         occlusion=np.full(count, np.nan) if occlusion is None else occlusion,
         points=points,
         views=views,
-        signs={name: _no_signs() for name in views},
+        signs={name: SignViews.none() for name in views},
     )
-
-
-def _no_signs() -> SignViews:
-    none, number = np.zeros(0, np.str_), np.zeros(0, np.int64)
-    return SignViews(none, none, np.zeros((0, 4)), number, np.zeros(0), number)
 
 
 def difference_tracks(track: NDArray[np.str_], time_s: Array, center: Array) -> Array:
@@ -171,22 +157,10 @@ def view_boxes(boxes: Boxes, pictures: Mapping[str, LogPicture]) -> dict[str, Vi
     show is unknown.
     """
     corners = boxes.corners()
-    return {name: _view_corners(corners, picture) for name, picture in pictures.items()}
-
-
-def _view_corners(corners: Array, picture: LogPicture) -> Views:
-    amodal = np.full((len(corners), 4), np.nan)
-    corners = transform_points(inverse(picture.world_from_camera), corners.reshape(-1, 3)).reshape(-1, 8, 3)
-    ahead = (corners[:, :, 2] >= NEAR_M).sum(axis=1)
-    whole = ahead == 8
-    pixels = project(picture.lens, corners[whole].reshape(-1, 3)).reshape(-1, 8, 2)
-    amodal[whole] = np.concatenate((pixels.min(axis=1), pixels.max(axis=1)), axis=1)
-    for row in np.flatnonzero((ahead > 0) & ~whole):  # the others are behind the camera
-        pixels = project(picture.lens, clip_in_front(corners[row], EDGES, NEAR_M))
-        amodal[row] = *pixels.min(axis=0), *pixels.max(axis=0)
-    truncation = compute_truncation(amodal, picture.lens)
-    amodal[truncation == 1] = np.nan
-    return unseen_views(amodal, truncation)
+    return {
+        name: unseen_views(*outline_boxes(corners, picture.lens, picture.world_from_camera))
+        for name, picture in pictures.items()
+    }
 
 
 def unseen_views(amodal: Array, truncation: Array, occlusion: Array | None = None) -> Views:

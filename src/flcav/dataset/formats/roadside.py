@@ -27,9 +27,8 @@ from flcav.dataset.formats.reading import (
     check_cloud,
     check_sizes,
     choose_split,
-    turned_boxes,
 )
-from flcav.geometry import Boxes, wrap_angle
+from flcav.geometry import Boxes, turned_boxes, wrap_angle
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, Frame
 

@@ -45,9 +45,9 @@ from flcav.dataset.recording.workers import start_actors, start_processes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, write_table
 from flcav.interface.progress import DAMAGED, Report, print_progress
 from flcav.machine.locks import LOCK, only_writer
-from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.opening import open_source
 from flcav.sources.recipe import Recipe, load_recipe
-from flcav.sources.source import Source, TownSource
+from flcav.sources.source import Isolated, Source, TownSource
 from flcav.storage.files import flush_all, sha256, write_bytes, write_json
 
 Header = Mapping[str, Mapping[str, Json]]  # "recipe" -> description of the source, "versions" -> of packages
@@ -90,7 +90,9 @@ def record(
     if isinstance(source, Path | str):
         source = load_recipe(source)
     if isinstance(source, Recipe):
-        source = EmbeddedSource(source)
+        source = open_source(source)
+    if isinstance(source, Isolated) and (jobs, engine) != (1, "processes"):
+        raise InputError(f"jobs = {jobs}, engine '{engine}': this source has one world, which one process records")
     out = Path(out)
     check_scenes(source.scenes())
     header: Header = json.loads(json.dumps({"recipe": source.describe(), "versions": package_versions()}))
@@ -98,7 +100,11 @@ def record(
         with only_writer(out):
             write = partial(_write, source, out / WORK, jobs, engine, progress)
             if begun := _claim(out, header):
-                write()
+                try:
+                    write()
+                except InputError:
+                    drop_unbegun(out)
+                    raise
                 _assemble(source, out, header)
             if damaged := find_damage(out):
                 more = f" (and {len(damaged) - 1} more)" if len(damaged) > 1 else ""
@@ -114,7 +120,7 @@ def record(
 def drop_unbegun(out: Path) -> None:
     """Remove what a failed recording left in `out` where no part of it was completed; otherwise it can be resumed."""
     work = out / WORK
-    if work.is_dir() and not any(path.is_dir() for path in work.glob("*/*")):
+    if work.is_dir() and not any(path.is_dir() and path.suffix != ".part" for path in work.glob("*/*")):
         shutil.rmtree(work)
         if not any(out.iterdir()):
             out.rmdir()

@@ -5,13 +5,14 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
 from flcav.dataset.recording.jobs import Engine, Job, Part, perform
 from flcav.machine.actors import actor_pool
 from flcav.machine.processes import process_pool, start_server
-from flcav.sources.source import Source
+from flcav.sources.source import Isolated, Source
 
 POLL_S = 0.2
 
@@ -22,15 +23,20 @@ _job: Any = None  # in a worker process: source, folder, and the shared counter 
 def start_processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
     """Yield an engine of `jobs` processes that perform jobs of `source` below the folder `work`.
 
-    It calls `wrote` with the number of frames written so far. A single one is this process; more are child
-    processes of one thread each, which end with this one, even if it is killed.
+    It calls `wrote` with the number of frames written so far. A single one is this process, unless the source is
+    `Isolated`; others are child processes of one thread each, which end with this one, even if it is killed.
     """
-    if jobs == 1:
+    if jobs == 1 and not isinstance(source, Isolated):
         yield _InProcessEngine(source, work, wrote)
         return
     written = start_server().Value("q", 0)
     with process_pool(jobs, _begin, source, work, written) as pool:
-        yield _PoolEngine(jobs, lambda task: pool.submit(_perform, task), lambda _: wrote(written.value))
+        try:
+            yield _PoolEngine(jobs, lambda task: pool.submit(_perform, task), lambda _: wrote(written.value))
+        except BrokenProcessPool:
+            if isinstance(source, Isolated):
+                raise OSError(source.explain_end()) from None
+            raise
 
 
 @contextlib.contextmanager
@@ -93,6 +99,10 @@ class _PoolEngine:
 def _begin(*job: Any) -> None:
     global _job
     _job = job
+    if isinstance(job[0], Isolated):
+        silent = os.open(os.devnull, os.O_WRONLY)
+        for stream in (1, 2):  # what its library prints; errors are returned
+            os.dup2(silent, stream)
 
 
 def _perform(task: Job) -> None:

@@ -10,13 +10,13 @@ from flcav.pipeline.recipe import EDGE, SPLITS_OF, Role, SplitName
 from flcav.pipeline.results.plans import Placed
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.settings import StepSettings, make_step
-from flcav.sources.recipe import Recipe
+from flcav.sources.recipe import CarlaRecipe, Recipe
 
 
 class RecordSettings(StepSettings):
     """Settings of the recording of a split."""
 
-    recipe: Recipe  # without poles
+    recipe: CarlaRecipe | Recipe  # without poles
     beside: str  # folder that the town is looked for in; "" for a town of the package
     places: tuple[str, ...]  # steps that chose the poles to record from
     version: Mapping[str, str]  # SHA-256 of each of the town's files, by name

@@ -15,6 +15,7 @@ from flcav.world.scene import Scene
 Array = NDArray[np.float64]
 
 NEAR_M = 0.1  # depth of the near plane, at which actors are clipped
+BOX_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
 BEYOND_IMAGE = 1.3  # distortion is extrapolated up to so many times the image's radius
 
 
@@ -120,3 +121,23 @@ def _project(lens: Lens, points: Array) -> Array:
 def _image_radius(lens: Lens) -> float:
     corners = unproject(lens, [(u, v) for u in (0, lens.width - 1) for v in (0, lens.height - 1)])
     return float(np.linalg.norm(corners, axis=1).max())
+
+
+def outline_boxes(corners: Array, lens: Lens, world_from_camera: Array) -> tuple[Array, Array]:
+    """Return the rectangles (M, 4) x1 y1 x2 y2 [px] that boxes fill in an image, and the shares (M,) outside it.
+
+    `corners` (M, 8, 3) are theirs in the world, in the order of `Boxes.corners`, `world_from_camera` (4, 4) is of the
+    optical frame. Rectangles are not clipped to the image; NaN where they do not touch it.
+    """
+    amodal = np.full((len(corners), 4), np.nan)
+    corners = transform_points(inverse(world_from_camera), corners.reshape(-1, 3)).reshape(-1, 8, 3)
+    ahead = (corners[:, :, 2] >= NEAR_M).sum(axis=1)
+    whole = ahead == 8
+    pixels = project(lens, corners[whole].reshape(-1, 3)).reshape(-1, 8, 2)
+    amodal[whole] = np.concatenate((pixels.min(axis=1), pixels.max(axis=1)), axis=1)
+    for row in np.flatnonzero((ahead > 0) & ~whole):  # the others are behind the camera
+        pixels = project(lens, clip_in_front(corners[row], BOX_EDGES, NEAR_M))
+        amodal[row] = *pixels.min(axis=0), *pixels.max(axis=0)
+    truncation = compute_truncation(amodal, lens)
+    amodal[truncation == 1] = np.nan
+    return amodal, truncation

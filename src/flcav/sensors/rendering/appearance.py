@@ -80,28 +80,55 @@ class Appearance(NamedTuple):
 
 _AS = {"van": "car", "prop": "static"}  # categories without a class of their own
 _KNOWN: WeakKeyDictionary[Scene, tuple[Surfaces, Appearance]] = WeakKeyDictionary()
+_TOWNS: WeakKeyDictionary[Scene, "_OfTown"] = WeakKeyDictionary()
+
+
+class _OfTown(NamedTuple):
+    """The tables of a town's F faces, and what else does not depend on the actors: see `Appearance`."""
+
+    semantic: NDArray[np.uint8]  # (F,)
+    thing: NDArray[np.int32]  # (F,)
+    part: NDArray[np.uint8]  # (F,)
+    part_row: NDArray[np.int32]  # (F,)
+    markings: Markings
+    facades: Facades
+    plates: Plates
 
 
 def build_appearance(scene: Scene) -> Appearance:
     """Return the appearance tables of `scene`: cached, the same for all instants with the same actors."""
     if scene not in _KNOWN or _KNOWN[scene][0] is not scene.surfaces:
-        _KNOWN[scene] = scene.surfaces, _appearance(scene)
+        if scene not in _TOWNS:
+            _TOWNS[scene] = _of_town(scene)
+        _KNOWN[scene] = scene.surfaces, _appearance(scene, _TOWNS[scene])
     return _KNOWN[scene][1]
 
 
-def _appearance(scene: Scene) -> Appearance:
-    surfaces, trace, town = scene.surfaces, scene.trace, scene.town
-    world = build_static_world(town)
-    rows, actors = len(surfaces.material), len(world.part)
-    semantic = np.zeros(rows, np.uint8)
-    part, part_row, thing = np.zeros(rows, np.uint8), np.zeros(rows, np.int32), np.zeros(rows, np.int32)
+def _of_town(scene: Scene) -> _OfTown:
+    town = scene.town
+    world, signs = build_static_world(town), town.signs
     numbers = np.array([SEMANTICS[_OF_PART[TownPart(value)]] for value in range(len(TownPart))], np.uint8)
     leafy = (world.part == TownPart.CLUTTER) & (world.mesh.material == Material.LEAF)
-    semantic[:actors] = np.where(leafy, SEMANTICS["vegetation"], numbers[world.part])
-    part[:actors], part_row[:actors] = world.part, world.row
-    thing[:actors] = -(scene.things.face + 1)
-    corner = np.zeros((rows - actors, 3, 3), np.float32)
-    corner_normal = np.zeros((rows - actors, 3, 3), np.float32)
+    place = np.c_[signs.position, left_vectors(signs.yaw)].astype(np.float32)
+    kinds = np.array([SIGN_KINDS.index(kind) for kind in signs.kind], np.uint8)
+    return _OfTown(
+        semantic=np.where(leafy, SEMANTICS["vegetation"], numbers[world.part]).astype(np.uint8),
+        thing=-(scene.things.face + 1),
+        part=world.part,
+        part_row=world.row,
+        markings=_markings(town),
+        facades=facades_of(town.name, town.buildings),
+        plates=Plates(place, kinds, draw_signs()),
+    )
+
+
+def _appearance(scene: Scene, of_town: _OfTown) -> Appearance:
+    surfaces, trace = scene.surfaces, scene.trace
+    actors = len(of_town.part)
+    beyond = (0, len(surfaces.material) - actors)  # the faces of the actors follow the town's
+    semantic = np.pad(of_town.semantic, beyond)
+    corner = np.zeros((beyond[1], 3, 3), np.float32)
+    corner_normal = np.zeros((beyond[1], 3, 3), np.float32)
     for instance, category in enumerate(trace.category, start=1):
         corners, normals = _corners(*trace.model(instance - 1))
         first = int(surfaces.first[instance])
@@ -111,25 +138,21 @@ def _appearance(scene: Scene) -> Appearance:
         semantic[faces] = SEMANTICS[_AS.get(str(category), str(category))]
         if category in ("bicycle", "motorcycle"):
             semantic[faces][np.isin(surfaces.material[faces], _RIDER)] = SEMANTICS["rider"]
-    signs = town.signs
-    place = np.c_[signs.position, left_vectors(signs.yaw)]
     return Appearance(
         material=surfaces.material,
         semantic=semantic,
-        thing=thing,
-        part=part,
-        part_row=part_row,
+        thing=np.pad(of_town.thing, beyond),
+        part=np.pad(of_town.part, beyond),
+        part_row=np.pad(of_town.part_row, beyond),
         first_actor=actors,
         corner=corner,
         corner_normal=corner_normal,
         colour=_colours([str(name) for name in trace.actor]),
         mirror=MIRROR,
         gloss=GLOSS,
-        markings=_markings(town),
-        facades=facades_of(town.name, town.buildings),
-        plates=Plates(
-            place.astype(np.float32), np.array([SIGN_KINDS.index(kind) for kind in signs.kind], np.uint8), draw_signs()
-        ),
+        markings=of_town.markings,
+        facades=of_town.facades,
+        plates=of_town.plates,
         noise=make_noise(),
     )
 

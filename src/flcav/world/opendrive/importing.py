@@ -4,10 +4,8 @@ The first pass splits the map into nodes, edges and connections; the second join
 """
 
 import copy
-import importlib.util
 import re
 import shutil
-import subprocess
 import tempfile
 import xml.etree.ElementTree as ElementTree
 import zlib
@@ -20,7 +18,6 @@ import yaml
 from shapely.geometry import LineString
 
 from flcav.config import InputError, shorten
-from flcav.interface.extras import format_install_command
 from flcav.machine.locks import only_writer
 from flcav.storage.files import find_existing, flush_tree
 from flcav.world.map.parameters import GeoReference, MapSource
@@ -33,6 +30,7 @@ from flcav.world.opendrive.georeference import locate_origin
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.mirror import mirror_map, mirror_parts
+from flcav.world.opendrive.netconvert import run_netconvert
 from flcav.world.opendrive.objects.crossings import take_crosswalks
 from flcav.world.opendrive.objects.crosswalks import Crosswalk, find_crosswalks
 from flcav.world.opendrive.objects.taken import take_objects, tell
@@ -41,7 +39,6 @@ from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 WIDEST_M = 5e5  # farthest that a street is from the middle of the town
 GAPS_M = 5000.0  # total length of the gaps between linked roads, in both directions, over which streets are drawn
 STRETCHED = 0.01  # difference between lengths of the map and on the ground that is worth a word
-NETCONVERT_S = 300.0  # longest run of netconvert
 PARTS = ("nod", "edg", "con")  # netconvert's plain XML files: nodes, edges, connections
 OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}
 JOINING = {
@@ -92,7 +89,7 @@ def split_map(root: ElementTree.Element, prefix: Path, origin: Path, *, left_han
         "plain-output-prefix": prefix.name,
         "output-file": f"{prefix.name}.net.xml",
     }
-    _run(options, prefix.parent, origin)
+    run_netconvert(options, prefix.parent, origin)
     if left_hand:
         mirror_parts(prefix)
 
@@ -108,11 +105,11 @@ def join_parts(
     plain, made = prefix.with_name("joined"), prefix.with_name("joined.net.xml")
     side |= {"output-file": made.name}
     also = {"plain-output-prefix": plain.name} if crosswalks else {}
-    _run(_name_parts(prefix) | JOINING | FIRST | side | also, prefix.parent, origin)
+    run_netconvert(_name_parts(prefix) | JOINING | FIRST | side | also, prefix.parent, origin)
     taken = 0
     if crosswalks:
         taken = take_crosswalks(plain, made, crosswalks)
-        _run(_name_parts(plain) | JOINING | side, prefix.parent, origin)
+        run_netconvert(_name_parts(plain) | JOINING | side, prefix.parent, origin)
     text = made.read_text(encoding="utf-8")
     net.write_text(re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL), encoding="utf-8")  # no dates and paths
     return taken
@@ -121,29 +118,6 @@ def join_parts(
 def _name_parts(prefix: Path) -> dict[str, str]:
     """Return netconvert's options for reading the `PARTS` beside `prefix`."""
     return {OPTIONS[part]: f"{prefix.name}.{part}.xml" for part in PARTS}
-
-
-def _run(options: dict[str, str], folder: Path, origin: Path) -> None:
-    """Run netconvert in `folder`; raises `InputError` where it is missing, or with its first error where it fails.
-
-    Options name files by their names there: in a path it would take a comma for a separator.
-    """
-    found = importlib.util.find_spec("sumo")
-    if found is None or not found.submodule_search_locations:
-        raise InputError(
-            f"importing towns needs SUMO's netconvert, which is not installed: {format_install_command('towns')}"
-        )
-    binary = Path(next(iter(found.submodule_search_locations))) / "bin" / "netconvert"
-    command = [str(binary), *(word for name, value in options.items() for word in (f"--{name}", value))]
-    try:
-        done = subprocess.run(
-            command, cwd=folder, capture_output=True, text=True, errors="replace", check=False, timeout=NETCONVERT_S
-        )
-    except subprocess.TimeoutExpired:
-        raise InputError(f"{origin}: netconvert did not come to an end with this map in {NETCONVERT_S:.0f} s") from None
-    if done.returncode:
-        errors = re.findall(r"Error: (.*)", done.stderr) or [f"exit code {done.returncode}"]
-        raise InputError(f"{origin}: netconvert cannot read this OpenDRIVE map ({errors[0].strip().rstrip('.')})")
 
 
 def _read_joined(path: Path, origin: Path, roads_m: float) -> RoadNet:

@@ -33,10 +33,9 @@ from flcav.dataset.formats.reading import (
     name_place,
     pinhole,
     read_pictures,
-    turned_boxes,
     view_boxes,
 )
-from flcav.geometry import Boxes, pose, transform_points
+from flcav.geometry import Boxes, pose, transform_points, turned_boxes
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import Lens
 

@@ -31,10 +31,9 @@ from flcav.dataset.formats.reading import (
     difference_tracks,
     pinhole,
     read_pictures,
-    turned_boxes,
     view_boxes,
 )
-from flcav.geometry import inverse
+from flcav.geometry import inverse, turned_boxes
 from flcav.sensors.frame import Calibration, LinkedFrame
 
 Array = NDArray[np.float64]

@@ -34,10 +34,9 @@ from flcav.dataset.formats.reading import (
     name_place,
     pinhole,
     read_pictures,
-    turned_boxes,
     view_boxes,
 )
-from flcav.geometry import Boxes, heading_vectors, inverse
+from flcav.geometry import Boxes, heading_vectors, inverse, turned_boxes
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import BODY_FROM_OPTICAL

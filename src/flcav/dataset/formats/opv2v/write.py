@@ -30,10 +30,10 @@ from flcav.dataset.formats.exporter import (
 from flcav.dataset.formats.mounts import agent_velocities, assign_channels, optical_yaw
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import yaw_of
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
+from flcav.sources.carla.frames import MIRROR, MapFrame
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,6 @@ CAMERAS = {  # yaw, counter-clockwise from ahead [rad]
     "camera3": np.pi,
 }
 FIRST_CAR, FIRST_POLE, FIRST_TRACK = 1001, 2001, 10001  # OpenCOOD takes the agent whose number sorts first as the ego
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 KMH = 3.6
 FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built without libyaml has only the slow one
 
@@ -128,32 +127,18 @@ def agent_numbers(agents: list[str]) -> dict[str, int]:
 
 
 def carla_pose(world_from_body: Array) -> list[float]:
-    """Return [x, y, z [m], roll, yaw, pitch [degrees]] in CARLA's left-handed world of a (4, 4) `world_from_body`.
+    """Return OPV2V's [x, y, z [m], roll, yaw, pitch [degrees]], in CARLA's frame, of a (4, 4) `world_from_body`.
 
     The body's axes are x ahead, y left, z up.
     """
-    matrix = MIRROR @ world_from_body @ MIRROR
-    roll = np.arctan2(-matrix[2, 1], matrix[2, 2])
-    pitch = np.arcsin(np.clip(matrix[2, 0], -1, 1))
-    return [*matrix[:3, 3].tolist(), *np.degrees((roll, yaw_of(matrix), pitch)).tolist()]
+    location, (pitch, yaw, roll) = MapFrame().to_transform(world_from_body)
+    return [*location, roll, yaw, pitch]
 
 
 def from_carla(values: Sequence[float]) -> Array:
-    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`.
-
-    OpenCOOD's `x_to_world`, mirrored.
-    """
-    x, y, z, *angles = values
-    (cr, cy, cp), (sr, sy, sp) = np.cos(np.radians(angles)), np.sin(np.radians(angles))
-    matrix = np.array(
-        [
-            [cp * cy, cy * sp * sr - sy * cr, -cy * sp * cr - sy * sr, x],
-            [sy * cp, sy * sp * sr + cy * cr, -sy * sp * cr + cy * sr, y],
-            [sp, -cp * sr, cp * cr, z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
-    return MIRROR @ matrix @ MIRROR
+    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`."""
+    x, y, z, roll, yaw, pitch = values
+    return MapFrame().from_transform((x, y, z), (pitch, yaw, roll))
 
 
 def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], speed_m_s: float) -> set[str]:
@@ -166,13 +151,14 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], 
     mounts = frame.calibration.agent_from_sensor
     cameras = assign_channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
     about: dict[str, Any] = {}
+    mirrored = np.diag((*MIRROR, 1.0))
     for name, camera in sorted(cameras.items(), key=lambda pair: pair[1]):
         check_rectified(frame, name, "OPV2V")
         (folder / f"{time}_{camera}.png").write_bytes(encode_png(frame.images[name].rgb))
         world_from_camera = frame.world_from_sensor(name) @ BODY_FROM_OPTICAL.T
         about[camera] = {
             "cords": carla_pose(world_from_camera),
-            "extrinsic": (MIRROR @ np.linalg.inv(world_from_camera) @ world_from_lidar @ MIRROR).tolist(),
+            "extrinsic": (mirrored @ np.linalg.inv(world_from_camera) @ world_from_lidar @ mirrored).tolist(),
             "intrinsic": frame.calibration.intrinsics[name].tolist(),
         }
     ego = carla_pose(frame.world_from_agent)

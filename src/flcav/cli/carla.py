@@ -1,0 +1,52 @@
+"""`flcav carla serve`: our own towns for the clients of CARLA 0.9.16."""
+
+import ipaddress
+import logging
+from pathlib import Path
+
+import typer
+
+carla = typer.Typer(help="CARLA: serve its clients from a town, without a GPU.", no_args_is_help=True)
+
+
+@carla.callback()
+def _group() -> None:
+    pass
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.add_typer(carla, name="carla")
+
+
+@carla.command()
+def serve(
+    town: str = typer.Argument(help="A town's name or folder, or a map of --maps."),
+    port: int = typer.Option(2000, "--port", min=1, max=65534, help="Port of the calls; the next one is for streams."),
+    seed: int = typer.Option(0, "--seed", min=0, help="Seed of traffic, walkers and sensors."),
+    traffic: int = typer.Option(0, "--traffic", min=0, max=1000, help="Vehicles of SUMO that drive by themselves."),
+    maps: Path | None = typer.Option(None, "--maps", help="Folder with OpenDRIVE maps: NAME.xodr is served as NAME."),
+    host: str = typer.Option("127.0.0.1", "--host", help="Address to listen on; anyone who reaches it is served."),
+) -> None:
+    """Serve the clients of CARLA 0.9.16 until interrupted: their scripts run unchanged (docs/carla.md)."""
+    from flcav.sources.carla.server.calls import Calls
+    from flcav.sources.carla.server.maps import Maps
+    from flcav.sources.carla.server.serve import open_doors
+    from flcav.sources.carla.server.serve import serve as serve_calls
+    from flcav.sources.carla.server.wire import VERSION
+
+    logging.basicConfig(format="flcav: %(message)s", level=logging.WARNING)
+    if not _is_loopback(host):
+        typer.echo(f"flcav: {host} is open to the network, and CARLA's protocol asks nobody for a password", err=True)
+    doors = open_doors(host, port)
+    calls = Calls(Maps(maps), town, seed=seed, traffic=traffic, port=port)
+    calls.episode.warm_up()
+    name = calls.episode.served.name
+    serve_calls(calls, doors, lambda: typer.echo(f"{name}: ready for clients of CARLA {VERSION} at {host}:{port}"))
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

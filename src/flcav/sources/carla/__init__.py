@@ -1,0 +1,1 @@
+"""CARLA: our world for its clients."""

@@ -1,0 +1,80 @@
+"""The actors that clients know, beside the bodies of the live world."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.sensors.frame import SEMANTICS
+from flcav.sources.carla.server import wire
+from flcav.sources.carla.server.sensing.sight import Sensor
+from flcav.sources.carla.server.sensing.table import Clock
+from flcav.sources.carla.server.wire import BoundingBox, Transform
+
+Array = NDArray[np.float64]
+
+NOTHING = (0.0, 0.0, 0.0)
+STILL = (NOTHING, NOTHING, NOTHING)
+STANDING, WAITING = wire.VehicleControl(), wire.WalkerControl()
+
+
+@dataclass
+class Actor:
+    """An actor, as clients know it."""
+
+    id: int
+    description: wire.Description
+    transform: Transform
+    pose: Array  # (4, 4) world from actor: the ground under a vehicle's middle, a walker's middle
+    name: str = ""  # of its body in the live world; empty without one
+    category: str = ""  # of that body
+    size: tuple[float, float, float] = (0.0, 0.0, 0.0)  # length, width, height [m]
+    parent: int = 0
+    mount: Array | None = None  # (4, 4) parent from actor, of one that is attached
+    stream: int = 0  # of a sensor
+    sensor: Sensor | None = None
+    clock: Clock | None = None
+    light: int | None = None  # row of its approach, of a traffic light
+    box: BoundingBox | None = None  # of a traffic light
+    motion: Sequence[wire.Vector] = STILL  # CARLA's velocity, angular velocity, acceleration
+    control: wire.VehicleControl = STANDING
+    walk: wire.WalkerControl = WAITING
+    ackermann: wire.AckermannControl | None = None
+    lamps: int = 0  # flags of a vehicle's lamps
+    simulated: bool = True
+    falling: bool = True
+    constant: Array | None = None  # (3,) velocity that is kept up, in the body's frame [m/s]
+    events: list[bytes] = field(default_factory=list)
+
+    @property
+    def kind(self) -> str:
+        """The first part of its blueprint's name."""
+        return self.description.id.partition(".")[0]
+
+    @property
+    def lift(self) -> float:
+        """The height of its origin above its underside [m]: CARLA's walkers have theirs in the middle."""
+        return self.size[2] / 2 if self.category == "pedestrian" else 0.0
+
+    def bounding_box(self) -> BoundingBox:
+        """Return its box in its own frame."""
+        if self.box is not None:
+            return self.box._replace(actor_id=self.id)
+        length, width, height = self.size
+        middle = (0.0, 0.0, height / 2 - self.lift)
+        return BoundingBox(middle, (length / 2, width / 2, height / 2), actor_id=self.id)
+
+    def record(self, port: int) -> wire.Actor:
+        """Return it as clients get it; `port` is that of the streams."""
+        token = wire.pack_token(self.stream, port) if self.stream else b""
+        return wire.Actor(self.id, self.parent, self.description, self.bounding_box(), self.tags(), token)
+
+    def tags(self) -> bytes:
+        """Return CARLA's semantic tags."""
+        if self.light is not None:
+            return bytes([SEMANTICS["traffic_light"]])
+        if not self.category:
+            return b""
+        names = {"van": "car", "prop": "static"}
+        return bytes([SEMANTICS[names.get(self.category, self.category)]])

@@ -1,0 +1,27 @@
+"""Ackermann control: pedals and steering wheel that bring a vehicle to a steering angle and a speed."""
+
+from flcav.sources.carla.server.wire import AckermannControl, VehicleControl
+
+PULL_MPS2, BRAKE_MPS2 = 4.0, 8.0  # accelerations that full pedals give
+SETTLE_S = 0.5  # time in which a difference of speed is to be made up
+STOPPED_MPS = 0.05
+
+
+def steer_towards(
+    told: AckermannControl, now: VehicleControl, speed_mps: float, limit_rad: float, dt_s: float
+) -> VehicleControl:
+    """Return the control of a vehicle with the greatest steering angle `limit_rad` at `speed_mps`, for one step."""
+    steer = min(max(told.steer / limit_rad, -1.0), 1.0)
+    if told.steer_speed > 0:
+        most = told.steer_speed / limit_rad * dt_s
+        steer = min(max(steer, now.steer - most), now.steer + most)
+    wanted = (told.speed - speed_mps) / SETTLE_S
+    if told.acceleration > 0:
+        wanted = min(max(wanted, -told.acceleration), told.acceleration)
+    backwards = told.speed < 0
+    push = -wanted if backwards else wanted
+    if abs(told.speed) < STOPPED_MPS and abs(speed_mps) < STOPPED_MPS:
+        return VehicleControl(steer=steer, brake=1.0, hand_brake=True)
+    if push >= 0:
+        return VehicleControl(throttle=min(push / PULL_MPS2, 1.0), steer=steer, reverse=backwards)
+    return VehicleControl(steer=steer, brake=min(-push / BRAKE_MPS2, 1.0), reverse=backwards)

@@ -1,0 +1,470 @@
+"""An episode: one map with its live world and actors, from loading it until the next is loaded.
+
+Every tick the world makes a step; then all actors take their places, and the sensors measure.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.geometry import rotations
+from flcav.sources.carla.frames import MapFrame, from_mount, mirror, mirror_spin, to_rotation, to_vector
+from flcav.sources.carla.server import wire
+from flcav.sources.carla.server.actors import Actor
+from flcav.sources.carla.server.blueprints import Blueprint, Refused, check, list_blueprints
+from flcav.sources.carla.server.driving import steer_towards
+from flcav.sources.carla.server.lights import Lights, find_approaches
+from flcav.sources.carla.server.maps import ServedMap
+from flcav.sources.carla.server.recorder import Recorder
+from flcav.sources.carla.server.sensing.events import describe_thing, find_collisions, find_obstacle
+from flcav.sources.carla.server.sensing.sight import Sensor, Sight
+from flcav.sources.carla.server.sensing.table import KINDS, Clock
+from flcav.sources.carla.server.walking import Footpaths, Stroll
+from flcav.sources.carla.server.weather import to_weather
+from flcav.sources.carla.server.wire import Transform
+from flcav.world import commands
+from flcav.world.commands import Controls, Drive, Push, Remove, Simulate, Spawn, Walk
+from flcav.world.live import LiveWorld, Obstructed, Settings
+from flcav.world.scene import Scene
+from flcav.world.snapshot import Snapshot
+
+Array = NDArray[np.float64]
+
+TRAFFIC_OF = {  # category -> blueprint by which clients know SUMO's traffic
+    "car": "vehicle.seat.leon",
+    "van": "vehicle.mercedes.sprinter",
+    "truck": "vehicle.carlamotors.carlacola",
+    "bus": "vehicle.mitsubishi.fusorosa",
+    "motorcycle": "vehicle.yamaha.yzf",
+    "bicycle": "vehicle.gazelle.omafiets",
+    "pedestrian": "walker.pedestrian.0001",
+}
+PARKED = "parked"  # begins the names of parked vehicles, which are no actors to clients
+NOWHERE = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+class Measurement(NamedTuple):
+    """What a sensor sends at one tick."""
+
+    stream: int
+    header: bytes
+    body: bytes | Callable[[], bytes]  # or how it is measured
+    rays: bool = False  # it takes rays to measure
+    late: bool = False  # it takes so long that the client need not wait
+
+
+class Counters:
+    """The numbers of actors, streams, frames and episodes, which a server never uses twice."""
+
+    def __init__(self) -> None:
+        self.actor = self.episode = self.frame = self.stream = 0
+
+    def next_actor(self) -> int:
+        """Return a number for an actor."""
+        self.actor += 1
+        return self.actor
+
+    def next_stream(self) -> int:
+        """Return a number for a stream."""
+        self.stream += 1
+        return self.stream
+
+
+class Episode:
+    """One map, from loading it until the next is loaded."""
+
+    def __init__(self, served: ServedMap, counters: Counters, *, seed: int, traffic: int, port: int) -> None:
+        """Start the world of a map; `port` is that of the streams, which actors' tokens name."""
+        self.served, self.counters, self.seed, self.port = served, counters, seed, port
+        counters.episode += 1
+        self.id = counters.episode
+        self.stream = counters.next_stream()  # of the world's state
+        self.world = LiveWorld(served.town, Settings(seed=seed, traffic=traffic))
+        self.weather = wire.WeatherParameters(cloudiness=10.0, sun_azimuth_angle=160.0, sun_altitude_angle=45.0)
+        self.lights = Lights(find_approaches(served))
+        self.actors: dict[int, Actor] = {}
+        self.tick, self.time_s = 0, 0.0
+        self._begun_s = time.monotonic()
+        self._bodies: dict[str, Actor] = {}  # by name in the live world
+        self._strolls: dict[int, Stroll] = {}  # by the number of the walker
+        self._paths: Footpaths | None = None
+        self._scene: Scene | None = None  # of the sensors
+        self._survey: Scene | None = None  # of the calls
+        self.recorder = Recorder()
+        self._spawned = 0
+        self.spectator = self._add(wire.Description(0, "spectator", ()), np.eye(4))
+        centre = np.mean(np.reshape(served.town.bounds, (2, 2)), axis=0)
+        self.place(
+            self.spectator, Transform(to_vector(served.frame.to_location(np.append(centre, 60.0))), (-60.0, 0.0, 0.0))
+        )
+        for row, approach in enumerate(self.lights.approaches):
+            light = self._add(wire.Description(0, "traffic.traffic_light", ()), approach.pose)
+            light.light, light.box = row, approach.box()
+        self.lights.follow(self.world, 0.0)
+        self._follow(self.world.snapshot, 0.0)
+
+    def warm_up(self) -> None:
+        """Build the scene, and load the compiled code of vehicles and cameras, so that no client waits for it."""
+        with LiveWorld(self.served.town, Settings(parked=False)) as world:
+            world.apply(Spawn("car", "car", 0, *self.spectator.pose[:2, 3].tolist(), anywhere=True))
+            world.step({"car": Controls(throttle=1.0)})
+        told = {"image_size_x": "32", "image_size_y": "32", "fov": "90"}
+        self.look().photograph(Sensor("sensor.camera.rgb", told, 0, self.spectator.pose))
+
+    @property
+    def age_s(self) -> float:
+        """The time since the map was loaded [s], by the clock."""
+        return time.monotonic() - self._begun_s
+
+    def close(self) -> None:
+        """End the world, and write what is recorded."""
+        self.recorder.stop()
+        self.world.close()
+
+    # ---- actors
+
+    def find(self, number: int, *kinds: str) -> Actor:
+        """Return an actor; raises `Refused` where there is none of this number, or where it is of another kind."""
+        actor = self.actors.get(number)
+        if actor is None:
+            raise Refused(f"actor {number} not found")
+        if kinds and actor.kind not in kinds:
+            raise Refused(f"actor {number} is no {' or '.join(kinds)}, but a {actor.description.id}")
+        return actor
+
+    def spawn(self, description: wire.Description, transform: Transform, parent: int | None = None) -> Actor:
+        """Return a new actor, attached to a parent where one is given; raises `Refused` where that cannot be."""
+        blueprint, description = check(description)
+        carrier = self.find(parent) if parent else None
+        if carrier is not None:
+            pose = carrier.pose @ from_mount(*transform)
+        else:
+            pose = self.served.frame.from_transform(*transform)
+        if blueprint.category:
+            return self._spawn_body(blueprint, description, pose, parent or 0)
+        if blueprint.kind == "controller" and (carrier is None or carrier.kind != "walker"):
+            raise Refused(f"{description.id} needs a walker as its parent")
+        actor = self._add(description, pose)
+        if carrier is None:
+            actor.transform = transform
+        else:
+            actor.parent, actor.mount = carrier.id, from_mount(*transform)
+        if blueprint.kind == "sensor":
+            values = {each.id: each.value for each in description.attributes}
+            name = carrier.name if carrier is not None else ""
+            actor.sensor = Sensor(description.id, values, self._spawned, pose, name)
+            actor.clock = Clock(float(values.get("sensor_tick", 0.0)))
+            actor.stream = self.counters.next_stream()
+        elif carrier is not None:
+            self._paths = self._paths or Footpaths(self.served.net)
+            self._strolls[carrier.id] = Stroll(self._paths, carrier.pose[:2, 3], self.seed, self._spawned)
+        return actor
+
+    def _add(self, description: wire.Description, pose: Array) -> Actor:
+        self._spawned += 1
+        transform = Transform(*self.served.frame.to_transform(pose))
+        actor = Actor(self.counters.next_actor(), description, transform, pose)
+        self.actors[actor.id] = actor
+        return actor
+
+    def _spawn_body(self, blueprint: Blueprint, description: wire.Description, pose: Array, parent: int) -> Actor:
+        x, y, z = pose[:3, 3].tolist()
+        lift = blueprint.size[2] / 2 if blueprint.category == "pedestrian" else 0.0
+        name = f"c{self._spawned + 1}"
+        yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
+        command = Spawn(name, blueprint.category, blueprint.shape, x, y, yaw, z - lift, blueprint.size)
+        try:
+            self.world.apply(command)
+        except Obstructed:
+            raise Refused("Spawn failed because of collision at spawn position") from None
+        actor = self._add(description, pose)
+        actor.name, actor.category, actor.size = name, blueprint.category, blueprint.size
+        actor.parent = parent
+        self._bodies[name] = actor
+        snapshot = self.world.snapshot
+        row = snapshot.row(name)
+        _take_place(actor, _list_places(snapshot, self.served.frame, row + 1)[row])
+        return actor
+
+    def destroy(self, actor: Actor) -> None:
+        """Remove an actor; sensors that it carries stay where they are."""
+        if actor is self.spectator or actor.light is not None or (actor.name and not self.is_own(actor)):
+            raise Refused(f"actor {actor.id} is a {actor.description.id} of the town, which cannot be destroyed")
+        del self.actors[actor.id]
+        self._strolls.pop(actor.id, None)
+        if actor.kind == "controller":
+            self._strolls.pop(actor.parent, None)
+        if actor.name:
+            del self._bodies[actor.name]
+            self.world.apply(Remove(actor.name))
+        for child in self.actors.values():
+            if child.parent == actor.id:
+                child.parent, child.mount = 0, None
+
+    def is_own(self, actor: Actor) -> bool:
+        """Return whether a client spawned the actor's body."""
+        return actor.name.startswith("c")
+
+    def body(self, number: int, *kinds: str) -> Actor:
+        """Return an actor whose body clients move; raises `Refused` for others."""
+        actor = self.find(number, *kinds)
+        if not self.is_own(actor):
+            raise Refused(f"actor {number} is a {actor.description.id} that clients cannot move")
+        return actor
+
+    # ---- motion
+
+    def place(self, actor: Actor, transform: Transform) -> None:
+        """Move an actor to another pose."""
+        pose = self.served.frame.from_transform(*transform)
+        if actor.parent and actor.mount is not None:
+            actor.mount = from_mount(*transform)
+            actor.pose = self.actors[actor.parent].pose @ actor.mount
+            actor.transform = Transform(*self.served.frame.to_transform(actor.pose))
+        else:
+            actor.pose, actor.transform = pose, transform
+        if actor.sensor is not None:
+            actor.sensor.pose = actor.pose
+        if self.is_own(actor):
+            x, y, z = actor.pose[:3, 3].tolist()
+            pitch, yaw, roll = np.radians(transform.rotation).tolist()
+            self.world.apply(commands.Place(actor.name, x, y, -yaw, z - actor.lift, -pitch, roll))
+
+    def drive(self, actor: Actor, control: wire.VehicleControl) -> None:
+        """Set a vehicle's pedals and steering wheel."""
+        actor.control = control
+        self.world.apply(
+            Drive(
+                actor.name,
+                Controls(
+                    throttle=min(max(control.throttle, 0.0), 1.0),
+                    steer=-min(max(control.steer, -1.0), 1.0),
+                    brake=min(max(control.brake, 0.0), 1.0),
+                    hand_brake=control.hand_brake,
+                    reverse=control.reverse or (control.manual and control.gear < 0),
+                ),
+            )
+        )
+
+    def walk(self, actor: Actor, control: wire.WalkerControl) -> None:
+        """Set a walker's direction and speed."""
+        actor.walk = control
+        x, y, _ = mirror(np.array(control.direction)) * control.speed
+        self.world.apply(Walk(actor.name, (float(x), float(y))))
+        if control.speed > 0 and (x or y):
+            self._turn(actor, float(np.arctan2(y, x)))
+
+    def _turn(self, actor: Actor, yaw: float) -> None:
+        x, y, z = actor.pose[:3, 3].tolist()
+        self.world.apply(commands.Place(actor.name, x, y, yaw, z - actor.lift))
+
+    def push(self, actor: Actor, velocity: Array, yaw_rate: float | None = None) -> None:
+        """Give an actor another velocity (3,) [m/s] in the town's frame."""
+        x, y, z = velocity.tolist()
+        self.world.apply(Push(actor.name, (x, y, z), yaw_rate))
+
+    def simulate(self, actor: Actor, *, physics: bool | None = None, gravity: bool | None = None) -> None:
+        """Switch an actor's physics or its weight on or off."""
+        actor.simulated = actor.simulated if physics is None else physics
+        actor.falling = actor.falling if gravity is None else gravity
+        self.world.apply(Simulate(actor.name, actor.simulated, actor.falling))
+
+    # ---- ticks
+
+    def step(self, dt_s: float) -> None:
+        """Let the world go on by one tick of `dt_s`."""
+        self.world.history.clear()  # nobody forks this world
+        for number, stroll in self._strolls.items():
+            walker = self.actors[number]
+            x, y = stroll.choose_velocity(walker.pose[:2, 3])
+            direction = mirror(np.array((x, y, 0.0)))
+            speed = float(np.hypot(x, y))
+            self.walk(walker, wire.WalkerControl(tuple((direction / max(speed, 1e-6)).tolist()), speed))
+        for actor in self._bodies.values():
+            if actor.constant is not None:
+                self.push(actor, actor.pose[:3, :3] @ actor.constant)
+            if actor.ackermann is not None:
+                limit, _ = self.steering(actor)
+                self.drive(actor, steer_towards(actor.ackermann, actor.control, self.speed(actor), limit, dt_s))
+        snapshot = self.world.step(dt_s=dt_s)
+        self.tick += 1
+        self.counters.frame += 1
+        self.time_s += dt_s
+        self.lights.follow(self.world, dt_s)
+        self._follow(snapshot, dt_s)
+        self.recorder.add(snapshot)
+
+    def steering(self, actor: Actor) -> tuple[float, float]:
+        """Return the greatest steering angle [rad] and the wheelbase [m] of a vehicle."""
+        made = self.world.bodies.find(actor.name).blueprint
+        return made.steer_limit_rad, made.wheelbase_m
+
+    def speed(self, actor: Actor) -> float:
+        """Return the speed of an actor along its heading [m/s]."""
+        return float(mirror(np.array(actor.motion[0])) @ actor.pose[:3, 0])
+
+    def _follow(self, snapshot: Snapshot, dt_s: float) -> None:
+        """Take the places of all actors from the world."""
+        names = [name for name in snapshot.trace.actor.tolist() if not name.startswith(PARKED)]
+        places = _list_places(snapshot, self.served.frame, len(names))
+        for row, name in enumerate(names):
+            actor = self._bodies.get(name) or self._meet(snapshot, row)
+            _take_place(actor, places[row])
+        if len(self._bodies) > len(names):
+            for name in set(self._bodies) - set(names):
+                del self.actors[self._bodies.pop(name).id]
+        for actor in self.actors.values():
+            if actor.mount is not None and not actor.name:
+                carrier = self.actors[actor.parent]
+                actor.pose = carrier.pose @ actor.mount
+                actor.transform = Transform(*self.served.frame.to_transform(actor.pose))
+                actor.motion = carrier.motion
+                if actor.sensor is not None:
+                    velocity, spin, acceleration = (np.array(part) for part in carrier.motion)
+                    actor.sensor.pose, actor.sensor.velocity = actor.pose, mirror(velocity)
+                    actor.sensor.spin, actor.sensor.acceleration = mirror_spin(np.radians(spin)), mirror(acceleration)
+
+    def _meet(self, snapshot: Snapshot, row: int) -> Actor:
+        """Return the actor of one of SUMO's traffic, which has come into the town."""
+        category = str(snapshot.trace.category[row])
+        blueprint = list_blueprints()[TRAFFIC_OF[category]]
+        told = tuple(wire.Attribute(each.id, each.type, each.value) for each in blueprint.definition.attributes)
+        told = tuple(each._replace(value="traffic") if each.id == "role_name" else each for each in told)
+        actor = self._add(wire.Description(blueprint.definition.uid, blueprint.definition.id, told), np.eye(4))
+        actor.name, actor.category = str(snapshot.trace.actor[row]), category
+        length, width, height = snapshot.trace.size[row].tolist()
+        actor.size = (length, width, height)
+        self._bodies[actor.name] = actor
+        return actor
+
+    # ---- what is sent
+
+    def describe_world(self, dt_s: float) -> bytes:
+        """Return the payload of the world's state."""
+        header = wire.pack_header(wire.Stream.WORLD, self.counters.frame, self.time_s, NOWHERE)
+        vehicles = [actor for actor in self.actors.values() if actor.kind == "vehicle"]
+        limits, at = self._look_up(vehicles)
+        states = dict(zip((actor.id for actor in vehicles), zip(limits, at)))
+        rows = [
+            wire.pack_actor(actor.id, actor.transform, actor.motion, self._union(actor, states))
+            for actor in self.actors.values()
+        ]
+        return header + wire.pack_world(self.id, time.time(), dt_s, rows)
+
+    def _look_up(self, vehicles: list[Actor]) -> tuple[list[float], list[int]]:
+        """Return the speed limits [km/h], and the rows of the lights at which vehicles stand."""
+        if not vehicles:
+            return [], []
+        poses = np.array([actor.pose for actor in vehicles])
+        half = np.array([actor.size[0] / 2 for actor in vehicles])
+        fronts = poses[:, :2, 3] + half[:, None] * poses[:, :2, 0]
+        yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+        limits = self.served.speed_limits_kmh(poses[:, :2, 3])
+        return limits.tolist(), self.lights.find_at(fronts, yaw).tolist()
+
+    def _union(self, actor: Actor, states: dict[int, tuple[float, int]]) -> bytes:
+        if actor.kind == "vehicle":
+            limit, row = states[actor.id]
+            light = self.lights.state[row] if row >= 0 else 2
+            number = self.light_number(row) if row >= 0 else 0
+            gear = actor.control.gear or (-1 if actor.control.reverse else 1)
+            return wire.pack_vehicle(actor.control, gear, limit, light, row >= 0, number)
+        if actor.kind == "walker":
+            return wire.pack_walker(actor.walk)
+        if (row := actor.light) is not None:
+            green, yellow, red = self.lights.times_s[row]
+            sign, elapsed = self.lights.approaches[row].sign, self.lights.elapsed_s[row]
+            return wire.pack_light(sign, (green, yellow, red), elapsed, 0, self.lights.frozen, self.lights.state[row])
+        return b""
+
+    def light_number(self, row: int) -> int:
+        """Return the number of the actor of an approach; lights follow the spectator."""
+        return self.spectator.id + 1 + row
+
+    def measure(self, dt_s: float, is_heard: Callable[[int], bool]) -> Iterator[Measurement]:
+        """Yield what each sensor that is due and heard sends, in the order in which they were spawned."""
+        sight: Sight | None = None
+        collisions = find_collisions(self.world.snapshot.collisions, self._describe)
+        for actor in list(self.actors.values()):
+            if (sensor := actor.sensor) is None or actor.clock is None or not is_heard(actor.stream):
+                continue
+            kind = KINDS[sensor.type]
+            header = wire.pack_header(kind.stream, self.counters.frame, self.time_s, actor.transform)
+            if kind.stream == wire.Stream.COLLISION:
+                for body in collisions.get(sensor.carrier, []):
+                    yield Measurement(actor.stream, header, body)
+            if kind.measure is None and kind.stream != wire.Stream.OBSTACLE:
+                continue
+            if (elapsed := actor.clock.take(self.time_s, dt_s)) is None:
+                continue
+            sensor.elapsed_s = elapsed
+            sight = sight or self.look()
+            if kind.measure is not None:
+                yield Measurement(actor.stream, header, partial(kind.measure, sight, sensor), kind.rays, kind.late)
+            elif found := find_obstacle(sight, sensor, self._describe(sensor.carrier), self._describe):
+                yield Measurement(actor.stream, header, found)
+
+    def _describe(self, name: str) -> wire.Actor:
+        """Return the record of an actor, or of a thing of the town, such as "building:3", by its name in the world."""
+        if name in self._bodies:
+            return self._bodies[name].record(self.port)
+        return describe_thing("vehicle" if name.startswith(PARKED) else name.partition(":")[0])
+
+    def look(self) -> Sight:
+        """Return the town as sensors see it now."""
+        self._scene = self._follow_with(self._scene)
+        names = self.world.snapshot.trace.actor.tolist()
+        numbers = [self._bodies[name].id if name in self._bodies else 0 for name in names]
+        weather, frame = to_weather(self.weather), self.served.frame
+        return Sight(self._scene, weather, frame, self.seed, self.tick, np.array(numbers, np.uint32))
+
+    def survey(self) -> Scene:
+        """Return the town as calls see it now: a scene of its own, since sensors may be looking at theirs."""
+        self._survey = self._follow_with(self._survey)
+        return self._survey
+
+    def _follow_with(self, scene: Scene | None) -> Scene:
+        trace = self.world.snapshot.trace
+        if scene is None:
+            return Scene(self.served.town, trace)
+        scene.follow(trace)
+        return scene
+
+
+class Place(NamedTuple):
+    """Where an actor is, and how it moves."""
+
+    pose: Array  # (4, 4) world from body
+    location: wire.Vector
+    rotation: wire.Vector
+    motion: Sequence[wire.Vector]  # velocity, angular velocity, acceleration
+
+
+def _list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]:
+    """Return the places of the first `count` actors of a snapshot; the parked ones are its last."""
+    trace = snapshot.trace
+    tilt, yaw, position = trace.tilts(0)[:count], trace.yaw[0, :count], trace.position[0, :count]
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = rotations(yaw, *tilt.T)
+    poses[:, :3, 3] = position
+    spin = np.column_stack((np.zeros((count, 2)), trace.yaw_rate[0, :count]))
+    columns = (
+        frame.to_location(position),
+        to_rotation(np.column_stack((yaw, tilt))),
+        mirror(trace.velocity[0, :count]),
+        np.degrees(mirror_spin(spin)),
+        mirror(trace.acceleration[0, :count]),
+    )
+    rows = zip(*((map(tuple, column.tolist())) for column in columns))
+    return [Place(pose, location, rotation, motion) for pose, (location, rotation, *motion) in zip(poses, rows)]
+
+
+def _take_place(actor: Actor, place: Place) -> None:
+    x, y, z = place.location
+    actor.pose, actor.motion = place.pose, place.motion
+    actor.pose[2, 3] += actor.lift
+    actor.transform = Transform((x, y, z + actor.lift), place.rotation)

@@ -1,0 +1,177 @@
+"""Traffic lights as CARLA's actors: one for each approach to a light, with the volume in which it counts.
+
+A light that a client sets keeps its state for the time of that state, then its junction goes on with its program.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.geometry import heading_vectors, inverse, pose, wrap_angle
+from flcav.sources.carla.frames import mirror
+from flcav.sources.carla.server.maps import ServedMap
+from flcav.sources.carla.server.wire import BoundingBox
+from flcav.world.commands import SetLight
+from flcav.world.live import LiveWorld
+from flcav.world.map.roads import Edge
+from flcav.world.opendrive.exporting import TRAFFIC_LIGHT, list_approaches, name_signal
+from flcav.world.opendrive.reference_line import ReferenceLine
+
+Array = NDArray[np.float64]
+
+RED, YELLOW, GREEN, OFF, UNKNOWN = 0, 1, 2, 3, 4
+LETTERS_OF = {GREEN: "Gg", YELLOW: "yYu", RED: "rRs", OFF: "oO"}
+STATES = {letter: state for state, letters in LETTERS_OF.items() for letter in letters}
+TIMES_S = (10.0, 3.0, 2.0)  # CARLA's of green, yellow and red
+BEFORE_M, BEYOND_M = 8.0, 1.0  # a vehicle is at a light where its front is so near to the stop line
+ALIGNED_RAD = 1.0
+
+
+@dataclass(frozen=True)
+class Approach:
+    """An approach to a traffic light: the lanes of one edge."""
+
+    junction: str
+    link: str  # "junction:link" of the signal that stands for it
+    links: tuple[int, ...]  # all its links in the junction's letters
+    sign: str  # id of its signal in the map
+    pose: Array  # (4, 4) world from actor: its x axis points across the road
+    stop: Array  # (3,) middle of the stop line: x, y [m] and direction of driving [rad]
+    half_width: float  # of its lanes [m]
+
+    def box(self) -> BoundingBox:
+        """Return the volume before the stop line in which the light counts, in the frame of its actor."""
+        ahead = heading_vectors(self.stop[2])
+        middle = np.append(self.stop[:2] - 3.0 * ahead, self.pose[2, 3] + 1.0)
+        x, y, z = mirror((inverse(self.pose) @ np.append(middle, 1.0))[:3]).tolist()
+        return BoundingBox((x, y, z), (self.half_width, 2.5, 1.5))
+
+
+def find_approaches(served: ServedMap) -> list[Approach]:
+    """Return the approaches to all lights of a map, in the net's order."""
+    signs = _read_signs(served)
+    net, signals = served.net, served.town.signals
+    place = {link: row for row, link in reversed(list(enumerate(signals.link)))}
+    found = []
+    for name, link in list_approaches(net).items():
+        edge = net.edges[name]
+        x, y, heading, half_width = _find_stop(edge)
+        lanes = {lane.id for lane in edge.lanes}
+        ruled = {way.light for way in net.connections if way.light and way.start in lanes}
+        foot = signals.foot[place[link]] if link in place else (x, y)
+        sign = name_signal(link)
+        if signs:
+            near = signals.position[place[link], :2] if link in place else np.array((x, y))
+            sign = min(signs, key=lambda each: float(np.hypot(*(signs[each] - near))))
+        ground = served.town.ground(float(foot[0]), float(foot[1]))
+        found.append(
+            Approach(
+                junction=link.rpartition(":")[0],
+                link=link,
+                links=tuple(sorted(int(each.rpartition(":")[2]) for each in ruled)),
+                sign=sign,
+                pose=pose(float(foot[0]), float(foot[1]), ground, heading - np.pi / 2),
+                stop=np.array((x, y, heading)),
+                half_width=half_width,
+            )
+        )
+    return found
+
+
+def _find_stop(edge: Edge) -> tuple[float, float, float, float]:
+    """Return the middle of an edge's stop line x, y, the direction of driving, and half its width."""
+    lanes = edge.lanes_of("driving")
+    ends = np.array([lane.shape[-1] for lane in lanes])
+    ahead = lanes[0].shape[-1] - lanes[0].shape[-2]
+    x, y = ends.mean(axis=0)
+    return float(x), float(y), float(np.arctan2(ahead[1], ahead[0])), sum(lane.width for lane in lanes) / 2
+
+
+def _read_signs(served: ServedMap) -> dict[str, Array]:
+    """Return the places (2,) of the traffic lights of an imported map by their ids; none of a town of flcav."""
+    if served.town.parameters.source is None:
+        return {}
+    found: dict[str, Array] = {}
+    for road in ElementTree.fromstring(served.opendrive.encode("utf-8", "surrogateescape")).iterfind("road"):
+        rows = [row for row in road.iterfind("signals/signal") if row.get("type") == TRAFFIC_LIGHT]
+        if not rows:
+            continue
+        line = ReferenceLine(road)
+        for row in rows:
+            x, y, heading = line.at(np.array([float(row.get("s", "0"))]))[0]
+            left = float(row.get("t", "0")) * np.array((-np.sin(heading), np.cos(heading)))
+            found[row.get("id", "")] = np.array((x, y)) + left + served.frame.offset_m
+    return found
+
+
+@dataclass
+class Lights:
+    """The lights of a live world, as clients see and set them."""
+
+    approaches: list[Approach]
+    state: list[int] = field(default_factory=list)  # of each approach
+    elapsed_s: list[float] = field(default_factory=list)  # in that state
+    times_s: list[list[float]] = field(default_factory=list)  # of green, yellow and red
+    frozen: bool = False
+    _held: dict[str, dict[int, tuple[int, float]]] = field(default_factory=dict)  # junction -> row -> state, until [s]
+
+    def __post_init__(self) -> None:
+        self.state = [UNKNOWN] * len(self.approaches)
+        self.elapsed_s = [0.0] * len(self.approaches)
+        self.times_s = [list(TIMES_S) for _ in self.approaches]
+
+    def follow(self, world: LiveWorld, dt_s: float) -> None:
+        """Take the states of the world, after a step of `dt_s`; release what was set long enough."""
+        for junction in [name for name, rows in self._held.items() if not self.frozen and self._is_over(rows, world)]:
+            del self._held[junction]
+            world.apply(SetLight(junction, None))
+        letters = world.lights.states()
+        for row, approach in enumerate(self.approaches):
+            number = int(approach.link.rpartition(":")[2])
+            state = STATES.get(letters[approach.junction][number], UNKNOWN)
+            self.elapsed_s[row] = self.elapsed_s[row] + dt_s if state == self.state[row] else 0.0
+            self.state[row] = state
+
+    @staticmethod
+    def _is_over(rows: dict[int, tuple[int, float]], world: LiveWorld) -> bool:
+        return all(until <= world.snapshot.time_s for _, until in rows.values())
+
+    def set_state(self, world: LiveWorld, row: int, state: int) -> None:
+        """Set the state of an approach, for the time of that state."""
+        approach = self.approaches[row]
+        held = self._held.setdefault(approach.junction, {})
+        green, yellow, red = self.times_s[row]
+        held[row] = (state, world.snapshot.time_s + {GREEN: green, YELLOW: yellow}.get(state, red))
+        letters = list(world.lights.states()[approach.junction])
+        for other, (shown, _) in held.items():
+            for link in self.approaches[other].links:
+                letters[link] = LETTERS_OF.get(shown, "O")[0]
+        world.apply(SetLight(approach.junction, "".join(letters)))
+        self.state[row], self.elapsed_s[row] = state, 0.0
+
+    def release(self, world: LiveWorld, junction: str | None = None) -> None:
+        """Let a junction, or all, go on with its program."""
+        for name in [junction] if junction is not None else list(self._held):
+            if self._held.pop(name, None) is not None:
+                world.apply(SetLight(name, None))
+
+    def group(self, row: int) -> Iterator[int]:
+        """Yield the rows of the approaches to the same junction."""
+        junction = self.approaches[row].junction
+        return (other for other, approach in enumerate(self.approaches) if approach.junction == junction)
+
+    def find_at(self, fronts: Array, yaw: Array) -> NDArray[np.int64]:
+        """Return the approach at whose light each vehicle stands (N,), by its front (N, 2) and yaw (N,); -1: none."""
+        if not self.approaches or not len(fronts):
+            return np.full(len(fronts), -1)
+        stop = np.array([approach.stop for approach in self.approaches])
+        half = np.array([approach.half_width for approach in self.approaches])
+        off = fronts[:, None] - stop[None, :, :2]
+        cos, sin = np.cos(stop[:, 2]), np.sin(stop[:, 2])
+        along, across = off[..., 0] * cos + off[..., 1] * sin, off[..., 1] * cos - off[..., 0] * sin
+        at = (along > -BEFORE_M) & (along < BEYOND_M) & (np.abs(across) < half)
+        at &= np.abs(wrap_angle(yaw[:, None] - stop[:, 2])) < ALIGNED_RAD
+        return np.where(at.any(axis=1), at.argmax(axis=1), -1)

@@ -1,0 +1,137 @@
+"""The maps that are served: towns with the OpenDRIVE text that clients get, and where cars may be spawned."""
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from shapely.geometry import LineString
+
+from flcav.config import InputError, shorten
+from flcav.interface.wording import suggest
+from flcav.sources.carla.frames import MapFrame, to_rotation, to_vector
+from flcav.sources.carla.server.wire import Transform
+from flcav.world.map.roads import Lane, RoadNet, read_net
+from flcav.world.map.town import NAME, PACKAGED, Town, load_town
+from flcav.world.opendrive.exporting import export_town
+from flcav.world.opendrive.importing import import_town
+
+Array = NDArray[np.float64]
+
+SPAWN_EVERY_M, SPAWN_FROM_END_M = 20.0, 7.0  # between spawn points of a lane, and to its ends
+ABOVE_M = 0.3  # of spawn points above the road
+LANE_STEP_M = 2.0  # between the points at which lanes are looked up
+OPENDRIVE_MAP = "OpenDriveMap"  # CARLA's name of a map that a client sent
+OPTIMISED = "_Opt"  # ending of CARLA's names of layered maps
+
+
+@dataclass(frozen=True)
+class ServedMap:
+    """A town as clients see it."""
+
+    name: str
+    town: Town
+    opendrive: str  # the map's text
+    frame: MapFrame
+
+    @cached_property
+    def net(self) -> RoadNet:
+        """The town's road network."""
+        return read_net(self.town.net)
+
+    @cached_property
+    def spawn_points(self) -> list[Transform]:
+        """Poses on driving lanes."""
+        return [
+            Transform(to_vector(self.frame.to_location(point)), to_vector(to_rotation(np.array((yaw, 0.0, 0.0)))))
+            for lane in _driving_lanes(self.net)
+            for point, yaw in self._places(lane)
+        ]
+
+    def _places(self, lane: Lane) -> Iterator[tuple[Array, float]]:
+        line = LineString(lane.shape)
+        room = line.length - 2 * SPAWN_FROM_END_M
+        if room < 0:
+            return
+        for number in range(int(room // SPAWN_EVERY_M) + 1):
+            at = SPAWN_FROM_END_M + number * SPAWN_EVERY_M
+            (x, y), (u, v) = (np.array(line.interpolate(at + ahead).coords[0]) for ahead in (0.0, 0.5))
+            yield np.array((x, y, self.town.ground(x, y) + ABOVE_M)), float(np.arctan2(v - y, u - x))
+
+    @cached_property
+    def _limits(self) -> tuple[KDTree, Array]:
+        points, speeds = [], []
+        for edge in self.net.edges.values():
+            for lane in edge.lanes_of("driving"):
+                line = LineString(lane.shape)
+                steps = np.arange(0.0, line.length, LANE_STEP_M)
+                points += [line.interpolate(at).coords[0] for at in steps]
+                speeds += [lane.speed] * len(steps)
+        return KDTree(np.array(points)), np.array(speeds)
+
+    def speed_limits_kmh(self, points: Array) -> Array:
+        """Return the limit (N,) [km/h] of the lane nearest to each of `points` (N, >=2)."""
+        tree, speeds = self._limits
+        return 3.6 * speeds[tree.query(points[:, :2])[1]]
+
+
+def _driving_lanes(net: RoadNet) -> Iterator[Lane]:
+    return (lane for edge in net.streets for lane in edge.lanes_of("driving"))
+
+
+class Maps:
+    """The maps by name: towns of flcav, folders of towns, and OpenDRIVE files, which are imported when asked for."""
+
+    def __init__(self, files: Path | None = None) -> None:
+        """Take the maps of all .xodr files in the folder `files`; raises `InputError` where it has none."""
+        self._files: dict[str, Path] = {}
+        self._loaded: dict[str, ServedMap] = {}
+        if files is not None:
+            if not files.is_dir():
+                raise InputError(f"{files}: is no folder; --maps takes one with .xodr files")
+            self._files = {path.stem: path for path in sorted(files.glob("*.xodr")) if NAME.fullmatch(path.stem)}
+            if not self._files:
+                raise InputError(f"{files}: has no map (.xodr)")
+        self._scratch = tempfile.TemporaryDirectory(prefix="flcav-carla-")
+        self._sent = 0
+
+    def names(self) -> list[str]:
+        """Return the names of the maps that can be loaded."""
+        return [*self._files, *(name for name in PACKAGED if name not in self._files)]
+
+    def load(self, name: str) -> ServedMap:
+        """Return the map of a name, or of the folder of a town; raises `InputError` where there is none.
+
+        CARLA's name of a layered map, such as Town10HD_Opt, is that of the map without layers.
+        """
+        if name not in self._loaded:
+            self._loaded[name] = self._read(name)
+        return self._loaded[name]
+
+    def _read(self, name: str) -> ServedMap:
+        for known in (name, name.removesuffix(OPTIMISED)):
+            if known in self._files:
+                return self._import(name, self._files[known])
+        if name not in PACKAGED and not Path(name).is_dir():
+            known = self.names()
+            raise InputError(f"no map {shorten(name)}; maps here: {', '.join(known)}{suggest(name, known)}")
+        town = load_town(name)
+        return ServedMap(town.name, town, export_town(town), MapFrame())
+
+    def receive(self, text: str) -> None:
+        """Take the text of an OpenDRIVE map as `OPENDRIVE_MAP`; raises `InputError` where it cannot be driven."""
+        self._sent += 1
+        path = Path(self._scratch.name) / f"sent-{self._sent}.xodr"
+        path.write_text(text, encoding="utf-8", errors="surrogateescape")
+        self._loaded[OPENDRIVE_MAP] = self._import(OPENDRIVE_MAP, path)
+
+    def _import(self, name: str, path: Path) -> ServedMap:
+        town = import_town(path, Path(self._scratch.name) / f"{path.stem}-{len(self._loaded)}-{self._sent}").town
+        source = town.parameters.source
+        offset = (0.0, 0.0) if source is None else source.offset_m
+        text = path.read_text(encoding="utf-8", errors="surrogateescape")
+        return ServedMap(name, town, text, MapFrame(offset))

@@ -1,0 +1,102 @@
+"""Export of a town's roads as an OpenDRIVE map, in the town's coordinates.
+
+netconvert writes the plan; what it leaves out or writes in its own way is put right here: the geo-reference, heights,
+and traffic lights, of which each approach gets one signal of CARLA's type, named "junction_link".
+"""
+
+import shutil
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+
+from flcav.world.map.parameters import GeoReference
+from flcav.world.map.roads import RoadNet, read_net
+from flcav.world.map.town import Town
+from flcav.world.opendrive.netconvert import run_netconvert
+from flcav.world.opendrive.reference_line import ReferenceLine
+
+TRAFFIC_LIGHT = "1000001"  # type of a signal with three lenses (ASAM OpenDRIVE signal catalogue)
+HEIGHT_STEP_M = 2.0  # between two heights along a road
+
+
+def export_town(town: Town) -> str:
+    """Return the OpenDRIVE map of a town as XML text; the same town gives the same text.
+
+    Raises `InputError` where netconvert is missing or refuses the net.
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        shutil.copyfile(town.net, folder / "town.net.xml")
+        options = {"sumo-net-file": "town.net.xml", "opendrive-output": "town.xodr"}
+        run_netconvert(options, folder, town.net)
+        root = ElementTree.parse(folder / "town.xodr").getroot()
+    header = root.find("header")
+    assert header is not None, "netconvert writes a header"
+    header.attrib["date"], header.attrib["name"] = "", town.name
+    ElementTree.SubElement(header, "geoReference").text = _format_projection(town.geo)
+    _keep_signals(root, {name_signal(link) for link in list_approaches(read_net(town.net)).values()})
+    if town.relief is not None:
+        for road in root.iterfind("road"):
+            _raise_road(road, town)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
+
+
+def list_approaches(net: RoadNet) -> dict[str, str]:
+    """Return the edges that lead to a traffic light, with the link "junction:link" that stands for each.
+
+    It is that of the way straight on, where there is one.
+    """
+    found: dict[str, str] = {}
+    for edge in net.streets:
+        lanes = {lane.id for lane in edge.lanes_of("driving")}
+        ruled = [way for way in net.connections if way.light and way.start in lanes]
+        if ruled:
+            found[edge.id] = min(ruled, key=lambda way: way.turn != "s").light
+    return found
+
+
+def name_signal(link: str) -> str:
+    """Return the id of the signal of a link "junction:link" in the map."""
+    junction, _, number = link.rpartition(":")
+    return f"{junction}_{number}"
+
+
+def _format_projection(geo: GeoReference) -> str:
+    return (
+        f"+proj=tmerc +lat_0={geo.latitude_deg:.10g} +lon_0={geo.longitude_deg:.10g} +k=1 +x_0=0 +y_0=0 "
+        "+datum=WGS84 +units=m +no_defs"
+    )
+
+
+def _keep_signals(root: ElementTree.Element, kept: set[str]) -> None:
+    """Remove all signals but those named, which become traffic lights, and the empty controllers."""
+    for signals in root.iter("signals"):
+        for signal in list(signals):
+            if signal.get("id") in kept:
+                signal.set("type", TRAFFIC_LIGHT)
+                signal.set("subtype", "-1")
+            else:
+                signals.remove(signal)
+    for controller in root.findall("controller"):
+        for control in list(controller):
+            if control.get("signalId") not in kept:
+                controller.remove(control)
+        if not len(controller):
+            root.remove(controller)
+
+
+def _raise_road(road: ElementTree.Element, town: Town) -> None:
+    """Write the heights of the ground under a road's reference line as its elevation profile."""
+    line = ReferenceLine(road)
+    s = np.linspace(0.0, line.length, max(2, int(np.ceil(line.length / HEIGHT_STEP_M)) + 1))
+    x, y, _ = line.at(s).T
+    z = town.grounds(x, y)
+    slope = np.append(np.diff(z) / np.maximum(np.diff(s), 1e-9), 0.0)
+    profile = road.find("elevationProfile")
+    assert profile is not None, "netconvert writes a profile for each road"
+    profile.clear()
+    for at, height, rise in zip(s[:-1].tolist(), z.tolist(), slope.tolist()):
+        row = {"s": f"{at:.3f}", "a": f"{height:.4f}", "b": f"{rise:.6f}", "c": "0", "d": "0"}
+        ElementTree.SubElement(profile, "elevation", row)

@@ -1,0 +1,131 @@
+"""CARLA's own smoke tests and examples, and scripts of others, against `flcav carla serve`: `make test-carla`.
+
+They are in the folder that FLCAV_REAL_DATA names, `carla_pythonapi` and `carla_scripts`, with maps in `carla_maps`.
+They run unchanged in an environment of their own, out/carla, built once; windows are on a dummy display. A script that
+runs for ever is interrupted after a while, and has then printed no traceback but that of the interruption.
+"""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+ROOM = HERE.parents[1] / "out" / "carla"
+DATA = Path(os.environ.get("FLCAV_REAL_DATA", "missing"))
+API, OTHERS, MAPS = DATA / "carla_pythonapi", DATA / "carla_scripts", DATA / "carla_maps"
+PACKAGES = ("carla==0.9.16", "pygame", "numpy==1.23.5", "matplotlib==3.8.4", "pandas<2.1", "plyfile<1.1")
+TOOLS = ("networkx", "shapely", "pytest")
+ENDLESS_S = 25
+# script -> arguments, and how long it runs: None to its own end
+SCRIPTS: dict[str, tuple[tuple[str, ...], int | None]] = {
+    "tutorial.py": ((), None),
+    "start_recording.py": (("-n", "5", "-t", "5"), None),
+    "lidar_to_camera.py": (("--frames", "5"), None),
+    "synchronous_mode.py": ((), ENDLESS_S),
+    "sensor_synchronization.py": ((), ENDLESS_S),
+    "dynamic_weather.py": ((), ENDLESS_S),
+    "vehicle_gallery.py": ((), ENDLESS_S),
+    "generate_traffic.py": (("-n", "20", "-w", "10"), ENDLESS_S),
+    "no_rendering_mode.py": ((), ENDLESS_S),
+    "client_bounding_boxes.py": ((), ENDLESS_S),
+    "automatic_control.py": (("--sync", "--res", "320x240"), ENDLESS_S),
+}
+INTERRUPTED = ("KeyboardInterrupt", "Cancelled by user", "Exited by user", "destroying", "done.", "EXIT")
+pytestmark = pytest.mark.skipif(not API.is_dir(), reason="needs FLCAV_REAL_DATA with carla_pythonapi")
+
+
+@pytest.fixture(scope="session")
+def python() -> Path:
+    """The interpreter of the scripts' environment."""
+    path = ROOM / "bin" / "python"
+    if not (ROOM / "ready").exists():
+        venv.create(ROOM, with_pip=True, clear=True)
+        subprocess.run([path, "-m", "pip", "install", "--quiet", *PACKAGES, *TOOLS], check=True)
+        (ROOM / "ready").touch()
+    return path
+
+
+def serve(port: int, folder: Path):
+    """Yield while a server of Town10HD_Opt is up at a port; Town02 is there as Town03 too, which smoke tests load."""
+    maps = folder / "maps"
+    maps.mkdir()
+    for name, source in {"Town10HD": "Town10HD", "Town02": "Town02", "Town03": "Town02"}.items():
+        shutil.copyfile(MAPS / f"{source}.xodr", maps / f"{name}.xodr")
+    command = [sys.executable, "-m", "flcav", "carla", "serve", "Town10HD_Opt", "--maps", str(maps)]
+    command += ["--port", str(port)]
+    with (folder / "log").open("w") as log:
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=folder)
+        assert server.stdout is not None
+        assert "ready" in server.stdout.readline(), (folder / "log").read_text()
+        yield
+        assert server.poll() is None
+        server.terminate()
+        server.wait()
+    assert "Traceback" not in (folder / "log").read_text()
+
+
+def is_free(port: int) -> bool:
+    with socket.socket() as door:
+        return door.connect_ex(("127.0.0.1", port)) != 0
+
+
+@pytest.fixture(scope="module")
+def usual_port(tmp_path_factory):
+    if not is_free(2000):
+        pytest.skip("port 2000, which the scripts ask, is in use")
+    yield from serve(2000, tmp_path_factory.mktemp("scripts"))
+
+
+@pytest.fixture(scope="module")
+def smoke_port(tmp_path_factory):
+    if not is_free(3654):
+        pytest.skip("port 3654, which the smoke tests ask, is in use")
+    yield from serve(3654, tmp_path_factory.mktemp("smoke"))
+
+
+def run_script(python: Path, script: Path, arguments: tuple[str, ...], for_s: int | None, folder: Path) -> str:
+    """Return what a script prints, to its end or until it is interrupted."""
+    settings = os.environ | {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy", "PYTHONUNBUFFERED": "1"}
+    settings |= {"PYTHONPATH": f"{API / 'carla'}{os.pathsep}{HERE / 'stand_ins'}", "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [str(python), str(script), *arguments]
+    process = subprocess.Popen(
+        command, cwd=folder, env=settings, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        told, _ = process.communicate(timeout=for_s or 300)
+        assert process.returncode == 0, told[-3000:]
+    except subprocess.TimeoutExpired:
+        assert for_s, "it did not come to its end"
+        process.send_signal(signal.SIGINT)
+        told, _ = process.communicate(timeout=60)
+        assert any(word in told for word in INTERRUPTED), told[-3000:]
+    assert "RuntimeError" not in told, told[-3000:]
+    return told
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_examples(script, python, usual_port, tmp_path):
+    run_script(python, API / "examples" / script, *SCRIPTS[script], tmp_path)
+
+
+@pytest.mark.skipif(not OTHERS.is_dir(), reason="needs FLCAV_REAL_DATA with carla_scripts")
+def test_two_semantic_lidars_at_a_junction(python, usual_port, tmp_path):
+    """The script's module `CoordConvertor` is not published with it, and open3d draws nothing: both are stand-ins."""
+    told = run_script(python, OTHERS / "generate_multi_lidar_junc1.py", (), ENDLESS_S, tmp_path)
+    assert "FPS" in told
+    assert list(tmp_path.rglob("*.ply"))
+
+
+def test_smoke_tests(python, smoke_port):
+    command = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", "smoke"]
+    settings = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(command, cwd=API / "test", env=settings, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stdout[-5000:]
+    assert "14 passed" in done.stdout

@@ -1,0 +1,101 @@
+"""`flcav carla serve` under the genuine client of CARLA 0.9.16, and under messages that no client sends."""
+
+import os
+import random
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import msgpack
+import pytest
+
+from flcav.cli.main import run
+from flcav.sources.carla.server import wire
+
+SESSION = Path(__file__).with_name("carla_session.py")
+SESSIONS = ("the_world", "actors", "sensors", "events", "traffic", "loading")  # the last one loads other maps
+
+
+def _find_port() -> int:
+    """Return a free port whose next one is free too."""
+    while True:
+        with socket.socket() as one, socket.socket() as other:
+            one.bind(("127.0.0.1", 0))
+            port = one.getsockname()[1]
+            try:
+                other.bind(("127.0.0.1", port + 1))
+            except OSError:
+                continue
+            return port
+
+
+@pytest.fixture(scope="module")
+def port(tmp_path_factory):
+    port = _find_port()
+    command = [sys.executable, "-m", "flcav", "carla", "serve", "suburb", "--port", str(port)]
+    log = tmp_path_factory.mktemp("carla") / "log"
+    with log.open("w") as errors:
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, cwd=log.parent)
+        assert server.stdout is not None
+        assert server.stdout.readline() == f"suburb: ready for clients of CARLA 0.9.16 at 127.0.0.1:{port}\n"
+        yield port
+        assert server.poll() is None, log.read_text()
+        server.terminate()
+        server.wait()
+    assert "Traceback" not in log.read_text()
+
+
+@pytest.mark.parametrize("session", SESSIONS)
+def test_the_genuine_client(session, port):
+    pytest.importorskip("carla", reason="needs the extra 'carla'")
+    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+    done = subprocess.run(
+        [sys.executable, str(SESSION), session, str(port)], capture_output=True, text=True, timeout=300, env=environment
+    )
+    assert done.stdout.endswith("passed\n"), done.stdout + done.stderr
+
+
+def _ask(port: int, message: bytes) -> bytes:
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as link:
+        link.sendall(message)
+        link.shutdown(socket.SHUT_WR)
+        answer = b""
+        while data := link.recv(1 << 16):
+            answer += data
+        return answer
+
+
+def test_messages_that_no_client_sends_leave_the_server_up(port):
+    rng = random.Random(0)
+    version = wire.pack([0, 1, "version", [[False]]])
+    for _ in range(200):
+        mutated = bytearray(version)
+        mutated[rng.randrange(len(mutated))] = rng.randrange(256)
+        _ask(port, bytes(mutated) + rng.randbytes(rng.randrange(20)))
+        _ask(port + 1, rng.randbytes(rng.randrange(8)))
+    assert msgpack.unpackb(_ask(port, version)) == [1, 1, None, [[1, "0.9.16"]]]
+
+
+def test_a_port_in_use_is_one_sentence(port, capsys):
+    with pytest.raises(SystemExit) as left:
+        run(["carla", "serve", "suburb", "--port", str(port)])
+    assert left.value.code == 2
+    told = capsys.readouterr().err
+    assert f"port {port} of 127.0.0.1: address already in use" in told
+    assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["atlantis"], "no map 'atlantis'; maps here: suburb"),
+        (["suburb", "--maps", "nowhere"], "nowhere: is no folder"),
+        (["suburb", "--port", "70000"], "70000"),
+    ],
+)
+def test_bad_input_is_one_sentence(arguments, told, capsys):
+    with pytest.raises(SystemExit) as left:
+        run(["carla", "serve", "--port", str(_find_port()), *arguments])
+    assert left.value.code == 2
+    assert told in capsys.readouterr().err

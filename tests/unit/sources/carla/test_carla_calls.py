@@ -1,0 +1,175 @@
+"""Calls without a network: what is refused, in which words, and the same images from the same seed."""
+
+import numpy as np
+import pytest
+
+from flcav.config import InputError
+from flcav.sources.carla.server import catalogue, wire
+from flcav.sources.carla.server.blueprints import Refused, check, list_blueprints
+from flcav.sources.carla.server.calls import Calls, invoke
+from flcav.sources.carla.server.maps import Maps
+from flcav.sources.carla.server.sensing.table import KINDS, Clock
+from flcav.sources.carla.server.weather import to_weather
+from flcav.world.shapes import SHAPES
+
+CAMERA = (("image_size_x", "64"), ("image_size_y", "48"))
+
+
+@pytest.fixture(scope="module")
+def maps():
+    return Maps()
+
+
+@pytest.fixture
+def calls(maps):
+    made = Calls(maps, "suburb", seed=3, traffic=0, port=2000)
+    yield made
+    made.episode.close()
+
+
+def describe(name, *attributes):
+    known = list_blueprints()[name].definition
+    return [known.uid, name, [[key, 4, value] for key, value in attributes]]
+
+
+def place(calls, number=0, ahead=0.0):
+    location, rotation = calls.episode.served.spawn_points[number]
+    return [[location[0] + ahead, *location[1:]], list(rotation)]
+
+
+def test_all_blueprints_of_sensors_are_served_or_refused_by_name(calls):
+    for name in (*catalogue.SENSORS, *catalogue.NOT_SERVED):
+        spawn = (describe(name), [[0.0, 0.0, 10.0], [0.0, 0.0, 0.0]])
+        if name in KINDS:
+            assert invoke(calls, "spawn_actor", spawn).token
+        else:
+            with pytest.raises(Refused, match=f"{name} is not served"):
+                invoke(calls, "spawn_actor", spawn)
+
+
+def test_bodies_of_blueprints_are_shapes_of_the_town():
+    for blueprint in list_blueprints().values():
+        if blueprint.category in SHAPES:
+            assert 0 <= blueprint.shape < len(SHAPES[blueprint.category])
+            assert min(blueprint.size) > 0.3
+
+
+def test_two_wheelers_are_as_wide_as_their_riders():
+    widths = [each.size[1] for each in list_blueprints().values() if each.category in ("bicycle", "motorcycle")]
+    assert min(widths) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "attribute", "told"),
+    [
+        ("sensor.camera.rgb", ("image_size_x", "0"), "'image_size_x' = 0 is not within 16 and 4096"),
+        ("sensor.camera.rgb", ("fov", "wide"), "'fov' = 'wide' is no number"),
+        ("sensor.lidar.ray_cast", ("channels", "1e3"), "'channels' = 1e3 is not within 1 and 512"),
+        ("sensor.lidar.ray_cast", ("range", "nan"), "'range' = nan is not within"),
+        ("sensor.other.obstacle", ("only_dynamics", "maybe"), "neither true nor false"),
+    ],
+)
+def test_attributes_out_of_range_are_refused(name, attribute, told):
+    with pytest.raises(Refused, match=told):
+        check(wire.read(wire.Description, describe(name, attribute)))
+
+
+def test_unknown_blueprints_are_refused_with_a_suggestion():
+    with pytest.raises(Refused, match=r"did you mean 'vehicle\.tesla\.model3'"):
+        check(wire.Description(1, "vehicle.tesla.modl3", ()))
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "told"),
+    [
+        ("fly", (), "'fly' is not served here"),
+        ("__init__", (), "is not served here"),
+        ("dt_s", (), "is not served here"),
+        ("destroy_actor", (99,), "actor 99 not found"),
+        ("destroy_actor", (1,), "spectator of the town"),
+        ("apply_control_to_vehicle", (1, [0.0, 0.0, 0.0, False, False, False, 0]), "actor 1 is no vehicle"),
+        ("set_traffic_light_state", (1, 2), "actor 1 is no traffic light"),
+        ("load_new_episode", ("atlantis", True, 0), "no map 'atlantis'; maps here: suburb"),
+        ("load_new_episode", ("../../etc", True, 0), "no map 'etc'"),
+        ("copy_opendrive_to_file", ("<x/>", []), "cannot be driven"),
+        ("set_episode_settings", ([False, False, [True, 19.0], True, 0.01, 10, 0.0, True, 1.0, 1.0, True],), "within"),
+    ],
+)
+def test_refusals(calls, method, arguments, told):
+    with pytest.raises((Refused, InputError), match=told):
+        invoke(calls, method, arguments)
+
+
+def test_wrong_arguments_name_the_version_that_is_served(calls):
+    with pytest.raises(wire.WireError, match=r"destroy_actor: 2 arguments where 1 belong; clients of CARLA 0\.9\.16"):
+        invoke(calls, "destroy_actor", (1, 2))
+    with pytest.raises(wire.WireError, match=r"0\.9\.16"):
+        invoke(calls, "set_episode_settings", ([False, False, [False]],))
+
+
+def test_a_batch_answers_every_command(calls):
+    car = describe("vehicle.audi.tt")
+    spawn = [[0, [car, place(calls), [False], 0, "", []]]]
+    control = [[2, [0, [1.0, 0.0, 0.0, False, False, False, 0]]]]
+    spawned, again, unknown, nothing = invoke(
+        calls, "apply_batch", ([[[0, [*spawn[0][1][:5], [control]]]], spawn, [[1, [999]]], [[77, [1]]]], False)
+    )
+    number = spawned[0][1]
+    assert calls.episode.actors[number].control.throttle == 1.0
+    assert again == wire.fail("Spawn failed because of collision at spawn position")
+    assert unknown == wire.fail("actor 999 not found")
+    assert nothing[0][0] == 0
+
+
+def test_a_car_drives_and_is_where_it_was_put(calls):
+    put = place(calls)
+    car = invoke(calls, "spawn_actor", (describe("vehicle.tesla.model3"), put))
+    calls.episode.step(0.05)
+    at = calls.episode.actors[car.id].transform
+    assert np.allclose(at.location[:2], put[0][:2], atol=1e-6)
+    assert np.allclose(at.rotation, put[1], atol=1e-6)
+    invoke(calls, "apply_control_to_vehicle", (car.id, [1.0, 0.0, 0.0, False, False, False, 0]))
+    for _ in range(40):
+        calls.episode.step(0.05)
+    assert calls.episode.speed(calls.episode.actors[car.id]) > 3.0
+
+
+def look(maps, seed):
+    """Return what all sensors on a car send in two ticks, of a new episode."""
+    calls = Calls(maps, "suburb", seed=seed, traffic=0, port=2000)
+    car = invoke(calls, "spawn_actor", (describe("vehicle.tesla.model3"), place(calls)))
+    noisy = (("noise_lat_stddev", "1e-6"), ("noise_accel_stddev_x", "0.1"))
+    for name in KINDS:
+        told = describe(name, *CAMERA, *noisy)
+        invoke(calls, "spawn_actor_with_parent", (told, [[0.0, 0.0, 2.4], [0.0, 0.0, 0.0]], car.id, 0))
+    sent = []
+    for _ in range(2):
+        calls.episode.step(0.05)
+        for each in calls.episode.measure(0.05, lambda stream: True):
+            sent.append((each.stream, each.header, each.body if isinstance(each.body, bytes) else each.body()))
+    calls.episode.close()
+    return sent
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_one_others(maps):
+    first, second, other = (look(maps, seed) for seed in (1, 1, 2))
+    assert len(first) == 2 * 9
+    assert first == second
+    assert first != other
+
+
+@pytest.mark.parametrize(("tick_s", "due"), [(0.0, [1, 2, 3, 4, 5, 6]), (0.1, [1, 3, 5]), (0.15, [1, 4])])
+def test_sensors_are_due_every_sensor_tick(tick_s, due):
+    clock = Clock(tick_s)
+    taken = {tick: clock.take(tick * 0.05, 0.05) for tick in range(1, 7)}
+    assert [tick for tick, elapsed in taken.items() if elapsed is not None] == due
+    assert taken[due[-1]] == pytest.approx(max(tick_s, 0.05))
+
+
+def test_weather_is_clear_at_zero_and_thick_at_a_hundred():
+    clear = to_weather(wire.WeatherParameters(sun_altitude_angle=45.0))
+    thick = to_weather(wire.WeatherParameters(100.0, 100.0, fog_density=100.0, wetness=100.0))
+    assert (clear.rain_mm_h, clear.cloud_cover, clear.fog_per_m) == (0.0, 0.0, 0.0)
+    assert thick.rain_mm_h > 50
+    assert thick.visibility_m < 60
+    assert to_weather(wire.WeatherParameters(-5.0, 1e6, fog_density=1e6)).visibility_m == 5.0
