@@ -268,7 +268,9 @@ class Episode:
         self.world.apply(Push(actor.name, (x, y, z), yaw_rate))
 
     def simulate(self, actor: Actor, *, physics: bool | None = None, gravity: bool | None = None) -> None:
-        """Switch an actor's physics or its weight on or off."""
+        """Switch an actor's physics or weight on or off; a walker that strolls keeps its own, whatever its AI asks."""
+        if actor.id in self._strolls:
+            return
         actor.simulated = actor.simulated if physics is None else physics
         actor.falling = actor.falling if gravity is None else gravity
         self.world.apply(Simulate(actor.name, actor.simulated, actor.falling))
