@@ -37,7 +37,7 @@ SCRIPTS: dict[str, tuple[tuple[str, ...], int | None]] = {
     "client_bounding_boxes.py": ((), ENDLESS_S),
     "automatic_control.py": (("--sync", "--res", "320x240"), ENDLESS_S),
 }
-INTERRUPTED = ("KeyboardInterrupt", "Cancelled by user", "Exited by user", "destroying", "done.", "EXIT")
+INTERRUPTED = ("KeyboardInterrupt", "Cancelled by user", "Exited by user", "destroying", "done.", "Done", "EXIT")
 pytestmark = pytest.mark.skipif(not API.is_dir(), reason="needs FLCAV_REAL_DATA with carla_pythonapi")
 
 

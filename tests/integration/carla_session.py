@@ -108,6 +108,13 @@ def actors(client: Any) -> None:
         for _ in range(5):
             world.tick()
         assert abs(walker.get_velocity().y - 1.4) < 0.1
+        mind = world.spawn_actor(library.find("controller.ai.walker"), carla.Transform(), attach_to=walker)
+        world.tick()
+        mind.start()
+        begun = walker.get_location()
+        for _ in range(40):
+            world.tick()
+        assert walker.get_location().distance(begun) > 2.0
         command = carla.command
         spawn = command.SpawnActor(library.find("vehicle.mini.cooper_s"), points[9])
         first, second, third = client.apply_batch_sync([spawn, spawn, command.DestroyActor(99999)], True)

@@ -83,7 +83,7 @@ class Episode:
         counters.episode += 1
         self.id = counters.episode
         self.stream = counters.next_stream()  # of the world's state
-        self.world = LiveWorld(served.town, Settings(seed=seed, traffic=traffic))
+        self.world = LiveWorld(served.town, Settings(seed=seed, traffic=traffic, remembers=False))
         self.weather = wire.WeatherParameters(cloudiness=10.0, sun_azimuth_angle=160.0, sun_altitude_angle=45.0)
         self.lights = Lights(find_approaches(served))
         self.actors: dict[int, Actor] = {}
@@ -268,7 +268,9 @@ class Episode:
         self.world.apply(Push(actor.name, (x, y, z), yaw_rate))
 
     def simulate(self, actor: Actor, *, physics: bool | None = None, gravity: bool | None = None) -> None:
-        """Switch an actor's physics or its weight on or off."""
+        """Switch an actor's physics or weight on or off; a walker that strolls keeps its own, whatever its AI asks."""
+        if actor.id in self._strolls:
+            return
         actor.simulated = actor.simulated if physics is None else physics
         actor.falling = actor.falling if gravity is None else gravity
         self.world.apply(Simulate(actor.name, actor.simulated, actor.falling))
@@ -277,7 +279,6 @@ class Episode:
 
     def step(self, dt_s: float) -> None:
         """Let the world go on by one tick of `dt_s`."""
-        self.world.history.clear()  # nobody forks this world
         for number, stroll in self._strolls.items():
             walker = self.actors[number]
             x, y = stroll.choose_velocity(walker.pose[:2, 3])
