@@ -1,0 +1,340 @@
+"""Inertial navigation of a car aided by satellites: an error-state Kalman filter over a drive, smoothed backwards.
+
+The nominal state (position and velocity of the IMU, attitude of the vehicle, biases) is integrated from the IMU's
+samples by the midpoint rule; the error state has 18 components: position and velocity in the world, attitude in the
+vehicle's axes, biases of specific force and angular rate, and the GNSS receiver's bias (Solà, "Quaternion kinematics
+for the error-state Kalman filter", 2017, eq. 235-238 and 260-270). Measurements, `RATE_HZ` times a second:
+
+- a fix: where the antenna is, and the receiver's bias, a first-order Gauss-Markov process. Of position and bias only
+  the sum is seen: what is left of the bias is in the covariance, and nearly the same in frames soon after one another;
+- a car neither slips aside nor leaves the road: across and upwards the velocity of its origin is 0 (Dissanayake et al.,
+  "The aiding of a low-cost strapdown inertial measurement unit using vehicle model constraints for land vehicle
+  applications", IEEE T-RA 17(5), 2001). In SUMO it is a car's middle that moves along its heading, as of a real car
+  its rear axle does;
+- at rest velocity and angular rate are 0 (Groves, "Principles of GNSS, inertial, and multisensor integrated navigation
+  systems", 2nd ed. 2013, 15.3): where the IMU is quiet and the filter's speed small;
+- the map: the car stands on its ground, whose height is known but on and below bridges.
+
+Labels are made after the drive, so a pose may use what was measured after it: Rauch, Tung and Striebel, "Maximum
+likelihood estimates of linear dynamic systems", AIAA Journal 3(8), 1965. The Earth is flat and does not turn.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.geometry import rotations_about_z
+from flcav.machine.compiled import compiled
+from flcav.sensors.navigation import GRAVITY
+from flcav.sensors.navigation_log import GNSS_HZ, NavigationLog
+from flcav.world.geodesy import convert_to_map
+from flcav.world.map.parameters import GeoReference
+
+Array = NDArray[np.float64]
+
+STATES = 18  # position, velocity, attitude, biases of force and rate, bias of the receiver: 3 each
+ACROSS_MPS, UP_MPS = 0.2, 0.1  # standard deviations of a car's velocity across and upwards, its own axes
+REST_MPS, REST_RADPS = 0.02, 0.001  # standard deviations of velocity and angular rate at rest
+SLOW_MPS, QUIET_S, QUIET = 0.3, 0.5, 2.0  # at rest: slower, and the IMU varies, so long before and after, so many sigmas
+HEIGHT_M = 0.2  # standard deviation of the height of the map's ground below a fix
+COURSE_S, COURSE_M = 2.0, 5.0  # time between two fixes that tell a course, and least way between them
+BEGIN_M, BEGIN_MPS, BEGIN_TILT_RAD, BEGIN_HEADING_RAD = 10.0, 2.0, 0.08, 0.2  # standard deviations at the beginning
+LEAST_BIAS = 1e-6  # standard deviation at the beginning, [m/s^2], [rad/s] or [m], of a sensor said to have none
+UNKNOWN_RAD = 1.8  # standard deviation of a heading of which nothing is known
+IMPOSSIBLE = 100.0  # median of a fix's normalised squared innovation: fixes and IMU are not of one drive
+SLACK_S = 1e-6
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimated poses of a vehicle at T times, and their covariance."""
+
+    world_from_agent: Array  # (T, 4, 4)
+    covariance: Array  # (T, 6, 6) of position [m], world frame, and attitude [rad], vehicle's axes
+
+    @property
+    def deviation(self) -> Array:
+        """Return the standard deviations (T, 2) of position, along x and y [m], and heading [rad]."""
+        turn = self.world_from_agent[:, :3, :3]
+        heading = np.einsum("ti,tij,tj->t", turn[:, 2], self.covariance[:, 3:, 3:], turn[:, 2])
+        return np.sqrt(np.stack((self.covariance[:, (0, 1), (0, 1)].mean(axis=1), heading), axis=1))
+
+
+class Mounts(NamedTuple):
+    """Places of a vehicle's sensors in its frame, as it assumes them."""
+
+    agent_from_gnss: Array  # (4, 4)
+    agent_from_imu: Array  # (4, 4)
+
+
+class _States(NamedTuple):
+    """The states at E epochs: nominal ones, and covariances of their errors."""
+
+    position: Array  # (E, 3) of the IMU [m]
+    velocity: Array  # (E, 3) of the IMU [m/s]
+    turn: Array  # (E, 3, 3) world from vehicle
+    bias: Array  # (E, 9) of force, rate and receiver
+    covariance: Array  # (E, STATES, STATES)
+
+
+def estimate_drive(
+    log: NavigationLog, mounts: Mounts, geo: GeoReference, ground: Callable[[Array, Array], Array], at_s: Array
+) -> Estimate:
+    """Return the poses of a vehicle at the times `at_s` (T,) within its log, by all of the log.
+
+    geo: position of the map's origin. ground: heights [m] of the map at x, y (M,) [m]; NaN where it has several.
+    Raises `InputError` where a time is not within the log, or the log's fixes and IMU are not of one drive.
+    """
+    begin_s, end_s = max(log.imu_time_s[0], log.fix_time_s[0]), log.imu_time_s[-1]
+    if (off := at_s[(at_s < begin_s - SLACK_S) | (at_s > end_s + SLACK_S)]).size:
+        raise InputError(f"the navigation log goes from {begin_s:.1f} to {end_s:.1f} s, and a frame is at {off[0]:g} s")
+    mount = mounts.agent_from_imu
+    inertia = np.concatenate((log.inertia[:, :3] @ mount[:3, :3].T, log.inertia[:, 3:] @ mount[:3, :3].T), axis=1)
+    places = convert_to_map(geo, log.fix)
+    used = np.flatnonzero((log.fix_time_s >= log.imu_time_s[0]) & (log.fix_time_s <= end_s + SLACK_S))
+    seen, asked = _nearest(log.imu_time_s, log.fix_time_s[used]), _nearest(log.imu_time_s, at_s)
+    epochs, first = np.unique(np.concatenate((seen, asked)), return_index=True)
+    number = np.where(first < len(used), first, -1)  # of each epoch's fix among those used
+    fixes = np.full((len(epochs), 5), np.nan)  # x, y, z, how long after the epoch, height of the ground
+    with_fix = used[number[number >= 0]]
+    after_s = log.fix_time_s[with_fix] - log.imu_time_s[epochs[number >= 0]]
+    height = ground(places[with_fix, 0], places[with_fix, 1])
+    fixes[number >= 0] = np.column_stack((places[with_fix], after_s, height))
+    levers = np.stack((mounts.agent_from_gnss[:3, 3], np.zeros(3))) - mount[:3, 3]
+    begin = _begin(log, inertia, places, levers[0], int(epochs[0]))
+    rest = _find_rest(log, inertia, epochs)
+    updated, predicted, transition, misfit = _filter(
+        log.imu_time_s, inertia, epochs, fixes, rest, levers, _sigmas(log), *begin
+    )
+    if not np.nanmedian(misfit) < IMPOSSIBLE or not np.isfinite(updated[-1]).all():
+        raise InputError("the fixes of the navigation log are not where its IMU leads: they are of no common drive")
+    smoothed = _smooth(_States(*updated), _States(*predicted), transition)
+    found = np.searchsorted(epochs, asked)
+    state = _States(*(each[found] for each in smoothed))
+    return _of_agent(state, inertia[asked, 3:], at_s - log.imu_time_s[asked], levers[1])
+
+
+def _nearest(times_s: Array, at_s: Array) -> NDArray[np.int64]:
+    """Return the index of the sample nearest to each of `at_s`."""
+    after = np.clip(np.searchsorted(times_s, at_s), 1, len(times_s) - 1)
+    return after - (at_s - times_s[after - 1] < times_s[after] - at_s)
+
+
+def _sigmas(log: NavigationLog) -> Array:
+    """Return the data sheets as an array: deviations of samples, walks, and white noise and bias of fixes."""
+    unit, receiver = log.unit, log.receiver
+    band = np.sqrt(unit.rate_hz / 2)
+    inertial = (unit.force_noise * band, unit.rate_noise * band, unit.force_walk, unit.rate_walk)
+    white = (receiver.noise_m, receiver.noise_up_m)
+    return np.array((*inertial, *np.maximum(white, 1e-3), receiver.bias_m, receiver.bias_up_m, receiver.bias_s))
+
+
+def _begin(log: NavigationLog, inertia: Array, places: Array, lever: Array, first: int) -> tuple[Array, ...]:
+    """Return position, velocity, attitude (3, 3) and covariance before the sample `first`: level, and by the course.
+
+    The course over ground is that of the first two fixes far enough apart, of a car that drives forwards; the gyroscope
+    leads back from between them. Where the car never moves, nothing is known of its heading.
+    """
+    times_s = log.fix_time_s
+    start = min(int(np.searchsorted(times_s, log.imu_time_s[first] - SLACK_S)), len(times_s) - 1)
+    later = np.minimum(np.searchsorted(times_s, times_s + COURSE_S - SLACK_S), len(times_s) - 1)
+    way = (places[later] - places)[start:, :2]
+    moved = start + np.flatnonzero(np.hypot(*way.T) >= COURSE_M)[:1]
+    yaw, heading_rad = 0.0, UNKNOWN_RAD
+    for i in moved.tolist():
+        turned = np.cumsum(inertia[:, 5] * np.gradient(log.imu_time_s))
+        middle = _nearest(log.imu_time_s, (times_s[i] + times_s[later[i]]) / 2)
+        yaw = float(np.arctan2(way[i - start, 1], way[i - start, 0]) - turned[middle] + turned[first])
+        heading_rad = BEGIN_HEADING_RAD
+    receiver, unit = log.receiver, log.unit
+    soon = min(start + int(GNSS_HZ), len(times_s) - 1)
+    velocity = (places[soon] - places[start]) / max(times_s[soon] - times_s[start], 1 / GNSS_HZ)
+    white, bias = (receiver.noise_m, receiver.noise_m, receiver.noise_up_m), (receiver.bias_m, receiver.bias_m, receiver.bias_up_m)
+    deviations = (
+        BEGIN_M + 10 * np.add(white, bias),
+        np.full(3, BEGIN_MPS),
+        np.array((BEGIN_TILT_RAD, BEGIN_TILT_RAD, heading_rad)),
+        np.full(3, max(unit.force_bias, LEAST_BIAS)),
+        np.full(3, max(unit.rate_bias, LEAST_BIAS)),
+        np.maximum(bias, LEAST_BIAS),
+    )
+    turn = rotations_about_z(yaw)
+    return places[start] - turn @ lever, velocity, turn, np.diag(np.concatenate(deviations) ** 2)
+
+
+def _find_rest(log: NavigationLog, inertia: Array, epochs: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return (E,) whether the IMU varies no more around an epoch than by its white noise."""
+    aside = max(round(QUIET_S * log.unit.rate_hz), 2)
+    around = np.clip(epochs[:, None] + np.arange(-aside, aside + 1), 0, len(inertia) - 1)
+    sigma = np.repeat((log.unit.force_noise, log.unit.rate_noise), 3) * np.sqrt(log.unit.rate_hz / 2)
+    return (inertia[around].std(axis=1) <= QUIET * np.maximum(sigma, LEAST_BIAS)).all(axis=1)
+
+
+@compiled
+def _skew(v):
+    """Return the matrix (3, 3) of the cross product with `v` (3,)."""
+    return np.array(((0.0, -v[2], v[1]), (v[2], 0.0, -v[0]), (-v[1], v[0], 0.0)))
+
+
+@compiled
+def _exp(v):
+    """Return the rotation matrix (3, 3) of a rotation vector (3,): Rodrigues' formula."""
+    angle = np.sqrt((v * v).sum())
+    cross = _skew(v)
+    if angle < 1e-8:
+        return np.eye(3) + cross
+    return np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * (cross @ cross)
+
+
+@compiled
+def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, velocity, turn, covariance):
+    """Return the updated and the predicted states at the epochs, transitions between them, and the fixes' misfit (E,).
+
+    sigmas: see `_sigmas`. levers: (2, 3) of antenna and vehicle's origin from the IMU, vehicle's axes.
+    """
+    count = len(epochs)
+    position, velocity, turn, bias = position.copy(), velocity.copy(), turn.copy(), np.zeros(9)
+    p, phi, eye = covariance.copy(), np.eye(STATES), np.eye(STATES)
+    transition = np.zeros((count, STATES, STATES))
+    misfit = np.full(count, np.nan)
+    both = (
+        (np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 9)), np.zeros((count, STATES, STATES))),
+        (np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 9)), np.zeros((count, STATES, STATES))),
+    )
+    h, r, noise = np.zeros((12, STATES)), np.zeros(12), np.zeros(12)
+    for epoch in range(count):
+        phi = np.eye(STATES)
+        for k in range(epochs[max(epoch - 1, 0)], epochs[epoch]):
+            dt = times_s[k + 1] - times_s[k]
+            force = (inertia[k, :3] + inertia[k + 1, :3]) / 2 - bias[:3]
+            rate = (inertia[k, 3:] + inertia[k + 1, 3:]) / 2 - bias[3:6]
+            middle = turn @ _exp(rate * dt / 2)
+            acceleration = middle @ force + GRAVITY
+            position += velocity * dt + acceleration * dt**2 / 2
+            velocity += acceleration * dt
+            step = np.eye(STATES)
+            step[:3, 3:6] = np.eye(3) * dt
+            step[3:6, 6:9] = -(middle @ _skew(force)) * dt
+            step[3:6, 9:12] = -middle * dt
+            step[6:9, 6:9] = _exp(-rate * dt)
+            step[6:9, 12:15] = -np.eye(3) * dt
+            kept = np.exp(-dt / sigmas[8])
+            step[15:, 15:] = np.eye(3) * kept
+            bias[6:] *= kept
+            turn = turn @ _exp(rate * dt)
+            p = step @ p @ step.T
+            phi = step @ phi
+            for i in range(3):
+                p[3 + i, 3 + i] += (sigmas[0] * dt) ** 2
+                p[6 + i, 6 + i] += (sigmas[1] * dt) ** 2
+                p[9 + i, 9 + i] += sigmas[2] ** 2 * dt
+                p[12 + i, 12 + i] += sigmas[3] ** 2 * dt
+                p[15 + i, 15 + i] += sigmas[7 if i == 2 else 6] ** 2 * (1 - kept**2)
+        transition[epoch] = phi
+        kept_in = both[1]
+        kept_in[0][epoch], kept_in[1][epoch], kept_in[2][epoch] = position, velocity, turn
+        kept_in[3][epoch], kept_in[4][epoch] = bias, p
+
+        rows = 0
+        rate = inertia[epochs[epoch], 3:] - bias[3:6]
+        back = turn.T @ velocity
+        if np.isfinite(fixes[epoch, 0]):
+            place = position + turn @ levers[0] + velocity * fixes[epoch, 3]
+            h[:3] = 0
+            h[:3, :3] = np.eye(3)
+            h[:3, 3:6] = np.eye(3) * fixes[epoch, 3]
+            h[:3, 6:9] = -turn @ _skew(levers[0])
+            h[:3, 15:] = np.eye(3)
+            r[:3] = fixes[epoch, :3] - place - bias[6:]
+            noise[:3] = np.array((sigmas[4], sigmas[4], sigmas[5])) ** 2
+            rows = 3
+            innovation = h[:3] @ p @ h[:3].T + np.diag(noise[:3])
+            misfit[epoch] = r[:3] @ np.linalg.solve(innovation, r[:3])
+        if np.isfinite(fixes[epoch, 4]):
+            h[rows] = 0
+            h[rows, 2] = 1
+            h[rows, 6:9] = -(turn @ _skew(levers[1]))[2]
+            r[rows] = fixes[epoch, 4] - position[2] - (turn @ levers[1])[2]
+            noise[rows] = HEIGHT_M**2
+            rows += 1
+        if rest[epoch] and np.sqrt((velocity * velocity).sum()) < SLOW_MPS:
+            h[rows : rows + 6] = 0
+            h[rows : rows + 3, 3:6] = np.eye(3)
+            h[rows + 3 : rows + 6, 12:15] = np.eye(3)
+            r[rows : rows + 3] = -velocity
+            r[rows + 3 : rows + 6] = rate
+            noise[rows : rows + 3] = REST_MPS**2
+            noise[rows + 3 : rows + 6] = REST_RADPS**2 + sigmas[1] ** 2
+            rows += 6
+        along = back + _skew(rate) @ levers[1]  # velocity of the vehicle's origin, its own axes
+        for axis in range(1, 3):
+            h[rows] = 0
+            h[rows, 3:6] = turn[:, axis]
+            h[rows, 6:9] = _skew(back)[axis]
+            h[rows, 12:15] = _skew(levers[1])[axis]
+            r[rows] = -along[axis]
+            noise[rows] = (ACROSS_MPS if axis == 1 else UP_MPS) ** 2
+            rows += 1
+        seen = h[:rows].copy()
+        innovation = seen @ p @ seen.T + np.diag(noise[:rows])
+        gain = np.linalg.solve(innovation, seen @ p).T
+        off = gain @ r[:rows]
+        left = eye - gain @ seen
+        p = left @ p @ left.T + (gain * noise[:rows]) @ gain.T
+        position += off[:3]
+        velocity += off[3:6]
+        turn = turn @ _exp(off[6:9])
+        bias += off[9:]
+        kept_in = both[0]
+        kept_in[0][epoch], kept_in[1][epoch], kept_in[2][epoch] = position, velocity, turn
+        kept_in[3][epoch], kept_in[4][epoch] = bias, p
+    return both[0], both[1], transition, misfit
+
+
+def _smooth(updated: _States, predicted: _States, transition: Array) -> _States:
+    """Return the smoothed states at the epochs: each updated one, corrected by what the next one's prediction missed."""
+    smoothed = _States(*(each.copy() for each in updated))
+    for k in range(len(transition) - 2, -1, -1):
+        then = predicted.covariance[k + 1]
+        gain = np.linalg.solve(then, transition[k + 1] @ updated.covariance[k]).T
+        missed = np.concatenate(
+            (
+                smoothed.position[k + 1] - predicted.position[k + 1],
+                smoothed.velocity[k + 1] - predicted.velocity[k + 1],
+                _log(predicted.turn[k + 1].T @ smoothed.turn[k + 1]),
+                smoothed.bias[k + 1] - predicted.bias[k + 1],
+            )
+        )
+        off = gain @ missed
+        smoothed.position[k] += off[:3]
+        smoothed.velocity[k] += off[3:6]
+        smoothed.turn[k] = updated.turn[k] @ _exp(off[6:9])
+        smoothed.bias[k] += off[9:]
+        smoothed.covariance[k] += gain @ (smoothed.covariance[k + 1] - then) @ gain.T
+    return smoothed
+
+
+def _log(turn: Array) -> Array:
+    """Return the rotation vector (3,) of a rotation matrix (3, 3) by less than half a turn."""
+    cross = np.array((turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])) / 2
+    sine = np.linalg.norm(cross)
+    angle = np.arctan2(sine, (np.trace(turn) - 1) / 2)
+    return cross * (angle / sine if sine > 1e-9 else 1.0)
+
+
+def _of_agent(state: _States, rate: Array, after_s: Array, lever: Array) -> Estimate:
+    """Return the poses of the vehicle's origin, `lever` from the IMU, so long after each state (T,)."""
+    count = len(after_s)
+    poses, covariance = np.zeros((count, 4, 4)), np.zeros((count, 6, 6))
+    for i in range(count):
+        turn = state.turn[i] @ _exp((rate[i] - state.bias[i, 3:6]) * after_s[i])
+        poses[i, :3, :3], poses[i, 3, 3] = turn, 1.0
+        poses[i, :3, 3] = state.position[i] + state.velocity[i] * after_s[i] + turn @ lever
+        jacobian = np.zeros((6, STATES))
+        jacobian[:3, :3], jacobian[:3, 6:9], jacobian[3:, 6:9] = np.eye(3), -turn @ _skew(lever), np.eye(3)
+        covariance[i] = jacobian @ state.covariance[i] @ jacobian.T
+    return Estimate(poses, covariance)
