@@ -30,23 +30,26 @@ from flcav.config import InputError
 from flcav.geometry import rotations_about_z
 from flcav.machine.compiled import compiled
 from flcav.sensors.navigation import GRAVITY
-from flcav.sensors.navigation_log import GNSS_HZ, NavigationLog
+from flcav.sensors.navigation_log import GNSS_HZ, SLACK_S, NavigationLog
 from flcav.world.geodesy import convert_to_map
 from flcav.world.map.parameters import GeoReference
 
 Array = NDArray[np.float64]
 
 STATES = 18  # position, velocity, attitude, biases of force and rate, bias of the receiver: 3 each
-ACROSS_MPS, UP_MPS = 0.2, 0.1  # standard deviations of a car's velocity across and upwards, its own axes
+ACROSS_MPS, UP_MPS = 0.2, 0.2  # standard deviations of a car's velocity across and upwards, its own axes
 REST_MPS, REST_RADPS = 0.02, 0.001  # standard deviations of velocity and angular rate at rest
-SLOW_MPS, QUIET_S, QUIET = 0.3, 0.5, 2.0  # at rest: slower, and the IMU varies, so long before and after, so many sigmas
-HEIGHT_M = 0.2  # standard deviation of the height of the map's ground below a fix
-COURSE_S, COURSE_M = 2.0, 5.0  # time between two fixes that tell a course, and least way between them
-BEGIN_M, BEGIN_MPS, BEGIN_TILT_RAD, BEGIN_HEADING_RAD = 10.0, 2.0, 0.08, 0.2  # standard deviations at the beginning
+SLOW_MPS, QUIET_S, QUIET = (
+    1.0,
+    1.0,
+    2.0,
+)  # at rest: slower, and the IMU varies, so long before and after, so many sigmas
+HEIGHT_M = 0.5  # standard deviation of the height of the map's ground below a fix
+HEADINGS = 8  # directions of the vehicle at the beginning that are tried
+LEAST_WEIGHT = 1e-4  # of a direction beside the likeliest that counts
+BEGIN_M, BEGIN_MPS, BEGIN_TILT_RAD = 10.0, 2.0, 0.08  # standard deviations at the beginning
 LEAST_BIAS = 1e-6  # standard deviation at the beginning, [m/s^2], [rad/s] or [m], of a sensor said to have none
-UNKNOWN_RAD = 1.8  # standard deviation of a heading of which nothing is known
 IMPOSSIBLE = 100.0  # median of a fix's normalised squared innovation: fixes and IMU are not of one drive
-SLACK_S = 1e-6
 
 
 @dataclass(frozen=True)
@@ -89,13 +92,14 @@ def estimate_drive(
     geo: position of the map's origin. ground: heights [m] of the map at x, y (M,) [m]; NaN where it has several.
     Raises `InputError` where a time is not within the log, or the log's fixes and IMU are not of one drive.
     """
-    begin_s, end_s = max(log.imu_time_s[0], log.fix_time_s[0]), log.imu_time_s[-1]
-    if (off := at_s[(at_s < begin_s - SLACK_S) | (at_s > end_s + SLACK_S)]).size:
-        raise InputError(f"the navigation log goes from {begin_s:.1f} to {end_s:.1f} s, and a frame is at {off[0]:g} s")
+    if (off := at_s[(at_s < log.begin_s) | (at_s > log.end_s)]).size:
+        raise InputError(
+            f"the navigation log goes from {log.begin_s:.1f} to {log.end_s:.1f} s, and a frame is at {off[0]:g} s"
+        )
     mount = mounts.agent_from_imu
     inertia = np.concatenate((log.inertia[:, :3] @ mount[:3, :3].T, log.inertia[:, 3:] @ mount[:3, :3].T), axis=1)
     places = convert_to_map(geo, log.fix)
-    used = np.flatnonzero((log.fix_time_s >= log.imu_time_s[0]) & (log.fix_time_s <= end_s + SLACK_S))
+    used = np.flatnonzero((log.fix_time_s >= log.imu_time_s[0]) & (log.fix_time_s <= log.end_s))
     seen, asked = _nearest(log.imu_time_s, log.fix_time_s[used]), _nearest(log.imu_time_s, at_s)
     epochs, first = np.unique(np.concatenate((seen, asked)), return_index=True)
     number = np.where(first < len(used), first, -1)  # of each epoch's fix among those used
@@ -105,17 +109,22 @@ def estimate_drive(
     height = ground(places[with_fix, 0], places[with_fix, 1])
     fixes[number >= 0] = np.column_stack((places[with_fix], after_s, height))
     levers = np.stack((mounts.agent_from_gnss[:3, 3], np.zeros(3))) - mount[:3, 3]
-    begin = _begin(log, inertia, places, levers[0], int(epochs[0]))
-    rest = _find_rest(log, inertia, epochs)
-    updated, predicted, transition, misfit = _filter(
-        log.imu_time_s, inertia, epochs, fixes, rest, levers, _sigmas(log), *begin
-    )
-    if not np.nanmedian(misfit) < IMPOSSIBLE or not np.isfinite(updated[-1]).all():
+    position, velocity, covariance = _begin(log, places, levers[0], int(epochs[0]))
+    about = (log.imu_time_s, inertia, epochs, fixes, _find_rest(log, inertia, epochs), levers, _sigmas(log))
+    headings = rotations_about_z(2 * np.pi / HEADINGS * np.arange(HEADINGS))
+    tried = [_filter(*about, position, velocity, turn, covariance) for turn in headings]
+    likelihood = np.nan_to_num([each[-1] for each in tried], nan=-np.inf)
+    best = tried[int(likelihood.argmax())]
+    if not np.nanmedian(best[3]) < IMPOSSIBLE or not np.isfinite(best[0][-1]).all():
         raise InputError("the fixes of the navigation log are not where its IMU leads: they are of no common drive")
-    smoothed = _smooth(_States(*updated), _States(*predicted), transition)
+    weights = np.exp(likelihood - likelihood.max())
+    kept = [(weight, each) for weight, each in zip(weights / weights.sum(), tried) if weight > LEAST_WEIGHT]
+    smoothed = [(weight, _smooth(_States(*each[0]), _States(*each[1]), each[2])) for weight, each in kept]
+    state = _mix(smoothed)
     found = np.searchsorted(epochs, asked)
-    state = _States(*(each[found] for each in smoothed))
-    return _of_agent(state, inertia[asked, 3:], at_s - log.imu_time_s[asked], levers[1])
+    return _of_agent(
+        _States(*(each[found] for each in state)), inertia[asked, 3:], at_s - log.imu_time_s[asked], levers[1]
+    )
 
 
 def _nearest(times_s: Array, at_s: Array) -> NDArray[np.int64]:
@@ -133,37 +142,23 @@ def _sigmas(log: NavigationLog) -> Array:
     return np.array((*inertial, *np.maximum(white, 1e-3), receiver.bias_m, receiver.bias_up_m, receiver.bias_s))
 
 
-def _begin(log: NavigationLog, inertia: Array, places: Array, lever: Array, first: int) -> tuple[Array, ...]:
-    """Return position, velocity, attitude (3, 3) and covariance before the sample `first`: level, and by the course.
-
-    The course over ground is that of the first two fixes far enough apart, of a car that drives forwards; the gyroscope
-    leads back from between them. Where the car never moves, nothing is known of its heading.
-    """
-    times_s = log.fix_time_s
-    start = min(int(np.searchsorted(times_s, log.imu_time_s[first] - SLACK_S)), len(times_s) - 1)
-    later = np.minimum(np.searchsorted(times_s, times_s + COURSE_S - SLACK_S), len(times_s) - 1)
-    way = (places[later] - places)[start:, :2]
-    moved = start + np.flatnonzero(np.hypot(*way.T) >= COURSE_M)[:1]
-    yaw, heading_rad = 0.0, UNKNOWN_RAD
-    for i in moved.tolist():
-        turned = np.cumsum(inertia[:, 5] * np.gradient(log.imu_time_s))
-        middle = _nearest(log.imu_time_s, (times_s[i] + times_s[later[i]]) / 2)
-        yaw = float(np.arctan2(way[i - start, 1], way[i - start, 0]) - turned[middle] + turned[first])
-        heading_rad = BEGIN_HEADING_RAD
+def _begin(log: NavigationLog, places: Array, lever: Array, first: int) -> tuple[Array, Array, Array]:
+    """Return position, velocity and covariance at the sample `first`, of a level vehicle, `lever` to its antenna."""
     receiver, unit = log.receiver, log.unit
-    soon = min(start + int(GNSS_HZ), len(times_s) - 1)
-    velocity = (places[soon] - places[start]) / max(times_s[soon] - times_s[start], 1 / GNSS_HZ)
-    white, bias = (receiver.noise_m, receiver.noise_m, receiver.noise_up_m), (receiver.bias_m, receiver.bias_m, receiver.bias_up_m)
+    start = min(int(np.searchsorted(log.fix_time_s, log.imu_time_s[first] - SLACK_S)), len(places) - 1)
+    soon = min(start + int(GNSS_HZ), len(places) - 1)
+    velocity = (places[soon] - places[start]) / max(log.fix_time_s[soon] - log.fix_time_s[start], 1 / GNSS_HZ)
+    white = np.array((receiver.noise_m, receiver.noise_m, receiver.noise_up_m))
+    bias = np.array((receiver.bias_m, receiver.bias_m, receiver.bias_up_m))
     deviations = (
-        BEGIN_M + 10 * np.add(white, bias),
+        BEGIN_M + 10 * (white + bias),
         np.full(3, BEGIN_MPS),
-        np.array((BEGIN_TILT_RAD, BEGIN_TILT_RAD, heading_rad)),
+        (BEGIN_TILT_RAD, BEGIN_TILT_RAD, np.pi / HEADINGS),
         np.full(3, max(unit.force_bias, LEAST_BIAS)),
         np.full(3, max(unit.rate_bias, LEAST_BIAS)),
         np.maximum(bias, LEAST_BIAS),
     )
-    turn = rotations_about_z(yaw)
-    return places[start] - turn @ lever, velocity, turn, np.diag(np.concatenate(deviations) ** 2)
+    return places[start] - (0, 0, lever[2]), velocity, np.diag(np.concatenate(deviations) ** 2)
 
 
 def _find_rest(log: NavigationLog, inertia: Array, epochs: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -192,7 +187,10 @@ def _exp(v):
 
 @compiled
 def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, velocity, turn, covariance):
-    """Return the updated and the predicted states at the epochs, transitions between them, and the fixes' misfit (E,).
+    """Return the updated and the predicted states at the epochs, transitions between them, and how well it fits.
+
+    The latter are the normalised squared innovations (E,) of fixes, and the logarithm of the likelihood of fixes,
+    heights and what a car does not do, rest apart.
 
     sigmas: see `_sigmas`. levers: (2, 3) of antenna and vehicle's origin from the IMU, vehicle's axes.
     """
@@ -200,10 +198,22 @@ def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, vel
     position, velocity, turn, bias = position.copy(), velocity.copy(), turn.copy(), np.zeros(9)
     p, phi, eye = covariance.copy(), np.eye(STATES), np.eye(STATES)
     transition = np.zeros((count, STATES, STATES))
-    misfit = np.full(count, np.nan)
+    misfit, likelihood = np.full(count, np.nan), 0.0
     both = (
-        (np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 9)), np.zeros((count, STATES, STATES))),
-        (np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 9)), np.zeros((count, STATES, STATES))),
+        (
+            np.zeros((count, 3)),
+            np.zeros((count, 3)),
+            np.zeros((count, 3, 3)),
+            np.zeros((count, 9)),
+            np.zeros((count, STATES, STATES)),
+        ),
+        (
+            np.zeros((count, 3)),
+            np.zeros((count, 3)),
+            np.zeros((count, 3, 3)),
+            np.zeros((count, 9)),
+            np.zeros((count, STATES, STATES)),
+        ),
     )
     h, r, noise = np.zeros((12, STATES)), np.zeros(12), np.zeros(12)
     for epoch in range(count):
@@ -261,15 +271,6 @@ def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, vel
             r[rows] = fixes[epoch, 4] - position[2] - (turn @ levers[1])[2]
             noise[rows] = HEIGHT_M**2
             rows += 1
-        if rest[epoch] and np.sqrt((velocity * velocity).sum()) < SLOW_MPS:
-            h[rows : rows + 6] = 0
-            h[rows : rows + 3, 3:6] = np.eye(3)
-            h[rows + 3 : rows + 6, 12:15] = np.eye(3)
-            r[rows : rows + 3] = -velocity
-            r[rows + 3 : rows + 6] = rate
-            noise[rows : rows + 3] = REST_MPS**2
-            noise[rows + 3 : rows + 6] = REST_RADPS**2 + sigmas[1] ** 2
-            rows += 6
         along = back + _skew(rate) @ levers[1]  # velocity of the vehicle's origin, its own axes
         for axis in range(1, 3):
             h[rows] = 0
@@ -279,8 +280,21 @@ def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, vel
             r[rows] = -along[axis]
             noise[rows] = (ACROSS_MPS if axis == 1 else UP_MPS) ** 2
             rows += 1
+        moving = rows
+        if rest[epoch] and np.sqrt((velocity * velocity).sum()) < SLOW_MPS:
+            h[rows : rows + 6] = 0
+            h[rows : rows + 3, 3:6] = np.eye(3)
+            h[rows + 3 : rows + 6, 12:15] = np.eye(3)
+            r[rows : rows + 3] = -velocity
+            r[rows + 3 : rows + 6] = rate
+            noise[rows : rows + 3] = REST_MPS**2
+            noise[rows + 3 : rows + 6] = REST_RADPS**2 + sigmas[1] ** 2
+            rows += 6
         seen = h[:rows].copy()
         innovation = seen @ p @ seen.T + np.diag(noise[:rows])
+        part = innovation[:moving, :moving].copy()
+        fit = r[:moving] @ np.linalg.solve(part, r[:moving])
+        likelihood -= (fit + np.log(np.linalg.det(part))) / 2
         gain = np.linalg.solve(innovation, seen @ p).T
         off = gain @ r[:rows]
         left = eye - gain @ seen
@@ -292,11 +306,11 @@ def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, vel
         kept_in = both[0]
         kept_in[0][epoch], kept_in[1][epoch], kept_in[2][epoch] = position, velocity, turn
         kept_in[3][epoch], kept_in[4][epoch] = bias, p
-    return both[0], both[1], transition, misfit
+    return both[0], both[1], transition, misfit, likelihood
 
 
 def _smooth(updated: _States, predicted: _States, transition: Array) -> _States:
-    """Return the smoothed states at the epochs: each updated one, corrected by what the next one's prediction missed."""
+    """Return the smoothed states at the epochs: each updated one, corrected by what the next's prediction missed."""
     smoothed = _States(*(each.copy() for each in updated))
     for k in range(len(transition) - 2, -1, -1):
         then = predicted.covariance[k + 1]
@@ -316,6 +330,20 @@ def _smooth(updated: _States, predicted: _States, transition: Array) -> _States:
         smoothed.bias[k] += off[9:]
         smoothed.covariance[k] += gain @ (smoothed.covariance[k + 1] - then) @ gain.T
     return smoothed
+
+
+def _mix(states: list[tuple[float, _States]]) -> _States:
+    """Return the likeliest of several states; the others' positions and headings spread its covariance."""
+    likeliest = max(states, key=lambda each: each[0])[1]
+    covariance = likeliest.covariance.copy()
+    for weight, other in states:
+        away = other.position - likeliest.position
+        across = np.einsum("eij,eij->e", likeliest.turn[:, :2, 1:2], other.turn[:, :2, :1])
+        along = np.einsum("eij,eij->e", likeliest.turn[:, :2, :1], other.turn[:, :2, :1])
+        heading = np.arctan2(across, along)[:, None] * likeliest.turn[:, 2]  # about the vertical, vehicle's axes
+        covariance[:, :3, :3] += weight * away[:, :, None] * away[:, None]
+        covariance[:, 6:9, 6:9] += weight * heading[:, :, None] * heading[:, None]
+    return likeliest._replace(covariance=covariance)
 
 
 def _log(turn: Array) -> Array:

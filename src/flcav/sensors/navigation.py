@@ -81,10 +81,8 @@ def measure_position(
     return convert_to_geodetic(scene.town.geo, world_from_gnss[:3, 3] + draw_fix_errors(gnss, time_s, rng, bias_rng))
 
 
-def draw_fix_errors(
-    gnss: Gnss, time_s: ArrayLike, rng: np.random.Generator, bias_rng: np.random.Generator
-) -> Array:
-    """Return the errors (..., 3) [m], along x, y and up, of fixes at the times `time_s` (...); see `measure_position`."""
+def draw_fix_errors(gnss: Gnss, time_s: ArrayLike, rng: np.random.Generator, bias_rng: np.random.Generator) -> Array:
+    """Return the errors (..., 3) x, y, up [m] of fixes at the times `time_s` (...); see `measure_position`."""
     noise = rng.standard_normal((*np.shape(time_s), 3)) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
     bias = draw_gauss_markov(bias_rng, time_s, np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m)), gnss.bias_s)
     return noise + bias

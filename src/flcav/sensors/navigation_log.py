@@ -22,6 +22,7 @@ from flcav.world.trace import Trace
 Array = NDArray[np.float64]
 
 GNSS_HZ = 10.0  # rate of fixes
+SLACK_S = 1e-6  # of times that are compared
 LEAST_STEPS = 4  # of the traffic in a drive, for its splines
 
 
@@ -37,6 +38,16 @@ class NavigationLog:
     fix: Array  # (M, 3) latitude [deg], longitude [deg], altitude [m], WGS 84
     imu_time_s: Array  # (N,) ascending
     inertia: Array  # (N, 6) specific force [m/s^2] and angular rate [rad/s], IMU's frame
+
+    @property
+    def begin_s(self) -> float:
+        """Return when both sensors measure [s], to a microsecond."""
+        return float(max(self.fix_time_s[0], self.imu_time_s[0])) - SLACK_S
+
+    @property
+    def end_s(self) -> float:
+        """Return until when the IMU measures [s], to a microsecond."""
+        return float(self.imu_time_s[-1]) + SLACK_S
 
 
 def log_drive(drives: Trace, agent: str, rig: Rig, geo: GeoReference, *, scene: str, seed: int) -> NavigationLog | None:
@@ -76,5 +87,5 @@ def log_drive(drives: Trace, agent: str, rig: Rig, geo: GeoReference, *, scene: 
 
 def _list_times(knots: Array, rate_hz: float) -> Array:
     """Return the times [s] of samples at a rate, multiples of its period, from the first of `knots` to the last."""
-    slack = 1e-6
+    slack = SLACK_S * rate_hz
     return np.arange(np.ceil(knots[0] * rate_hz - slack), np.floor(knots[-1] * rate_hz + slack) + 1) / rate_hz

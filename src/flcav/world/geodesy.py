@@ -33,7 +33,7 @@ def convert_from_geodetic(origin: GeoReference, place: GeoReference) -> Array:
 
 
 def convert_to_map(origin: GeoReference, geodetic: Array) -> Array:
-    """Return (..., 3) x, y, up [m] of (..., 3) latitude [deg], longitude [deg], altitude [m]; the inverse of `convert_to_geodetic`."""
+    """Return (..., 3) x, y, up [m] of places (..., 3): the inverse of `convert_to_geodetic`."""
     enu = (_place_on_earth(*np.moveaxis(geodetic, -1, 0)) - _to_earth(origin)) @ _earth_from_enu(origin)
     return enu @ np.linalg.inv(_enu_from_map(origin)).T
 
