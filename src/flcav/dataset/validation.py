@@ -9,6 +9,8 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
+import numpy as np
+
 from flcav.config import InputError, parse_config, path_within
 from flcav.dataset.checks.calibration import check_calibrations
 from flcav.dataset.checks.copies import find_copies
@@ -82,8 +84,8 @@ def _log_problems(dataset: Dataset, damaged: Collection[str]) -> Iterator[str]:
             yield str(error)
             continue
         for agent, log in logs.items():
-            times_s = [dataset.keys[i].time_s for i in dataset.select(scenes=[scene], agents=[agent])]
-            if times_s and not log.begin_s <= times_s[0] <= times_s[-1] <= log.end_s:
+            times_s = np.array([dataset.keys[i].time_s for i in dataset.select(scenes=[scene], agents=[agent])])
+            if not log.covers(times_s).all():
                 yield (
                     f"{dataset.folder / navigation_path(scene)}: the log of '{agent}' goes from {log.begin_s:.1f} to "
                     f"{log.end_s:.1f} s, its frames from {times_s[0]:.1f} to {times_s[-1]:.1f} s"

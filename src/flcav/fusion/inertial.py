@@ -30,7 +30,7 @@ from flcav.config import InputError
 from flcav.geometry import rotations_about_z
 from flcav.machine.compiled import compiled
 from flcav.sensors.navigation import GRAVITY
-from flcav.sensors.navigation_log import GNSS_HZ, SLACK_S, NavigationLog
+from flcav.sensors.navigation_log import NavigationLog
 from flcav.world.geodesy import convert_to_map
 from flcav.world.map.parameters import GeoReference
 
@@ -46,10 +46,12 @@ SLOW_MPS, QUIET_S, QUIET = (
 )  # at rest: slower, and the IMU varies, so long before and after, so many sigmas
 HEIGHT_M = 0.5  # standard deviation of the height of the map's ground below a fix
 HEADINGS = 8  # directions of the vehicle at the beginning that are tried
+BACKWARDS_M = 1.0  # no car drives farther backwards, all in all
 LEAST_WEIGHT = 1e-4  # of a direction beside the likeliest that counts
 BEGIN_M, BEGIN_MPS, BEGIN_TILT_RAD = 10.0, 2.0, 0.08  # standard deviations at the beginning
+LEAST_SAMPLE, LEAST_FIX_M = (3e-3, 1e-4), 0.01  # least noise of an IMU's samples, [m/s^2] and [rad/s], and of fixes
 LEAST_BIAS = 1e-6  # standard deviation at the beginning, [m/s^2], [rad/s] or [m], of a sensor said to have none
-IMPOSSIBLE = 100.0  # median of a fix's normalised squared innovation: fixes and IMU are not of one drive
+IMPOSSIBLE = 20.0  # median of a fix's normalised squared innovation: fixes and IMU are not of one drive
 
 
 @dataclass(frozen=True)
@@ -89,42 +91,59 @@ def estimate_drive(
 ) -> Estimate:
     """Return the poses of a vehicle at the times `at_s` (T,) within its log, by all of the log.
 
-    geo: position of the map's origin. ground: heights [m] of the map at x, y (M,) [m]; NaN where it has several.
-    Raises `InputError` where a time is not within the log, or the log's fixes and IMU are not of one drive.
+    geo: position of the map's origin. ground: heights [m] of the map at x, y (M,) [m]; NaN where it has several. Of the
+    heading at the beginning nothing is known: `HEADINGS` are tried, and of those with which the car drives forwards the
+    likeliest is taken, with the spread of those that are nearly as likely in its covariance. Raises `InputError` where a time is not within the log, or the
+    log's fixes and IMU are not of one drive.
     """
-    if (off := at_s[(at_s < log.begin_s) | (at_s > log.end_s)]).size:
+    if (off := at_s[~log.covers(at_s)]).size:
         raise InputError(
             f"the navigation log goes from {log.begin_s:.1f} to {log.end_s:.1f} s, and a frame is at {off[0]:g} s"
         )
     mount = mounts.agent_from_imu
-    inertia = np.concatenate((log.inertia[:, :3] @ mount[:3, :3].T, log.inertia[:, 3:] @ mount[:3, :3].T), axis=1)
-    places = convert_to_map(geo, log.fix)
-    used = np.flatnonzero((log.fix_time_s >= log.imu_time_s[0]) & (log.fix_time_s <= log.end_s))
-    seen, asked = _nearest(log.imu_time_s, log.fix_time_s[used]), _nearest(log.imu_time_s, at_s)
-    epochs, first = np.unique(np.concatenate((seen, asked)), return_index=True)
-    number = np.where(first < len(used), first, -1)  # of each epoch's fix among those used
-    fixes = np.full((len(epochs), 5), np.nan)  # x, y, z, how long after the epoch, height of the ground
-    with_fix = used[number[number >= 0]]
-    after_s = log.fix_time_s[with_fix] - log.imu_time_s[epochs[number >= 0]]
-    height = ground(places[with_fix, 0], places[with_fix, 1])
-    fixes[number >= 0] = np.column_stack((places[with_fix], after_s, height))
+    inertia = (log.inertia.reshape(-1, 2, 3) @ mount[:3, :3].T).reshape(-1, 6)  # vehicle's axes
     levers = np.stack((mounts.agent_from_gnss[:3, 3], np.zeros(3))) - mount[:3, 3]
-    position, velocity, covariance = _begin(log, places, levers[0], int(epochs[0]))
-    about = (log.imu_time_s, inertia, epochs, fixes, _find_rest(log, inertia, epochs), levers, _sigmas(log))
-    headings = rotations_about_z(2 * np.pi / HEADINGS * np.arange(HEADINGS))
-    tried = [_filter(*about, position, velocity, turn, covariance) for turn in headings]
-    likelihood = np.nan_to_num([each[-1] for each in tried], nan=-np.inf)
-    best = tried[int(likelihood.argmax())]
-    if not np.nanmedian(best[3]) < IMPOSSIBLE or not np.isfinite(best[0][-1]).all():
+    places = convert_to_map(geo, log.fix)
+    epochs, fixes = _list_epochs(log, places, ground, at_s)
+    position, velocity, covariance = _begin(log, places, levers[0])
+    rest = _find_rest(log, inertia, epochs)
+    tried = []
+    for turn in rotations_about_z(2 * np.pi / HEADINGS * np.arange(HEADINGS)):
+        given = (position, velocity, turn, covariance)
+        tried.append(_filter(log.imu_time_s, inertia, epochs, fixes, rest, levers, _sigmas(log), *given))
+    forwards = [_measure_way(log.imu_time_s[epochs], both) > -BACKWARDS_M for both, *_ in tried]
+    likelihood = np.nan_to_num(np.where(forwards, [each[-1] for each in tried], -np.inf), nan=-np.inf)
+    best = int(likelihood.argmax())
+    if not np.nanmedian(tried[best][2]) < IMPOSSIBLE or not np.isfinite(tried[best][0][-1]).all():
         raise InputError("the fixes of the navigation log are not where its IMU leads: they are of no common drive")
-    weights = np.exp(likelihood - likelihood.max())
-    kept = [(weight, each) for weight, each in zip(weights / weights.sum(), tried) if weight > LEAST_WEIGHT]
-    smoothed = [(weight, _smooth(_States(*each[0]), _States(*each[1]), each[2])) for weight, each in kept]
-    state = _mix(smoothed)
-    found = np.searchsorted(epochs, asked)
-    return _of_agent(
-        _States(*(each[found] for each in state)), inertia[asked, 3:], at_s - log.imu_time_s[asked], levers[1]
-    )
+    weights = np.exp(likelihood - likelihood[best])
+    kept = [(weight, *each[:2]) for weight, each in zip(weights / weights.sum(), tried) if weight > LEAST_WEIGHT]
+    state = _mix([(weight, _smooth(both, transition)) for weight, both, transition in kept])
+    asked = _nearest(log.imu_time_s, at_s)
+    state = _States(*(each[np.searchsorted(epochs, asked)] for each in state))
+    return _of_agent(state, inertia[asked, 3:], at_s - log.imu_time_s[asked], levers[1])
+
+
+def _measure_way(times_s: Array, both: tuple[Array, ...]) -> float:
+    """Return how far [m] a vehicle drives forwards, by its updated states at these times."""
+    _, velocity, turn, *_ = both
+    return float(np.einsum("ei,ei->e", velocity[0], turn[0, :, :, 0]) @ np.gradient(times_s))
+
+
+def _list_epochs(
+    log: NavigationLog, places: Array, ground: Callable[[Array, Array], Array], at_s: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Return the IMU samples (E,) nearest to fixes and to `at_s`, and the fixes (E, 5), NaN where there are none.
+
+    A fix is x, y, z, how long after the sample it is, and the height of the ground there. places: (M, 3) of all fixes.
+    """
+    used = np.flatnonzero(log.covers(log.fix_time_s))
+    near = _nearest(log.imu_time_s, log.fix_time_s[used])
+    epochs = np.unique(np.concatenate((near, _nearest(log.imu_time_s, at_s))))
+    fixes, row = np.full((len(epochs), 5), np.nan), np.searchsorted(epochs, near)
+    x, y, _ = places[used].T
+    fixes[row] = np.column_stack((places[used], log.fix_time_s[used] - log.imu_time_s[near], ground(x, y)))
+    return epochs, fixes
 
 
 def _nearest(times_s: Array, at_s: Array) -> NDArray[np.int64]:
@@ -136,18 +155,23 @@ def _nearest(times_s: Array, at_s: Array) -> NDArray[np.int64]:
 def _sigmas(log: NavigationLog) -> Array:
     """Return the data sheets as an array: deviations of samples, walks, and white noise and bias of fixes."""
     unit, receiver = log.unit, log.receiver
-    band = np.sqrt(unit.rate_hz / 2)
-    inertial = (unit.force_noise * band, unit.rate_noise * band, unit.force_walk, unit.rate_walk)
-    white = (receiver.noise_m, receiver.noise_up_m)
-    return np.array((*inertial, *np.maximum(white, 1e-3), receiver.bias_m, receiver.bias_up_m, receiver.bias_s))
+    samples = np.sqrt(unit.rate_hz / 2) * np.array((unit.force_noise, unit.rate_noise))
+    walks, white = (unit.force_walk, unit.rate_walk), np.array((receiver.noise_m, receiver.noise_up_m))
+    bias = (receiver.bias_m, receiver.bias_up_m, receiver.bias_s)
+    return np.concatenate((np.maximum(samples, LEAST_SAMPLE), walks, np.maximum(white, LEAST_FIX_M), bias))
 
 
-def _begin(log: NavigationLog, places: Array, lever: Array, first: int) -> tuple[Array, Array, Array]:
-    """Return position, velocity and covariance at the sample `first`, of a level vehicle, `lever` to its antenna."""
-    receiver, unit = log.receiver, log.unit
-    start = min(int(np.searchsorted(log.fix_time_s, log.imu_time_s[first] - SLACK_S)), len(places) - 1)
-    soon = min(start + int(GNSS_HZ), len(places) - 1)
-    velocity = (places[soon] - places[start]) / max(log.fix_time_s[soon] - log.fix_time_s[start], 1 / GNSS_HZ)
+def _begin(log: NavigationLog, places: Array, lever: Array) -> tuple[Array, Array, Array]:
+    """Return position, velocity and covariance at the first fix, of a level vehicle, `lever` (3,) to its antenna.
+
+    The velocity is that of the first second. Raises `InputError` where there is but one fix while the IMU measures.
+    """
+    receiver, unit, times_s = log.receiver, log.unit, log.fix_time_s
+    used = np.flatnonzero(log.covers(times_s))
+    if len(used) < 2:
+        raise InputError("the navigation log has no two fixes while its IMU measures")
+    first, soon = used[0], used[max(1, int((times_s[used] <= times_s[used[0]] + 1.0).sum()) - 1)]
+    velocity = (places[soon] - places[first]) / (times_s[soon] - times_s[first])
     white = np.array((receiver.noise_m, receiver.noise_m, receiver.noise_up_m))
     bias = np.array((receiver.bias_m, receiver.bias_m, receiver.bias_up_m))
     deviations = (
@@ -158,7 +182,7 @@ def _begin(log: NavigationLog, places: Array, lever: Array, first: int) -> tuple
         np.full(3, max(unit.rate_bias, LEAST_BIAS)),
         np.maximum(bias, LEAST_BIAS),
     )
-    return places[start] - (0, 0, lever[2]), velocity, np.diag(np.concatenate(deviations) ** 2)
+    return places[first] - (0, 0, lever[2]), velocity, np.diag(np.concatenate(deviations) ** 2)
 
 
 def _find_rest(log: NavigationLog, inertia: Array, epochs: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -187,130 +211,111 @@ def _exp(v):
 
 @compiled
 def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, velocity, turn, covariance):
-    """Return the updated and the predicted states at the epochs, transitions between them, and how well it fits.
+    """Return the updated and the predicted states (2, E, ...), transitions between epochs, and how well all this fits.
 
-    The latter are the normalised squared innovations (E,) of fixes, and the logarithm of the likelihood of fixes,
-    heights and what a car does not do, rest apart.
-
-    sigmas: see `_sigmas`. levers: (2, 3) of antenna and vehicle's origin from the IMU, vehicle's axes.
+    fixes: (E, 5), see `estimate_drive`. rest: (E,). levers: (2, 3) of antenna and vehicle's origin from the IMU,
+    vehicle's axes. sigmas: see `_sigmas`. How well: normalised squared innovations (E,) of fixes, and the logarithm of
+    the likelihood of all measurements but rest, which each nominal state assumes at times of its own.
     """
-    count = len(epochs)
-    position, velocity, turn, bias = position.copy(), velocity.copy(), turn.copy(), np.zeros(9)
-    p, phi, eye = covariance.copy(), np.eye(STATES), np.eye(STATES)
-    transition = np.zeros((count, STATES, STATES))
-    misfit, likelihood = np.full(count, np.nan), 0.0
-    both = (
-        (
-            np.zeros((count, 3)),
-            np.zeros((count, 3)),
-            np.zeros((count, 3, 3)),
-            np.zeros((count, 9)),
-            np.zeros((count, STATES, STATES)),
-        ),
-        (
-            np.zeros((count, 3)),
-            np.zeros((count, 3)),
-            np.zeros((count, 3, 3)),
-            np.zeros((count, 9)),
-            np.zeros((count, STATES, STATES)),
-        ),
-    )
-    h, r, noise = np.zeros((12, STATES)), np.zeros(12), np.zeros(12)
-    for epoch in range(count):
+    count, bias, p, likelihood = len(epochs), np.zeros(9), covariance, 0.0
+    positions, velocities, turns = np.zeros((2, count, 3)), np.zeros((2, count, 3)), np.zeros((2, count, 3, 3))
+    biases, covariances = np.zeros((2, count, 9)), np.zeros((2, count, STATES, STATES))
+    transition, misfit = np.zeros((count, STATES, STATES)), np.where(np.isfinite(fixes[:, 0]), 0.0, np.nan)
+    for e in range(count):
         phi = np.eye(STATES)
-        for k in range(epochs[max(epoch - 1, 0)], epochs[epoch]):
-            dt = times_s[k + 1] - times_s[k]
-            force = (inertia[k, :3] + inertia[k + 1, :3]) / 2 - bias[:3]
-            rate = (inertia[k, 3:] + inertia[k + 1, 3:]) / 2 - bias[3:6]
-            middle = turn @ _exp(rate * dt / 2)
-            acceleration = middle @ force + GRAVITY
-            position += velocity * dt + acceleration * dt**2 / 2
-            velocity += acceleration * dt
-            step = np.eye(STATES)
-            step[:3, 3:6] = np.eye(3) * dt
-            step[3:6, 6:9] = -(middle @ _skew(force)) * dt
-            step[3:6, 9:12] = -middle * dt
-            step[6:9, 6:9] = _exp(-rate * dt)
-            step[6:9, 12:15] = -np.eye(3) * dt
-            kept = np.exp(-dt / sigmas[8])
-            step[15:, 15:] = np.eye(3) * kept
-            bias[6:] *= kept
-            turn = turn @ _exp(rate * dt)
-            p = step @ p @ step.T
+        for k in range(epochs[max(e - 1, 0)], epochs[e]):
+            sample, dt = (inertia[k] + inertia[k + 1]) / 2, times_s[k + 1] - times_s[k]
+            step, spread = _transit(turn, bias, sample, dt, sigmas)
+            acceleration = turn @ _exp((sample[3:] - bias[3:6]) * dt / 2) @ (sample[:3] - bias[:3]) + GRAVITY
+            position = position + velocity * dt + acceleration * dt**2 / 2
+            velocity = velocity + acceleration * dt
+            turn = turn @ _exp((sample[3:] - bias[3:6]) * dt)
+            bias[6:] *= step[15, 15]
+            p = step @ p @ step.T + np.diag(spread)
             phi = step @ phi
-            for i in range(3):
-                p[3 + i, 3 + i] += (sigmas[0] * dt) ** 2
-                p[6 + i, 6 + i] += (sigmas[1] * dt) ** 2
-                p[9 + i, 9 + i] += sigmas[2] ** 2 * dt
-                p[12 + i, 12 + i] += sigmas[3] ** 2 * dt
-                p[15 + i, 15 + i] += sigmas[7 if i == 2 else 6] ** 2 * (1 - kept**2)
-        transition[epoch] = phi
-        kept_in = both[1]
-        kept_in[0][epoch], kept_in[1][epoch], kept_in[2][epoch] = position, velocity, turn
-        kept_in[3][epoch], kept_in[4][epoch] = bias, p
+        transition[e], covariances[1, e] = phi, p
+        positions[1, e], velocities[1, e], turns[1, e], biases[1, e] = position, velocity, turn, bias
 
-        rows = 0
-        rate = inertia[epochs[epoch], 3:] - bias[3:6]
-        back = turn.T @ velocity
-        if np.isfinite(fixes[epoch, 0]):
-            place = position + turn @ levers[0] + velocity * fixes[epoch, 3]
-            h[:3] = 0
-            h[:3, :3] = np.eye(3)
-            h[:3, 3:6] = np.eye(3) * fixes[epoch, 3]
-            h[:3, 6:9] = -turn @ _skew(levers[0])
-            h[:3, 15:] = np.eye(3)
-            r[:3] = fixes[epoch, :3] - place - bias[6:]
-            noise[:3] = np.array((sigmas[4], sigmas[4], sigmas[5])) ** 2
-            rows = 3
-            innovation = h[:3] @ p @ h[:3].T + np.diag(noise[:3])
-            misfit[epoch] = r[:3] @ np.linalg.solve(innovation, r[:3])
-        if np.isfinite(fixes[epoch, 4]):
-            h[rows] = 0
-            h[rows, 2] = 1
-            h[rows, 6:9] = -(turn @ _skew(levers[1]))[2]
-            r[rows] = fixes[epoch, 4] - position[2] - (turn @ levers[1])[2]
-            noise[rows] = HEIGHT_M**2
-            rows += 1
-        along = back + _skew(rate) @ levers[1]  # velocity of the vehicle's origin, its own axes
-        for axis in range(1, 3):
-            h[rows] = 0
-            h[rows, 3:6] = turn[:, axis]
-            h[rows, 6:9] = _skew(back)[axis]
-            h[rows, 12:15] = _skew(levers[1])[axis]
-            r[rows] = -along[axis]
-            noise[rows] = (ACROSS_MPS if axis == 1 else UP_MPS) ** 2
-            rows += 1
-        moving = rows
-        if rest[epoch] and np.sqrt((velocity * velocity).sum()) < SLOW_MPS:
-            h[rows : rows + 6] = 0
-            h[rows : rows + 3, 3:6] = np.eye(3)
-            h[rows + 3 : rows + 6, 12:15] = np.eye(3)
-            r[rows : rows + 3] = -velocity
-            r[rows + 3 : rows + 6] = rate
-            noise[rows : rows + 3] = REST_MPS**2
-            noise[rows + 3 : rows + 6] = REST_RADPS**2 + sigmas[1] ** 2
-            rows += 6
-        seen = h[:rows].copy()
-        innovation = seen @ p @ seen.T + np.diag(noise[:rows])
-        part = innovation[:moving, :moving].copy()
-        fit = r[:moving] @ np.linalg.solve(part, r[:moving])
-        likelihood -= (fit + np.log(np.linalg.det(part))) / 2
-        gain = np.linalg.solve(innovation, seen @ p).T
-        off = gain @ r[:rows]
-        left = eye - gain @ seen
-        p = left @ p @ left.T + (gain * noise[:rows]) @ gain.T
-        position += off[:3]
-        velocity += off[3:6]
-        turn = turn @ _exp(off[6:9])
-        bias += off[9:]
-        kept_in = both[0]
-        kept_in[0][epoch], kept_in[1][epoch], kept_in[2][epoch] = position, velocity, turn
-        kept_in[3][epoch], kept_in[4][epoch] = bias, p
-    return both[0], both[1], transition, misfit, likelihood
+        h, r, noise, common = _measure(
+            position, velocity, turn, bias, inertia[epochs[e], 3:], fixes[e], rest[e], levers, sigmas
+        )
+        off = np.zeros(STATES)
+        for i in range(len(r)):  # one after another, since their noise is independent
+            seen = p @ h[i]
+            variance, missed = (seen * h[i]).sum() + noise[i], r[i] - (h[i] * off).sum()
+            off += seen * (missed / variance)
+            p = p - np.outer(seen, seen / variance)
+            if i < common:
+                likelihood -= (missed**2 / variance + np.log(variance)) / 2
+            if i < 3 and np.isfinite(fixes[e, 0]):
+                misfit[e] += missed**2 / variance
+        p = (p + p.T) / 2
+        position, velocity, turn, bias = position + off[:3], velocity + off[3:6], turn @ _exp(off[6:9]), bias + off[9:]
+        covariances[0, e] = p
+        positions[0, e], velocities[0, e], turns[0, e], biases[0, e] = position, velocity, turn, bias
+    return (positions, velocities, turns, biases, covariances), transition, misfit, likelihood
 
 
-def _smooth(updated: _States, predicted: _States, transition: Array) -> _States:
-    """Return the smoothed states at the epochs: each updated one, corrected by what the next's prediction missed."""
+@compiled
+def _transit(turn, bias, sample, dt, sigmas):
+    """Return the transition of the error state over a sample, and the variance (STATES,) that it adds."""
+    force, rate = sample[:3] - bias[:3], sample[3:] - bias[3:6]
+    middle = turn @ _exp(rate * dt / 2)
+    step, spread = np.eye(STATES), np.zeros(STATES)
+    step[:3, 3:6] = np.eye(3) * dt
+    step[3:6, 6:9] = -(middle @ _skew(force)) * dt
+    step[3:6, 9:12] = -middle * dt
+    step[6:9, 6:9] = _exp(-rate * dt)
+    step[6:9, 12:15] = -np.eye(3) * dt
+    step[15:, 15:] = np.eye(3) * np.exp(-dt / sigmas[8])
+    spread[3:6], spread[6:9] = (sigmas[0] * dt) ** 2, (sigmas[1] * dt) ** 2
+    spread[9:12], spread[12:15] = sigmas[2] ** 2 * dt, sigmas[3] ** 2 * dt
+    spread[15:17], spread[17] = sigmas[6] ** 2, sigmas[7] ** 2
+    spread[15:] *= 1 - np.exp(-2 * dt / sigmas[8])
+    return step, spread
+
+
+@compiled
+def _measure(position, velocity, turn, bias, sample, fix, rests, levers, sigmas):
+    """Return Jacobians (M, STATES), innovations (M,) and variances (M,) of an epoch's measurements.
+
+    They are across and upwards velocity, before them the fix and the height of the ground where there are any, after
+    them velocity and angular rate at rest; also the number of those before the latter. sample: (3,) angular rate.
+    """
+    h, r, noise, rows = np.zeros((12, STATES)), np.zeros(12), np.zeros(12), 0
+    rate, back = sample - bias[3:6], turn.T @ velocity
+    if np.isfinite(fix[0]):
+        h[:3, :3], h[:3, 3:6], h[:3, 15:] = np.eye(3), np.eye(3) * fix[3], np.eye(3)
+        h[:3, 6:9] = -turn @ _skew(levers[0])
+        r[:3] = fix[:3] - (position + velocity * fix[3] + turn @ levers[0] + bias[6:])
+        noise[:2], noise[2], rows = sigmas[4] ** 2, sigmas[5] ** 2, 3
+    if np.isfinite(fix[4]):
+        h[rows, 2] = 1
+        h[rows, 6:9] = -(turn @ _skew(levers[1]))[2]
+        r[rows], noise[rows] = fix[4] - position[2] - (turn @ levers[1])[2], HEIGHT_M**2
+        rows += 1
+    along = back + _skew(rate) @ levers[1]  # velocity of the vehicle's origin, its own axes
+    for axis in range(1, 3):
+        h[rows, 3:6] = turn[:, axis]
+        h[rows, 6:9] = _skew(back)[axis]
+        h[rows, 12:15] = _skew(levers[1])[axis]
+        r[rows], noise[rows] = -along[axis], (ACROSS_MPS if axis == 1 else UP_MPS) ** 2
+        rows += 1
+    common = rows
+    if rests and np.sqrt((velocity * velocity).sum()) < SLOW_MPS:
+        h[rows : rows + 3, 3:6], h[rows + 3 : rows + 6, 12:15] = np.eye(3), np.eye(3)
+        r[rows : rows + 3], r[rows + 3 : rows + 6] = -velocity, rate
+        noise[rows : rows + 3], noise[rows + 3 : rows + 6] = REST_MPS**2, REST_RADPS**2 + sigmas[1] ** 2
+        rows += 6
+    return h[:rows].copy(), r[:rows].copy(), noise[:rows].copy(), common
+
+
+def _smooth(both: tuple[Array, ...], transition: Array) -> _States:
+    """Return the smoothed states: each updated one, corrected by what the next one's prediction missed.
+
+    both: the updated and the predicted states (2, E, ...).
+    """
+    updated, predicted = (_States(*(each[i] for each in both)) for i in range(2))
     smoothed = _States(*(each.copy() for each in updated))
     for k in range(len(transition) - 2, -1, -1):
         then = predicted.covariance[k + 1]

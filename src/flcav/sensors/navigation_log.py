@@ -41,13 +41,17 @@ class NavigationLog:
 
     @property
     def begin_s(self) -> float:
-        """Return when both sensors measure [s], to a microsecond."""
-        return float(max(self.fix_time_s[0], self.imu_time_s[0])) - SLACK_S
+        """Return from when on both sensors measure [s]."""
+        return float(max(self.fix_time_s[0], self.imu_time_s[0]))
 
     @property
     def end_s(self) -> float:
-        """Return until when the IMU measures [s], to a microsecond."""
-        return float(self.imu_time_s[-1]) + SLACK_S
+        """Return until when the IMU measures [s]."""
+        return float(self.imu_time_s[-1])
+
+    def covers(self, times_s: Array) -> NDArray[np.bool_]:
+        """Return (T,) whether the times [s] are within the log, to a microsecond."""
+        return (times_s >= self.begin_s - SLACK_S) & (times_s <= self.end_s + SLACK_S)
 
 
 def log_drive(drives: Trace, agent: str, rig: Rig, geo: GeoReference, *, scene: str, seed: int) -> NavigationLog | None:
