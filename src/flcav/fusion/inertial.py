@@ -51,7 +51,7 @@ LEAST_WEIGHT = 1e-4  # of a direction beside the likeliest that counts
 BEGIN_M, BEGIN_MPS, BEGIN_TILT_RAD = 10.0, 2.0, 0.08  # standard deviations at the beginning
 LEAST_SAMPLE, LEAST_FIX_M = (3e-3, 1e-4), 0.01  # least noise of an IMU's samples, [m/s^2] and [rad/s], and of fixes
 LEAST_BIAS = 1e-6  # standard deviation at the beginning, [m/s^2], [rad/s] or [m], of a sensor said to have none
-IMPOSSIBLE = 20.0  # median of a fix's normalised squared innovation: fixes and IMU are not of one drive
+IMPOSSIBLE = 10.0  # mean of fixes' normalised squared innovations, of 3 dimensions: fixes and IMU are not of one drive
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def estimate_drive(
     forwards = [_measure_way(log.imu_time_s[epochs], both) > -BACKWARDS_M for both, *_ in tried]
     likelihood = np.nan_to_num(np.where(forwards, [each[-1] for each in tried], -np.inf), nan=-np.inf)
     best = int(likelihood.argmax())
-    if not np.nanmedian(tried[best][2]) < IMPOSSIBLE or not np.isfinite(tried[best][0][-1]).all():
+    if not np.nanmean(tried[best][2]) < IMPOSSIBLE or not np.isfinite(tried[best][0][-1]).all():
         raise InputError("the fixes of the navigation log are not where its IMU leads: they are of no common drive")
     weights = np.exp(likelihood - likelihood[best])
     kept = [(weight, *each[:2]) for weight, each in zip(weights / weights.sum(), tried) if weight > LEAST_WEIGHT]

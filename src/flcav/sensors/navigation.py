@@ -78,14 +78,17 @@ def measure_position(
     rendered before.
     """
     time_s = float(scene.trace.time_s[scene.index]) + scene.offset_s
-    return convert_to_geodetic(scene.town.geo, world_from_gnss[:3, 3] + draw_fix_errors(gnss, time_s, rng, bias_rng))
+    noise, bias = draw_fix_errors(gnss, time_s, rng, bias_rng)
+    return convert_to_geodetic(scene.town.geo, world_from_gnss[:3, 3] + noise + bias)
 
 
-def draw_fix_errors(gnss: Gnss, time_s: ArrayLike, rng: np.random.Generator, bias_rng: np.random.Generator) -> Array:
-    """Return the errors (..., 3) x, y, up [m] of fixes at the times `time_s` (...); see `measure_position`."""
+def draw_fix_errors(
+    gnss: Gnss, time_s: ArrayLike, rng: np.random.Generator, bias_rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return noise and bias (..., 3) x, y, up [m] of fixes at the times `time_s` (...); see `measure_position`."""
     noise = rng.standard_normal((*np.shape(time_s), 3)) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
     bias = draw_gauss_markov(bias_rng, time_s, np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m)), gnss.bias_s)
-    return noise + bias
+    return noise, bias
 
 
 class Imu(Config):
@@ -118,16 +121,18 @@ def measure_inertia(
     turn = world_from_imu[:3, :3]
     acceleration, rate = _motion(scene, world_from_imu[:3, 3], carrier)
     true = np.concatenate((turn.T @ (acceleration - GRAVITY), turn.T @ rate))
-    return true + draw_imu_errors(imu, time_s, rng, bias_rng)
+    noise, bias = draw_imu_errors(imu, time_s, rng, bias_rng)
+    return true + noise + bias
 
 
-def draw_imu_errors(imu: Imu, time_s: ArrayLike, rng: np.random.Generator, bias_rng: np.random.Generator) -> Array:
-    """Return the errors (..., 6) of IMU samples at the times `time_s` (...); see `measure_inertia`."""
+def draw_imu_errors(
+    imu: Imu, time_s: ArrayLike, rng: np.random.Generator, bias_rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return noise and bias (..., 6) of IMU samples at the times `time_s` (...); see `measure_inertia`."""
     noise = np.repeat((imu.force_noise, imu.rate_noise), 3) * np.sqrt(imu.rate_hz / 2)
     start = np.repeat((imu.force_bias, imu.rate_bias), 3)
     growth = np.repeat((imu.force_walk, imu.rate_walk), 3)
-    white = noise * rng.standard_normal((*np.shape(time_s), 6))
-    return white + draw_random_walk(bias_rng, time_s, start, growth)
+    return noise * rng.standard_normal((*np.shape(time_s), 6)), draw_random_walk(bias_rng, time_s, start, growth)
 
 
 def _motion(scene: Scene, at: Array, carrier: int | None) -> tuple[Array, Array]:

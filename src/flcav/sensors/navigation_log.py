@@ -78,14 +78,14 @@ def log_drive(drives: Trace, agent: str, rig: Rig, geo: GeoReference, *, scene: 
 
     at_s = _list_times(knots, GNSS_HZ)
     antenna = way(at_s) + turn(at_s).apply(receiver.mount.agent_from_sensor()[:3, 3])
-    fix = convert_to_geodetic(geo, antenna + draw_fix_errors(receiver.settings, at_s, *draw(gnss)))
+    fix = convert_to_geodetic(geo, antenna + sum(draw_fix_errors(receiver.settings, at_s, *draw(gnss))))
     imu_s, mount = _list_times(knots, unit.settings.rate_hz), unit.mount.agent_from_sensor()
     rate, change = turn(imu_s, 1), turn(imu_s, 2)  # vehicle's frame
     arm = np.broadcast_to(mount[:3, 3], rate.shape)
     lever = np.cross(change, arm) + np.cross(rate, np.cross(rate, arm))
     force = turn(imu_s).inv().apply(way(imu_s, 2) - GRAVITY) + lever
     true = np.concatenate((force @ mount[:3, :3], rate @ mount[:3, :3]), axis=1)
-    inertia = true + draw_imu_errors(unit.settings, imu_s, *draw(imu))
+    inertia = true + sum(draw_imu_errors(unit.settings, imu_s, *draw(imu)))
     return NavigationLog(gnss, imu, receiver.settings, unit.settings, at_s, fix, imu_s, inertia)
 
 
