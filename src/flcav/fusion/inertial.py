@@ -93,8 +93,8 @@ def estimate_drive(
 
     geo: position of the map's origin. ground: heights [m] of the map at x, y (M,) [m]; NaN where it has several. Of the
     heading at the beginning nothing is known: `HEADINGS` are tried, and of those with which the car drives forwards the
-    likeliest is taken, with the spread of those that are nearly as likely in its covariance. Raises `InputError` where a time is not within the log, or the
-    log's fixes and IMU are not of one drive.
+    likeliest is taken, with the spread of those that are nearly as likely in its covariance. Raises `InputError` where
+    a time is not within the log, or the log's fixes and IMU are not of one drive.
     """
     if (off := at_s[~log.covers(at_s)]).size:
         raise InputError(
