@@ -26,7 +26,7 @@ AT_S = np.arange(12.0, 30.01, 0.2)
 def drive(speed_mps: np.ndarray, yaw_rate: np.ndarray, heading: float = 0.5, slope: float = 0.0) -> Trace:
     """Return the trace of a car that moves along its heading, on a plane that rises by `slope` to the east."""
     fine = 20  # steps of the integration in each of the trace's
-    time_s = STEP_S * np.arange(len(speed_mps))
+    time_s = np.arange(len(speed_mps), dtype=np.float64) * STEP_S
     inner = np.arange(0, time_s[-1] + 1e-9, STEP_S / fine)
     speed, turning = (np.interp(inner, time_s, each) for each in (speed_mps, yaw_rate))
     yaw = heading + np.concatenate(([0], np.cumsum((turning[1:] + turning[:-1]) / 2 * STEP_S / fine)))
@@ -61,15 +61,15 @@ def city(seed: int = 0) -> Trace:
     speed = np.interp(time_s, knots, np.array([6, 10, 8, 0, 0, 7, 11, 5]) * rng.uniform(0.7, 1.3))
     turning = np.interp(time_s, knots, [0, 0, *rng.uniform(-0.3, 0.3, 1), 0, 0, *rng.uniform(-0.5, 0.5, 2), 0])
     smooth = np.ones(9) / 9
-    return drive(
-        *(np.convolve(np.pad(each, 4, "edge"), smooth, "valid") for each in (speed, turning)), rng.uniform(-3, 3)
-    )
+    smoothed = [np.convolve(np.pad(each, 4, "edge"), smooth, "valid") for each in (speed, turning)]
+    return drive(smoothed[0], smoothed[1], rng.uniform(-3, 3))
 
 
 def truth(trace: Trace, at_s: np.ndarray) -> np.ndarray:
     row = np.rint(at_s / STEP_S).astype(int)
     tilt = np.zeros((len(trace.time_s), 2)) if trace.tilt is None else trace.tilt[:, 0]
-    return np.stack([pose(*trace.position[k, 0], float(trace.yaw[k, 0]), *tilt[k]) for k in row])
+    place = trace.position[:, 0]
+    return np.stack([pose(*place[k].tolist(), float(trace.yaw[k, 0]), tilt[k, 0], tilt[k, 1]) for k in row])
 
 
 def rig_of(gnss: Gnss | None = None, imu: Imu | None = None, imu_mount: Mount | None = None) -> Rig:
@@ -222,10 +222,10 @@ def test_a_factor_graph_finds_the_same_poses() -> None:
     seen, none = convert_to_map(GEO, log.fix), gtsam.imuBias.ConstantBias()
 
     def numerical(error: Any, keys: list[int], sigmas: list[float], graph: Any = graph) -> None:
-        def factor(this: Any, at: Any, jacobians: Any) -> np.ndarray:
+        def factor(_: Any, at: Any, jacobians: Any) -> np.ndarray:
             parts = [at.atPose3(keys[0]), *((at.atVector(keys[1]),) if len(keys) > 1 else ())]
             out = error(*parts)
-            for i, part in enumerate(parts if jacobians is not None else ()):
+            for i, part in enumerate(parts) if jacobians is not None else ():
                 width = 6 if i == 0 else 3
                 columns = []
                 for step in 1e-6 * np.eye(width):
