@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.fusion.inertial import Mounts, estimate_drive
-from flcav.geometry import pose, wrap_angle
+from flcav.geometry import rotations, wrap_angle
 from flcav.sensors.navigation_log import log_drive
 from flcav.sensors.rig import RIGS
 from flcav.world.geodesy import convert_to_map
@@ -69,8 +69,8 @@ def measure_drive(town: Town, drives: Trace, agent: str, seed: int) -> NDArray[n
     bent = turned[middle, None] * np.einsum("ij,ij->i", place - place[middle], along)[:, None] * left
     apart = off - off[middle] - bent  # what the frame's own heading error does not explain
     tilts = np.zeros((len(step), 2)) if drives.tilt is None else drives.tilt[step, own]
-    poses = np.stack([pose(*drives.position[k, own], float(drives.yaw[k, own]), *tilt) for k, tilt in zip(step, tilts)])
-    antenna = (poses @ MOUNTS.agent_from_gnss)[:, :2, 3]
+    lever = rotations(yaw, *tilts.T) @ MOUNTS.agent_from_gnss[:3, 3]
+    antenna = place + lever[:, :2]
     fix = convert_to_map(town.geo, log.fix[np.searchsorted(log.fix_time_s, at_s - 1e-6)])[:, :2] - antenna
     columns = (
         np.linalg.norm(off, axis=1),
