@@ -147,6 +147,22 @@ def test_the_loop(tmp_path: Path):
     assert "<html" in (tmp_path / "loop/plan.html").read_text()
 
 
+@pytest.mark.slow
+def test_drive_in_live_traffic(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    run("08_drive_in_live_traffic.py", 20, monkeypatch=monkeypatch)
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 4
+    assert all(", 0 collisions; " in line for line in said)
+    assert int(re.findall(r": (\d+) m along the route", said[-1])[0]) > 30
+
+
+def test_the_program_in_the_page_of_live_traffic_runs(capsys: pytest.CaptureFixture[str]):
+    page = (EXAMPLES.parent / "docs" / "live.md").read_text(encoding="utf-8")
+    first, *_ = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
+    exec(first, {})
+    assert re.match(r"\d", capsys.readouterr().out)
+
+
 def test_the_loop_is_the_same_as_a_page_and_as_a_program():
     page = (EXAMPLES.parent / "docs" / "loop.md").read_text()
     program = (EXAMPLES / "07_the_loop.sh").read_text()

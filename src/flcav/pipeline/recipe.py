@@ -131,7 +131,7 @@ def draw_stragglers(how: Stragglers, vehicles: Sequence[str], seed: int, region:
 class FixedPlan(Config):
     """A task's plan, given by hand instead of computed."""
 
-    samples: int = Field(ge=1, le=10**6)  # samples uploaded for pretraining
+    samples: Count  # samples uploaded for pretraining; 0: none, and the network stays that of `weights`
     edge_rounds: Count  # rounds of edge FL
     cloud_rounds: Count  # rounds of cloud FL
 
@@ -159,6 +159,9 @@ class TaskRecipe(Config):
     """Settings of one perception task in a run."""
 
     network: str | None = None  # name of a network configuration; default: the task's first
+    weights: str | None = (
+        None  # file of weights of this network, from which training goes on; shipped: those of the package
+    )
     weight: Positive = 1.0  # weight of the task's error in the plan's objective
     labels: str | None = None  # kind of labels in stages II and III; default: the task's first
     train_s: float = Field(default=0.0, ge=0)  # time that a vehicle trains in one round [s], for `horizon_s`
@@ -166,6 +169,17 @@ class TaskRecipe(Config):
     plan: FixedPlan | None = None  # a plan given by hand, instead of a history
     recording: Recording = Recording()  # changes to how the task is recorded
     training: Training | None = None  # training schedule; default: the run's
+
+    @property
+    def pretrains(self) -> bool:
+        """Return whether stage I trains: it does unless the plan has no samples for it."""
+        return self.plan is None or self.plan.samples > 0
+
+    @model_validator(mode="after")
+    def _begins_with_a_network(self) -> Self:
+        if not self.pretrains and self.weights is None:
+            raise ValueError("a plan of 0 samples trains nothing in stage I: name the 'weights' to begin with")
+        return self
 
 
 class Region(Config):
@@ -379,6 +393,11 @@ class RunRecipe(Config):
         ]
         if self.stragglers is not None and not any(timed):
             raise ValueError("stragglers: time counts with 'horizon_s' or 'federation.network' alone; give one of them")
+        replays = any(
+            how.get("replay") for how in (self.federation.model_dump(), *(arm.federation for arm in self.arms.values()))
+        )
+        if replays and not all(task.pretrains for task in self.tasks.values()):
+            raise ValueError("federation.replay: the cloud trains on samples of stage I, and a plan has none")
         if MAIN in self.arms:
             raise ValueError(f"arms: '{MAIN}' is the run itself; choose another name")
         for name, arm in self.arms.items():
@@ -393,6 +412,8 @@ class RunRecipe(Config):
         return self
 
     def _check_arm(self, name: str, arm: Arm) -> None:
+        if arm.central == PRETRAIN and not all(task.pretrains for task in self.tasks.values()):
+            raise ValueError(f"arms.{name}.central: more pretraining goes with samples of stage I, and a plan has none")
         federating = self.with_role("federate")
         for field, known in (("regions", federating), ("labels", tuple(self.tasks))):
             for each in getattr(arm, field) or ():

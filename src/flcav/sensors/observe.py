@@ -36,18 +36,21 @@ def observe(
     seed: int,
     weather: Weather = CLEAR,
     error: CalibrationError = EXACT,
+    number: int | None = None,
 ) -> Frame:
     """Return the frame of `agent` ("cav0", "pole3") with `rig` at instant `index` of the scene's traffic run.
 
+    Its own index is `number`, by default `index`: of a live world, whose traces have one instant, that of the step.
     Moves `scene` there. The same arguments give the same bytes, whatever was observed before: each sensor has a random
-    stream of its own, named by `seed`, scene, instant, agent and sensor, so that it does not depend on the rig's other
+    stream of its own, named by `seed`, scene, number, agent and sensor, so that it does not depend on the rig's other
     sensors. `error` changes the frame's assumed calibration alone.
     Raises `InputError` for an agent that the run does not have, or not at that instant.
     """
+    number = index if number is None else number
     carrier = _Carrier(scene, agent, index, _actor_of(scene, agent, index), build_calibration(rig))
 
     def rng(sensor: str) -> np.random.Generator:
-        return stream(seed, scene_name, index, agent, sensor)
+        return stream(seed, scene_name, number, agent, sensor)
 
     def bias_rng(sensor: str) -> np.random.Generator:
         return stream(seed, scene_name, agent, sensor)
@@ -84,7 +87,7 @@ def observe(
     row[actors + 1] = np.arange(1, len(actors) + 1)
     return Frame(
         scene=scene_name,
-        index=index,
+        index=number,
         time_s=float(scene.trace.time_s[index]),
         agent=agent,
         world_from_agent=carrier.pose(),

@@ -13,7 +13,7 @@ from flcav.sensors.frame import LONGEST_NAME, Frame, format_key
 from flcav.sensors.navigation_log import NavigationLog, log_drive
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
-from flcav.sources.randomisation import randomise_rig, randomise_sizes, randomise_town, town_files
+from flcav.sources.randomisation import randomise_bodies, randomise_rig, randomise_town, town_files
 from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import derive_seed, stream
 from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, check_town_name, load_town
@@ -170,7 +170,7 @@ class EmbeddedSource:
                 scenarios=self.recipe.scenarios,
             )
             if self.recipe.randomise is not None:
-                trace = randomise_sizes(trace, stream(self.recipe.seed, scene, "sizes"))
+                trace = randomise_bodies(trace, stream(self.recipe.seed, scene, "sizes"))
             self._last_traffic = scene, trace, drives
         return self._last_traffic[1:]
 

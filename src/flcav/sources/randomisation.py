@@ -31,7 +31,15 @@ Draw = np.random.Generator
 
 CELL_M, FAR_CELL_M = 5.0, 50.0  # of the terrain within the town's bounds, and beyond them
 STEEPEST = 0.035  # slope of one of three long waves of the terrain
+BOW_M = (0.1, 0.5)  # least and most of a car's ends; on KITTI's cars about .25 m at the rear, .35 m at the front
 LARGEST = 1.06  # factor of a car's length: parked cars keep apart
+Spans = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+ALIKE: Spans = ((1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
+FACTORS: Mapping[str, Spans] = {  # of length, width and height, by category; others keep their size
+    **dict.fromkeys(("car", "van"), ((0.85, LARGEST), (0.92, 1.08), (0.9, 1.12))),
+    **dict.fromkeys(("bicycle", "motorcycle"), ((0.92, 1.08), (0.85, 1.1), (0.95, 1.06))),
+    "pedestrian": ((0.75, 1.7), (0.7, 1.15), (0.9, 1.08)),
+}
 PATTERNS = ("hdl64e", "vlp32c twice", "vls128", "os1_128", "even")  # of beams; "twice": two LiDARs, one on the other
 EVEN_BEAMS = (40, 96)  # fewest and most of the pattern "even"
 DRAWN_BEAMS = (40, 128)  # fewest and most of all `PATTERNS`
@@ -184,9 +192,12 @@ def _draw_beams(pattern: str, draw: Draw) -> tuple[tuple[float, ...], int]:
     return tuple(float(elevation) for elevation in off.round(3)), steps
 
 
-def randomise_sizes(trace: Trace, draw: Draw) -> Trace:
-    """Return the trace with the length, width and height of cars and vans drawn around those of their shapes."""
-    cars = np.isin(trace.category, ("car", "van"))[:, None]
-    low, high = np.transpose(((0.85, LARGEST), (0.92, 1.08), (0.9, 1.12)))
-    factor = draw.uniform(low, high, size=trace.size.shape)
-    return replace(trace, size=np.where(cars, (trace.size * factor).round(3), trace.size))
+def randomise_bodies(trace: Trace, draw: Draw) -> Trace:
+    """Return the trace with sizes of actors drawn around those of their shapes, and the ends of cars and vans bowed.
+
+    Pedestrians differ most: in their stride, and in how they hold their arms.
+    """
+    spans = np.array([FACTORS.get(kind, ALIKE) for kind in trace.category.tolist()]).reshape(-1, 3, 2)
+    size = (trace.size * draw.uniform(spans[..., 0], spans[..., 1])).round(3)
+    bow = draw.uniform(*BOW_M, size=len(size)).round(3)
+    return replace(trace, size=size, bow=np.where(np.isin(trace.category, ("car", "van")), bow, 0.0))

@@ -44,18 +44,35 @@ class Scene:
         Raises `OSError` where the ray casting engine is missing.
         """
         self.town = town
-        self.trace = trace
-        self.index = 0
-        self.offset_s = 0.0
-        models = [_town_model(town), *(_actor_model(*trace.model(actor)) for actor in range(len(trace.actor)))]
+        self._engine = Embree()
+        self._town_model = _town_model(town)
+        self._cast(trace)
+
+    def follow(self, trace: Trace) -> None:
+        """Go to the first instant of another trace in the same town, in which actors may have come and gone.
+
+        If they are the same, nothing but their places changes: so a scene can follow the snapshots of a live world.
+        """
+        same = all(
+            np.array_equal(getattr(trace, name), getattr(self.trace, name))
+            for name in ("actor", "category", "shape", "size", "bow")
+        )
+        if not same:
+            self._cast(trace)
+            return
+        self.trace, self.index, self.offset_s, self._hidden = trace, 0, 0.0, None
+        self._place()
+
+    def _cast(self, trace: Trace) -> None:
+        """Make an instance of each actor of a trace, and go to its first instant."""
+        self.trace, self.index, self.offset_s = trace, 0, 0.0
+        models = [self._town_model, *(_actor_model(*trace.model(actor)) for actor in range(len(trace.actor)))]
         self.surfaces = _surfaces(models, [str(name) for name in trace.actor])
         self._solids = [model.solid for model in models]
-        self._engine = Embree()
         self._assembly = self._engine.assembly(self._solids)
         self._assembly.place(0, np.eye(4))
-        self._placed = np.full(
-            (len(trace.actor), 6), np.nan
-        )  # x, y, z, yaw, pitch, roll; NaN where an actor is not placed
+        # x, y, z, yaw, pitch, roll; NaN where an actor is not placed
+        self._placed = np.full((len(trace.actor), 6), np.nan)
         self._hidden: int | None = None
         self._place()
 

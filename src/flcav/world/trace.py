@@ -52,8 +52,8 @@ class Trace:
     town: str  # name of the town
     time_s: Array  # (T,) ascending, from the start of the traffic
     actor: NDArray[np.str_]  # (A,) track ids, e.g. "cav0", "veh17", "parked3", "ped8"
-    category: NDArray[np.str_]  # (A,) one of CATEGORIES
-    shape: NDArray[np.int64]  # (A,) row of SHAPES[category]
+    category: NDArray[np.str_]  # (A,) one of CATEGORIES; "prop" of what a client has put into a live world
+    shape: NDArray[np.int64]  # (A,) row of SHAPES[category], of props of PROPS
     size: Array  # (A, 3) length, width, height [m]
     present: NDArray[np.bool_]  # (T, A) whether the actor is in the town
     position: Array  # (T, A, 3) ground centre [m]; NaN where absent
@@ -67,10 +67,12 @@ class Trace:
     tilt: Array | None = (
         None  # (T, A, 2) pitch and roll [rad], as in `geometry.pose`; NaN where absent; None: all level
     )
+    bow: Array | None = None  # (A,) of the ends of its body [m], see `meshes.mesh.bow_ends`; None: all are flat
 
     def model(self, actor: int) -> tuple[str, int, tuple[float, ...]]:
-        """Return category, shape and size [m] of an actor, by which its mesh is known."""
-        return str(self.category[actor]), int(self.shape[actor]), tuple(self.size[actor].tolist())
+        """Return category, shape, and size with any bow [m] of an actor, by which its mesh is known."""
+        bow = () if self.bow is None else (float(self.bow[actor]),)
+        return str(self.category[actor]), int(self.shape[actor]), (*self.size[actor].tolist(), *bow)
 
     def tilts(self, index: int) -> Array:
         """Return pitch and roll (A, 2) [rad] at an instant."""
@@ -103,6 +105,8 @@ class Trace:
             "light": self.light.tolist(),
             "light_state": [[i, "".join(self.light_state[i])] for i in changed if i < len(self.time_s)],
         }
+        if self.bow is not None:
+            rest["bow"] = self.bow.tolist()
         if self.events:
             rest["events"] = [event._asdict() for event in self.events]
         table = pa.table(columns).replace_schema_metadata({METADATA: json.dumps(rest)})
@@ -158,6 +162,7 @@ class Trace:
             light_state=light_state,
             events=tuple(Event(row["kind"], row["begins_s"], tuple(row["actors"])) for row in rest.get("events", [])),
             tilt=tilt,
+            bow=np.array(rest["bow"], dtype=np.float64) if "bow" in rest else None,
         )
         trace._check()
         return trace
@@ -176,5 +181,9 @@ class Trace:
         numbers = (np.concatenate(motion, axis=2)[self.present], self.time_s, self.size, tilts)
         if not all(np.isfinite(each).all() for each in numbers):
             raise ValueError("a number is not finite")
+        if self.bow is not None and not (
+            self.bow.shape == self.actor.shape and ((self.bow >= 0) & (self.bow < 1)).all()
+        ):
+            raise ValueError("a bow is not of an actor, or not within 0 and 1 m")
         if (self.size <= 0).any() or (np.diff(self.time_s) <= 0).any():
             raise ValueError("a size is not above 0, or time does not go on")

@@ -169,3 +169,13 @@ def test_no_point_is_left_out_that_augmentation_brings_into_the_range(seed):
     low, high = np.array(config.range_m[:3]), np.array(config.range_m[3:])
     within = ((moved[:, :3] >= low) & (moved[:, :3] < high)).all(1)
     assert set(moved[within, 3]) <= set(crop_to_range(points, config)[:, 3])
+
+
+def test_a_margin_makes_the_boxes_of_its_class_larger_and_moves_no_return():
+    boxes = Boxes(np.zeros((2, 3)), np.full((2, 3), 2.0), np.array([0.0, 1.0]), np.array(["Car", "Cyclist"]))
+    sample = Sample(np.ones((3, 4), np.float32), boxes)
+    how = Augmentation(turn_rad=0, scale=0, margin_m=(("Car", 0.2, -0.1, 0.4),))
+    out = augment(sample, how, np.random.default_rng(0))
+    np.testing.assert_array_equal(out.points, sample.points)
+    np.testing.assert_allclose(out.boxes.size, [[2.2, 1.9, 2.4], [2, 2, 2]])
+    np.testing.assert_allclose(out.boxes.center[:, 2] - out.boxes.size[:, 2] / 2, -1)

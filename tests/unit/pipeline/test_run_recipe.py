@@ -48,6 +48,7 @@ def test_every_region_is_validated_and_tested() -> None:
     assert all({"validation", "test"} <= set(splits) for splits in SPLITS_OF.values())
 
 
+STARTED = {"objects": {"weights": "shipped", "plan": {"samples": 0, "edge_rounds": 1, "cloud_rounds": 1}}}
 ARM = {"placement": {"rule": "densest"}}
 
 
@@ -60,6 +61,12 @@ ARM = {"placement": {"rule": "densest"}}
             {"tasks": {"objects": {"history": "objects", "plan": {"samples": 1, "edge_rounds": 1, "cloud_rounds": 1}}}},
             "it has both",
         ),
+        (
+            {"tasks": {"objects": {"plan": {"samples": 0, "edge_rounds": 1, "cloud_rounds": 1}}}},
+            "a plan of 0 samples trains nothing in stage I: name the 'weights' to begin with",
+        ),
+        ({"tasks": STARTED, "arms": {"more": {"central": "pretrain"}}}, "more pretraining goes with samples"),
+        ({"tasks": STARTED, "federation": {"replay": 0.3}}, "the cloud trains on samples of stage I"),
         ({"regions": {"grid": {"role": "federate"}}}, "one with the role pretrain is wanted"),
         ({"regions": {"suburb": {"role": "pretrain"}}}, "one with the role federate is wanted"),
         ({"regions": {"a": {"role": "pretrain", "vehicles": 2}}}, "'vehicles' belong to a town with the role federate"),

@@ -251,7 +251,7 @@ def test_pretraining_takes_the_tasks_schedule_and_ends_with_its_last_step(
 ) -> None:
     learning = Learning(LINEAR, None, Training(steps=25), 3)
     monkeypatch.setattr(centralised, "mean_score", lambda task, network, splits: -float(network.weight.detach()))
-    found = pretrain(learning, SAMPLES, (), tmp_path, ignore_progress)
+    found = pretrain(learning, learning.build_network(), SAMPLES, (), tmp_path, ignore_progress)
     other = learning.build_network()
     history = train(LINEAR, other, SAMPLES, steps=25, schedule="one_cycle", seed=derive_seed(3, "pretrain"))
     kept = load_file(tmp_path / WEIGHTS)
@@ -269,12 +269,19 @@ def test_a_kill_does_not_change_pretraining(tmp_path: Path, monkeypatch: pytest.
             raise KeyboardInterrupt
 
     learning = Learning(LINEAR, None, Training(steps=90), 3)
-    whole = pretrain(learning, SAMPLES, (), tmp_path, ignore_progress)
+    whole = pretrain(learning, learning.build_network(), SAMPLES, (), tmp_path, ignore_progress)
     (tmp_path / "killed").mkdir()
     with pytest.raises(KeyboardInterrupt):
-        pretrain(learning, SAMPLES, (), tmp_path / "killed", killed)
+        pretrain(learning, learning.build_network(), SAMPLES, (), tmp_path / "killed", killed)
     taken: list[int] = []
-    again = pretrain(learning, SAMPLES, (), tmp_path / "killed", lambda done, total, note="": taken.append(done))
+    again = pretrain(
+        learning,
+        learning.build_network(),
+        SAMPLES,
+        (),
+        tmp_path / "killed",
+        lambda done, total, note="": taken.append(done),
+    )
     assert taken[0] == 64  # validated, and kept, every 9 steps
     assert again == whole
     assert (tmp_path / "killed" / WEIGHTS).read_bytes() == (tmp_path / WEIGHTS).read_bytes()

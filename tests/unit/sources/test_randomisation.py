@@ -13,9 +13,10 @@ from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.randomisation import (
     DRAWN_BEAMS,
+    FACTORS,
     draw_terrain,
+    randomise_bodies,
     randomise_rig,
-    randomise_sizes,
     randomise_town,
     town_files,
 )
@@ -108,16 +109,22 @@ def test_every_car_has_a_lidar_of_its_own(source: EmbeddedSource):
     assert max(beams) == DRAWN_BEAMS[1]
 
 
-def test_cars_alone_change_their_sizes(source: EmbeddedSource):
+def test_sizes_are_drawn_by_category_and_the_ends_of_cars_are_bowed(source: EmbeddedSource):
     trace = source.trace(source.scenes()[0])
     nominal = np.array([SHAPES[kind][shape][1:] for kind, shape in zip(trace.category, trace.shape)])
+    for kind, spans in FACTORS.items():
+        low, high = np.transpose(spans)
+        factor = (trace.size / nominal)[trace.category == kind]
+        assert (factor >= low - 0.002).all()
+        assert (factor <= high + 0.002).all()
+        assert len(factor) < 3 or (np.std(factor, axis=0) > (high - low) / 10).all()
+    others = ~np.isin(trace.category, [*FACTORS])
+    np.testing.assert_array_equal(trace.size[others], nominal[others])
     cars = np.isin(trace.category, ("car", "van"))
-    np.testing.assert_array_equal(trace.size[~cars], nominal[~cars])
-    factor = trace.size[cars] / nominal[cars]
-    assert (factor >= (0.849, 0.919, 0.899)).all()
-    assert (factor <= (1.061, 1.081, 1.121)).all()
-    assert np.std(factor[:, 0]) > 0.03
-    again = randomise_sizes(trace, stream(0, "sizes"))
+    assert trace.bow is not None
+    assert (trace.bow[~cars] == 0).all()
+    assert 0.1 <= trace.bow[cars].min() < trace.bow[cars].max() <= 0.5
+    again = randomise_bodies(trace, stream(0, "sizes"))
     assert again.model(0)[:2] == trace.model(0)[:2]
 
 

@@ -109,3 +109,17 @@ def test_every_category_and_material_is_known():
     assert set(MAKERS) == set(CATEGORIES) == set(SHAPES)
     assert set(OPTICS) == set(Material)
     assert all(0 < optics.reflectivity <= 1 for optics in OPTICS.values())
+
+
+@pytest.mark.parametrize("shape", [1, 3, 6])
+def test_bowed_ends_keep_the_box_and_draw_in_its_corners(shape: int):
+    size = SHAPES["car"][shape][1:]
+    flat, bowed = actor_mesh("car", shape, size), actor_mesh("car", shape, (*size, 0.4))
+    np.testing.assert_allclose(bowed.bounds(), flat.bounds(), atol=1e-5)
+    drawn_in = np.abs(flat.vertices[:, 0]) - np.abs(bowed.vertices[:, 0])
+    assert (drawn_in >= -1e-6).all()
+    ends = np.abs(flat.vertices[:, 0]) > size[0] / 2 - 0.01
+    side = np.abs(flat.vertices[:, 1]) / (size[1] / 2)
+    np.testing.assert_allclose(drawn_in[ends], 0.4 * side[ends] ** 3, atol=0.02)
+    assert drawn_in[ends].max() > 0.15
+    assert (drawn_in[np.abs(flat.vertices[:, 0]) < size[0] / 2 - 0.6] < 1e-6).all()

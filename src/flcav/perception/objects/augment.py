@@ -2,14 +2,15 @@
 
 Global mirroring, turning and scaling, and ground-truth sampling are those of SECOND (Yan et al. 2018, sec. 3.2.1). The
 others vary what differs between LiDARs, cars and countries: sizes of objects (random object scaling of Yang et al.,
-"ST3D", CVPR 2021), pose of the sensor, lost returns, field of view.
+"ST3D", CVPR 2021), pose of the sensor, lost returns, field of view. Boxes that annotators draw have a margin: they
+begin before the first return, and leave out mirrors.
 
 Ground-truth sampling pastes an object with its returns at the place where it was recorded, so that their density is
 that of its distance. It is left out where its footprint overlaps another; returns of the scene inside its box are
 removed.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,8 +29,8 @@ VIEW = (0.845, 0.28, 0.24)  # tangents of a camera's field of view, sideways, do
 def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Sample:
     """Return the sample augmented by random amounts drawn from `rng`, within the limits of `how`.
 
-    The order is: cars resized; the whole mirrored, turned and scaled; shifted; tilted and lifted; returns dropped; cut
-    to a camera's field of view.
+    The order is: cars resized, boxes given their margin; the whole mirrored, turned and scaled; shifted; tilted and
+    lifted; returns dropped; cut to a camera's field of view.
     """
     mirror = -1.0 if how.flip and rng.random() < 0.5 else 1.0
     turn = rng.uniform(-how.turn_rad, how.turn_rad)
@@ -39,6 +40,8 @@ def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Samp
         factor = rng.uniform(low, high, size=(len(sample.boxes), 3))
         changed = (sample.boxes.label == "Car") & (rng.random(len(factor)) < how.resized)
         sample = resize_objects(sample, np.where(changed[:, None], factor, 1.0))
+    for name, *margin_m in how.margin_m:
+        sample = replace(sample, boxes=add_margin(sample.boxes, name, margin_m))
     sample = transform_sample(sample, mirror, turn, scale)
     if how.shift_m:
         sample = shift_sample(sample, rng.uniform(-how.shift_m, how.shift_m, size=2))
@@ -90,6 +93,12 @@ def resize_objects(sample: Sample, factor: NDArray[np.float64]) -> Sample:
         points[inside, :3] = (sample.points[inside, :3] - foot[row]) @ stretch + foot[row]
     size = boxes.size * factor
     return replace(sample, points=points, boxes=replace(boxes, center=foot + size * (0, 0, 0.5), size=size))
+
+
+def add_margin(boxes: Boxes, name: str, margin_m: Sequence[float]) -> Boxes:
+    """Return the boxes with those of a class longer, wider and higher by a margin [m]; undersides stay in place."""
+    more = np.where((boxes.label == name)[:, None], margin_m, 0.0)
+    return replace(boxes, center=boxes.center + more * (0, 0, 0.5), size=boxes.size + more)
 
 
 def shift_sample(sample: Sample, by_m: NDArray[np.float64]) -> Sample:

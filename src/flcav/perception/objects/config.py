@@ -13,6 +13,7 @@ Share = Annotated[float, Field(gt=0, lt=1)]
 Count = Annotated[int, Field(gt=0, le=4096)]
 Layers = Annotated[int, Field(ge=0, le=64)]
 Span = tuple[Positive, Positive]  # minimum, maximum
+Margin = Annotated[float, Field(ge=-0.5, le=0.5)]
 Portion = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -38,6 +39,7 @@ class Augmentation:
     shift_m: Annotated[float, Field(ge=0)] = 0.0  # of the whole scene, along x and along y, to either side
     resize: tuple[Span, Span, Span] = ((1, 1), (1, 1), (1, 1))  # factors of a car's length, width and height
     resized: Annotated[float, Field(ge=0, le=1)] = 1.0  # probability that a car is resized
+    margin_m: tuple[tuple[str, Margin, Margin, Margin], ...] = ()  # class; its boxes are longer, wider, higher by that
     tilt_rad: Portion = 0.0  # of the sensor, about any horizontal axis
     lift_m: Portion = 0.0  # of the sensor, up or down
     drop: Portion = 0.0  # share of the returns that are dropped

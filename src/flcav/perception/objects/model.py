@@ -227,8 +227,8 @@ def small_config(
     KITTI's benchmark asks for cars of 25 pixels or more, which are within 43 m. Intensity is no input, since each LiDAR
     reports it in its own way. The augmentation varies what differs between simulated and real streets: tilt and height
     of the sensor, distance and size of cars, lost returns, field of view. KITTI's cars are smaller than the simulated
-    ones, so the anchor is the published one, KITTI's mean car, and half of the cars are resized. Raises `InputError`
-    for unknown classes.
+    ones, so the anchor is the published one, KITTI's mean car, and most cars are resized. Boxes have the margins of
+    KITTI's labels. Raises `InputError` for unknown classes.
     """
     return SecondConfig(
         anchors=tuple(KITTI_CAR if anchor.name == "Car" else anchor for anchor in _anchors(classes)),
@@ -247,8 +247,9 @@ def small_config(
             turn_rad=math.pi / 4,
             scale=0.05,
             shift_m=1.5,
-            resize=((0.7, 1.1), (0.8, 1.05), (0.9, 1.15)),
-            resized=0.5,
+            resize=((0.7, 1.05), (0.8, 1.05), (0.9, 1.15)),
+            resized=0.8,
+            margin_m=(("Car", 0.12, -0.06, 0.0), ("Pedestrian", 0.08, 0.08, 0.0)),
             tilt_rad=0.02,
             lift_m=0.2,
             drop=0.3,

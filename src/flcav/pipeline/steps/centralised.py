@@ -5,6 +5,7 @@ The latter is a control that takes as many optimiser steps as stage II.
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,22 +42,28 @@ from flcav.pipeline.steps.settings import (
 from flcav.pipeline.training.checkpoints import LAST
 from flcav.pipeline.training.learning import Learning, load_stage_network
 from flcav.pipeline.training.messages import choose_planned_uploads, choose_uploads, upload_samples
+from flcav.pipeline.training.starting_weights import StartingWeights, load_start
 from flcav.statistics.streams import derive_seed
 
 CHECKPOINT, ROUND = "checkpoint.pt", LAST
+COUNTED_MB = 1e9  # budget of a link that is counted and never full
 VALIDATIONS, APART = 10, 5  # during pretraining; at least so many steps apart
 
 
 def pretrain(
-    learning: Learning, samples: Sequence[Any], validation: Sequence[Frames], folder: Path, report: Report
+    learning: Learning,
+    network: Any,
+    samples: Sequence[Any],
+    validation: Sequence[Frames],
+    folder: Path,
+    report: Report,
 ) -> tuple[Validated, ...]:
-    """Pretrain with the task's schedule of the learning rate; return the validations on the way.
+    """Pretrain a network with the task's schedule of the learning rate; return the validations on the way.
 
     Writes the weights of the last step. An interrupted training resumes after its last validation.
     """
     task, steps = learning.task, learning.training.steps
     every = max(steps // VALIDATIONS, min(APART, steps))
-    network = learning.build_network()
     history = train(
         task,
         network,
@@ -111,6 +118,7 @@ class PretrainSettings(StepSettings):
     """Settings of stage I of a task."""
 
     learning: LearningSettings
+    start: StartingWeights | None = None  # None: initial weights are drawn
     plan: str
     pools: Mapping[str, str]  # recordings of the candidates for upload, by region
     validation: tuple[str, ...]  # recordings of the frames that it is validated on
@@ -141,21 +149,26 @@ def pretrain_step(work: Work, settings: PretrainSettings, processes: int = 1) ->
     else:
         held = {region: dict(list_frames(region, split)) for region, split in opened.items()}
         chosen = choose_planned_uploads(held, uploads, settings.upload_seed)
+    network = learning.build_network() if settings.start is None else load_start(learning.task, settings.start)
     book, samples = Ledger(share_plan_budget(plan, settings.budgets_mb, task)), list[Any]()
     for region, frames in chosen.items():
         if frames:
-            received = upload_samples(book, learning.task, learning.config, region, opened[region], frames)
+            received = upload_samples(book, learning.task, network.config, region, opened[region], frames)
             samples += [received[number] for number in range(len(received))]  # in memory: each is drawn many times
     book.save(work.folder / LEDGER)
-    with second_core() if processes > 1 else contextlib.nullcontext():
-        validated = pretrain(learning, samples, watched, work.folder, work.report)
+    validated = ()
+    if samples:
+        with second_core() if processes > 1 else contextlib.nullcontext():
+            validated = pretrain(learning, network, samples, watched, work.folder, work.report)
+    else:
+        save_network(learning.task, network, work.folder / WEIGHTS)
     trained = load_stage_network(learning.task, work.folder)
     Pretrained(
         task=task,
         network=learning.network or next(iter(learning.task.configurations)),
         uploaded=chosen,
         validated=validated,
-        steps=learning.training.steps,
+        steps=learning.training.steps if samples else 0,
         threshold=fit_label_threshold(trained, watched) if settings.thresholded else None,
         track_threshold=fit_track_threshold(trained, watched, work.report) if settings.tracked else None,
     ).save(work.folder)
@@ -168,6 +181,7 @@ def list_pretraining(outline: Outline, arm: Setting) -> Iterator[Step]:
         kinds = [LABEL_SOURCES[each.labels[task]] for each in outline.settings.values()]
         settings = PretrainSettings(
             learning=outline.learning(arm, task),
+            start=outline.starts[task],
             plan=names.plan(arm.name),
             pools=outline.pools(task),
             validation=tuple(names.recording(region, "validation", task) for region in recipe.with_role("pretrain")),
@@ -229,6 +243,7 @@ def oracle_step(work: Work, settings: OracleSettings) -> None:
         held = learning.task.samples(split.data, trained.config, frames)
     else:
         share = share_plan_budget(Plan.load(work.inputs[inputs.plan]), settings.budgets_mb, learning.task.name)
+        share = replace(share, wireline_mb=COUNTED_MB)  # the cloud rounds that it was planned for do not take place
         book = Ledger(share, read_entries(work, inputs.pretrain))
         before = len(book.entries)
         chosen = choose_uploads({inputs.region: frames}, settings.uploads, settings.learning.seed)[inputs.region]

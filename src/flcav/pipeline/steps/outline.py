@@ -18,6 +18,7 @@ from flcav.pipeline.labels.tracks import WINDOW_EVERY_S, WINDOW_S
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, Region, Role, RunRecipe, SplitName, find_path
 from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.steps.settings import LearningSettings, RegionInputs
+from flcav.pipeline.training.starting_weights import find_start
 from flcav.statistics.streams import derive_seed
 
 NAVIGATION_S = 20.0  # of navigation logs before the first frame
@@ -34,6 +35,7 @@ class Outline:
         self.recipe, self.beside = recipe, beside.absolute()
         for task, own in recipe.tasks.items():
             check_network(task_named(task), own.network)
+        self.starts = {task: find_start(task_named(task), own, self.beside) for task, own in recipe.tasks.items()}
         self.settings = resolve_settings(recipe)
         for setting in self.settings.values():
             for task, kind in setting.labels.items():

@@ -124,7 +124,7 @@ def _draw(axes: Axes, slices: Mapping[str, Sequence[Bar]]) -> None:
 def costs(
     panels: Mapping[str, Mapping[str, tuple[float, MeanOverSeeds]]], cost: str, measure: str, front: Sequence[str]
 ) -> Figure:
-    """Return a panel per title with a measure against its cost, named points with intervals; `front` joins the best."""
+    """Return a panel per title with a measure against its cost, named points with intervals; `front` joins some."""
     figure = style.canvas(PANEL_IN * len(panels), 3.6)
     for axes, (title, points) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         best = sorted((points[name][0], points[name][1].mean) for name in front)
@@ -134,9 +134,18 @@ def costs(
             if mean.low is not None and mean.high is not None:
                 axes.plot([x, x], [mean.low, mean.high], color=colour, linewidth=1)
             axes.plot(x, mean.mean, "o", color=colour, markersize=5)
-            left = x > 0.6 * max(each[0] for each in points.values())
-            shift = {"xytext": (-6 if left else 6, 4), "ha": "right" if left else "left"}
-            axes.annotate(name, (x, mean.mean), textcoords="offset points", color=colour, fontsize=style.SMALL, **shift)
+            axes.annotate(
+                name,
+                (x, 0.03),
+                xycoords=axes.get_xaxis_transform(),
+                xytext=(-3, 0),
+                textcoords="offset points",
+                rotation=90,
+                ha="right",
+                va="bottom",
+                color=colour,
+                fontsize=style.SMALL,
+            )
         axes.set_xlim(0, None)
         axes.set_xlabel(cost)
         axes.set_ylabel(measure)

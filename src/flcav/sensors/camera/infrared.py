@@ -163,7 +163,7 @@ def _driving(scene: Scene, seen: GBuffer, material: NDArray[np.uint8], lamps_on:
     trace = scene.trace
     warm = np.zeros(len(seen))
     for actor in np.unique(seen.instance[seen.instance > 0]) - 1:
-        if trace.category[actor] in ("pedestrian", "bicycle") or str(trace.actor[actor]).startswith("parked"):
+        if trace.category[actor] in ("pedestrian", "bicycle", "prop") or str(trace.actor[actor]).startswith("parked"):
             continue
         rows = np.flatnonzero(seen.instance == actor + 1)
         body = scene.world_from_actor(int(actor))

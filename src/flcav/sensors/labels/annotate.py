@@ -48,13 +48,14 @@ def annotate(
 ) -> tuple[Annotations, NDArray[np.int64]]:
     """Return the annotations of M actors, and their indices (M,) in the trace.
 
-    Annotated are all actors but `own` (the carrier) that are `within` (A,) range or show in a camera. `sweeps` are by
-    LiDAR, `sights` by camera; `echoes` are by radar the number (A,) of detections of each actor. Moves `scene` to the
-    cameras' trigger times, and back to the spin.
+    Annotated are all actors but props and `own` (the carrier) that are `within` (A,) range or show in a camera.
+    `sweeps` are by LiDAR, `sights` by camera; `echoes` are by radar the number (A,) of detections of each actor. Moves
+    `scene` to the cameras' trigger times, and back to the spin.
     """
     trace, index = scene.trace, scene.index
     regions = {name: find_actor_regions(sight.instance, len(trace.actor)) for name, sight in sights.items()}
     labelled = np.logical_or.reduce([within, *(region.pixels > 0 for region in regions.values())])
+    labelled &= trace.category != "prop"
     if own is not None:
         labelled[own] = False
     actors = np.flatnonzero(labelled)

@@ -64,7 +64,9 @@ ACTOR_RCS: dict[str, AspectRcs] = {
     "bicycle": AspectRcs(-3.0, 4.0, -4.0),
     "pedestrian": AspectRcs(-8.0, 1.0, 1.5),
 }
-_ACTOR = np.array([ACTOR_RCS[category] for category in CATEGORIES])
+PROP_RCS = AspectRcs(-5.0, 4.0, 0.0)
+_CATEGORIES = (*CATEGORIES, "prop")
+_ACTOR = np.array([*(ACTOR_RCS[category] for category in CATEGORIES), PROP_RCS])
 
 
 def compute_actor_rcs(category: NDArray[np.str_], aspect: Array) -> Array:
@@ -72,7 +74,7 @@ def compute_actor_rcs(category: NDArray[np.str_], aspect: Array) -> Array:
 
     `category` (K,) are their classes, `aspect` (K,) the direction to the radar [rad], counter-clockwise from ahead.
     """
-    mean, flash, end = _ACTOR[[CATEGORIES.index(str(name)) for name in category]].reshape(-1, 3).T
+    mean, flash, end = _ACTOR[[_CATEGORIES.index(str(name)) for name in category]].reshape(-1, 3).T
     ahead, aside = np.abs(np.cos(aspect)) ** FLASH, np.abs(np.sin(aspect)) ** FLASH
     return 10 ** ((mean + flash * (ahead + aside) + end * np.cos(aspect) ** 2) / 10)
 

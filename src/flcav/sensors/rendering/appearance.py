@@ -29,7 +29,7 @@ from flcav.world.materials import (
     Material,
 )
 from flcav.world.meshes import actor_mesh
-from flcav.world.scene import Scene
+from flcav.world.scene import Scene, Surfaces
 from flcav.world.static import TownPart, build_static_world
 
 _OF_PART = {
@@ -78,14 +78,15 @@ class Appearance(NamedTuple):
     noise: NDArray[np.float32]  # see `noise.clouds`
 
 
-_KNOWN: WeakKeyDictionary[Scene, Appearance] = WeakKeyDictionary()
+_AS = {"van": "car", "prop": "static"}  # categories without a class of their own
+_KNOWN: WeakKeyDictionary[Scene, tuple[Surfaces, Appearance]] = WeakKeyDictionary()
 
 
 def build_appearance(scene: Scene) -> Appearance:
-    """Return the appearance tables of `scene`: cached, the same for all its instants."""
-    if scene not in _KNOWN:
-        _KNOWN[scene] = _appearance(scene)
-    return _KNOWN[scene]
+    """Return the appearance tables of `scene`: cached, the same for all instants with the same actors."""
+    if scene not in _KNOWN or _KNOWN[scene][0] is not scene.surfaces:
+        _KNOWN[scene] = scene.surfaces, _appearance(scene)
+    return _KNOWN[scene][1]
 
 
 def _appearance(scene: Scene) -> Appearance:
@@ -107,7 +108,7 @@ def _appearance(scene: Scene) -> Appearance:
         faces = slice(first, first + len(corners))
         corner[first - actors : first - actors + len(corners)] = corners
         corner_normal[first - actors : first - actors + len(corners)] = normals
-        semantic[faces] = SEMANTICS["car" if category == "van" else str(category)]
+        semantic[faces] = SEMANTICS[_AS.get(str(category), str(category))]
         if category in ("bicycle", "motorcycle"):
             semantic[faces][np.isin(surfaces.material[faces], _RIDER)] = SEMANTICS["rider"]
     signs = town.signs

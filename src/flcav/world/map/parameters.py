@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from flcav.config import Config
 from flcav.interface.wording import suggest
-from flcav.world.shapes import ANGLED, PARKED_ONLY, RARE, SHAPES
+from flcav.world.shapes import ANGLED, PARKED_ONLY, RARE, SHAPES, Shape
 
 LARGEST_M = 1000.0
 MOST = 10_000  # vehicles, or pedestrians
@@ -26,9 +26,15 @@ CLUTTER: dict[str, tuple[float, float, float]] = {  # kind -> length, width, hei
     "bin": (0.6, 0.7, 1.1),
     "bollard": (0.15, 0.15, 0.95),
     "post": (0.09, 0.09, 2.6),
+    "rack": (3.6, 1.8, 1.1),  # of bicycles
+    "bicycle": (1.75, 0.62, 1.05),  # parked
+    "motorbike": (2.1, 0.8, 1.15),  # parked
+    "trailer": (3.4, 1.7, 1.5),
+    "guard_rail": (4.0, 0.3, 0.75),
 }
-BOUNDARIES = ("hedge", "hedgerow", "wall", "fence", "railing")  # kinds of `CLUTTER` that enclose plots
-KERBSIDE = ("bin", "bollard", "cabinet", "post")  # kinds that stand between kerb and walkers
+PROPS: tuple[Shape, ...] = tuple(Shape(kind, *size) for kind, size in CLUTTER.items())  # of the category "prop"
+BOUNDARIES = ("hedge", "hedgerow", "wall", "fence", "railing", "guard_rail")  # of `CLUTTER`: they enclose plots
+KERBSIDE = ("bin", "bollard", "cabinet", "post", "bicycle", "motorbike")  # kinds that stand between kerb and walkers
 Height = Annotated[float, Field(ge=0.1, le=100)]
 Spacing = Annotated[float, Field(ge=0.5, le=10_000)]
 NotNegative = Annotated[float, Field(ge=0, le=10_000)]

@@ -3,7 +3,9 @@
 from collections.abc import Callable
 from functools import lru_cache
 
-from flcav.world.meshes.mesh import Mesh, fit_to_size
+from flcav.world.map.parameters import PROPS
+from flcav.world.meshes.furniture import make_clutter
+from flcav.world.meshes.mesh import Mesh, bow_ends, fit_to_size
 from flcav.world.meshes.people import bicycle, motorcycle, pedestrian
 from flcav.world.meshes.vehicles import bus, car, truck
 from flcav.world.shapes import SHAPES, Shape
@@ -25,8 +27,14 @@ MAKERS: dict[str, Callable[[Shape], Mesh]] = {
 def actor_mesh(category: str, shape: int, size: tuple[float, ...] | None = None) -> Mesh:
     """Return the mesh of `SHAPES[category][shape]` in its body frame: ground centre at the origin, x forward.
 
-    It has exactly the outer dimensions `size` (3,) [m], None: those of the shape. Raises `KeyError` and `IndexError`
-    for an unknown shape.
+    That of a "prop" is the piece of street furniture `PROPS[shape]`. It has exactly the outer dimensions `size` (3,)
+    [m], None: those of the shape; a fourth number is the bow of a vehicle's ends, see `bow_ends`. Raises `KeyError`
+    and `IndexError` for an unknown shape.
     """
+    if category == "prop":
+        kind, *usual = PROPS[shape]
+        return make_clutter(kind, *(size or usual)[:3])
     wanted = SHAPES[category][shape]
-    return fit_to_size(MAKERS[category](wanted), *(size or wanted[1:]))
+    length, width, height, *bow = size or wanted[1:]
+    mesh = fit_to_size(MAKERS[category](wanted), length, width, height)
+    return bow_ends(mesh, *bow) if bow else mesh

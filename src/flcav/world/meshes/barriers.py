@@ -1,4 +1,4 @@
-"""Meshes of what stands along real streets: hedges and shrubs of uneven foliage, walls, fences, bins and posts.
+"""Meshes of what stands along real streets: hedges, shrubs, walls, fences, bins, posts, parked bicycles and trailers.
 
 Each is `length` along x, `width` along y and `height` [m], about its foot.
 """
@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 
 from flcav.statistics.streams import stream
 from flcav.world.materials import Material
-from flcav.world.meshes.mesh import Mesh, box, fit_to_size, join_meshes, sheet, tube
+from flcav.world.meshes.bodywork import wheel
+from flcav.world.meshes.mesh import Mesh, add_mirror_image, box, fit_to_size, join_meshes, sheet, transform_mesh, tube
+from flcav.world.meshes.people import bicycle, motorcycle
+from flcav.world.shapes import SHAPES
 
 UNEVEN = 0.12  # standard deviation of foliage's surface, over its half extent
 LEAVES_PER_M2 = 14.0  # loose clusters of leaves on a surface of foliage
 LEAF_M = 0.16  # size of such a cluster
 PICKET_M, BAR_M = 0.16, 0.13  # from one picket, or bar, to the next
+BICYCLE_M, POST_M = 0.55, 2.0  # from one bicycle of a rack to the next, and from one post of a guard rail
 
 
 def make_hedgerow(length: float, width: float, height: float) -> Mesh:
@@ -66,6 +70,54 @@ def make_post(length: float, width: float, height: float) -> Mesh:
     return fit_to_size(tube((0, 0, 0), (0, 0, 1), 0.5, Material.METAL, sides=8), length, width, height)
 
 
+def make_rack(length: float, width: float, height: float) -> Mesh:
+    """Return bicycles in a rack across its `length`, without riders, every fifth place empty; for one place a bicycle.
+
+    A single bicycle stands along x.
+    """
+    shape = SHAPES["bicycle"][0]
+    one = bicycle(shape, ridden=False)
+    if length < 2 * shape.length:
+        return fit_to_size(one, length, width, height)
+    rng = stream(0, "rack", *(round(1000 * size) for size in (length, width, height)))
+    places = np.linspace(-0.5, 0.5, max(3, round(length / BICYCLE_M))) * length
+    taken = [x for number, x in enumerate(places.tolist()) if number in (0, len(places) - 1) or rng.random() > 0.2]
+    parts = [transform_mesh(one, x, rng.uniform(-0.12, 0.12), 0.0, np.pi / 2 + rng.normal(0, 0.06)) for x in taken]
+    rail = box((0, 0.3, 0.45), (length, 0.05, 0.05), Material.METAL)
+    return fit_to_size(join_meshes((*parts, rail)), length, width, height)
+
+
+def make_motorbike(length: float, width: float, height: float) -> Mesh:
+    """Return a parked motorcycle."""
+    return fit_to_size(motorcycle(SHAPES["motorcycle"][0], ridden=False), length, width, height)
+
+
+def make_trailer(length: float, width: float, height: float) -> Mesh:
+    """Return a parked car trailer: a tarpaulin on boards, one axle, and a drawbar ahead."""
+    bed, rear = 0.72 * length, -length / 2
+    middle, floor = rear + bed / 2, min(0.5, 0.4 * height)
+    parts = [
+        box((middle, 0, floor), (bed, 0.84 * width, 0.1), Material.TRIM),
+        box((middle, 0, floor + 0.15 * height), (bed, 0.84 * width, 0.3 * height), Material.METAL),
+        box((middle, 0, (floor + height) / 2 + 0.1), (0.96 * bed, 0.8 * width, height - floor - 0.2), Material.CLOTH),
+        box(((rear + bed + length / 2) / 2, 0, floor), (length - bed, 0.08, 0.08), Material.METAL),
+        add_mirror_image(transform_mesh(wheel(0.29, 0.16), middle, width / 2 - 0.08)),
+    ]
+    return fit_to_size(join_meshes(parts), length, width, height)
+
+
+def make_guard_rail(length: float, width: float, height: float) -> Mesh:
+    """Return a guard rail: a corrugated beam before posts."""
+    waves = ((0.0, 1.0), (0.5, 0.86), (0.0, 0.72), (0.5, 0.58), (0.0, 0.44))
+    rows = [[(x, width * (0.5 - depth), height * top) for depth, top in waves] for x in (-length / 2, length / 2)]
+    count = max(2, round(length / POST_M))
+    posts = [
+        box((x, -0.3 * width, 0.4 * height), (0.06, 0.4 * width, 0.8 * height), Material.METAL)
+        for x in ((np.arange(count) - (count - 1) / 2) * length / count).tolist()
+    ]
+    return fit_to_size(join_meshes((sheet(rows, Material.METAL), *posts)), length, width, height)
+
+
 def _barrier(length: float, width: float, height: float, pitch_m: float, full: float, material: Material) -> Mesh:
     """Return upright slats, `full` of their pitch wide, and two rails at 20 % and 85 % of the height."""
     count = max(2, round(length / pitch_m))
@@ -113,4 +165,9 @@ MAKERS: Mapping[str, Callable[[float, float, float], Mesh]] = {
     "bin": make_bin,
     "bollard": make_post,
     "post": make_post,
+    "rack": make_rack,
+    "bicycle": make_rack,
+    "motorbike": make_motorbike,
+    "trailer": make_trailer,
+    "guard_rail": make_guard_rail,
 }

@@ -11,6 +11,7 @@ from flcav.geometry import rotations_about_z
 from flcav.world.materials import Material
 
 Array = NDArray[np.float64]
+BOWED_M = 0.6  # of a vehicle's front and rear that curve in plan
 _BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _BOX_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]], np.int32)
 _BOX_FACES = _BOX_QUADS[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
@@ -87,6 +88,19 @@ def fit_to_size(mesh: Mesh, length: float, width: float, height: float) -> Mesh:
     unit = (mesh.vertices - low) / (high - low)
     vertices = (unit - (0.5, 0.5, 0.0)) * (length, width, height)
     return Mesh(vertices.astype(np.float32), mesh.faces, mesh.material)
+
+
+def bow_ends(mesh: Mesh, bow_m: float) -> Mesh:
+    """Return a vehicle's mesh whose front and rear curve in plan: their corners lie `bow_m` behind their middles.
+
+    The last `BOWED_M` of either end are drawn in by the cube of the distance from the middle, as bumpers are.
+    """
+    x, y, _ = mesh.vertices.T
+    end, side = float(x.max()), float(y.max())
+    near = np.clip((np.abs(x) - (end - BOWED_M)) / BOWED_M, 0, 1)
+    vertices = mesh.vertices.copy()
+    vertices[:, 0] -= np.sign(x) * near * bow_m * np.abs(y / side) ** 3
+    return Mesh(vertices, mesh.faces, mesh.material)
 
 
 def sheet(points: ArrayLike, material: Material | NDArray[np.uint8]) -> Mesh:

@@ -60,8 +60,8 @@ def pedestrian(shape: Shape) -> Mesh:
     return make_figure((0.0, 0.0, 0.88), (0.0, 0.0, 1.50), (sides[0], sides[1]))
 
 
-def bicycle(shape: Shape) -> Mesh:
-    """Return the bicycle `shape` with its rider; that of a sport bike leans further forward."""
+def bicycle(shape: Shape, *, ridden: bool = True) -> Mesh:
+    """Return the bicycle `shape`, if `ridden` with its rider; that of a sport bike leans further forward."""
     lean = 0.42 if shape.name == "sport_bike" else 0.22
     wheel_x, hub = 0.53, 0.34
     parts = [_spoked_wheel(x, hub, 0.022) for x in (-wheel_x, wheel_x)]
@@ -78,8 +78,9 @@ def bicycle(shape: Shape) -> Mesh:
     parts += [tube(start, end, 0.018, Material.METAL, sides=5) for start, end in bars]
     parts.append(box((-0.22, 0, 0.94), (0.26, 0.15, 0.06), Material.TRIM))
     parts.append(box((-0.60, 0, 0.68), (0.03, 0.07, 0.07), Material.TAILLAMP))
-    neck = (-0.18 + lean, 0.0, 0.97 + np.sqrt(0.55**2 - lean**2))
-    parts.append(_rider(saddle, neck, knee_x=0.18, feet=((0.02, 0.18), (-0.14, 0.42)), hand=(0.38, 0.25, 1.02)))
+    if ridden:
+        neck = (-0.18 + lean, 0.0, 0.97 + np.sqrt(0.55**2 - lean**2))
+        parts.append(_rider(saddle, neck, knee_x=0.18, feet=((0.02, 0.18), (-0.14, 0.42)), hand=(0.38, 0.25, 1.02)))
     if shape.name == "cargo_bike":  # the front wheel is ahead of a box for children or goods
         parts = [transform_mesh(join_meshes(parts), -0.40, 0.0)]
         parts.append(box((0.62, 0.0, 0.52), (0.85, 0.62, 0.55), Material.PAINT))
@@ -87,8 +88,8 @@ def bicycle(shape: Shape) -> Mesh:
     return join_meshes(parts)
 
 
-def motorcycle(shape: Shape) -> Mesh:
-    """Return the motorcycle `shape` with its rider; a scooter has a leg shield and a flat floor."""
+def motorcycle(shape: Shape, *, ridden: bool = True) -> Mesh:
+    """Return the motorcycle `shape`, if `ridden` with its rider; a scooter has a leg shield and a flat floor."""
     scooter = shape.name == "scooter"
     radius, wheel_x = (0.26, 0.62) if scooter else (0.31, 0.72)
     parts = []
@@ -108,8 +109,9 @@ def motorcycle(shape: Shape) -> Mesh:
     parts.append(ellipsoid((0.54, 0, 0.90), (0.10, 0.10, 0.10), Material.HEADLAMP, 6))
     parts.append(box((-0.76, 0, 0.74), (0.06, 0.16, 0.09), Material.TAILLAMP))
     parts.append(box((-0.82, 0, 0.56), (0.02, 0.20, 0.15), Material.PLATE))
-    feet = ((0.10, 0.40), (0.10, 0.40))
-    parts.append(_rider((-0.25, 0, 0.86), (-0.08, 0, 1.38), knee_x=0.16, feet=feet, hand=(0.40, 0.32, 1.04)))
+    if ridden:
+        feet = ((0.10, 0.40), (0.10, 0.40))
+        parts.append(_rider((-0.25, 0, 0.86), (-0.08, 0, 1.38), knee_x=0.16, feet=feet, hand=(0.40, 0.32, 1.04)))
     return join_meshes(parts)
 
 

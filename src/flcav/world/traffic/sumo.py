@@ -36,14 +36,19 @@ def simulate_in(folder: Path) -> None:
         raise RuntimeError(said.read_text()[-500:].strip() if said.exists() else f"exit code {code}")
 
 
+def start_server(serve: str) -> subprocess.Popen[str]:
+    """Start a process that runs the function `serve`, "module:name", of flcav, with pipes to its input and output."""
+    module, name = serve.split(":")
+    code = f"import sys; sys.path.append({ROOT!r}); from {module} import {name}; {name}()"
+    command = [sys.executable, "-P", "-c", code]  # -P: a user's json.py in the working directory is not imported
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
 def _running() -> subprocess.Popen[str]:
     """Return the SUMO process of this process; start it where there is none."""
     global _process
     if _process is None or _process[0] != os.getpid() or _process[1].poll() is not None:
-        module, name = SERVE.split(":")
-        code = f"import sys; sys.path.append({ROOT!r}); from {module} import {name}; {name}()"
-        command = [sys.executable, "-P", "-c", code]  # -P: a user's json.py in the working directory is not imported
-        started = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        started = start_server(SERVE)
         _process = os.getpid(), started
     return _process[1]
 

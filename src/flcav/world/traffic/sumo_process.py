@@ -66,6 +66,23 @@ class Walkers:
         return target
 
 
+def start_sumo(sumo: Any, net: Path, routes: Path, seed: int) -> None:
+    """Start libsumo, the module `sumo`, with the demand in the file `routes`."""
+    options = {
+        "net-file": net,
+        "route-files": routes,
+        "seed": seed,
+        "step-length": STEP_S,
+        "default.action-step-length": 0.5,  # drivers decide twice a second: the simulation is three times as fast
+        "lanechange.duration": 2,
+        "time-to-teleport": -1,  # vehicles in a jam are not removed
+        "collision.action": "none",
+        "no-step-log": "true",
+        "no-warnings": "true",
+    }
+    sumo.start(["sumo", *(part for name, value in options.items() for part in (f"--{name}", str(value)))])
+
+
 def run_sumo(
     net: Path,
     routes: Path,
@@ -85,19 +102,7 @@ def run_sumo(
     """
     import libsumo
 
-    options = {
-        "net-file": net,
-        "route-files": routes,
-        "seed": seed,
-        "step-length": STEP_S,
-        "default.action-step-length": 0.5,  # drivers decide twice a second: the simulation is three times as fast
-        "lanechange.duration": 2,
-        "time-to-teleport": -1,  # vehicles in a jam are not removed
-        "collision.action": "none",
-        "no-step-log": "true",
-        "no-warnings": "true",
-    }
-    libsumo.start(["sumo", *(part for name, value in options.items() for part in (f"--{name}", str(value)))])
+    start_sumo(libsumo, net, routes, seed)
     director = Director(libsumo, net, scenarios) if scenarios else None
     walkers = Walkers(STEP_S)
     index: dict[str, int] = {}

@@ -128,7 +128,7 @@ def _build_trace(
     earlier, state, later = (_smooth(raw, window) for window in (before, now, after))
     rates = _rates(earlier, state, later)
     seen = np.flatnonzero(~np.isnan(state[..., 0]).all(axis=0))
-    order = np.array(sorted(seen, key=lambda i: _natural(str(raw["id"][i]))), dtype=np.int64)
+    order = np.array(sorted(seen, key=lambda i: number_of(str(raw["id"][i]))), dtype=np.int64)
     known = {name: (category, shape) for name, category, shape in list_vehicle_types()}
     kinds = [known[str(raw["type"][i])] for i in order] + [(car.category, car.shape) for car in parked]
     size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], dtype=np.float64).reshape(-1, 3)
@@ -268,7 +268,7 @@ def _pavement(town: Town) -> BaseGeometry:
     return pavement
 
 
-def _natural(name: str) -> tuple[str, int]:
+def number_of(name: str) -> tuple[str, int]:
     """Return the key that sorts names by their number: "veh2" before "veh10"."""
     kind = name.rstrip("0123456789")
     return kind, int(name[len(kind) :])

@@ -1,0 +1,1 @@
+"""Dynamics of vehicles and walkers under control: vehicle model, contacts of boxes, the ground and its obstacles."""

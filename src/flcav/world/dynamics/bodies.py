@@ -1,0 +1,165 @@
+"""Bodies under control: vehicles, walkers and props that a client has put into a live world."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError, shorten
+from flcav.geometry import heading_vectors, wrap_angle
+from flcav.world.actors import Actors
+from flcav.world.commands import Controls
+from flcav.world.dynamics.blueprints import VEHICLES, Blueprint
+from flcav.world.dynamics.standing import Ground
+from flcav.world.dynamics.vehicle import Motion, Pedals, Vehicles, drive, stack_blueprints
+
+Array = NDArray[np.float64]
+
+AT_REST = Controls()
+WALK_MPS2 = 10.0  # by which walkers change their velocity, also after they were hit
+
+
+@dataclass
+class Body:
+    """A body under control, but for its motion."""
+
+    name: str
+    blueprint: Blueprint
+    controls: Controls = AT_REST
+    walk: tuple[float, float] = (0.0, 0.0)  # wanted velocity [m/s]
+    physics: bool = True
+    gravity: bool = True
+
+    @property
+    def category(self) -> str:
+        """Return that of the blueprint."""
+        return self.blueprint.category
+
+
+class Bodies:
+    """N bodies and their motion."""
+
+    def __init__(self, ground: Ground) -> None:
+        """Start without any, on this ground."""
+        self.members: list[Body] = []
+        self.position, self.velocity, self.acceleration = (np.zeros((0, 3)) for _ in range(3))
+        self.yaw, self.yaw_rate, self.steer = (np.zeros(0) for _ in range(3))
+        self.tilt = np.zeros((0, 2))
+        self.size = np.zeros((0, 3))
+        self._vehicles: Vehicles = stack_blueprints([])
+        self._ground = ground
+
+    def row(self, name: str) -> int:
+        """Return the row of a body; raises `InputError` where there is none of this name."""
+        for row, body in enumerate(self.members):
+            if body.name == name:
+                return row
+        raise InputError(f"actor {shorten(name)}: there is none of this name under control")
+
+    def find(self, name: str) -> Body:
+        """Return a body; raises `InputError` where there is none of this name."""
+        return self.members[self.row(name)]
+
+    def add(self, body: Body, x: float, y: float, yaw: float, z: float | None) -> None:
+        """Add a body at rest."""
+        self.members.append(body)
+        for name in ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "tilt"):
+            array = getattr(self, name)
+            setattr(self, name, np.concatenate((array, np.zeros((1, *array.shape[1:])))))
+        self._recast()
+        self.place(len(self.members) - 1, x, y, yaw, z)
+
+    def remove(self, row: int) -> None:
+        """Remove a body."""
+        del self.members[row]
+        for name in ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "tilt"):
+            setattr(self, name, np.delete(getattr(self, name), row, axis=0))
+        self._recast()
+
+    def place(
+        self, row: int, x: float, y: float, yaw: float, z: float | None, pitch: float = 0.0, roll: float = 0.0
+    ) -> None:
+        """Move a body to another pose; with physics and gravity it stands on the ground there."""
+        self.position[row] = x, y, np.nan if z is None else z
+        self.yaw[row] = wrap_angle(yaw)
+        self.tilt[row] = pitch, roll
+        body = self.members[row]
+        if z is None or (body.physics and body.gravity):
+            self._stand(np.array([row]))
+
+    def move(self, dt_s: float) -> None:
+        """Move all with physics by `dt_s` [s], as if nothing were in their way."""
+        drives = [body.physics and body.category in VEHICLES for body in self.members]
+        if len(rows := np.flatnonzero(drives)):
+            self._drive(rows, dt_s)
+        walks = [body.physics and body.category == "pedestrian" for body in self.members]
+        if len(rows := np.flatnonzero(walks)):
+            self._walk(rows, dt_s)
+
+    def settle(self) -> None:
+        """Let all with physics stand on the ground where they are; they climb with its slope."""
+        stands = np.array([body.physics and body.gravity for body in self.members], np.bool_)
+        if len(rows := np.flatnonzero(stands)):
+            self._stand(rows)
+            ahead = (self.velocity[rows, :2] * heading_vectors(self.yaw[rows])).sum(axis=1)
+            self.velocity[rows, 2] = -ahead * np.tan(self.tilt[rows, 0])
+
+    def weights(self) -> tuple[Array, Array]:
+        """Return the masses (N,) [kg] and moments of inertia (N,) [kg m^2], infinite for what nothing moves."""
+        held = np.array([not body.physics or body.category == "prop" for body in self.members], np.bool_)
+        upright = np.array([body.category == "pedestrian" for body in self.members], np.bool_)
+        mass = np.where(held, np.inf, self._vehicles.mass_kg)
+        inertia = np.array([body.blueprint.inertia_kgm2 for body in self.members])
+        return mass, np.where(held | upright, np.inf, inertia)
+
+    def actors(self) -> Actors:
+        """Return the bodies as they are now."""
+        return Actors(
+            name=tuple(body.name for body in self.members),
+            category=tuple(body.category for body in self.members),
+            shape=np.array([body.blueprint.shape for body in self.members], np.int64),
+            size=self.size,
+            position=self.position.copy(),
+            yaw=self.yaw.copy(),
+            velocity=self.velocity.copy(),
+            acceleration=self.acceleration.copy(),
+            yaw_rate=self.yaw_rate.copy(),
+            tilt=self.tilt.copy(),
+        )
+
+    def _recast(self) -> None:
+        self._vehicles = stack_blueprints([body.blueprint for body in self.members])
+        self.size = np.array([body.blueprint.size for body in self.members], np.float64).reshape(-1, 3)
+
+    def _drive(self, rows: NDArray[np.int64], dt_s: float) -> None:
+        told = [self.members[row].controls for row in rows]
+        pedals = Pedals(
+            np.array([each.throttle for each in told]),
+            np.array([each.steer for each in told]),
+            np.array([each.brake for each in told]),
+            np.array([each.hand_brake for each in told]),
+            np.array([each.reverse for each in told]),
+        )
+        motion = Motion(
+            self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2], self.yaw_rate[rows], self.steer[rows]
+        )
+        vehicles = Vehicles(*(values[rows] for values in self._vehicles))
+        after = drive(motion, vehicles, pedals, self.tilt[rows, 0], dt_s)
+        self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2] = after.position, after.yaw, after.velocity
+        self.yaw_rate[rows], self.steer[rows] = after.yaw_rate, after.steer
+
+    def _walk(self, rows: NDArray[np.int64], dt_s: float) -> None:
+        wanted = np.array([self.members[row].walk for row in rows])
+        yaw = np.where(wanted.any(axis=1), np.arctan2(wanted[:, 1], wanted[:, 0]), self.yaw[rows])
+        self.yaw_rate[rows] = wrap_angle(yaw - self.yaw[rows]) / dt_s
+        change = wanted - self.velocity[rows, :2]
+        needed = np.linalg.norm(change, axis=1, keepdims=True)
+        velocity = self.velocity[rows, :2] + change * np.minimum(1.0, WALK_MPS2 * dt_s / np.maximum(needed, 1e-12))
+        self.position[rows, :2] += velocity * dt_s
+        self.velocity[rows, :2], self.yaw[rows] = velocity, yaw
+
+    def _stand(self, rows: NDArray[np.int64]) -> None:
+        upright = np.array([self.members[row].category == "pedestrian" for row in rows], np.bool_)
+        self.position[rows, 2], self.tilt[rows] = self._ground.stand(
+            self.position[rows], self.yaw[rows], self.size[rows], upright
+        )

@@ -1,0 +1,213 @@
+"""Contacts of upright boxes: the separating axis test, and impulses between those that touch (rigid bodies in plan).
+
+Where two boxes overlap, they are moved apart along the axis of least overlap, and those that approach exchange an
+impulse at the contact, without friction (Baraff, An Introduction to Physically Based Modeling, 1997, part II,
+section 8).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.machine.compiled import compiled
+
+Array = NDArray[np.float64]
+
+RESTITUTION = 0.1  # speed after a collision over that before, along its normal
+PASSES = 12  # over all pairs of neighbours
+SLOP_M = 1e-6  # gap that is left between two boxes that were moved apart
+HEAVY = 5.0  # what is so many times as heavy as the other is not moved aside
+UNDO_PASSES = 1000
+
+
+class Footprints(NamedTuple):
+    """N upright boxes: their footprints and levels."""
+
+    place: Array  # (N, 3) x, y [m], yaw [rad] of the middle
+    half: Array  # (N, 2) half of length and width [m]
+    level: Array  # (N, 2) lowest and highest point [m]
+
+
+class Contacts(NamedTuple):
+    """C contacts, each of two boxes."""
+
+    first: NDArray[np.int64]  # (C,) row of a box
+    second: NDArray[np.int64]  # (C,) row of the other; greater
+    normal: Array  # (C, 2) unit vector from the second towards the first
+    point: Array  # (C, 2) place of the contact [m]
+    impulse: Array  # (C,) along the normal, on the first [N s]
+
+
+def resolve(
+    boxes: Footprints, before: Array, velocity: Array, yaw_rate: Array, mass: Array, inertia: Array
+) -> tuple[Array, Array, Array, Contacts]:
+    """Return places (N, 3), velocities (N, 2), yaw rates (N,) after all contacts of N boxes, and these.
+
+    `mass` (N,) [kg] and `inertia` (N,) [kg m^2] are infinite for what nothing moves. `before` (N, 3) are the places
+    before the last motion: who still overlaps in the end goes back there, and stands still, so that boxes that did not
+    overlap there never do unless something immovable was moved into them.
+    """
+    place, velocity, yaw_rate = boxes.place.copy(), velocity.copy(), yaw_rate.copy()
+    pairs = _find_neighbours(place, before, boxes.half, boxes.level, 1 / mass)
+    normal, point, impulse = np.zeros((len(pairs), 2)), np.zeros((len(pairs), 2)), np.zeros(len(pairs))
+    touched = np.zeros(len(pairs), np.bool_)
+    _resolve(
+        pairs, place, before, boxes.half, velocity, yaw_rate, 1 / mass, 1 / inertia, normal, point, impulse, touched
+    )
+    first, second = pairs[touched].T
+    return place, velocity, yaw_rate, Contacts(first, second, normal[touched], point[touched], impulse[touched])
+
+
+def find_overlaps(boxes: Footprints, others: Footprints) -> NDArray[np.int64]:
+    """Return the rows (K, 2) of each of `boxes` and of `others` that overlap."""
+    both = Footprints(*(np.concatenate(pair) for pair in zip(boxes, others)))
+    inverse = np.repeat((1.0, 0.0), (len(boxes.place), len(others.place)))
+    pairs = _find_neighbours(both.place, both.place, both.half, both.level, inverse)
+    pairs = pairs[(pairs[:, 0] < len(boxes.place)) & (pairs[:, 1] >= len(boxes.place))]
+    met = np.array([_overlap(both.place, both.half, i, j)[0] > 0 for i, j in pairs], np.bool_)
+    return pairs[met] - (0, len(boxes.place)) if len(pairs) else pairs
+
+
+@compiled
+def _find_neighbours(place, before, half, level, inverse_mass):
+    """Return the pairs (P, 2) of boxes that may come to touch, one of which at least can move."""
+    count = len(place)
+    reach = np.empty(count)
+    for i in range(count):
+        reach[i] = np.hypot(half[i, 0], half[i, 1])
+    moved = np.empty(count)
+    for i in range(count):
+        moved[i] = np.hypot(place[i, 0] - before[i, 0], place[i, 1] - before[i, 1]) + 1.0
+    pairs = []
+    for i in range(count):
+        for j in range(i + 1, count):
+            if inverse_mass[i] == 0 and inverse_mass[j] == 0:
+                continue
+            near = reach[i] + reach[j] + moved[i] + moved[j]
+            if abs(place[i, 0] - place[j, 0]) > near or abs(place[i, 1] - place[j, 1]) > near:
+                continue
+            if level[i, 0] < level[j, 1] and level[j, 0] < level[i, 1]:
+                pairs.append((i, j))
+    out = np.empty((len(pairs), 2), np.int64)
+    for row, (i, j) in enumerate(pairs):
+        out[row, 0], out[row, 1] = i, j
+    return out
+
+
+@compiled
+def _overlap(place, half, i, j):
+    """Return the least overlap [m] of two boxes, not positive where they are apart, and its axis towards i."""
+    dx, dy = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1]
+    least, least_x, least_y = np.inf, 0.0, 0.0
+    if np.hypot(dx, dy) > np.hypot(half[i, 0], half[i, 1]) + np.hypot(half[j, 0], half[j, 1]):
+        return -1.0, 0.0, 0.0
+    turn = place[i, 2] - place[j, 2]
+    cos, sin = abs(np.cos(turn)), abs(np.sin(turn))
+    for side in range(4):
+        own, other = (i, j) if side < 2 else (j, i)
+        along = side % 2
+        angle = place[own, 2] + along * np.pi / 2
+        x, y = np.cos(angle), np.sin(angle)
+        offset = dx * x + dy * y
+        across = half[other, 0] * (sin if along else cos) + half[other, 1] * (cos if along else sin)
+        depth = half[own, along] + across - abs(offset)
+        if depth < least:
+            least = depth
+            least_x, least_y = (x, y) if offset >= 0 else (-x, -y)
+            if depth <= 0:
+                break
+    return least, least_x, least_y
+
+
+@compiled
+def _find_point(place, half, i, j):
+    """Return the middle of the corners of each box that lie in the other; of the two boxes where there is none."""
+    sum_x, sum_y, found = 0.0, 0.0, 0
+    for own, other in ((i, j), (j, i)):
+        cos, sin = np.cos(place[own, 2]), np.sin(place[own, 2])
+        cos_other, sin_other = np.cos(place[other, 2]), np.sin(place[other, 2])
+        for corner in range(4):
+            along = half[own, 0] * (1 if corner % 2 else -1)
+            aside = half[own, 1] * (1 if corner // 2 else -1)
+            x = place[own, 0] + along * cos - aside * sin
+            y = place[own, 1] + along * sin + aside * cos
+            dx, dy = x - place[other, 0], y - place[other, 1]
+            inside = abs(dx * cos_other + dy * sin_other) <= half[other, 0]
+            if inside and abs(dy * cos_other - dx * sin_other) <= half[other, 1]:
+                sum_x, sum_y, found = sum_x + x, sum_y + y, found + 1
+    if not found:
+        return (place[i, 0] + place[j, 0]) / 2, (place[i, 1] + place[j, 1]) / 2
+    return sum_x / found, sum_y / found
+
+
+@compiled
+def _resolve(
+    pairs, place, before, half, velocity, yaw_rate, inverse_mass, inverse_inertia, normal, point, impulse, touched
+):
+    """Move boxes apart and exchange impulses, in place; note each pair's contact."""
+    for _ in range(PASSES):
+        apart = True
+        for row in range(len(pairs)):
+            i, j = pairs[row]
+            depth, x, y = _overlap(place, half, i, j)
+            if depth <= 0:
+                continue
+            apart = False
+            if not touched[row]:
+                touched[row] = True
+                normal[row] = (x, y)
+                point[row] = _find_point(place, half, i, j)
+            impulse[row] += _strike(row, i, j, place, velocity, yaw_rate, inverse_mass, inverse_inertia, normal, point)
+            a, b = inverse_mass[i], inverse_mass[j]
+            a, b = (0.0 if a * HEAVY < b else a), (0.0 if b * HEAVY < a else b)
+            move = (depth + SLOP_M) / (a + b)
+            place[i, 0] += a * move * x
+            place[i, 1] += a * move * y
+            place[j, 0] -= b * move * x
+            place[j, 1] -= b * move * y
+        if apart:
+            return
+    for _ in range(UNDO_PASSES):
+        apart = True
+        for row in range(len(pairs)):
+            i, j = pairs[row]
+            if _overlap(place, half, i, j)[0] <= 0:
+                continue
+            for body in (i, j):
+                away = (
+                    place[body, 0] != before[body, 0]
+                    or place[body, 1] != before[body, 1]
+                    or place[body, 2] != before[body, 2]
+                )
+                if inverse_mass[body] > 0 and away:
+                    place[body] = before[body]
+                    velocity[body] = 0.0
+                    yaw_rate[body] = 0.0
+                    apart = False
+        if apart:
+            return
+
+
+@compiled
+def _strike(row, i, j, place, velocity, yaw_rate, inverse_mass, inverse_inertia, normal, point):
+    """Return the impulse [N s] by which two boxes that approach each other stop doing so, and apply it."""
+    x, y = normal[row]
+    arm_i = point[row] - place[i, :2]
+    arm_j = point[row] - place[j, :2]
+    speed_x = velocity[i, 0] - yaw_rate[i] * arm_i[1] - velocity[j, 0] + yaw_rate[j] * arm_j[1]
+    speed_y = velocity[i, 1] + yaw_rate[i] * arm_i[0] - velocity[j, 1] - yaw_rate[j] * arm_j[0]
+    towards = speed_x * x + speed_y * y
+    if towards >= 0:
+        return 0.0
+    lever_i = arm_i[0] * y - arm_i[1] * x
+    lever_j = arm_j[0] * y - arm_j[1] * x
+    give = inverse_mass[i] + inverse_mass[j] + lever_i**2 * inverse_inertia[i] + lever_j**2 * inverse_inertia[j]
+    size = -(1 + RESTITUTION) * towards / give
+    velocity[i, 0] += size * inverse_mass[i] * x
+    velocity[i, 1] += size * inverse_mass[i] * y
+    velocity[j, 0] -= size * inverse_mass[j] * x
+    velocity[j, 1] -= size * inverse_mass[j] * y
+    yaw_rate[i] += size * inverse_inertia[i] * lever_i
+    yaw_rate[j] -= size * inverse_inertia[j] * lever_j
+    return size

@@ -1,0 +1,88 @@
+"""Obstacles: what stands in a town and stops vehicles and walkers, as upright boxes."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from flcav.geometry import heading_vectors
+from flcav.world.actors import NOBODY, Actors
+from flcav.world.dynamics.contacts import Footprints
+from flcav.world.map.town import Town
+from flcav.world.meshes.furniture import MAST_BEHIND_M
+
+Array = NDArray[np.float64]
+
+LAMP_M, POST_M, MAST_M = 0.08, 0.05, 0.09  # radius of the posts of lamps, of signs and signals, and of sensors
+BELOW_M = 1.0  # obstacles reach so far below the ground at their middle, since it may slope
+
+
+class Obstacles(NamedTuple):
+    """The obstacles of a town, with a search tree."""
+
+    boxes: Footprints  # of S obstacles
+    name: tuple[str, ...]  # (S,) "kind:row", e.g. "building:3"
+    tree: shapely.STRtree
+
+    def near(self, low: Array, high: Array) -> NDArray[np.int64]:
+        """Return the rows (K,), ascending, of obstacles about boxes with these corners, (N, 2) [m] each."""
+        return np.unique(self.tree.query(shapely.box(*low.T, *high.T))[1])
+
+
+def list_obstacles(town: Town, parked: Actors = NOBODY) -> Obstacles:
+    """Return a town's buildings, trunks, clutter and posts, and the `parked` vehicles by their own names."""
+    rows, name = [np.zeros((0, 6))], []
+    for kind, part in _parts(town):
+        rows.append(part)
+        name += [f"{kind}:{row}" for row in range(len(part))]
+    x, y, yaw, length, width, height = np.concatenate(rows).T
+    ground = town.grounds(x, y)
+    standing = Footprints(
+        np.column_stack((x, y, yaw)),
+        np.column_stack((length, width)) / 2,
+        np.column_stack((ground - BELOW_M, ground + height)),
+    )
+    boxes = join_footprints(standing, outline(parked))
+    low, high = corners(boxes)
+    return Obstacles(boxes, (*name, *parked.name), shapely.STRtree(shapely.box(*low.T, *high.T)))
+
+
+def outline(actors: Actors) -> Footprints:
+    """Return the boxes of actors, upright."""
+    z = actors.position[:, 2]
+    return Footprints(actors.places, actors.size[:, :2] / 2, np.column_stack((z, z + actors.size[:, 2])))
+
+
+def join_footprints(*parts: Footprints) -> Footprints:
+    """Return the boxes of all parts, in order."""
+    return Footprints(*(np.concatenate(arrays) for arrays in zip(*parts)))
+
+
+def corners(boxes: Footprints) -> tuple[Array, Array]:
+    """Return the lowest and the highest x, y of footprints, (N, 2) each [m]."""
+    cos, sin = np.abs(heading_vectors(boxes.place[:, 2])).T
+    length, width = boxes.half.T
+    reach = np.column_stack((length * cos + width * sin, length * sin + width * cos))
+    return boxes.place[:, :2] - reach, boxes.place[:, :2] + reach
+
+
+def _parts(town: Town) -> Iterator[tuple[str, Array]]:
+    """Yield kind, and x, y, yaw, length, width, height (K, 6), of all obstacles."""
+    yield "building", town.buildings
+    x, y, height, _ = town.trees.T
+    yield "tree", _posts(np.column_stack((x, y)), 0.05 + 0.018 * height, height)
+    yield "clutter", np.concatenate([np.zeros((0, 6)), *(rows for _, rows in town.clutter)])
+    yield "post", _posts(town.posts[:, :2], POST_M, town.posts[:, 2])
+    yield "lamp", _posts(town.lamps[:, :2], LAMP_M, town.lamps[:, 2])
+    yield "sign", _posts(town.signs.position[:, :2], POST_M, 2.0)
+    masts = town.poles.position[:, :2] - MAST_BEHIND_M * heading_vectors(town.poles.yaw)
+    yield "pole", _posts(masts, MAST_M, town.poles.position[:, 2])
+    yield "signal", _posts(town.signals.foot, POST_M, 3.0)
+
+
+def _posts(foot: Array, radius: Array | float, height: Array | float) -> Array:
+    """Return posts at `foot` (K, 2) of this radius and height [m] as rows x, y, yaw, length, width, height."""
+    level = np.zeros(len(foot))
+    return np.column_stack((foot, level, 2 * radius + level, 2 * radius + level, height + level))

@@ -1,0 +1,87 @@
+"""Snapshots of a live world: all actors, lights and collisions at one instant."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.world.commands import Controls
+from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Collision:
+    """The contact of an actor under control with another actor, or with an obstacle of the town, during one step."""
+
+    name: str  # the actor
+    other: str  # the other one, or an obstacle as "kind:row": building, tree, clutter, post, lamp, sign, pole, signal
+    impulse: tuple[float, float]  # x, y on the actor [N s]; on the other one its opposite
+    point: tuple[float, float]  # x, y of the contact [m]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A live world at one instant; its arrays cannot be written."""
+
+    step: int  # number of steps since the start
+    time_s: float  # since the start
+    trace: Trace  # with one instant, of all actors: under control in the order they came, SUMO's, parked ones
+    controls: Mapping[str, Controls]  # of the vehicles under control
+    collisions: tuple[Collision, ...]  # of the step that led here
+
+    def __post_init__(self) -> None:
+        for field in fields(self.trace):
+            if isinstance(array := getattr(self.trace, field.name), np.ndarray):
+                array.flags.writeable = False
+
+    def row(self, name: str) -> int:
+        """Return the row of an actor in the trace; raises `KeyError` where it is absent."""
+        found = np.flatnonzero(self.trace.actor == name)
+        if not len(found):
+            raise KeyError(name)
+        return int(found[0])
+
+
+def join_snapshots(snapshots: Sequence[Snapshot]) -> Trace:
+    """Return the trace of all actors at the times of one snapshot or more, in ascending order.
+
+    Raises `ValueError` for none, and where an actor's category, shape or size is not the same in all.
+    """
+    if not snapshots:
+        raise ValueError("a trace needs at least one snapshot")
+    names = list(dict.fromkeys(name for each in snapshots for name in each.trace.actor.tolist()))
+    row = {name: i for i, name in enumerate(names)}
+    count, actors = len(snapshots), len(names)
+    known: dict[str, tuple[str, int, tuple[float, ...]]] = {}
+    present = np.zeros((count, actors), np.bool_)
+    motion = {name: np.full((count, actors, 3), np.nan) for name in ("position", "velocity", "acceleration")}
+    turning = {name: np.full((count, actors), np.nan) for name in ("yaw", "yaw_rate")}
+    tilt = np.full((count, actors, 2), np.nan)
+    for i, each in enumerate(snapshots):
+        trace = each.trace
+        at = [row[name] for name in trace.actor.tolist()]
+        for actor, name in enumerate(trace.actor.tolist()):
+            if known.setdefault(name, trace.model(actor)) != trace.model(actor):
+                raise ValueError(f"actor '{name}' is not the same in all snapshots")
+        present[i, at] = True
+        for name, array in (motion | turning).items():
+            array[i, at] = getattr(trace, name)[0]
+        tilt[i, at] = trace.tilts(0)
+    category, shape, size = zip(*(known[name] for name in names)) if names else ((), (), ())
+    last = snapshots[-1].trace
+    return replace(
+        last,
+        time_s=np.array([each.time_s for each in snapshots]),
+        actor=np.array(names, np.str_),
+        category=np.array(category, np.str_),
+        shape=np.array(shape, np.int64),
+        size=np.array(size, np.float64).reshape(-1, 3),
+        present=present,
+        light_state=np.concatenate([each.trace.light_state for each in snapshots]),
+        tilt=None if all(each.trace.tilt is None for each in snapshots) else tilt,
+        **motion,
+        **turning,
+    )

@@ -1,0 +1,273 @@
+"""Client of the SUMO process of a live world: its traffic between the steps of SUMO."""
+
+import atexit
+import contextlib
+import json
+import os
+import subprocess
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.geometry import heading_vectors, left_vectors, wrap_angle
+from flcav.statistics.streams import derive_seed, stream
+from flcav.world.actors import NOBODY, Actors
+from flcav.world.dynamics.blueprints import VEHICLES
+from flcav.world.dynamics.standing import Ground
+from flcav.world.map.roads import read_net
+from flcav.world.map.town import Town
+from flcav.world.shapes import SHAPES
+from flcav.world.traffic.bridges import find_footing
+from flcav.world.traffic.demand import list_vehicle_types, park, write_demand
+from flcav.world.traffic.sumo import start_server
+from flcav.world.traffic.sumo_process import STEP_S
+from flcav.world.traffic.traffic import number_of
+
+Array = NDArray[np.float64]
+
+SERVE = "flcav.world.traffic.live_process:serve"
+FILL_S = 20.0  # all actors have departed by then
+WARM_UP_S = 30.0  # time of SUMO at the start of a live world
+TOUR_S = 900.0  # length of a vehicle's tour, at least; it then sets out again
+SLOW_MPS = 1.0  # traffic brakes for a slower vehicle wherever it stands, and for a faster one in its lane
+DANGERS = (-0.4, 0.0, 0.4)  # places to brake for, over a body's length from its middle
+SOON_S = 0.7  # so far ahead traffic looks at who crosses its way
+BERTH_M = 1.0  # half the width of a vehicle that passes
+
+_idle: list[tuple[int, subprocess.Popen[str]]] = []  # processes without a world, with the id of their parent
+
+
+def write_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians: int) -> dict[str, Any]:
+    """Return the first request for a live world, see `live_process`, whose files are in `folder`.
+
+    Raises `InputError` as `write_demand`.
+    """
+    parameters = town.parameters.model_copy(update={"vehicles": vehicles, "pedestrians": pedestrians})
+    net = read_net(town.net)
+    try:
+        demand = write_demand(net, parameters, seed=seed, cavs=0, from_s=0.0, until_s=TOUR_S, fill_s=FILL_S)
+    except InputError as error:
+        raise InputError(f"{town.name}: {error}") from None
+    linked, routes = folder / "town.net.xml", folder / "town.rou.xml"  # SUMO takes no commas or ${...} in paths
+    linked.symlink_to(town.net.absolute())
+    routes.write_text(demand.routes, encoding="utf-8")
+    return {
+        "net": str(linked),
+        "routes": str(routes),
+        "followers": demand.followers,
+        "next": vehicles + len(demand.followers),
+        "seed": derive_seed(seed, "sumo"),
+        # a route of those under control; SUMO does not see them where there is none
+        "edge": next((edge.id for edge in net.streets if edge.lanes_of("driving")), ""),
+        "steps": round(WARM_UP_S / STEP_S),
+    }
+
+
+class SumoTraffic:
+    """SUMO's traffic in a town, with a SUMO process of its own until it is closed."""
+
+    def __init__(self, town: Town, ground: Ground, *, seed: int, vehicles: int, pedestrians: int) -> None:
+        """Start with the traffic under way; raises `InputError` as `write_demand`, `RuntimeError` where SUMO fails."""
+        self.ticks = 0  # steps of SUMO since the start
+        self._actors = NOBODY  # those present before and after the step of SUMO under way, at their last places
+        self._ground, self._town = ground, town
+        self._kinds = {name: (category, shape) for name, category, shape in list_vehicle_types()}
+        self._lights: dict[str, str] = {}
+        self._process: subprocess.Popen[str] | None = None
+        with tempfile.TemporaryDirectory(prefix="flcav_live_") as folder:
+            job = write_job(town, Path(folder), seed=seed, vehicles=vehicles, pedestrians=pedestrians)
+            self._process = _take_process()
+            self._after = self._before = self._ask(job)
+        self.advance(NOBODY, {}, [])
+
+    def advance(self, bodies: Actors, lights: Mapping[str, str], halted: Sequence[str]) -> None:
+        """Let SUMO make its next step, in which its traffic sees the `bodies` under control.
+
+        `lights` are the letters of each junction's links. Vehicles that are `halted` stand for a while. Raises
+        `RuntimeError` where SUMO fails.
+        """
+        changed = {name: state for name, state in lights.items() if self._lights.get(name) != state}
+        self._lights |= changed
+        request = {
+            "bodies": _list_vehicles(bodies),
+            "dangers": _list_dangers(bodies),
+            "lights": changed,
+            "halted": list(halted),
+        }
+        self._before, self._after = self._after, self._ask(request)
+        self.ticks += 1
+        names = sorted((name for name in self._before if name in self._after), key=number_of)
+        self._ends = tuple(
+            np.array([state[name][1:] for name in names], np.float64).reshape(-1, 4)
+            for state in (self._before, self._after)
+        )
+        if tuple(names) != self._actors.name:
+            self._recast(names)
+
+    def at(self, time_s: float) -> Actors:
+        """Return those present at a time since the start, within the step of SUMO under way: linear in it.
+
+        Times must ascend, since who is on a bridge stays on it.
+        """
+        share = time_s / STEP_S - (self.ticks - 1)
+        first, last = self._ends
+        turn = wrap_angle(np.radians(first[:, 2] - last[:, 2]))
+        yaw = np.pi / 2 - np.radians(first[:, 2]) + share * turn
+        speed = first[:, 3] + share * (last[:, 3] - first[:, 3])
+        ahead = heading_vectors(yaw)
+        middle = first[:, :2] + share * (last[:, :2] - first[:, :2]) - self._actors.size[:, :1] / 2 * ahead
+        yaw_rate = turn / STEP_S
+        walks = self._walks[:, None]
+        velocity = np.where(walks, (last[:, :2] - first[:, :2]) / STEP_S, speed[:, None] * ahead)
+        gain = (last[:, 3] - first[:, 3])[:, None] / STEP_S * ahead + (speed * yaw_rate)[:, None] * left_vectors(yaw)
+        position = np.column_stack((middle, self._actors.position[:, 2]))
+        z, tilt = self._ground.stand(position, yaw, self._actors.size, self._walks)
+        climb = -speed * np.tan(tilt[:, 0])
+        self._actors = self._actors._replace(
+            position=np.column_stack((middle, z)),
+            yaw=wrap_angle(yaw),
+            velocity=np.column_stack((velocity, climb)),
+            acceleration=np.column_stack((np.where(walks, 0.0, gain), np.zeros(len(z)))),
+            yaw_rate=yaw_rate,
+            tilt=tilt,
+        )
+        return self._actors
+
+    def _recast(self, names: Sequence[str]) -> None:
+        """Take over these actors; those who come are on the ground, or on the bridge that their lane leads over."""
+        kinds = [self._kinds[self._after[name][0]] for name in names]
+        size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], np.float64).reshape(-1, 3)
+        count = len(names)
+        front, turned = self._ends[0][:, :2], np.pi / 2 - np.radians(self._ends[0][:, 2])
+        position = np.column_stack((front - size[:, :1] / 2 * heading_vectors(turned), np.full(count, np.nan)))
+        known = dict(zip(self._actors.name, self._actors.position[:, 2].tolist()))
+        position[:, 2] = [known.get(name, np.nan) for name in names]
+        relief, new = self._town.relief, np.flatnonzero(np.isnan(position[:, 2]))
+        if relief is not None and relief.decks and len(new):
+            centre, yaw = position[None, new, :2], turned[None, new]
+            footing = find_footing(relief, self._town.net, centre, yaw)
+            position[new, 2] = footing(centre[..., 0], centre[..., 1])[0]
+        self._actors = Actors(
+            name=tuple(names),
+            category=tuple(category for category, _ in kinds),
+            shape=np.array([shape for _, shape in kinds], np.int64),
+            size=size,
+            position=position,
+            yaw=turned,
+            velocity=np.zeros((count, 3)),
+            acceleration=np.zeros((count, 3)),
+            yaw_rate=np.zeros(count),
+            tilt=np.zeros((count, 2)),
+        )
+        self._walks = np.array([category == "pedestrian" for category, _ in kinds], np.bool_)
+
+    def close(self) -> None:
+        """End the world's SUMO; its process is kept for the next world."""
+        if self._process is None:
+            return
+        process, self._process = self._process, None
+        with contextlib.suppress(BrokenPipeError):
+            assert process.stdin is not None
+            process.stdin.write("\n")
+            process.stdin.flush()
+            _idle.append((os.getpid(), process))
+
+    def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the answer to a request: type and state by name."""
+        if self._process is None:
+            raise RuntimeError("the live world is closed")
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        except BaseException:
+            self._kill()  # or its answer would be taken for that to the next request
+            raise
+        answer = json.loads(line) if line else {"error": "its process has ended"}
+        if "error" in answer:
+            self._kill()
+            raise RuntimeError(f"SUMO failed: {answer['error']}")
+        return answer
+
+    def _kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+            self._process = None
+
+
+def _list_vehicles(bodies: Actors) -> list[tuple[str | float, ...]]:
+    """Return the rows of `bodies` in a request."""
+    front = bodies.position[:, :2] + bodies.size[:, :1] / 2 * heading_vectors(bodies.yaw)
+    angle = (90.0 - np.degrees(bodies.yaw)) % 360.0
+    speed = np.linalg.norm(bodies.velocity[:, :2], axis=1)
+    numbers = np.column_stack((bodies.size[:, :2], front, angle, speed)).tolist()
+    kinds = zip(bodies.name, bodies.category, bodies.shape.tolist(), numbers)
+    return [
+        (name, f"{category}.{SHAPES[category][shape].name}", *row)
+        for name, category, shape, row in kinds
+        if category in VEHICLES
+    ]
+
+
+def _list_dangers(bodies: Actors) -> list[list[float]]:
+    """Return x, y, half width [m], cosine and sine of the heading, of places to brake for, now and `SOON_S` later.
+
+    The heading of walkers, props and vehicles that hardly move is 0, 0: all brake for them, and for others only those
+    whose way they cross.
+    """
+    moves = np.isin(bodies.category, VEHICLES) & (np.linalg.norm(bodies.velocity[:, :2], axis=1) >= SLOW_MPS)
+    heading = heading_vectors(bodies.yaw)
+    along = bodies.size[:, :1] * heading
+    places = [
+        bodies.position[:, :2] + share * along + time_s * bodies.velocity[:, :2]
+        for share in DANGERS
+        for time_s in (0.0, SOON_S)
+    ]
+    row = np.column_stack((BERTH_M + bodies.size[:, 1] / 2, moves[:, None] * heading))
+    return np.column_stack((np.concatenate(places), np.tile(row, (len(places), 1)))).tolist()
+
+
+def _take_process() -> subprocess.Popen[str]:
+    """Return a SUMO process without a world, started where there is none."""
+    while _idle:
+        parent, process = _idle.pop()
+        if parent == os.getpid() and process.poll() is None:
+            return process
+    return start_server(SERVE)
+
+
+@atexit.register
+def _stop() -> None:
+    """Kill the idle processes that this process started."""
+    for parent, process in _idle:
+        if parent == os.getpid():
+            process.kill()
+            process.communicate()
+    _idle.clear()
+
+
+def stand_parked(town: Town, ground: Ground, seed: int) -> Actors:
+    """Return the vehicles parked along a town's streets, the same as in a recording with this seed."""
+    cars = park(read_net(town.net), town.parameters, stream(seed, "parked")) if town.net.exists() else []
+    if not cars:
+        return NOBODY
+    count = len(cars)
+    size = np.array([SHAPES[car.category][car.shape][1:] for car in cars], np.float64)
+    position = np.array([(car.x, car.y, np.nan) for car in cars])
+    yaw = np.array([car.yaw for car in cars])
+    position[:, 2], tilt = ground.stand(position, yaw, size, np.zeros(count, np.bool_))
+    still = np.zeros((count, 3))
+    return Actors(
+        *(tuple(f"parked{i}" for i in range(count)), tuple(car.category for car in cars)),
+        *(np.array([car.shape for car in cars], np.int64), size, position, yaw, still, still, np.zeros(count), tilt),
+    )
