@@ -15,6 +15,7 @@ MANIFEST = "manifest.json"  # written last: a folder without it is unfinished
 CALIBRATION = "calibration.json"  # see `flcav.dataset.calibration`
 FILES = "files"  # table that lists all other files: payloads, traffic, the town's files
 TRACES = "traces"
+NAVIGATION = "navigation"
 TOWN = "town"  # contains the folder of a town that does not come with flcav
 WORK = ".recording"  # folder of an unfinished recording; removed at its end
 PACKAGES = ("flcav", "embreex", "libsumo", "numba", "numpy", "pillow", "pyarrow")  # those that determine the bytes
@@ -103,6 +104,11 @@ def payload_path(sensor: str, key: str, suffix: str) -> str:
 def trace_path(scene: str) -> str:
     """Return the relative path of a scene's traffic."""
     return f"{TRACES}/{scene}.parquet"
+
+
+def navigation_path(scene: str) -> str:
+    """Return the relative path of the navigation logs of a scene's vehicles."""
+    return f"{NAVIGATION}/{scene}.parquet"
 
 
 def package_versions(names: Sequence[str] = PACKAGES) -> dict[str, str]:

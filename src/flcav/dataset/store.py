@@ -25,15 +25,18 @@ from flcav.dataset.layout import (
     MANIFEST,
     FrameKey,
     Manifest,
+    navigation_path,
     payload_path,
     read_manifest,
     table_path,
     town_path,
     trace_path,
 )
+from flcav.dataset.navigation_logs import load_logs
 from flcav.dataset.payloads import INFRARED, PICTURES, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, TILTS, read_table
 from flcav.sensors.frame import LONGEST_NAME, CameraImage, Frame, format_key
+from flcav.sensors.navigation_log import NavigationLog
 from flcav.world.map.town import PACKAGED, Town, load_town
 from flcav.world.trace import Trace
 
@@ -184,6 +187,11 @@ class Dataset:
         """Return the traffic of a scene, None if it was not recorded; raises `InputError` if its file is damaged."""
         path = self.folder / trace_path(scene)
         return Trace.load(path) if path.is_file() else None
+
+    def navigation_logs(self, scene: str) -> dict[str, NavigationLog]:
+        """Return vehicle -> its navigation log of a scene; empty if none were recorded. `InputError` as `trace`."""
+        path = self.folder / navigation_path(scene)
+        return load_logs(path) if path.is_file() else {}
 
     def town(self) -> Town | None:
         """Return the town of the dataset, from its own folder or from flcav; None where neither has it."""

@@ -9,13 +9,15 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
+import numpy as np
+
 from flcav.config import InputError, parse_config, path_within
 from flcav.dataset.checks.calibration import check_calibrations
 from flcav.dataset.checks.copies import find_copies
 from flcav.dataset.checks.frames import check_measurements, check_points, check_sweeps, check_traffic, check_values
 from flcav.dataset.checks.images import check_images
 from flcav.dataset.checks.scenes import BlockedViews, check_motion
-from flcav.dataset.layout import MANIFEST, FrameKey, Manifest, read_manifest, trace_path
+from flcav.dataset.layout import MANIFEST, FrameKey, Manifest, navigation_path, read_manifest, trace_path
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import list_files
 from flcav.interface.progress import Report, print_progress
@@ -67,7 +69,27 @@ def validate(path: Path | str, *, progress: Report = print_progress) -> list[str
             if not any(str(error).startswith(str(folder / name)) for name in damaged):
                 problems.append(str(error))
         progress(i + 1, len(dataset), "")
+    problems += _log_problems(dataset, damaged)
     return [*problems, *sight.problems()]
+
+
+def _log_problems(dataset: Dataset, damaged: Collection[str]) -> Iterator[str]:
+    """Yield a sentence for each navigation log that cannot be read, or ends before its vehicle's last frame."""
+    for scene in dataset.manifest.scenes:
+        if navigation_path(scene) in damaged:
+            continue
+        try:
+            logs = dataset.navigation_logs(scene)
+        except InputError as error:
+            yield str(error)
+            continue
+        for agent, log in logs.items():
+            times_s = np.array([dataset.keys[i].time_s for i in dataset.select(scenes=[scene], agents=[agent])])
+            if not log.covers(times_s).all():
+                yield (
+                    f"{dataset.folder / navigation_path(scene)}: the log of '{agent}' goes from {log.begin_s:.1f} to "
+                    f"{log.end_s:.1f} s, its frames from {times_s[0]:.1f} to {times_s[-1]:.1f} s"
+                )
 
 
 def _frame_problems(frame: Frame, trace: Trace | None, *, imported: bool) -> Iterator[str]:

@@ -1,4 +1,9 @@
-"""Errors of vehicles' own navigation: the poses and clocks by which labels of road sensors reach their frames."""
+"""Vehicles' own navigation: the poses and clocks by which labels of tracks and road sensors reach their frames.
+
+Poses are either the true ones with drawn errors, or estimated from what the vehicle's GNSS receiver and IMU measured.
+"""
+
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +25,8 @@ class NavigationErrors(Config):
 
     @property
     def stated(self) -> Navigation:
-        """Return what a vehicle states of its accuracy: at least a centimetre and .001 rad."""
-        return Navigation(max(self.position_m, 0.01), max(float(np.radians(self.heading_deg)), 0.001))
+        """Return what a vehicle states of its accuracy."""
+        return state_accuracy(self.position_m, float(np.radians(self.heading_deg)))
 
     def navigate(self, world_from_agent: Array, rng: np.random.Generator) -> Array:
         """Return a vehicle's pose (4, 4) as its navigation has it, with errors drawn from `rng`."""
@@ -29,3 +34,12 @@ class NavigationErrors(Config):
         known = world_from_agent @ pose(0, 0, 0, float(turned))
         known[:2, 3] = world_from_agent[:2, 3] + off_m
         return known
+
+
+ESTIMATED: Literal["estimated"] = "estimated"
+PoseSource = NavigationErrors | Literal["estimated"]  # "estimated": see `flcav.fusion.inertial`; clocks are exact
+
+
+def state_accuracy(position_m: float, heading_rad: float) -> Navigation:
+    """Return standard deviations as a vehicle states them: at least a centimetre and .001 rad."""
+    return Navigation(max(position_m, 0.01), max(heading_rad, 0.001))

@@ -65,8 +65,9 @@ def make_recording_recipe(
     """Return the recording recipe of a split in a region's town, without poles.
 
     Settings of the task, the run, the region, and the run's entry of the task override each other in this order.
-    window: fields of `Recipe` of the spins around others. Raises `InputError`, naming the recording by its `name`,
-    where they do not go together.
+    window: fields of `Recipe` of what is recorded for labels: spins around others, and navigation logs, for which
+    vehicles without a GNSS receiver or an IMU get one. Raises `InputError`, naming the recording by its `name`, where
+    they do not go together.
     """
     place, frames = recipe.regions[region], getattr(recipe.sized_splits, split)
     changes = [as_shared(task_named(task)).recording, recipe.recording.fields(split), place.recording.fields(split)]
@@ -87,6 +88,9 @@ def make_recording_recipe(
         "cavs": recipe.vehicles(region) if split == "edge" else frames.cavs,
         **window,
     }
+    if fields.get("navigation_s"):
+        rig = parse_recipe(fields | {"navigation_s": 0.0}, name).vehicle_rig
+        fields["vehicle_rig"] = rig.with_navigation()
     return parse_recipe(fields, name)
 
 

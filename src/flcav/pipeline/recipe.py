@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.rules import Rules
 from flcav.fusion.distillation import Distillation
-from flcav.fusion.navigation import NavigationErrors
+from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.problem import Budgets
 from flcav.sensors.calibration import CalibrationError
@@ -358,7 +358,9 @@ class RunRecipe(Config):
     placement: PlacementSettings = PlacementSettings()  # placement of roadside sensors
     federation: Federation = Federation()  # settings of aggregation
     distillation: Distillation | None = None  # of labels "road-average"; None: the defaults
-    navigation: NavigationErrors = NavigationErrors()  # errors of vehicles' poses and clocks, in labels of road sensors
+    navigation: PoseSource = (
+        NavigationErrors()
+    )  # errors of vehicles' poses and clocks, in labels of tracks and road sensors; or "estimated"
     recording: Recording = Recording()  # changes to how all regions are recorded
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
     primary_claims: tuple[str, ...] = Field(

@@ -9,7 +9,7 @@ walk, as on data sheets (IEEE 952).
 """
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from flcav.config import Config
@@ -22,8 +22,8 @@ STEP_S = 0.1  # of the grid on which biases are simulated
 GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
 
 
-def draw_gauss_markov(rng: np.random.Generator, time_s: float, deviation: Array, correlation_s: float) -> Array:
-    """Return (K,) values of independent first-order Gauss-Markov processes at `time_s` >= 0.
+def draw_gauss_markov(rng: np.random.Generator, time_s: ArrayLike, deviation: Array, correlation_s: float) -> Array:
+    """Return (..., K) values of independent first-order Gauss-Markov processes at the times `time_s` (...) >= 0.
 
     Each is stationary, with the standard deviation `deviation` (K,) and the autocorrelation exp(-t / `correlation_s`).
     """
@@ -35,8 +35,8 @@ def draw_gauss_markov(rng: np.random.Generator, time_s: float, deviation: Array,
     return deviation * _read(np.asarray(lfilter([1.0], [1.0, -kept], normal, axis=0)), time_s)
 
 
-def draw_random_walk(rng: np.random.Generator, time_s: float, start: Array, per_root_s: Array) -> Array:
-    """Return (K,) values of independent random walks at `time_s` >= 0.
+def draw_random_walk(rng: np.random.Generator, time_s: ArrayLike, start: Array, per_root_s: Array) -> Array:
+    """Return (..., K) values of independent random walks at the times `time_s` (...) >= 0.
 
     The initial values have the standard deviations `start` (K,), increments over t seconds `per_root_s` (K,) * sqrt(t).
     """
@@ -46,13 +46,14 @@ def draw_random_walk(rng: np.random.Generator, time_s: float, start: Array, per_
     return _read(np.cumsum(normal, axis=0), time_s)
 
 
-def _grid(rng: np.random.Generator, time_s: float, axes: int) -> Array:
-    return rng.standard_normal((int(time_s / STEP_S) + 2, axes))
+def _grid(rng: np.random.Generator, time_s: ArrayLike, axes: int) -> Array:
+    return rng.standard_normal((int(np.max(time_s) / STEP_S) + 2, axes))
 
 
-def _read(values: Array, time_s: float) -> Array:
-    step, share = divmod(time_s / STEP_S, 1.0)
-    return (1 - share) * values[int(step)] + share * values[int(step) + 1]
+def _read(values: Array, time_s: ArrayLike) -> Array:
+    step, share = np.divmod(np.asarray(time_s, dtype=np.float64) / STEP_S, 1.0)
+    step, share = step.astype(np.int64), share[..., None]
+    return (1 - share) * values[step] + share * values[step + 1]
 
 
 class Gnss(Config):
@@ -77,15 +78,17 @@ def measure_position(
     rendered before.
     """
     time_s = float(scene.trace.time_s[scene.index]) + scene.offset_s
-    error = draw_position_error(gnss, time_s, rng, bias_rng)
-    return convert_to_geodetic(scene.town.geo, world_from_gnss[:3, 3] + error)
+    noise, bias = draw_fix_errors(gnss, time_s, rng, bias_rng)
+    return convert_to_geodetic(scene.town.geo, world_from_gnss[:3, 3] + noise + bias)
 
 
-def draw_position_error(gnss: Gnss, time_s: float, rng: np.random.Generator, bias_rng: np.random.Generator) -> Array:
-    """Return the error (3,) east, north, up [m] of a fix at `time_s`; generators as in `measure_position`."""
-    noise = rng.standard_normal(3) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
-    bias = np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m))
-    return noise + draw_gauss_markov(bias_rng, time_s, bias, gnss.bias_s)
+def draw_fix_errors(
+    gnss: Gnss, time_s: ArrayLike, rng: np.random.Generator, bias_rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return noise and bias (..., 3) x, y, up [m] of fixes at the times `time_s` (...); see `measure_position`."""
+    noise = rng.standard_normal((*np.shape(time_s), 3)) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
+    bias = draw_gauss_markov(bias_rng, time_s, np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m)), gnss.bias_s)
+    return noise, bias
 
 
 class Imu(Config):
@@ -118,15 +121,18 @@ def measure_inertia(
     turn = world_from_imu[:3, :3]
     acceleration, rate = _motion(scene, world_from_imu[:3, 3], carrier)
     true = np.concatenate((turn.T @ (acceleration - GRAVITY), turn.T @ rate))
-    return true + draw_inertia_error(imu, time_s, rng, bias_rng)
+    noise, bias = draw_imu_errors(imu, time_s, rng, bias_rng)
+    return true + noise + bias
 
 
-def draw_inertia_error(imu: Imu, time_s: float, rng: np.random.Generator, bias_rng: np.random.Generator) -> Array:
-    """Return the error (6,) of a sample at `time_s`, in its units; generators as in `measure_inertia`."""
+def draw_imu_errors(
+    imu: Imu, time_s: ArrayLike, rng: np.random.Generator, bias_rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return noise and bias (..., 6) of IMU samples at the times `time_s` (...); see `measure_inertia`."""
     noise = np.repeat((imu.force_noise, imu.rate_noise), 3) * np.sqrt(imu.rate_hz / 2)
     start = np.repeat((imu.force_bias, imu.rate_bias), 3)
     growth = np.repeat((imu.force_walk, imu.rate_walk), 3)
-    return noise * rng.standard_normal(6) + draw_random_walk(bias_rng, time_s, start, growth)
+    return noise * rng.standard_normal((*np.shape(time_s), 6)), draw_random_walk(bias_rng, time_s, start, growth)
 
 
 def _motion(scene: Scene, at: Array, carrier: int | None) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ from flcav.sensors.radar.radar import Radar
 
 CAMERA_RANGE_M = 100.0  # of ground truth for rigs without LiDAR; what shows in an image is labelled at any distance
 TRIGGER_MS = 100.0  # largest offset of a trigger from the spin
-RESERVED = ("traces", "town")  # folders of a dataset, so no names of sensors
+RESERVED = ("traces", "navigation", "town")  # folders of a dataset, so no names of sensors
 _NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_-]{{0,{LONGEST_NAME - 1}}}")
 
 Reach = Annotated[float, Field(ge=-100, le=100)]  # [m]
@@ -127,6 +127,11 @@ class Rig(Config):
     def sensors(self) -> Mapping[str, MountedLidar | Mounted]:
         """Return all sensors of all kinds, by name."""
         return {name: sensor for kind in type(self).model_fields for name, sensor in getattr(self, kind).items()}
+
+    def with_navigation(self) -> "Rig":
+        """Return the rig with the GNSS receiver and the IMU of `car`, where it has none of its own."""
+        known = car()
+        return self.model_copy(update={"gnss": self.gnss or known.gnss, "imus": self.imus or known.imus})
 
 
 def lidar32() -> Rig:

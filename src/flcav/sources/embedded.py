@@ -10,6 +10,7 @@ import numpy as np
 
 from flcav.config import InputError, Json
 from flcav.sensors.frame import Frame
+from flcav.sensors.navigation_log import NavigationLog, log_drive
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
 from flcav.sources.division import Division
@@ -19,7 +20,7 @@ from flcav.statistics.streams import derive_seed, stream
 from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, Town, check_town_name, load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
-from flcav.world.traffic.traffic import simulate
+from flcav.world.traffic.traffic import simulate_drives
 
 
 class EmbeddedSource:
@@ -56,7 +57,7 @@ class EmbeddedSource:
             mount_m = z - self.town.ground(x, y)
             check_mounts("pole_rig", recipe.pole_rig, f"pole {pole}", mount_m)
         self._division = Division(recipe, self.town.name, tuple(self.agents))
-        self._last_trace: tuple[str, Trace] | None = None
+        self._last_traffic: tuple[str, Trace, Trace] | None = None
         self._last_scene: tuple[str, Scene] | None = None
 
     def describe(self) -> Mapping[str, Json]:
@@ -68,6 +69,7 @@ class EmbeddedSource:
             "window_s",
             "window_every_s",
             "window_range_m",
+            "navigation_s",
         }  # left out where they are not asked for
         return {
             **{name: value for name, value in own.items() if name not in asked or value},
@@ -132,15 +134,36 @@ class EmbeddedSource:
 
     def trace(self, scene: str) -> Trace:
         """Return the simulated traffic of the scene, sampled at the times of its spins."""
-        if self._last_trace is None or self._last_trace[0] != scene:
+        return self._simulate(scene)[0]
+
+    def navigation_logs(self, scene: str) -> Mapping[str, NavigationLog]:
+        """Return vehicle -> the navigation log of its drive in a scene; empty without `navigation_s`."""
+        if not self.recipe.navigation_s:
+            return {}
+        drives, about = self._simulate(scene)[1], {"scene": scene, "seed": self.recipe.seed}
+        logs = {
+            agent: log_drive(drives, agent, rig, self.town.geo, **about)
+            for agent, rig in zip(self.agents, self.vehicle_rigs)
+        }
+        return {agent: log for agent, log in logs.items() if log is not None}
+
+    def _simulate(self, scene: str) -> tuple[Trace, Trace]:
+        """Return the traffic of the scene, and the motion of its vehicles for their navigation logs."""
+        if self._last_traffic is None or self._last_traffic[0] != scene:
             seed = derive_seed(self.recipe.seed, "traffic", self.scenes().index(scene))
             warmup = stream(self.recipe.seed, scene, "warmup").integers(*self.recipe.warmup_steps, endpoint=True)
-            times_s, scenarios = self.recipe.times_s(int(warmup)), self.recipe.scenarios
-            trace = simulate(self.town, seed=seed, cavs=self.recipe.cavs, times_s=times_s, scenarios=scenarios)
+            trace, drives = simulate_drives(
+                self.town,
+                seed=seed,
+                cavs=self.recipe.cavs,
+                times_s=self.recipe.times_s(int(warmup)),
+                lead_s=self.recipe.navigation_s,
+                scenarios=self.recipe.scenarios,
+            )
             if self.recipe.randomise is not None:
                 trace = randomise_bodies(trace, stream(self.recipe.seed, scene, "sizes"))
-            self._last_trace = scene, trace
-        return self._last_trace[1]
+            self._last_traffic = scene, trace, drives
+        return self._last_traffic[1:]
 
     def _vehicle_rig(self, number: int) -> Rig:
         """Return the rig of the vehicle "cav<number>"."""
@@ -156,7 +179,7 @@ class EmbeddedSource:
         return read_town_files(self.town, self.recipe.town)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_last_trace": None, "_last_scene": None}
+        return self.__dict__ | {"_last_traffic": None, "_last_scene": None}
 
 
 def read_town_files(town: Town, name: str) -> Mapping[str, bytes]:

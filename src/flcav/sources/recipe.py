@@ -20,6 +20,7 @@ from flcav.world.scenarios.scenario import LONGEST_S, Scenario
 from flcav.world.weather import WEATHERS, WeatherSchedule
 
 STEP_S = 0.1  # step of the traffic simulation
+LEAST_IMU_HZ = 20.0  # of navigation logs
 MOST = 10**6  # upper limit of scenes, frames and spins
 
 
@@ -97,6 +98,9 @@ class Recipe(Config):
     window_range_m: Annotated[float, Field(gt=0)] | None = (
         None  # where poles record, vehicles record windows only of spins within this of one of them, and poles none [m]
     )
+    navigation_s: Annotated[float, Field(ge=0, le=LONGEST_S), AfterValidator(_multiple_of_step)] = (
+        0.0  # above 0: navigation logs of the vehicles, from up to so long before the first spin to the last
+    )
     cavs: int = Field(default=1, ge=0, le=1000)  # connected vehicles that record: cav0, cav1, ...
     poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()  # numbers of the poles that record
     vehicle_rig: NamedRig = RIGS["lidar32"]  # every vehicle's sensors: the name of a rig, or a rig
@@ -136,6 +140,15 @@ class Recipe(Config):
             )
         if self.window_range_m is not None and not self.window_s:
             raise ValueError("window_range_m: there are no windows around spins; give 'window_s'")
+        return self
+
+    @model_validator(mode="after")
+    def _navigates(self) -> "Recipe":
+        if self.navigation_s and not (self.vehicle_rig.gnss and self.vehicle_rig.imus):
+            raise ValueError("navigation_s: the vehicles need a GNSS receiver and an IMU; give them a 'vehicle_rig'")
+        slow = [imu.settings.rate_hz for imu in self.vehicle_rig.imus.values() if imu.settings.rate_hz < LEAST_IMU_HZ]
+        if self.navigation_s and slow:
+            raise ValueError(f"navigation_s: an IMU of {slow[0]:g} Hz is too slow; {LEAST_IMU_HZ:g} Hz or more are")
         return self
 
     @property

@@ -5,6 +5,7 @@ from typing import Protocol, runtime_checkable
 
 from flcav.config import Json
 from flcav.sensors.frame import Frame
+from flcav.sensors.navigation_log import NavigationLog
 from flcav.world.trace import Trace
 
 
@@ -45,6 +46,15 @@ class Replayable(Source, Protocol):
 
     def replay(self, scene: str, trace: Trace, numbers: range) -> Iterator[Frame]:
         """Yield the frames with the given `numbers`, positions in `frames(scene)`, of a scene with traffic `trace`."""
+        ...
+
+
+@runtime_checkable
+class LoggingSource(Replayable, Protocol):
+    """A source that also knows what the vehicles' navigation sensors measured over their whole drives."""
+
+    def navigation_logs(self, scene: str) -> Mapping[str, NavigationLog]:
+        """Return vehicle -> its navigation log of a scene; empty where none are asked for."""
         ...
 
 

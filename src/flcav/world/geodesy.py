@@ -32,13 +32,22 @@ def convert_from_geodetic(origin: GeoReference, place: GeoReference) -> Array:
     return (_to_earth(place) - _to_earth(origin)) @ _earth_from_enu(origin)
 
 
+def convert_to_map(origin: GeoReference, geodetic: Array) -> Array:
+    """Return (..., 3) x, y, up [m] of places (..., 3): the inverse of `convert_to_geodetic`."""
+    enu = (_place_on_earth(*np.moveaxis(geodetic, -1, 0)) - _to_earth(origin)) @ _earth_from_enu(origin)
+    return enu @ np.linalg.inv(_enu_from_map(origin)).T
+
+
 def _to_earth(at: GeoReference) -> Array:
-    lat, lon = np.radians((at.latitude_deg, at.longitude_deg))
+    return _place_on_earth(*np.array((at.latitude_deg, at.longitude_deg, at.altitude_m)))
+
+
+def _place_on_earth(latitude_deg: Array, longitude_deg: Array, altitude_m: Array) -> Array:
+    lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
     normal = EQUATOR_M / np.sqrt(1 - ECCENTRICITY2 * np.sin(lat) ** 2)
-    level = (normal + at.altitude_m) * np.cos(lat)
-    return np.array(
-        [level * np.cos(lon), level * np.sin(lon), (normal * (1 - ECCENTRICITY2) + at.altitude_m) * np.sin(lat)]
-    )
+    level = (normal + altitude_m) * np.cos(lat)
+    up = (normal * (1 - ECCENTRICITY2) + altitude_m) * np.sin(lat)
+    return np.stack((level * np.cos(lon), level * np.sin(lon), up), axis=-1)
 
 
 def _earth_from_enu(at: GeoReference) -> Array:

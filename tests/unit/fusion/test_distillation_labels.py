@@ -283,7 +283,8 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     keys = [SimpleNamespace(scene="s", index=0, agent=f"cav{n}", time_s=0.0) for n in (1, 0)]
     spins = [frame([BOTH]), frame([BOTH, OUT_OF_SIGHT])]
     manifest = SimpleNamespace(recipe={"seed": 1})
-    data = SimpleNamespace(keys=keys, frame=lambda i: spins[i], manifest=manifest, town=lambda: "town")
+    about = {"frame": lambda i: spins[i], "world_from_agent": lambda i: spins[i].world_from_agent}
+    data = SimpleNamespace(keys=keys, manifest=manifest, town=lambda: "town", **about)
     monkeypatch.setattr(road_average, "map_layers", lambda town: lane_through(BOTH, np.pi))
     found = [boxes(BOTH, z=-1.0), boxes(BOTH, OUT_OF_SIGHT, z=-1.0)]
     monkeypatch.setattr(road_average, "road_views", lambda *about: {("s", 0): {3: seen}})

@@ -124,7 +124,8 @@ def split_of(times_s: tuple[float, ...], middle: tuple[int, ...], scenes: tuple[
         for n in range(2)
     ]
     manifest = SimpleNamespace(recipe={"seed": 1})
-    data = SimpleNamespace(keys=keys, frame=lambda i: frame(keys[i]), manifest=manifest, town=lambda: None)
+    about = {"frame": lambda i: frame(keys[i]), "world_from_agent": lambda i: frame(keys[i]).world_from_agent}
+    data = SimpleNamespace(keys=keys, manifest=manifest, town=lambda: None, **about)
     return Frames(cast(Any, data), tuple(i for i, key in enumerate(keys) if key.index in middle), {})
 
 
@@ -203,7 +204,7 @@ def test_road_boxes_reach_a_vehicle_s_frame_by_the_pose_that_it_tells_of(monkeyp
 
     def labels(errors: NavigationErrors) -> np.ndarray:
         about = (network, 0.6, split, split.vehicles, (3,), "grid", ignore_progress)
-        found = pseudo_label_samples(*about, errors=errors)
+        found = pseudo_label_samples(*about, poses=errors)
         return np.concatenate([sample.boxes.center[:, :2] for name in sorted(found) for sample in found[name]])
 
     np.testing.assert_allclose(labels(NavigationErrors()), np.tile(HIDDEN, (4, 1)), atol=1e-6)

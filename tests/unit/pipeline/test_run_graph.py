@@ -334,3 +334,23 @@ def test_messages_of_labels_are_priced_with_posts_where_any_arm_has_a_pose_graph
     for chosen, wanted in ((arms, True), ({"plain": about}, False)):
         steps = {step.name: settings_of(step) for step in Graph(recipe_of(arms=chosen), Path()).steps}
         assert steps["plan"].tasks["objects"].labels.distillation.pose_graph is wanted
+
+
+def test_estimated_poses_are_logged_where_vehicles_train_and_change_the_steps_that_take_them() -> None:
+    def asked(**changes: Any) -> dict[str, Any]:
+        return {step.name: settings_of(step) for step in Graph(recipe_of(**changes), Path()).steps}
+
+    drawn, found = asked(tasks=TRACKED), asked(tasks=TRACKED, navigation="estimated")
+    recipes = {name: own.recipe for name, own in found.items() if hasattr(own, "recipe")}
+    assert {name for name, own in recipes.items() if own.navigation_s} == {"grid-edge-objects"}
+    rig = recipes["grid-edge-objects"].vehicle_rig
+    assert (set(rig.gnss), set(rig.imus)) == ({"gnss"}, {"imu"})
+    assert rig.lidars == drawn["grid-edge-objects"].recipe.vehicle_rig.lidars
+    steps = [steps_of(recipe_of(tasks=TRACKED, **each)) for each in ({}, {"navigation": "estimated"})]
+    changed = {name for name, fingerprint in steps[0].items() if steps[1][name] != fingerprint}
+    assert changed >= {"grid-edge-objects", "grid-tracks-objects", "grid-edge-fl-objects"}
+    assert changed.isdisjoint({"pretrain-objects", "suburb-pool-objects", "grid-registry-objects"})
+    same = asked(navigation="estimated", tasks={"objects": {"history": "objects", "labels": "own-detections"}})
+    assert not any(own.recipe.navigation_s for own in same.values() if hasattr(own, "recipe"))
+    with pytest.raises(ValueError, match="navigation"):
+        recipe_of(navigation="exact")

@@ -18,7 +18,7 @@ from flcav.sensors.navigation import (
     measure_inertia,
     measure_position,
 )
-from flcav.world.geodesy import convert_to_geodetic
+from flcav.world.geodesy import convert_to_geodetic, convert_to_map
 from flcav.world.map.parameters import GeoReference
 from flcav.world.map.town import Town
 from flcav.world.scene import Scene
@@ -62,6 +62,10 @@ def test_many_points_at_once():
     enu = np.random.default_rng(0).uniform(-500, 500, (4, 5, 3))
     many = convert_to_geodetic(GeoReference(), enu)
     np.testing.assert_allclose(many[2, 3], convert_to_geodetic(GeoReference(), enu[2, 3]))
+    turned = GeoReference(
+        latitude_deg=-33.0, longitude_deg=151.0, altitude_m=40.0, x_axis=(0.6, 0.8), y_axis=(-0.9, 0.5)
+    )
+    np.testing.assert_allclose(convert_to_map(turned, convert_to_geodetic(turned, enu)), enu, atol=1e-6)
     np.testing.assert_allclose(convert_to_geodetic(GeoReference(), np.zeros(3)), (49.0, 8.4, 0.0), atol=1e-8)
 
 
@@ -74,6 +78,7 @@ def test_errors_are_the_same_in_whatever_order_times_are_asked():
         forwards = [error(t) for t in times]
         backwards = [error(t) for t in times[::-1]][::-1]
         np.testing.assert_array_equal(forwards, backwards)
+        np.testing.assert_array_equal(forwards, error(times))
         assert np.ptp(forwards) > 0.1
 
 

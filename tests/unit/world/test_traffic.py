@@ -16,7 +16,7 @@ from flcav.world.map.town import KERB_M, TOWNS, Town, load_town
 from flcav.world.shapes import SHAPES
 from flcav.world.trace import CATEGORIES, Trace
 from flcav.world.traffic.sumo_process import HURRY_MPS, Walkers
-from flcav.world.traffic.traffic import simulate
+from flcav.world.traffic.traffic import simulate, simulate_drives
 
 TIMES_S = 60.0 + 0.1 * np.arange(300)
 ROUGHLY = {
@@ -194,6 +194,24 @@ def test_sampling_does_not_change_the_run() -> None:
     np.testing.assert_array_equal(dense.position[[0, 20]][:, kept], sparse.position)
     np.testing.assert_allclose(dense.acceleration[[0, 20]][:, kept], sparse.acceleration, atol=1e-9)
     np.testing.assert_allclose(dense.yaw_rate[[0, 20]][:, kept], sparse.yaw_rate, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["ring", "hilly_ring"])
+def test_drives_are_the_same_motion_at_every_step(name: str) -> None:
+    town, times_s = load_town(name), np.array([30.0, 32.0, 32.5])
+    about = {"seed": 2, "cavs": 2, "times_s": times_s}
+    trace, drives = simulate_drives(town, lead_s=5.0, **about)
+    plain = simulate(town, **about)
+    assert drives.actor.tolist() == ["cav0", "cav1"]
+    np.testing.assert_allclose(drives.time_s, np.arange(250, 326) / 10)
+    own, rows = [trace.actor.tolist().index(name) for name in drives.actor], np.array([50, 70, 75])
+    for field in ("position", "yaw", "velocity", "acceleration", "yaw_rate", *(("tilt",) if town.relief else ())):
+        np.testing.assert_array_equal(getattr(trace, field), getattr(plain, field))
+        np.testing.assert_allclose(getattr(drives, field)[rows], getattr(trace, field)[:, own], atol=1e-12)
+    moved = np.diff(drives.position, axis=0) / 0.1  # its speed is SUMO's, and nearly that of its positions
+    assert np.abs(moved - drives.velocity[1:]).mean() < 0.2
+    late = simulate_drives(town, lead_s=100.0, **about)[1]
+    assert late.time_s[0] == 0.1
 
 
 def test_pole_8_of_grid_is_the_densest() -> None:

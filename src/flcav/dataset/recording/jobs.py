@@ -1,8 +1,9 @@
 """The jobs of a recording: their division of the frames, how one is performed, and their scheduling.
 
 A scene of a `Replayable` source is one job for its traffic and one for each part of its frames; any other scene is one
-job. A job writes below `work/SCENE`: the traffic, or the folder of a part, which appears there when it is complete. A
-scene's traffic is scheduled before its parts, and only a few scenes are under way at a time.
+job. A job writes below `work/SCENE`: the traffic, with navigation logs if there are any, or the folder of a part, which
+appears there when it is complete. A scene's traffic is scheduled before its parts, and only a few scenes are under way
+at a time.
 """
 
 import hashlib
@@ -18,22 +19,24 @@ import pyarrow as pa
 
 from flcav.config import shorten
 from flcav.dataset.calibration import encode_calibration
-from flcav.dataset.layout import CALIBRATION, FILES, MANIFEST, TOWN, TRACES, payload_path, table_path
+from flcav.dataset.layout import CALIBRATION, FILES, MANIFEST, NAVIGATION, TOWN, TRACES, payload_path, table_path
+from flcav.dataset.navigation_logs import save_logs
 from flcav.dataset.payloads import PICTURES, POINTS, check_image, encode_payloads
 from flcav.dataset.rows import build_table, encode_frame
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
 from flcav.sensors.frame import LONGEST_NAME, Frame, LinkedFrame
-from flcav.sources.source import Replayable, Source
+from flcav.sources.source import LoggingSource, Replayable, Source
 from flcav.storage.files import flush_all, flush_tree, sha256, write_bytes, write_in_pieces
 from flcav.world.trace import Trace
 
 PART_FRAMES = 16  # frames of a part: few are lost by an interruption, and starting a part is cheap beside them
 TRAFFIC = "traffic.parquet"
+LOGS = "navigation.parquet"
 HEADER = "recipe.json"
 JOINED = "joined"  # folder below `.recording` of the concatenated tables and the calibration
 PAYLOADS = "payloads"  # folder of a part with the files that are moved into the dataset unchanged
 _SAFE_NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")
-OWN_NAMES = {TRACES, TOWN, MANIFEST, CALIBRATION, HEADER, JOINED, *map(table_path, (*SCHEMAS, FILES))}
+OWN_NAMES = {TRACES, NAVIGATION, TOWN, MANIFEST, CALIBRATION, HEADER, JOINED, *map(table_path, (*SCHEMAS, FILES))}
 AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
@@ -86,7 +89,9 @@ def perform(source: Source, task: Job, work: Path, wrote_frame: Callable[[], Non
         trace = source.trace(task.scene)
         if trace is None:
             raise ValueError(f"{task.scene}: the source can replay this scene but has no traffic of it")
-        trace.save(work / task.scene / TRAFFIC)
+        if isinstance(source, LoggingSource) and (logs := source.navigation_logs(task.scene)):
+            save_logs(logs, work / task.scene / LOGS)
+        trace.save(work / task.scene / TRAFFIC)  # last: with it the job is done
         return
     part = task.folder(work).with_suffix(".part")
     shutil.rmtree(part, ignore_errors=True)

@@ -10,8 +10,8 @@ from collections.abc import Callable, Collection
 from pathlib import Path, PurePosixPath
 
 from flcav.config import InputError, path_within
-from flcav.dataset.layout import TOWN, WORK, read_manifest, table_path, town_path, trace_path
-from flcav.dataset.recording.jobs import PAYLOADS, TRAFFIC, split_scene
+from flcav.dataset.layout import TOWN, WORK, navigation_path, read_manifest, table_path, town_path, trace_path
+from flcav.dataset.recording.jobs import LOGS, PAYLOADS, TRAFFIC, split_scene
 from flcav.dataset.tables import list_files, read_table
 from flcav.sources.source import Source, TownSource
 from flcav.storage.files import flush_all, sha256, write_bytes
@@ -67,11 +67,13 @@ def _make_parts(source: Source, out: Path, damaged: Collection[str], record: Cal
     for part in parts:
         whole = len(keys[part.scene]) == source.frame_count(part.scene)  # else no frame's part is known, as of windows
         own = keys[part.scene][part.first : part.first + part.frames] if whole else keys[part.scene]
-        if touched.isdisjoint(own) and (part.number or trace_path(part.scene) not in damaged):
+        moving = {trace_path(part.scene), navigation_path(part.scene)}
+        if touched.isdisjoint(own) and (part.number or moving.isdisjoint(damaged)):
             part.folder(out / WORK).mkdir(parents=True)  # as if it were recorded
     (out / WORK).mkdir(exist_ok=True)
     record()
     made = {trace_path(scene): out / WORK / scene / TRAFFIC for scene in keys}
+    made |= {navigation_path(scene): out / WORK / scene / LOGS for scene in keys}
     made = {name: path for name, path in made.items() if path.exists()}
     folders = [part.folder(out / WORK) / PAYLOADS for part in parts]
     return made | {name: folder / name for name in damaged for folder in folders if (folder / name).exists()}

@@ -24,6 +24,7 @@ from flcav.dataset.layout import (
     LEVEL_FORMAT,
     MANIFEST,
     WORK,
+    navigation_path,
     package_versions,
     read_manifest,
     table_path,
@@ -33,6 +34,7 @@ from flcav.dataset.layout import (
 from flcav.dataset.recording.jobs import (
     HEADER,
     JOINED,
+    LOGS,
     PAYLOADS,
     TRAFFIC,
     check_scenes,
@@ -254,11 +256,18 @@ def _list(files: Mapping[str, Path], folder: Path) -> None:
 
 
 def _move_traffic(folder: Path, scene: str, out: Path) -> Path | None:
-    """Move the traffic of a scene into the dataset and return the file of its listing; None without traffic."""
+    """Move the traffic of a scene, and navigation logs, into the dataset; return the file of their listing.
+
+    None without traffic.
+    """
     traffic, listing = folder / TRAFFIC, folder / table_path(FILES)
     if traffic.exists():
-        _list({trace_path(scene): traffic}, folder)
-        _move(traffic, out / trace_path(scene))
+        made = {trace_path(scene): traffic, navigation_path(scene): folder / LOGS}
+        held = {name: path if path.exists() else out / name for name, path in made.items()}  # moved before
+        _list({name: path for name, path in held.items() if path.exists()}, folder)
+        for name in reversed(made):  # the traffic last: with it all is done
+            if made[name].exists():
+                _move(made[name], out / name)
     return listing if listing.exists() else None
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from flcav.dataset.ground import Ground
 from flcav.fusion.detector import road_detector
 from flcav.fusion.labels import label_sample
-from flcav.fusion.navigation import NavigationErrors
+from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.fusion.road import RoadView, build_road_view, label_ideally
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report
@@ -75,14 +75,14 @@ def pseudo_label_samples(
     report: Report,
     book: Ledger | None = None,
     trained: bool = False,
-    errors: NavigationErrors = EXACT,
+    poses: PoseSource = EXACT,
 ) -> dict[str, list[Sample]]:
     """Return each vehicle's sweeps with pseudo-labels, by "region/vehicle".
 
     Labels are the frozen network's detections that score `threshold` or more, and the boxes of the sensors `poles`, by
     the package's road detector if `trained`, else by an ideal one, as their messages have them, which enter `book` as
-    downlinks; stage III passes none, since its labels are those of stage II. A vehicle places them by its pose as its
-    navigation, with `errors`, has it.
+    downlinks; stage III passes none, since its labels are those of stage II. A vehicle places them by the `poses`
+    of its navigation.
     """
     relief = Ground(split.data).relief
 
@@ -90,7 +90,7 @@ def pseudo_label_samples(
         (detections,) = detect_in(network, [frame], score_threshold=threshold)
         return label_sample(frame, detections, told, network.config, choose_lidar(frame), relief)
 
-    return label_frames(label, split, frames, poles, region, report, book, trained, errors)
+    return label_frames(label, split, frames, poles, region, report, book, trained, poses)
 
 
 def label_frames(
@@ -102,7 +102,7 @@ def label_frames(
     report: Report,
     book: Ledger | None = None,
     trained: bool = False,
-    errors: NavigationErrors = EXACT,
+    poses: PoseSource = EXACT,
 ) -> dict[str, list[Sample]]:
     """Return each vehicle's samples, by "region/vehicle", as `label` makes them.
 
@@ -118,7 +118,7 @@ def label_frames(
         if book is not None:
             about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
             told = [RoadView.from_message(send(book, view.message(), **about)) for view in told]
-        known = replace(frame, world_from_agent=navigate(data, i, frame, errors))
+        known = replace(frame, world_from_agent=navigate(data, i, poses)[0])
         samples.setdefault(name, []).append(label(i, known, told))
         report(done, len(frames), "labels")
     return samples

@@ -23,7 +23,7 @@ from flcav.fusion.distillation import (
     unpack_sighting,
 )
 from flcav.fusion.map_context import build_context
-from flcav.fusion.navigation import NavigationErrors
+from flcav.fusion.navigation import PoseSource
 from flcav.fusion.posts import posts_of
 from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Sighting
@@ -54,7 +54,7 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
     def __init__(
         self,
         how: Distillation,
-        errors: NavigationErrors,
+        poses: PoseSource,
         config: SecondConfig,
         threshold: float,
         split: Frames,
@@ -68,10 +68,11 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
     ) -> None:
         """Hold the vehicles' `frames` of a split, to be labelled with the sensors on `poles`.
 
-        errors: of the vehicles' navigation. threshold: lowest score of a label that vehicles alone tell of. book: holds
+        poses: of the vehicles' navigation. threshold: lowest score of a label that vehicles alone tell of. book: holds
         the messages, under `stage`. folder: where the quality of the labels is kept, `read_history`; None: nowhere.
         """
-        self._how, self._errors, self._config, self._threshold = how, errors, config, threshold
+        self._how, self._config, self._threshold = how, config, threshold
+        self._poses: PoseSource = poses
         self._split, self._region = split, region
         self._frames, self._book, self._stage, self._folder, self._report = frames, book, stage, folder, report
         self._told = list_window(split, frames, how.window_s)
@@ -132,7 +133,7 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
         told: dict[int, Sighting] = {}
         own: dict[int, Boxes] = {}
         for done, i in enumerate(self._told, start=1):
-            sighting, own[i] = make_sighting(network, self._split.data, i, self._how, self._errors)
+            sighting, own[i] = make_sighting(network, self._split.data, i, self._how, self._poses)
             told[i] = unpack_sighting(sighting.agent, self._send("up", i, round_, pack_sighting(sighting)))
             self._report(done, len(self._told), "labels")
         given = {

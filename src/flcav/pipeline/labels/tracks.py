@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flcav.fusion.average import BoxReport
 from flcav.fusion.labels import label_by_tracks
-from flcav.fusion.navigation import NavigationErrors
+from flcav.fusion.navigation import PoseSource
 from flcav.fusion.road import RoadView
 from flcav.fusion.tracks import LEAST_SCORE, Sweep, track_objects
 from flcav.geometry import Boxes, concatenate, inverse, transform_points
@@ -41,18 +41,18 @@ def label_tracked(tracks: Mapping[int, Boxes], threshold: float, config: SecondC
 
 
 def track_frame(
-    network: Second, split: Frames, i: int, views: Sequence[RoadView] = (), errors: NavigationErrors = EXACT
+    network: Second, split: Frames, i: int, views: Sequence[RoadView] = (), poses: PoseSource = EXACT
 ) -> Boxes:
     """Return the tracks at frame `i` that score `LEAST_SCORE` or more, in the frame of its LiDAR.
 
     They are of the detections of `network` in the sweeps that the vehicle recorded within `WINDOW_S` of the frame, by
-    poses that its navigation gives, with `errors`. views: of the road sensors at the spin, whose boxes join them.
+    the `poses` of its navigation. views: of the road sensors at the spin, whose boxes join them.
     """
     data, sweeps, known = split.data, list[Sweep](), dict[int, NDArray[np.float64]]()
     for number in list_window(split, (i,), WINDOW_S):
         frame = data.frame(number)
         lidar = choose_lidar(frame)
-        world_from_lidar = navigate(data, number, frame, errors) @ frame.assumed.agent_from_sensor[lidar]
+        world_from_lidar = navigate(data, number, poses)[0] @ frame.assumed.agent_from_sensor[lidar]
         known[number] = world_from_lidar
         (found,) = detect_in(network, [frame], score_threshold=LOWEST_SCORE)
         points = transform_points(world_from_lidar, frame.lidar[lidar][:, :3].astype(np.float64))

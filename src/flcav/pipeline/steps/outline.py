@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from flcav.config import InputError, shorten
+from flcav.dataset.layout import navigation_path, read_manifest
 from flcav.federation.strategies import sends_outputs
 from flcav.fusion.distillation import Distillation
-from flcav.fusion.navigation import NavigationErrors
+from flcav.fusion.navigation import ESTIMATED, NavigationErrors
 from flcav.perception.client import check_network
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
@@ -19,6 +20,8 @@ from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.steps.settings import LearningSettings, RegionInputs
 from flcav.pipeline.training.starting_weights import find_start
 from flcav.statistics.streams import derive_seed
+
+NAVIGATION_S = 20.0  # of navigation logs before the first frame
 
 
 class Outline:
@@ -41,6 +44,8 @@ class Outline:
         self.spreads = read_spreads(recipe.spread, self.beside) if recipe.spread is not None else {}
         self.federating = recipe.with_role("federate")
         self.recorded = {name: self._count_frames(name) for name in self.federating if recipe.regions[name].data}
+        for name in self.recorded if any(map(self.estimates, recipe.tasks)) else ():
+            self._check_logs(recipe.regions[name])
 
     def tested(self, arm: Setting) -> list[tuple[str, str, str]]:
         """Return stage, region and task of every test of an arm.
@@ -96,6 +101,11 @@ class Outline:
         """Return whether vehicles label frames of a task by tracks in any arm."""
         return any(LABEL_SOURCES[arm.labels[task]].tracked for arm in self.settings.values())
 
+    def estimates(self, task: str) -> bool:
+        """Return whether labels of a task reach vehicles' frames by estimated poses in any arm."""
+        placed = any(LABEL_SOURCES[arm.labels[task]].placed for arm in self.settings.values())
+        return placed and self.recipe.navigation == ESTIMATED
+
     def window_s(self, task: str) -> float:
         """Return how long before and after a task's training frames others are recorded for labels [s]; 0: none are.
 
@@ -117,6 +127,8 @@ class Outline:
         if not (split == EDGE or (self.tracks(task) and role == "pretrain" and split == "validation")):
             return {}
         window = {"window_s": self.window_s(task)}
+        if split == EDGE and self.estimates(task):
+            window |= {"navigation_s": NAVIGATION_S}
         if self.tracks(task):
             window |= {"window_every_s": WINDOW_EVERY_S}
             if split == EDGE and self.helped(task):
@@ -181,6 +193,16 @@ class Outline:
         if found is None or not found.is_dir():
             raise InputError(f"regions: there is no dataset folder {shorten(named)} in {self.beside}")
         return found.absolute()
+
+    def _check_logs(self, region: Region) -> None:
+        """Raise `InputError` where a scene of a region's training data has no navigation logs."""
+        path = self.find_data(region, EDGE)
+        for scene in read_manifest(path).scenes:
+            if not (path / navigation_path(scene)).is_file():
+                raise InputError(
+                    f"{path}: navigation 'estimated' needs navigation logs, and '{scene}' has none; record with "
+                    "'navigation_s', or state errors instead"
+                )
 
     def _count_frames(self, region: str) -> dict[str, int]:
         own = self.recipe.regions[region]

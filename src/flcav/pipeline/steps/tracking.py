@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from flcav.config import InputError
-from flcav.fusion.navigation import NavigationErrors
+from flcav.fusion.navigation import PoseSource
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.engine import Step, Work
@@ -25,7 +25,7 @@ class TrackSettings(StepSettings):
     task: str
     inputs: RegionInputs
     labels: str  # kind of labels, see `LABEL_SOURCES`
-    navigation: NavigationErrors  # of the vehicles
+    navigation: PoseSource  # of the vehicles
 
     @property
     def needs(self) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 PLACE = ("deck", "section")  # columns of a town's heights with bridges
 AXLE_SHARE, TRACK_SHARE = 0.3, 0.4  # from the middle of a vehicle to its wheels, of its length and width
 FARTHEST_M = 1e8
+BESIDE_M = 5.0  # so near to a deck a place that is roughly known may be on it
 NOISE_M = 0.1  # a point so far below the surface of a deck still is on it
 
 
@@ -66,6 +67,13 @@ class Relief:
         at = np.clip(np.stack(np.broadcast_arrays(x, y), axis=-1).astype(np.float64), low + inset, high - inset)
         found = _interpolate(at.reshape(-1, 2), self.points, self._tin.simplices, self._tin.neighbors)
         return found.reshape(at.shape[:-1])
+
+    def sole_heights(self, x: Array, y: Array) -> Array:
+        """Return the height [m] of the ground at `x`, `y` (N,) [m]; NaN on and below bridges, where it has two."""
+        out = self.heights(x, y)
+        for deck in self.decks:
+            out[shapely.dwithin(deck.outline, shapely.points(x, y), BESIDE_M)] = np.nan
+        return out
 
     def above(self, points: Array) -> Array:
         """Return how high (N,) [m] points (N, 3), world frame [m], are above the ground, or the deck below them."""

@@ -43,6 +43,17 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: S
     where not all CAVs are on the road at all times, and for a red-light scenario in a town without traffic lights;
     `RuntimeError` where SUMO fails.
     """
+    return simulate_drives(town, seed=seed, cavs=cavs, times_s=times_s, lead_s=0.0, scenarios=scenarios)[0]
+
+
+def simulate_drives(
+    town: Town, *, seed: int, cavs: int, times_s: NDArray, lead_s: float, scenarios: Sequence[Scenario] = ()
+) -> tuple[Trace, Trace]:
+    """Return the traffic as `simulate` does, and the motion of the CAVs alone at every step.
+
+    The latter is from `lead_s` before the first of `times_s` to the last; a CAV that was not yet under way is absent.
+    Raises `InputError` and `RuntimeError` as `simulate` does.
+    """
     times_s = np.asarray(times_s, dtype=np.float64)
     steps = np.rint(times_s / STEP_S).astype(np.int64)
     if not len(steps) or not np.allclose(steps * STEP_S, times_s, atol=1e-6) or (np.diff(steps, prepend=0) <= 0).any():
@@ -57,18 +68,28 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: S
         demand = write_demand(net, town.parameters, seed=seed, cavs=cavs, fill_s=FILL_S, **span)
     except InputError as error:
         raise InputError(f"{town.name}: {error}") from None
-    before, now, after = (_windows(steps + offset) for offset in (-1, 0, 1))
-    read = np.unique((before, now, after))
+    driven = np.arange(max(steps[0] - round(lead_s / STEP_S), 1), steps[-1] + 1) if lead_s else steps[:1]
+    windows, drive_windows = ([_windows(at + offset) for offset in (-1, 0, 1)] for at in (steps, driven))
+    read = np.unique(np.concatenate((*windows, *drive_windows)))
     raw = _run(town.net, demand, derive_seed(seed, "sumo"), read, scenarios)
     parked = _drop_obstructing(raw, park(net, town.parameters, stream(seed, "parked")))
-    rows = tuple(np.searchsorted(read, window) for window in (before, now, after))
+    rows, drive_rows = (tuple(np.searchsorted(read, each) for each in own) for own in (windows, drive_windows))
     trace = _build_trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
     under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
     if under_way.sum() < cavs * len(times_s):
         told = "the CAV is not" if cavs == 1 else f"not all of {cavs} CAVs are"
         fewer = ", or take fewer" if cavs > 1 else ""
         raise InputError(f"{told} under way at {times_s[0]} s: begin later{fewer}")
-    return trace
+    return trace, _build_trace(town, (driven * np.float64(STEP_S)).round(1), _of_cavs(raw), drive_rows, [])
+
+
+def _of_cavs(raw: dict[str, NDArray]) -> dict[str, NDArray]:
+    """Return the arrays of `sumo_process.run_sumo` with the states of CAVs alone."""
+    own = np.char.startswith(raw["id"], "cav")
+    kept = own[raw["row"][:, 1]]
+    row = raw["row"][kept]
+    row[:, 1] = (np.cumsum(own) - 1)[row[:, 1]]
+    return raw | {"id": raw["id"][own], "type": raw["type"][own], "row": row, "state": raw["state"][kept]}
 
 
 def _windows(steps: NDArray[np.int64]) -> NDArray[np.int64]:

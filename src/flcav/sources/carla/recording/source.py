@@ -14,7 +14,7 @@ from flcav.config import InputError, Json
 from flcav.geometry import Boxes, points_in_boxes, pose, transform_points
 from flcav.sensors.calibration import build_calibration, perturb_calibration
 from flcav.sensors.frame import Calibration, CameraImage, Frame
-from flcav.sensors.navigation import draw_inertia_error, draw_position_error
+from flcav.sensors.navigation import draw_fix_errors, draw_imu_errors
 from flcav.sensors.rig import CAMERA_RANGE_M, Rig
 from flcav.sources.carla.frames import MapFrame
 from flcav.sources.carla.recording.labels import Sight, Sweep, annotate
@@ -237,11 +237,11 @@ class CarlaSource:
                 for name, sight in sights.items()
             },
             gnss={
-                name: _fix(read_position(take(name)), draw_position_error(mounted.settings, time_s, *errors(name)))
+                name: _fix(read_position(take(name)), np.add(*draw_fix_errors(mounted.settings, time_s, *errors(name))))
                 for name, mounted in agent.rig.gnss.items()
             },
             imu={
-                name: read_inertia(take(name)) + draw_inertia_error(mounted.settings, time_s, *errors(name))
+                name: read_inertia(take(name)) + sum(draw_imu_errors(mounted.settings, time_s, *errors(name)))
                 for name, mounted in agent.rig.imus.items()
             },
             weather=weather,

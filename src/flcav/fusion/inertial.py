@@ -1,0 +1,373 @@
+"""Inertial navigation of a car aided by satellites: an error-state Kalman filter over a drive, smoothed backwards.
+
+The nominal state (position and velocity of the IMU, attitude of the vehicle, biases) is integrated from the IMU's
+samples by the midpoint rule; the error state has 18 components: position and velocity in the world, attitude in the
+vehicle's axes, biases of specific force and angular rate, and the GNSS receiver's bias (Solà, "Quaternion kinematics
+for the error-state Kalman filter", 2017, eq. 235-238 and 260-270). Measurements, `RATE_HZ` times a second:
+
+- a fix: where the antenna is, and the receiver's bias, a first-order Gauss-Markov process. Of position and bias only
+  the sum is seen: what is left of the bias is in the covariance, and nearly the same in frames soon after one another;
+- a car neither slips aside nor leaves the road: across and upwards the velocity of its origin is 0 (Dissanayake et al.,
+  "The aiding of a low-cost strapdown inertial measurement unit using vehicle model constraints for land vehicle
+  applications", IEEE T-RA 17(5), 2001). In SUMO it is a car's middle that moves along its heading, as of a real car
+  its rear axle does;
+- at rest velocity and angular rate are 0 (Groves, "Principles of GNSS, inertial, and multisensor integrated navigation
+  systems", 2nd ed. 2013, 15.3): where the IMU is quiet and the filter's speed small;
+- the map: the car stands on its ground, whose height is known but on and below bridges.
+
+Labels are made after the drive, so a pose may use what was measured after it: Rauch, Tung and Striebel, "Maximum
+likelihood estimates of linear dynamic systems", AIAA Journal 3(8), 1965. The Earth is flat and does not turn.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.geometry import rotations_about_z
+from flcav.machine.compiled import compiled
+from flcav.sensors.navigation import GRAVITY
+from flcav.sensors.navigation_log import NavigationLog
+from flcav.world.geodesy import convert_to_map
+from flcav.world.map.parameters import GeoReference
+
+Array = NDArray[np.float64]
+
+STATES = 18  # position, velocity, attitude, biases of force and rate, bias of the receiver: 3 each
+ACROSS_MPS, UP_MPS = 0.2, 0.2  # standard deviations of a car's velocity across and upwards, its own axes
+REST_MPS, REST_RADPS = 0.02, 0.001  # standard deviations of velocity and angular rate at rest
+SLOW_MPS, QUIET_S, QUIET = (
+    1.0,
+    1.0,
+    2.0,
+)  # at rest: slower, and the IMU varies, so long before and after, so many sigmas
+HEIGHT_M = 0.5  # standard deviation of the height of the map's ground below a fix
+HEADINGS = 8  # directions of the vehicle at the beginning that are tried
+BACKWARDS_M = 1.0  # no car drives farther backwards, all in all
+LEAST_WEIGHT = 1e-4  # of a direction beside the likeliest that counts
+BEGIN_M, BEGIN_MPS, BEGIN_TILT_RAD = 10.0, 2.0, 0.08  # standard deviations at the beginning
+LEAST_SAMPLE, LEAST_FIX_M = (3e-3, 1e-4), 0.01  # least noise of an IMU's samples, [m/s^2] and [rad/s], and of fixes
+LEAST_BIAS = 1e-6  # standard deviation at the beginning, [m/s^2], [rad/s] or [m], of a sensor said to have none
+IMPOSSIBLE = 10.0  # mean of fixes' normalised squared innovations, of 3 dimensions: fixes and IMU are not of one drive
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimated poses of a vehicle at T times, and their covariance."""
+
+    world_from_agent: Array  # (T, 4, 4)
+    covariance: Array  # (T, 6, 6) of position [m], world frame, and attitude [rad], vehicle's axes
+
+    @property
+    def deviation(self) -> Array:
+        """Return the standard deviations (T, 2) of position, along x and y [m], and heading [rad]."""
+        turn = self.world_from_agent[:, :3, :3]
+        heading = np.einsum("ti,tij,tj->t", turn[:, 2], self.covariance[:, 3:, 3:], turn[:, 2])
+        return np.sqrt(np.stack((self.covariance[:, (0, 1), (0, 1)].mean(axis=1), heading), axis=1))
+
+
+class Mounts(NamedTuple):
+    """Places of a vehicle's sensors in its frame, as it assumes them."""
+
+    agent_from_gnss: Array  # (4, 4)
+    agent_from_imu: Array  # (4, 4)
+
+
+class _States(NamedTuple):
+    """The states at E epochs: nominal ones, and covariances of their errors."""
+
+    position: Array  # (E, 3) of the IMU [m]
+    velocity: Array  # (E, 3) of the IMU [m/s]
+    turn: Array  # (E, 3, 3) world from vehicle
+    bias: Array  # (E, 9) of force, rate and receiver
+    covariance: Array  # (E, STATES, STATES)
+
+
+def estimate_drive(
+    log: NavigationLog, mounts: Mounts, geo: GeoReference, ground: Callable[[Array, Array], Array], at_s: Array
+) -> Estimate:
+    """Return the poses of a vehicle at the times `at_s` (T,) within its log, by all of the log.
+
+    geo: position of the map's origin. ground: heights [m] of the map at x, y (M,) [m]; NaN where it has several. Of the
+    heading at the beginning nothing is known: `HEADINGS` are tried, and of those with which the car drives forwards the
+    likeliest is taken, with the spread of those that are nearly as likely in its covariance. Raises `InputError` where
+    a time is not within the log, or the log's fixes and IMU are not of one drive.
+    """
+    if (off := at_s[~log.covers(at_s)]).size:
+        raise InputError(
+            f"the navigation log goes from {log.begin_s:.1f} to {log.end_s:.1f} s, and a frame is at {off[0]:g} s"
+        )
+    mount = mounts.agent_from_imu
+    inertia = (log.inertia.reshape(-1, 2, 3) @ mount[:3, :3].T).reshape(-1, 6)  # vehicle's axes
+    levers = np.stack((mounts.agent_from_gnss[:3, 3], np.zeros(3))) - mount[:3, 3]
+    places = convert_to_map(geo, log.fix)
+    epochs, fixes = _list_epochs(log, places, ground, at_s)
+    position, velocity, covariance = _begin(log, places, levers[0])
+    rest = _find_rest(log, inertia, epochs)
+    tried = []
+    for turn in rotations_about_z(2 * np.pi / HEADINGS * np.arange(HEADINGS)):
+        given = (position, velocity, turn, covariance)
+        tried.append(_filter(log.imu_time_s, inertia, epochs, fixes, rest, levers, _sigmas(log), *given))
+    forwards = [_measure_way(log.imu_time_s[epochs], both) > -BACKWARDS_M for both, *_ in tried]
+    likelihood = np.nan_to_num(np.where(forwards, [each[-1] for each in tried], -np.inf), nan=-np.inf)
+    best = int(likelihood.argmax())
+    if not np.nanmean(tried[best][2]) < IMPOSSIBLE or not np.isfinite(tried[best][0][-1]).all():
+        raise InputError("the fixes of the navigation log are not where its IMU leads: they are of no common drive")
+    weights = np.exp(likelihood - likelihood[best])
+    kept = [(weight, *each[:2]) for weight, each in zip(weights / weights.sum(), tried) if weight > LEAST_WEIGHT]
+    state = _mix([(weight, _smooth(both, transition)) for weight, both, transition in kept])
+    asked = _nearest(log.imu_time_s, at_s)
+    state = _States(*(each[np.searchsorted(epochs, asked)] for each in state))
+    return _of_agent(state, inertia[asked, 3:], at_s - log.imu_time_s[asked], levers[1])
+
+
+def _measure_way(times_s: Array, both: tuple[Array, ...]) -> float:
+    """Return how far [m] a vehicle drives forwards, by its updated states at these times."""
+    _, velocity, turn, *_ = both
+    return float(np.einsum("ei,ei->e", velocity[0], turn[0, :, :, 0]) @ np.gradient(times_s))
+
+
+def _list_epochs(
+    log: NavigationLog, places: Array, ground: Callable[[Array, Array], Array], at_s: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Return the IMU samples (E,) nearest to fixes and to `at_s`, and the fixes (E, 5), NaN where there are none.
+
+    A fix is x, y, z, how long after the sample it is, and the height of the ground there. places: (M, 3) of all fixes.
+    """
+    used = np.flatnonzero(log.covers(log.fix_time_s))
+    near = _nearest(log.imu_time_s, log.fix_time_s[used])
+    epochs = np.unique(np.concatenate((near, _nearest(log.imu_time_s, at_s))))
+    fixes, row = np.full((len(epochs), 5), np.nan), np.searchsorted(epochs, near)
+    x, y, _ = places[used].T
+    fixes[row] = np.column_stack((places[used], log.fix_time_s[used] - log.imu_time_s[near], ground(x, y)))
+    return epochs, fixes
+
+
+def _nearest(times_s: Array, at_s: Array) -> NDArray[np.int64]:
+    """Return the index of the sample nearest to each of `at_s`."""
+    after = np.clip(np.searchsorted(times_s, at_s), 1, len(times_s) - 1)
+    return after - (at_s - times_s[after - 1] < times_s[after] - at_s)
+
+
+def _sigmas(log: NavigationLog) -> Array:
+    """Return the data sheets as an array: deviations of samples, walks, and white noise and bias of fixes."""
+    unit, receiver = log.unit, log.receiver
+    samples = np.sqrt(unit.rate_hz / 2) * np.array((unit.force_noise, unit.rate_noise))
+    walks, white = (unit.force_walk, unit.rate_walk), np.array((receiver.noise_m, receiver.noise_up_m))
+    bias = (receiver.bias_m, receiver.bias_up_m, receiver.bias_s)
+    return np.concatenate((np.maximum(samples, LEAST_SAMPLE), walks, np.maximum(white, LEAST_FIX_M), bias))
+
+
+def _begin(log: NavigationLog, places: Array, lever: Array) -> tuple[Array, Array, Array]:
+    """Return position, velocity and covariance at the first fix, of a level vehicle, `lever` (3,) to its antenna.
+
+    The velocity is that of the first second. Raises `InputError` where there is but one fix while the IMU measures.
+    """
+    receiver, unit, times_s = log.receiver, log.unit, log.fix_time_s
+    used = np.flatnonzero(log.covers(times_s))
+    if len(used) < 2:
+        raise InputError("the navigation log has no two fixes while its IMU measures")
+    first, soon = used[0], used[max(1, int((times_s[used] <= times_s[used[0]] + 1.0).sum()) - 1)]
+    velocity = (places[soon] - places[first]) / (times_s[soon] - times_s[first])
+    white = np.array((receiver.noise_m, receiver.noise_m, receiver.noise_up_m))
+    bias = np.array((receiver.bias_m, receiver.bias_m, receiver.bias_up_m))
+    deviations = (
+        BEGIN_M + 10 * (white + bias),
+        np.full(3, BEGIN_MPS),
+        (BEGIN_TILT_RAD, BEGIN_TILT_RAD, np.pi / HEADINGS),
+        np.full(3, max(unit.force_bias, LEAST_BIAS)),
+        np.full(3, max(unit.rate_bias, LEAST_BIAS)),
+        np.maximum(bias, LEAST_BIAS),
+    )
+    return places[first] - (0, 0, lever[2]), velocity, np.diag(np.concatenate(deviations) ** 2)
+
+
+def _find_rest(log: NavigationLog, inertia: Array, epochs: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return (E,) whether the IMU varies no more around an epoch than by its white noise."""
+    aside = max(round(QUIET_S * log.unit.rate_hz), 2)
+    around = np.clip(epochs[:, None] + np.arange(-aside, aside + 1), 0, len(inertia) - 1)
+    sigma = np.repeat((log.unit.force_noise, log.unit.rate_noise), 3) * np.sqrt(log.unit.rate_hz / 2)
+    return (inertia[around].std(axis=1) <= QUIET * np.maximum(sigma, LEAST_BIAS)).all(axis=1)
+
+
+@compiled
+def _skew(v):
+    """Return the matrix (3, 3) of the cross product with `v` (3,)."""
+    return np.array(((0.0, -v[2], v[1]), (v[2], 0.0, -v[0]), (-v[1], v[0], 0.0)))
+
+
+@compiled
+def _exp(v):
+    """Return the rotation matrix (3, 3) of a rotation vector (3,): Rodrigues' formula."""
+    angle = np.sqrt((v * v).sum())
+    cross = _skew(v)
+    if angle < 1e-8:
+        return np.eye(3) + cross
+    return np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * (cross @ cross)
+
+
+@compiled
+def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, velocity, turn, covariance):
+    """Return the updated and the predicted states (2, E, ...), transitions between epochs, and how well all this fits.
+
+    fixes: (E, 5), see `estimate_drive`. rest: (E,). levers: (2, 3) of antenna and vehicle's origin from the IMU,
+    vehicle's axes. sigmas: see `_sigmas`. How well: normalised squared innovations (E,) of fixes, and the logarithm of
+    the likelihood of all measurements but rest, which each nominal state assumes at times of its own.
+    """
+    count, bias, p, likelihood = len(epochs), np.zeros(9), covariance, 0.0
+    positions, velocities, turns = np.zeros((2, count, 3)), np.zeros((2, count, 3)), np.zeros((2, count, 3, 3))
+    biases, covariances = np.zeros((2, count, 9)), np.zeros((2, count, STATES, STATES))
+    transition, misfit = np.zeros((count, STATES, STATES)), np.where(np.isfinite(fixes[:, 0]), 0.0, np.nan)
+    for e in range(count):
+        phi = np.eye(STATES)
+        for k in range(epochs[max(e - 1, 0)], epochs[e]):
+            sample, dt = (inertia[k] + inertia[k + 1]) / 2, times_s[k + 1] - times_s[k]
+            step, spread = _transit(turn, bias, sample, dt, sigmas)
+            acceleration = turn @ _exp((sample[3:] - bias[3:6]) * dt / 2) @ (sample[:3] - bias[:3]) + GRAVITY
+            position = position + velocity * dt + acceleration * dt**2 / 2
+            velocity = velocity + acceleration * dt
+            turn = turn @ _exp((sample[3:] - bias[3:6]) * dt)
+            bias[6:] *= step[15, 15]
+            p = step @ p @ step.T + np.diag(spread)
+            phi = step @ phi
+        transition[e], covariances[1, e] = phi, p
+        positions[1, e], velocities[1, e], turns[1, e], biases[1, e] = position, velocity, turn, bias
+
+        h, r, noise, common = _measure(
+            position, velocity, turn, bias, inertia[epochs[e], 3:], fixes[e], rest[e], levers, sigmas
+        )
+        off = np.zeros(STATES)
+        for i in range(len(r)):  # one after another, since their noise is independent
+            seen = p @ h[i]
+            variance, missed = (seen * h[i]).sum() + noise[i], r[i] - (h[i] * off).sum()
+            off += seen * (missed / variance)
+            p = p - np.outer(seen, seen / variance)
+            if i < common:
+                likelihood -= (missed**2 / variance + np.log(variance)) / 2
+            if i < 3 and np.isfinite(fixes[e, 0]):
+                misfit[e] += missed**2 / variance
+        p = (p + p.T) / 2
+        position, velocity, turn, bias = position + off[:3], velocity + off[3:6], turn @ _exp(off[6:9]), bias + off[9:]
+        covariances[0, e] = p
+        positions[0, e], velocities[0, e], turns[0, e], biases[0, e] = position, velocity, turn, bias
+    return (positions, velocities, turns, biases, covariances), transition, misfit, likelihood
+
+
+@compiled
+def _transit(turn, bias, sample, dt, sigmas):
+    """Return the transition of the error state over a sample, and the variance (STATES,) that it adds."""
+    force, rate = sample[:3] - bias[:3], sample[3:] - bias[3:6]
+    middle = turn @ _exp(rate * dt / 2)
+    step, spread = np.eye(STATES), np.zeros(STATES)
+    step[:3, 3:6] = np.eye(3) * dt
+    step[3:6, 6:9] = -(middle @ _skew(force)) * dt
+    step[3:6, 9:12] = -middle * dt
+    step[6:9, 6:9] = _exp(-rate * dt)
+    step[6:9, 12:15] = -np.eye(3) * dt
+    step[15:, 15:] = np.eye(3) * np.exp(-dt / sigmas[8])
+    spread[3:6], spread[6:9] = (sigmas[0] * dt) ** 2, (sigmas[1] * dt) ** 2
+    spread[9:12], spread[12:15] = sigmas[2] ** 2 * dt, sigmas[3] ** 2 * dt
+    spread[15:17], spread[17] = sigmas[6] ** 2, sigmas[7] ** 2
+    spread[15:] *= 1 - np.exp(-2 * dt / sigmas[8])
+    return step, spread
+
+
+@compiled
+def _measure(position, velocity, turn, bias, sample, fix, rests, levers, sigmas):
+    """Return Jacobians (M, STATES), innovations (M,) and variances (M,) of an epoch's measurements.
+
+    They are across and upwards velocity, before them the fix and the height of the ground where there are any, after
+    them velocity and angular rate at rest; also the number of those before the latter. sample: (3,) angular rate.
+    """
+    h, r, noise, rows = np.zeros((12, STATES)), np.zeros(12), np.zeros(12), 0
+    rate, back = sample - bias[3:6], turn.T @ velocity
+    if np.isfinite(fix[0]):
+        h[:3, :3], h[:3, 3:6], h[:3, 15:] = np.eye(3), np.eye(3) * fix[3], np.eye(3)
+        h[:3, 6:9] = -turn @ _skew(levers[0])
+        r[:3] = fix[:3] - (position + velocity * fix[3] + turn @ levers[0] + bias[6:])
+        noise[:2], noise[2], rows = sigmas[4] ** 2, sigmas[5] ** 2, 3
+    if np.isfinite(fix[4]):
+        h[rows, 2] = 1
+        h[rows, 6:9] = -(turn @ _skew(levers[1]))[2]
+        r[rows], noise[rows] = fix[4] - position[2] - (turn @ levers[1])[2], HEIGHT_M**2
+        rows += 1
+    along = back + _skew(rate) @ levers[1]  # velocity of the vehicle's origin, its own axes
+    for axis in range(1, 3):
+        h[rows, 3:6] = turn[:, axis]
+        h[rows, 6:9] = _skew(back)[axis]
+        h[rows, 12:15] = _skew(levers[1])[axis]
+        r[rows], noise[rows] = -along[axis], (ACROSS_MPS if axis == 1 else UP_MPS) ** 2
+        rows += 1
+    common = rows
+    if rests and np.sqrt((velocity * velocity).sum()) < SLOW_MPS:
+        h[rows : rows + 3, 3:6], h[rows + 3 : rows + 6, 12:15] = np.eye(3), np.eye(3)
+        r[rows : rows + 3], r[rows + 3 : rows + 6] = -velocity, rate
+        noise[rows : rows + 3], noise[rows + 3 : rows + 6] = REST_MPS**2, REST_RADPS**2 + sigmas[1] ** 2
+        rows += 6
+    return h[:rows].copy(), r[:rows].copy(), noise[:rows].copy(), common
+
+
+def _smooth(both: tuple[Array, ...], transition: Array) -> _States:
+    """Return the smoothed states: each updated one, corrected by what the next one's prediction missed.
+
+    both: the updated and the predicted states (2, E, ...).
+    """
+    updated, predicted = (_States(*(each[i] for each in both)) for i in range(2))
+    smoothed = _States(*(each.copy() for each in updated))
+    for k in range(len(transition) - 2, -1, -1):
+        then = predicted.covariance[k + 1]
+        gain = np.linalg.solve(then, transition[k + 1] @ updated.covariance[k]).T
+        missed = np.concatenate(
+            (
+                smoothed.position[k + 1] - predicted.position[k + 1],
+                smoothed.velocity[k + 1] - predicted.velocity[k + 1],
+                _log(predicted.turn[k + 1].T @ smoothed.turn[k + 1]),
+                smoothed.bias[k + 1] - predicted.bias[k + 1],
+            )
+        )
+        off = gain @ missed
+        smoothed.position[k] += off[:3]
+        smoothed.velocity[k] += off[3:6]
+        smoothed.turn[k] = updated.turn[k] @ _exp(off[6:9])
+        smoothed.bias[k] += off[9:]
+        smoothed.covariance[k] += gain @ (smoothed.covariance[k + 1] - then) @ gain.T
+    return smoothed
+
+
+def _mix(states: list[tuple[float, _States]]) -> _States:
+    """Return the likeliest of several states; the others' positions and headings spread its covariance."""
+    likeliest = max(states, key=lambda each: each[0])[1]
+    covariance = likeliest.covariance.copy()
+    for weight, other in states:
+        away = other.position - likeliest.position
+        across = np.einsum("eij,eij->e", likeliest.turn[:, :2, 1:2], other.turn[:, :2, :1])
+        along = np.einsum("eij,eij->e", likeliest.turn[:, :2, :1], other.turn[:, :2, :1])
+        heading = np.arctan2(across, along)[:, None] * likeliest.turn[:, 2]  # about the vertical, vehicle's axes
+        covariance[:, :3, :3] += weight * away[:, :, None] * away[:, None]
+        covariance[:, 6:9, 6:9] += weight * heading[:, :, None] * heading[:, None]
+    return likeliest._replace(covariance=covariance)
+
+
+def _log(turn: Array) -> Array:
+    """Return the rotation vector (3,) of a rotation matrix (3, 3) by less than half a turn."""
+    cross = np.array((turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])) / 2
+    sine = np.linalg.norm(cross)
+    angle = np.arctan2(sine, (np.trace(turn) - 1) / 2)
+    return cross * (angle / sine if sine > 1e-9 else 1.0)
+
+
+def _of_agent(state: _States, rate: Array, after_s: Array, lever: Array) -> Estimate:
+    """Return the poses of the vehicle's origin, `lever` from the IMU, so long after each state (T,)."""
+    count = len(after_s)
+    poses, covariance = np.zeros((count, 4, 4)), np.zeros((count, 6, 6))
+    for i in range(count):
+        turn = state.turn[i] @ _exp((rate[i] - state.bias[i, 3:6]) * after_s[i])
+        poses[i, :3, :3], poses[i, 3, 3] = turn, 1.0
+        poses[i, :3, 3] = state.position[i] + state.velocity[i] * after_s[i] + turn @ lever
+        jacobian = np.zeros((6, STATES))
+        jacobian[:3, :3], jacobian[:3, 6:9], jacobian[3:, 6:9] = np.eye(3), -turn @ _skew(lever), np.eye(3)
+        covariance[i] = jacobian @ state.covariance[i] @ jacobian.T
+    return Estimate(poses, covariance)
