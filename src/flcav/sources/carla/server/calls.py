@@ -61,11 +61,11 @@ class Calls:
         """Return the version of CARLA that is served."""
         return wire.VERSION
 
-    def get_episode_info(self) -> Any:
+    def get_episode_info(self) -> wire.Packed:
         """Return the episode's number and the token of the world's state."""
         return [self.episode.id, [wire.pack_token(self.episode.stream, self._port + 1)]]
 
-    def get_sensor_token(self, stream: int) -> Any:
+    def get_sensor_token(self, stream: int) -> wire.Packed:
         """Return the token of a stream."""
         streams = {actor.stream for actor in self.episode.actors.values()} | {self.episode.stream}
         if stream not in streams:
@@ -73,7 +73,7 @@ class Calls:
         self.expected.add(stream)
         return [wire.pack_token(stream, self._port + 1)]
 
-    def get_map_info(self) -> Any:
+    def get_map_info(self) -> wire.Packed:
         """Return the map's name and spawn points."""
         return [f"Carla/Maps/{self.episode.served.name}", self.episode.served.spawn_points]
 
@@ -81,7 +81,7 @@ class Calls:
         """Return the map's OpenDRIVE text."""
         return self.episode.served.opendrive
 
-    def get_required_files(self, folder: str, download: Any = None) -> Any:
+    def get_required_files(self, folder: str, download: wire.Packed = None) -> wire.Packed:
         """Return the files that a client should fetch: none."""
         return []
 
@@ -89,7 +89,7 @@ class Calls:
         """Return the mesh on which CARLA's walkers walk: an empty one."""
         return b""
 
-    def get_available_maps(self) -> Any:
+    def get_available_maps(self) -> wire.Packed:
         """Return the names of the maps."""
         return [f"/Game/Carla/Maps/{name}" for name in self._maps.names()]
 
@@ -105,7 +105,7 @@ class Calls:
         if reset:
             self.settings = wire.Settings()
 
-    def copy_opendrive_to_file(self, text: str, parameters: Any) -> None:
+    def copy_opendrive_to_file(self, text: str, parameters: wire.Packed) -> None:
         """Take the text of a map that is to be loaded next."""
         try:
             self._maps.receive(text)
@@ -118,7 +118,7 @@ class Calls:
     def unload_map_layer(self, layers: int) -> None:
         """Hide layers of the map: the town has one, which always shows."""
 
-    def get_episode_settings(self) -> Any:
+    def get_episode_settings(self) -> wire.Packed:
         """Return the settings."""
         return self.settings.packed()
 
@@ -137,15 +137,15 @@ class Calls:
 
     # ---- actors
 
-    def get_actor_definitions(self) -> Any:
+    def get_actor_definitions(self) -> wire.Packed:
         """Return all blueprints."""
         return [blueprint.definition for blueprint in list_blueprints().values()]
 
-    def get_spectator(self) -> Any:
+    def get_spectator(self) -> wire.Packed:
         """Return the spectator."""
         return self._record(self.episode.spectator)
 
-    def get_actors_by_id(self, numbers: tuple[int, ...]) -> Any:
+    def get_actors_by_id(self, numbers: tuple[int, ...]) -> wire.Packed:
         """Return actors; those that are no more are left out."""
         known = self.episode.actors
         return [self._record(known[number]) for number in numbers if number in known]
@@ -153,13 +153,18 @@ class Calls:
     def _record(self, actor: Actor) -> wire.Actor:
         return actor.record(self._port + 1)
 
-    def spawn_actor(self, description: wire.Description, transform: Transform) -> Any:
+    def spawn_actor(self, description: wire.Description, transform: Transform) -> wire.Packed:
         """Spawn an actor."""
         return self._record(self.episode.spawn(description, transform))
 
     def spawn_actor_with_parent(
-        self, description: wire.Description, transform: Transform, parent: int, attachment: int, socket: Any = ""
-    ) -> Any:
+        self,
+        description: wire.Description,
+        transform: Transform,
+        parent: int,
+        attachment: int,
+        socket: wire.Packed = "",
+    ) -> wire.Packed:
         """Spawn an actor on another one; it is always rigid."""
         return self._record(self.episode.spawn(description, transform, parent))
 
@@ -254,7 +259,7 @@ class Calls:
         """Let an actor stop for good."""
         self.episode.simulate(self.episode.body(actor, *BODIES), physics=False)
 
-    def set_actor_autopilot(self, actor: int, on: bool, port: Any = None) -> None:
+    def set_actor_autopilot(self, actor: int, on: bool, port: wire.Packed = None) -> None:
         """Note that a Traffic Manager of a client drives a vehicle."""
         self.episode.find(actor, "vehicle", "walker")
 
@@ -262,7 +267,7 @@ class Calls:
         """Return an actor's box."""
         return self.episode.find(actor).bounding_box()
 
-    def get_actor_component_names(self, actor: int) -> Any:
+    def get_actor_component_names(self, actor: int) -> wire.Packed:
         """Return the names of an actor's components: none."""
         self.episode.find(actor)
         return []
@@ -283,12 +288,12 @@ class Calls:
         """Set a vehicle's Ackermann control."""
         self.episode.body(actor, "vehicle").ackermann = control
 
-    def get_ackermann_controller_settings(self, actor: int) -> Any:
+    def get_ackermann_controller_settings(self, actor: int) -> wire.Packed:
         """Return the gains of CARLA's Ackermann controller."""
         self.episode.body(actor, "vehicle")
         return [0.15, 0.0, 0.25, 0.01, 0.0, 0.01]
 
-    def apply_ackermann_controller_settings(self, actor: int, settings: Any) -> None:
+    def apply_ackermann_controller_settings(self, actor: int, settings: wire.Packed) -> None:
         """Set the gains of CARLA's Ackermann controller, which is not served."""
         raise Refused("apply_ackermann_controller_settings is not served: the controller here has no gains")
 
@@ -296,16 +301,16 @@ class Calls:
         """Set a walker's control."""
         self.episode.walk(self.episode.body(actor, "walker"), control)
 
-    def get_physics_control(self, actor: int) -> Any:
+    def get_physics_control(self, actor: int) -> wire.Packed:
         """Return a vehicle's physics."""
         vehicle = self.episode.find(actor, "vehicle")
         return describe_physics(vehicle, self.episode.world)
 
-    def apply_physics_control(self, actor: int, physics: Any) -> None:
+    def apply_physics_control(self, actor: int, physics: wire.Packed) -> None:
         """Set a vehicle's physics, which stays that of its size."""
         self.episode.body(actor, "vehicle")
 
-    def get_telemetry_data(self, actor: int) -> Any:
+    def get_telemetry_data(self, actor: int) -> wire.Packed:
         """Return a vehicle's telemetry."""
         vehicle = self.episode.find(actor, "vehicle")
         return describe_telemetry(vehicle, self.episode.speed(vehicle))
@@ -314,16 +319,16 @@ class Calls:
         """Show a vehicle's telemetry, for which there is no window."""
         self.episode.find(actor, "vehicle")
 
-    def get_vehicle_light_state(self, actor: int) -> Any:
+    def get_vehicle_light_state(self, actor: int) -> wire.Packed:
         """Return the flags of a vehicle's lamps."""
         return [self.episode.find(actor, "vehicle").lamps]
 
-    def set_vehicle_light_state(self, actor: int, lamps: Any) -> None:
+    def set_vehicle_light_state(self, actor: int, lamps: wire.Packed) -> None:
         """Set the flags of a vehicle's lamps."""
         flags = lamps[0] if isinstance(lamps, list) and lamps else lamps
         self.episode.find(actor, "vehicle").lamps = wire.read(int, flags) & 0xFFFFFFFF
 
-    def get_vehicle_light_states(self) -> Any:
+    def get_vehicle_light_states(self) -> wire.Packed:
         """Return the flags of the lamps of all vehicles."""
         return [[actor.id, actor.lamps] for actor in self.episode.actors.values() if actor.kind == "vehicle"]
 
@@ -388,11 +393,11 @@ class Calls:
         """Let all lights go on with their programs."""
         self.episode.lights.release(self.episode.world)
 
-    def get_group_traffic_lights(self, actor: int) -> Any:
+    def get_group_traffic_lights(self, actor: int) -> wire.Packed:
         """Return the numbers of the lights of a junction."""
         return [self.episode.light_number(row) for row in self.episode.lights.group(self._light(actor))]
 
-    def get_light_boxes(self, actor: int) -> Any:
+    def get_light_boxes(self, actor: int) -> wire.Packed:
         """Return the boxes of a light's heads."""
         actor_found = self.episode.find(actor)
         self._light(actor)
@@ -405,7 +410,7 @@ class Calls:
         """Return whether a Traffic Manager runs at a port."""
         return port in self._managers
 
-    def get_traffic_manager_running(self, port: int) -> Any:
+    def get_traffic_manager_running(self, port: int) -> wire.Packed:
         """Return where the Traffic Manager of a port runs."""
         return self._managers.get(port, ("", 0))
 
@@ -419,7 +424,7 @@ class Calls:
 
     # ---- the world
 
-    def get_weather_parameters(self) -> Any:
+    def get_weather_parameters(self) -> wire.Packed:
         """Return the weather."""
         return self.episode.weather
 
@@ -435,45 +440,45 @@ class Calls:
         """Set the acceleration that an IMU measures at rest, which is not served."""
         raise Refused("set_imui_sensor_gravity is not served: gravity is 9.81 m/s^2")
 
-    def get_all_level_BBs(self, tag: int) -> Any:
+    def get_all_level_BBs(self, tag: int) -> wire.Packed:
         """Return the boxes of the town's things with a semantic tag."""
         return find_boxes(self.episode, tag)
 
-    def get_environment_objects(self, tag: int) -> Any:
+    def get_environment_objects(self, tag: int) -> wire.Packed:
         """Return the town's things with a semantic tag."""
         return find_objects(self.episode, tag)
 
-    def enable_environment_objects(self, numbers: Any, on: bool) -> None:
+    def enable_environment_objects(self, numbers: wire.Packed, on: bool) -> None:
         """Show things of the town; hiding them is not served."""
         if not on:
             raise Refused("enable_environment_objects(False) is not served: the town's things stay")
 
-    def get_names_of_all_objects(self) -> Any:
+    def get_names_of_all_objects(self) -> wire.Packed:
         """Return the names of the town's things."""
         return [row[3] for row in find_objects(self.episode, 0xFF)]
 
-    def project_point(self, location: Vector, direction: Vector, distance: float) -> Any:
+    def project_point(self, location: Vector, direction: Vector, distance: float) -> wire.Packed:
         """Return where a ray meets the town, as an optional labelled point."""
         found = project(self.episode, location, direction, distance)
         return [False] if not found else [True, found[0]]
 
-    def cast_ray(self, start: Vector, end: Vector) -> Any:
+    def cast_ray(self, start: Vector, end: Vector) -> wire.Packed:
         """Return where a ray meets the town, as labelled points."""
         way = np.subtract(end, start)
         length = float(np.linalg.norm(way))
         return project(self.episode, start, tuple(way.tolist()), length) if length else []
 
-    def query_lights_state(self, client: Any) -> Any:
+    def query_lights_state(self, client: wire.Packed) -> wire.Packed:
         """Return the lights of CARLA's light manager: none."""
         return []
 
-    def update_lights_state(self, client: Any, lights: Any, discard: Any = None) -> None:
+    def update_lights_state(self, client: wire.Packed, lights: wire.Packed, discard: wire.Packed = None) -> None:
         """Change lights of CARLA's light manager, of which there are none."""
 
-    def update_day_night_cycle(self, client: Any, on: bool) -> None:
+    def update_day_night_cycle(self, client: wire.Packed, on: bool) -> None:
         """Let lamps follow the sun: they always do."""
 
-    def draw_debug_shape(self, shape: Any) -> None:
+    def draw_debug_shape(self, shape: wire.Packed) -> None:
         """Draw into the view of the engine's window, which does not exist here."""
 
     def start_recorder(self, name: str, additional: bool) -> str:
@@ -484,12 +489,12 @@ class Calls:
         """Write the recording."""
         self.episode.recorder.stop()
 
-    def get_bones_transform(self, actor: int) -> Any:
+    def get_bones_transform(self, actor: int) -> wire.Packed:
         """Return a walker's bones: none."""
         self.episode.find(actor, "walker")
         return [[]]
 
-    def set_bones_transform(self, actor: int, bones: Any) -> None:
+    def set_bones_transform(self, actor: int, bones: wire.Packed) -> None:
         """Set a walker's bones, which is not served."""
         raise Refused("set_bones is not served: walkers here have no bones")
 
@@ -497,14 +502,14 @@ class Calls:
         """Blend a walker's pose, which is not served."""
         raise Refused("blend_pose is not served: walkers here have no bones")
 
-    def enable_sensor_for_ros(self, sensor: Any) -> None:
+    def enable_sensor_for_ros(self, sensor: wire.Packed) -> None:
         """Publish a sensor on ROS 2, which is not served."""
         raise Refused("enable_for_ros is not served")
 
-    def disable_sensor_for_ros(self, sensor: Any) -> None:
+    def disable_sensor_for_ros(self, sensor: wire.Packed) -> None:
         """Do not publish a sensor on ROS 2."""
 
-    def is_sensor_enabled_for_ros(self, sensor: Any) -> bool:
+    def is_sensor_enabled_for_ros(self, sensor: wire.Packed) -> bool:
         """Return whether a sensor is published on ROS 2: never."""
         return False
 
@@ -514,7 +519,7 @@ class Calls:
 
     # ---- batches
 
-    def apply_batch(self, commands: Any, tick: bool) -> Any:
+    def apply_batch(self, commands: wire.Packed, tick: bool) -> wire.Packed:
         """Carry out commands; return an actor's number or an error for each."""
         answers = [self._carry_out(command) for command in commands] if isinstance(commands, list) else []
         self.ticks += tick
@@ -538,7 +543,7 @@ class Calls:
             return wire.fail(str(error))
 
     def _spawn(
-        self, description: wire.Description, transform: Transform, parent: int | None, then: tuple[Any, ...]
+        self, description: wire.Description, transform: Transform, parent: int | None, then: tuple[wire.Packed, ...]
     ) -> int:
         actor = self.episode.spawn(description, transform, parent)
         for command in then:
@@ -565,7 +570,7 @@ def _signature(name: str) -> tuple[Callable[..., Any], tuple[Any, ...], int]:
     return method, kinds, len(kinds) - len(method.__defaults__ or ())
 
 
-def invoke(calls: Calls, name: str, arguments: tuple[Any, ...]) -> Any:
+def invoke(calls: Calls, name: str, arguments: tuple[wire.Packed, ...]) -> wire.Packed:
     """Carry out the call of a name; raises `Refused`, `InputError` or `WireError` where that cannot be."""
     method, kinds, least = _signature(name)
     if not least <= len(arguments) <= len(kinds):

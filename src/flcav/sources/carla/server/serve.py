@@ -12,7 +12,6 @@ import struct
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
 
 from flcav.config import InputError
 from flcav.sources.carla.server import wire
@@ -199,7 +198,7 @@ class Server:
         finally:
             self._forget(writer)
 
-    def _answer(self, call: wire.Call) -> list[Any]:
+    def _answer(self, call: wire.Call) -> wire.Packed:
         """Return the response to a call."""
         log.debug("%s %.200s", call.method, call.arguments)
         try:

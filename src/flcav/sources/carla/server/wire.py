@@ -18,6 +18,8 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.config import Json
+
 VERSION = "0.9.16"
 LARGEST = 32 << 20  # bytes of a call; the text of a map is the largest
 MOST_ARRAYS = 200_000  # in one call
@@ -33,6 +35,7 @@ FARTHEST = 1e9  # numbers beyond are refused
 ACTIVE, TCP = 1, 1
 
 Vector = tuple[float, float, float]
+Packed = Json | bytes  # a value on the wire
 
 
 class WireError(ValueError):
@@ -320,7 +323,7 @@ def pack_reply(number: int, response: Any) -> bytes:
 def read(kind: Any, value: Any) -> Any:
     """Return an unpacked value as the type `kind`: a number, text, bytes, named tuple, tuple or optional of these.
 
-    Raises `WireError` where it is none. `Any` takes everything.
+    Raises `WireError` where it is none. `Any` and `Packed` take everything.
     """
     return _reader(kind)(value)
 
@@ -328,7 +331,7 @@ def read(kind: Any, value: Any) -> Any:
 @lru_cache(maxsize=256)
 def _reader(kind: Any) -> Any:
     """Return the function that reads values of a type."""
-    if kind is Any:
+    if kind in (Any, Packed):
         return lambda value: value
     if kind is float:
         return _read_float
