@@ -79,6 +79,38 @@ def the_world(client: Any) -> None:
         assert world.get_spectator().get_transform().location.distance(here.location) < 1e-3
 
 
+def walkers(client: Any) -> None:
+    """The client's own crowd, on the navigation mesh of the server: walkers keep to footpaths and crossings."""
+    with synchronous(client) as world:
+        library, crowd = world.get_blueprint_library(), []
+        for number in range(8):
+            place = world.get_random_location_from_navigation()
+            assert abs(place.z - 0.12) < 0.05  # upon the kerb
+            kind = library.filter("walker.pedestrian.*")[number]
+            crowd.append(world.spawn_actor(kind, carla.Transform(place + carla.Location(z=1.0))))
+        world.tick()
+        mind = library.find("controller.ai.walker")
+        minds = [world.spawn_actor(mind, carla.Transform(), attach_to=walker) for walker in crowd]
+        world.tick()
+        for each in minds:
+            each.start()
+            each.go_to_location(world.get_random_location_from_navigation())
+            each.set_max_speed(1.4)
+        begun = [walker.get_location() for walker in crowd]
+        for _ in range(100):
+            world.tick()
+        gone = [walker.get_location().distance(place) for walker, place in zip(crowd, begun, strict=True)]
+        assert sorted(gone)[4] > 4.0
+        assert max(gone) < 1.5 * 5.0
+        assert sum(abs(walker.get_velocity().length() - 1.4) < 0.2 for walker in crowd) >= 6
+        town = world.get_map()
+        lanes = [town.get_waypoint(walker.get_location(), True, carla.LaneType.Sidewalk) for walker in crowd]
+        away = [lane.transform.location.distance_2d(walker.get_location()) for lane, walker in zip(lanes, crowd)]
+        assert sorted(away)[5] < 3.0
+        for each in (*minds, *crowd):
+            each.destroy()
+
+
 def actors(client: Any) -> None:
     """Vehicles, walkers and props: spawning, driving, batches, lamps and physics."""
     with synchronous(client) as world:
@@ -108,13 +140,7 @@ def actors(client: Any) -> None:
         for _ in range(5):
             world.tick()
         assert abs(walker.get_velocity().y - 1.4) < 0.1
-        mind = world.spawn_actor(library.find("controller.ai.walker"), carla.Transform(), attach_to=walker)
-        world.tick()
-        mind.start()
-        begun = walker.get_location()
-        for _ in range(40):
-            world.tick()
-        assert walker.get_location().distance(begun) > 2.0
+        walker.destroy()
         command = carla.command
         spawn = command.SpawnActor(library.find("vehicle.mini.cooper_s"), points[9])
         first, second, third = client.apply_batch_sync([spawn, spawn, command.DestroyActor(99999)], True)
@@ -246,7 +272,7 @@ def loading(client: Any) -> None:
     assert client.load_world("suburb").get_map().name.endswith("suburb")
 
 
-SESSIONS = {each.__name__: each for each in (the_world, actors, sensors, events, traffic, loading)}
+SESSIONS = {each.__name__: each for each in (the_world, actors, walkers, sensors, events, traffic, loading)}
 
 if __name__ == "__main__":
     genuine = carla.Client("127.0.0.1", int(sys.argv[2]))

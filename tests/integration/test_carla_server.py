@@ -14,7 +14,15 @@ from flcav.cli.main import run
 from flcav.sources.carla.server import wire
 
 SESSION = Path(__file__).with_name("carla_session.py")
-SESSIONS = ("the_world", "actors", "sensors", "events", "traffic", "loading")  # the last one loads other maps
+SESSIONS = (
+    "the_world",
+    "actors",
+    "walkers",
+    "sensors",
+    "events",
+    "traffic",
+    "loading",
+)  # the last one loads other maps
 
 
 def _find_port() -> int:

@@ -67,7 +67,15 @@ def asked() -> Iterator[dict[str, Any]]:
     """Return the fields of a recipe for a server that runs."""
     port = free_port()
     server = start_server(port)
-    yield {**FIELDS, "source": "carla", "port": port, "traffic_port": free_port(), "vehicles": 8, "timeout_s": 60}
+    yield {
+        **FIELDS,
+        "source": "carla",
+        "port": port,
+        "traffic_port": free_port(),
+        "vehicles": 8,
+        "pedestrians": 12,
+        "timeout_s": 60,
+    }
     server.terminate()
     server.wait(20)
 
@@ -129,6 +137,8 @@ def test_boxes_hold_their_returns_and_cars_move_ahead(recorded: Dataset) -> None
         returns, moving = returns + int(truth.returns.sum()), moving + int(fast.sum())
     assert returns > 100
     assert moving > 4
+    people = [recorded.frame(i).annotations.boxes for i in range(len(recorded))]
+    assert any("pedestrian" in boxes.label for boxes in people)
 
 
 def test_the_same_command_has_nothing_to_do(asked: dict[str, Any], recorded: Dataset) -> None:
@@ -149,7 +159,6 @@ def refused(fields: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "map": ({"town": "atlantis", "poles": []}, "has no map 'atlantis'; it has"),
     "misspelt": ({"map": "subrb"}, "did you mean 'suburb'?"),
-    "walkers": ({"pedestrians": 3}, "has no navigation mesh for walkers here: set 'pedestrians' to 0"),
     "many": ({"cavs": 1000, "vehicles": 0, "poles": []}, "has no free spawn point for cav"),
 }
 

@@ -6,6 +6,7 @@ of the reply. `Refused` is the reply's error.
 
 from collections.abc import Callable
 from functools import lru_cache
+from hashlib import sha256
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -82,12 +83,23 @@ class Calls:
         return self.episode.served.opendrive
 
     def get_required_files(self, folder: str, download: wire.Packed = None) -> wire.Packed:
-        """Return the files that a client should fetch: none."""
-        return []
+        """Return the files of a folder that a client should fetch: of "Nav" the navigation mesh."""
+        return [self._mesh_name()] if folder == "Nav" and self.episode.served.mesh else []
+
+    def request_file(self, name: str) -> bytes:
+        """Return such a file."""
+        if name != self._mesh_name():
+            raise Refused(f"no file {shorten(name)} on this server")
+        return self.episode.served.mesh
+
+    def _mesh_name(self) -> str:
+        """Return the mesh's name in the clients' cache, another one for another mesh."""
+        served = self.episode.served
+        return f"Nav/{served.name}-{sha256(served.mesh).hexdigest()[:16]}.bin"
 
     def get_navigation_mesh(self) -> bytes:
-        """Return the mesh on which CARLA's walkers walk: an empty one."""
-        return b""
+        """Return the mesh on which the client's walkers walk."""
+        return self.episode.served.mesh
 
     def get_available_maps(self) -> wire.Packed:
         """Return the names of the maps."""
@@ -183,9 +195,11 @@ class Calls:
         self.episode.place(self.episode.find(actor), transform)
 
     def set_walker_state(self, actor: int, transform: Transform, speed: float) -> None:
-        """Place a walker that walks at a speed."""
+        """Place a walker that walks at a speed; its location is that of its feet."""
         walker = self.episode.body(actor, "walker")
-        self.episode.place(walker, transform)
+        x, y, z = transform.location
+        self.episode.place(walker, Transform((x, y, z + walker.lift), transform.rotation))
+        self.episode.push(walker, speed * walker.pose[:3, 0])
         ahead = mirror(walker.pose[:3, 0])
         walker.walk = wire.WalkerControl((float(ahead[0]), float(ahead[1]), 0.0), speed)
 

@@ -23,7 +23,6 @@ from flcav.sources.carla.server.recorder import Recorder
 from flcav.sources.carla.server.sensing.events import describe_thing, find_collisions, find_obstacle
 from flcav.sources.carla.server.sensing.sight import Sensor, Sight
 from flcav.sources.carla.server.sensing.table import KINDS, Clock
-from flcav.sources.carla.server.walking import Footpaths, Stroll
 from flcav.sources.carla.server.weather import to_weather
 from flcav.sources.carla.server.wire import Transform
 from flcav.world import commands
@@ -90,8 +89,6 @@ class Episode:
         self.tick, self.time_s = 0, 0.0
         self._begun_s = time.monotonic()
         self._bodies: dict[str, Actor] = {}  # by name in the live world
-        self._strolls: dict[int, Stroll] = {}  # by the number of the walker
-        self._paths: Footpaths | None = None
         self._scene: Scene | None = None  # of the sensors
         self._survey: Scene | None = None  # of the calls
         self.recorder = Recorder()
@@ -159,9 +156,6 @@ class Episode:
             actor.sensor = Sensor(description.id, values, self._spawned, pose, name)
             actor.clock = Clock(float(values.get("sensor_tick", 0.0)))
             actor.stream = self.counters.next_stream()
-        elif carrier is not None:
-            self._paths = self._paths or Footpaths(self.served.net)
-            self._strolls[carrier.id] = Stroll(self._paths, carrier.pose[:2, 3], self.seed, self._spawned)
         return actor
 
     def _add(self, description: wire.Description, pose: Array) -> Actor:
@@ -195,9 +189,6 @@ class Episode:
         if actor is self.spectator or actor.light is not None or (actor.name and not self.is_own(actor)):
             raise Refused(f"actor {actor.id} is a {actor.description.id} of the town, which cannot be destroyed")
         del self.actors[actor.id]
-        self._strolls.pop(actor.id, None)
-        if actor.kind == "controller":
-            self._strolls.pop(actor.parent, None)
         if actor.name:
             del self._bodies[actor.name]
             self.world.apply(Remove(actor.name))
@@ -268,9 +259,7 @@ class Episode:
         self.world.apply(Push(actor.name, (x, y, z), yaw_rate))
 
     def simulate(self, actor: Actor, *, physics: bool | None = None, gravity: bool | None = None) -> None:
-        """Switch an actor's physics or weight on or off; a walker that strolls keeps its own, whatever its AI asks."""
-        if actor.id in self._strolls:
-            return
+        """Switch an actor's physics or weight on or off."""
         actor.simulated = actor.simulated if physics is None else physics
         actor.falling = actor.falling if gravity is None else gravity
         self.world.apply(Simulate(actor.name, actor.simulated, actor.falling))
@@ -279,12 +268,6 @@ class Episode:
 
     def step(self, dt_s: float) -> None:
         """Let the world go on by one tick of `dt_s`."""
-        for number, stroll in self._strolls.items():
-            walker = self.actors[number]
-            x, y = stroll.choose_velocity(walker.pose[:2, 3])
-            direction = mirror(np.array((x, y, 0.0)))
-            speed = float(np.hypot(x, y))
-            self.walk(walker, wire.WalkerControl(tuple((direction / max(speed, 1e-6)).tolist()), speed))
         for actor in self._bodies.values():
             if actor.constant is not None:
                 self.push(actor, actor.pose[:3, :3] @ actor.constant)

@@ -14,6 +14,7 @@ from shapely.geometry import LineString
 from flcav.config import InputError, shorten
 from flcav.interface.wording import suggest
 from flcav.sources.carla.frames import MapFrame, to_rotation, to_vector
+from flcav.sources.carla.server.navmesh import build_navigation_mesh
 from flcav.sources.carla.server.wire import Transform
 from flcav.world.map.roads import Lane, RoadNet, read_net
 from flcav.world.map.town import NAME, PACKAGED, Town, load_town
@@ -61,6 +62,11 @@ class ServedMap:
             at = SPAWN_FROM_END_M + number * SPAWN_EVERY_M
             (x, y), (u, v) = (np.array(line.interpolate(at + ahead).coords[0]) for ahead in (0.0, 0.5))
             yield np.array((x, y, self.town.ground(x, y) + ABOVE_M)), float(np.arctan2(v - y, u - x))
+
+    @cached_property
+    def mesh(self) -> bytes:
+        """The file of the navigation mesh of walkers."""
+        return build_navigation_mesh(self.net, self.town, self.frame)
 
     @cached_property
     def _limits(self) -> tuple[KDTree, Array]:
