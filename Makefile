@@ -18,10 +18,10 @@ test: $(STAMP)
 test-peers: $(STAMP)
 	$(BIN)/python -m pytest -n 0 -rs tests/peers
 
-# CARLA's own scripts and those of others against `flcav carla serve`, in an environment of their own, out/carla; they and
-# the maps are in the folder of FLCAV_REAL_DATA, and without it these tests are skipped: docs/carla.md.
+# Recordings from `flcav carla serve`, and CARLA's own scripts and those of others against it, in an environment of their
+# own, out/carla; they and the maps are in the folder of FLCAV_REAL_DATA, and without it these tests are skipped: docs/carla.md.
 test-carla: $(STAMP)
-	$(BIN)/python -m pytest -n 0 -rs tests/carla
+	$(BIN)/python -m pytest -n 0 -rs tests/carla_clients
 
 # What runs on Ray beside what runs without it, in an environment of its own with the extra 'ray', below out/ray.
 test-ray:
@@ -60,7 +60,7 @@ format: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "flcav needs Python 3.11 or newer: make PYTHON=python3.x"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,docs,fusion,gym,towns]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[carla,dev,docs,fusion,gym,towns]"
 	touch $(STAMP)
 
 clean:
