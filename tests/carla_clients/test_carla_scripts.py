@@ -18,7 +18,7 @@ import pytest
 
 HERE = Path(__file__).parent
 ROOM = HERE.parents[1] / "out" / "carla"
-DATA = Path(os.environ.get("FLCAV_REAL_DATA", "missing"))
+DATA = Path(os.environ.get("FLCAV_REAL_DATA", HERE.parents[1].parent / "shared" / "data"))
 API, OTHERS, MAPS = DATA / "carla_pythonapi", DATA / "carla_scripts", DATA / "carla_maps"
 PACKAGES = ("carla==0.9.16", "pygame", "numpy==1.23.5", "matplotlib==3.8.4", "pandas<2.1", "plyfile<1.1")
 TOOLS = ("networkx", "shapely", "pytest")
@@ -38,7 +38,7 @@ SCRIPTS: dict[str, tuple[tuple[str, ...], int | None]] = {
     "automatic_control.py": (("--sync", "--res", "320x240"), ENDLESS_S),
 }
 INTERRUPTED = ("KeyboardInterrupt", "Cancelled by user", "Exited by user", "destroying", "done.", "Done", "EXIT")
-pytestmark = pytest.mark.skipif(not API.is_dir(), reason="needs FLCAV_REAL_DATA with carla_pythonapi")
+pytestmark = pytest.mark.skipif(not API.is_dir(), reason=f"not at {API}: set FLCAV_REAL_DATA")
 
 
 @pytest.fixture(scope="session")
@@ -115,7 +115,7 @@ def test_examples(script, python, usual_port, tmp_path):
     run_script(python, API / "examples" / script, *SCRIPTS[script], tmp_path)
 
 
-@pytest.mark.skipif(not OTHERS.is_dir(), reason="needs FLCAV_REAL_DATA with carla_scripts")
+@pytest.mark.skipif(not OTHERS.is_dir(), reason=f"not at {OTHERS}: set FLCAV_REAL_DATA")
 def test_two_semantic_lidars_at_a_junction(python, usual_port, tmp_path):
     """The script's module `CoordConvertor` is not published with it, and open3d draws nothing: both are stand-ins."""
     told = run_script(python, OTHERS / "generate_multi_lidar_junc1.py", (), ENDLESS_S, tmp_path)
