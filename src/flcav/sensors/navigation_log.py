@@ -28,7 +28,7 @@ LEAST_STEPS = 4  # of the traffic in a drive, for its splines
 
 @dataclass(frozen=True)
 class NavigationLog:
-    """What the first GNSS receiver and the first IMU of a vehicle measured over a drive, with their data sheets."""
+    """Measurements of a vehicle's first GNSS receiver and first IMU over a drive, with their data sheets."""
 
     gnss: str  # names of the sensors
     imu: str

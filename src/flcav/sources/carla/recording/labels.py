@@ -39,7 +39,7 @@ class Sweep(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """What a camera's pixels show."""
+    """Depth and semantic class of a camera's pixels, with its pose."""
 
     lens: Lens
     world_from_camera: Array  # (4, 4), optical frame

@@ -38,7 +38,7 @@ PINHOLE = {  # a camera without the lens that CARLA simulates by default
 
 
 class SemanticSweep(NamedTuple):
-    """What a semantic LiDAR met, by N rays that met anything."""
+    """Returns of a semantic LiDAR, N of them."""
 
     points: NDArray[np.float32]  # (N, 3) sensor frame [m]
     actor: NDArray[np.uint32]  # (N,) CARLA's number; 0 for the town

@@ -15,7 +15,7 @@ LARGEST_INT = 2**31
 
 
 class Refused(ValueError):
-    """What a call asks for cannot be done; its text is the reply."""
+    """The error of a call that cannot be carried out; its text is the reply."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ NOWHERE = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 class Measurement(NamedTuple):
-    """What a sensor sends at one tick."""
+    """A message of a sensor at one tick."""
 
     stream: int
     header: bytes

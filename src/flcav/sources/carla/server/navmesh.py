@@ -22,7 +22,7 @@ GRID_M = 0.01  # of corners
 JOINED_M = 0.15  # paths so near to each other are one
 SMOOTHED_M = 0.08  # most that outlines move
 SMALLEST_M2 = 0.5  # of a face that is walked on
-MOST_CORNERS = 0xFFFE
+MOST_CORNERS = 0xFFFE  # that the format can number
 SET = struct.Struct("<3i3f2f2iIi")  # "MSET", version, tiles; origin, size and capacities of the mesh; reference, bytes
 TILE = struct.Struct("<5iI9i10f")  # "DNAV", version, place; user; counts; walkers; bounds; factor of a tree
 POLYGON = np.dtype(
@@ -49,9 +49,9 @@ class Area(IntEnum):
 
 
 def build_navigation_mesh(net: RoadNet, town: Town, frame: MapFrame) -> bytes:
-    """Return the file of a town's navigation mesh; empty where it has no footpaths."""
+    """Return the file of a town's navigation mesh; empty without footpaths, and beyond `MOST_CORNERS`."""
     corners, triangles, areas = triangulate(*list_footpaths(net))
-    if not len(triangles):
+    if not len(triangles) or len(corners) > MOST_CORNERS:
         return b""
     height = town.grounds(*corners.T) + KERB_M
     points = frame.to_location(np.column_stack((corners, height)))
