@@ -26,7 +26,7 @@ STUDY = StudyRecipe(
     patience=8,
 )
 
-# Training in drawn streets, five of each town, beside a third of the authored sweeps of `STUDY`, whose cars have flat ends.
+# Training in drawn streets, five of each town, beside a third of the sweeps of `STUDY`, whose cars have flat ends.
 DRAWN = read_recipe("streets")
 DRAWN_TEST = {**DRAWN, "split": "test", "scenes": 10}
 STREETS_STUDY = StudyRecipe(
