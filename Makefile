@@ -60,7 +60,7 @@ format: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "flcav needs Python 3.11 or newer: make PYTHON=python3.x"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[carla,dev,docs,fusion,gym,towns]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[carla,dev,docs,fusion,gym,releases,ros,towns]"
 	touch $(STAMP)
 
 clean:

@@ -1,6 +1,6 @@
 """A Flower grid within one process: a message reaches the client app by a function call, without sockets or daemons.
 
-The only module that uses private parts of Flower (pinned to 1.41): the process-wide task identity, the empty run
+The only module that uses private parts of Flower (pinned to 1.42): the process-wide task identity, the empty run
 record, the id of a message, and the serialised form of a record and of an array.
 """
 
