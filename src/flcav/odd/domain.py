@@ -1,0 +1,232 @@
+"""Operational design domains (ODD) in ASAM OpenODD 1.0: read by openodd-py, with flcav's own binding and no other.
+
+A domain is one of `DOMAINS`, or a stranger's OpenODD file. The library would import what a binding calls
+`module:function`, and fetch what an import calls `git:`; of strangers' files both are refused by name before it reads them.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flcav.config import InputError, path_within, read_yaml, shorten
+from flcav.interface.wording import suggest
+
+if TYPE_CHECKING:
+    from openodd import Backend, CoverItem, OddDefinition, OddKnob
+
+FOLDER = Path(__file__).parent / "domains"
+TAXONOMY, BINDING = FOLDER / "taxonomy.yaml", FOLDER / "binding.yaml"
+DOMAINS = ("urban", "rural", "campus", "mine", "port", "parking_lot")
+MOST_BYTES, MOST_FILES = 1_000_000, 20
+REFUSED = {  # keys of strangers' files
+    "git": "it names a git source to fetch",
+    "probe": "it brings a binding, which may name code to import",
+    "probes": "it brings a binding, which may name code to import",
+    "measure": "it brings a binding, which may name code to import",
+    "openodd": "it brings a binding, which may name code to import",
+}
+
+Value = float | str | None  # of an attribute: None is missing
+
+
+@dataclass(frozen=True)
+class Domain:
+    """An operational design domain, with flcav's binding of its concepts."""
+
+    name: str
+    definition: "OddDefinition"
+    bound: Mapping[str, str]  # attribute -> column of `flcav.odd.measure` that measures it
+    tested: tuple[str, ...]  # attributes that its modules test
+    representatives: Mapping[str, tuple[float, ...] | tuple[str, ...]]  # values between which no condition changes
+    backend: "Backend"
+
+    @property
+    def unbound(self) -> tuple[str, ...]:
+        """Return the attributes that its modules test and nothing measures."""
+        return tuple(name for name in self.tested if name not in self.bound)
+
+    def values(self, measured: Mapping[str, Value]) -> dict[str, Value]:
+        """Return the value of each bound attribute from measured columns; None where one is missing."""
+        return {name: measured.get(column) for name, column in self.bound.items()}
+
+    def knobs(self) -> "dict[str, OddKnob]":
+        """Return how a recipe sets each attribute that it can set, by attribute: the knobs of the binding."""
+        from openodd import knobs_from_mapping
+
+        given = _section("knobs")
+        return knobs_from_mapping({name: given[column] for name, column in self.bound.items() if column in given})
+
+    def require_bound(self) -> None:
+        """Raise `InputError` where the domain tests an attribute that nothing measures."""
+        if self.unbound:
+            raise InputError(
+                f"{self.name}: nothing in flcav's binding measures '{self.unbound[0]}'"
+                + (f" (and {len(self.unbound) - 1} more)" if len(self.unbound) > 1 else "")
+                + "; `flcav odd check` lists what it measures"
+            )
+
+
+def read_domain(name: str | Path) -> Domain:
+    """Return the domain of that name, or in that OpenODD file, with flcav's binding.
+
+    A file without a taxonomy has flcav's. Raises `InputError` where it is missing, too large, names code to import or a
+    source to fetch, is not OpenODD as the library reads it, has units that do not convert, tests nothing, or is empty.
+    """
+    path = FOLDER / f"{name}.yaml" if str(name) in DOMAINS else Path(name)
+    if str(name) not in DOMAINS:
+        if not path.exists() and not path.suffix:
+            raise InputError(f"unknown domain {shorten(str(name))}; those of flcav: {', '.join(DOMAINS)}, or an OpenODD "
+                             f"file{suggest(str(name), DOMAINS)}")
+        _refuse_foreign(path, path.parent, set())
+    own = any("TAXONOMY" in document for document in _documents(path, path.parent))
+    domain = _load([path] if own else [path, TAXONOMY], path.stem, path)
+    _refuse_empty(domain, path)
+    return domain
+
+
+def everything() -> Domain:
+    """Return the domain without bounds: all concepts of flcav's taxonomy, and no modules."""
+    return _load([TAXONOMY], "taxonomy", TAXONOMY)
+
+
+def _load(sources: list[Path], name: str, origin: Path) -> Domain:
+    backend = _backend()
+    concepts = _read(sources, {}, backend, name, origin)
+    bindings = {
+        each.name: _section("probes")[leaf]
+        for each in concepts.attributes
+        if (leaf := each.name.rpartition(".")[2]) in _section("probes")
+    }
+    # A stranger's concept of other words is not bound: flcav's would be none of them, and so outside by mistake.
+    words = _literals()
+    spoken = {each.name: each.item for each in _read(sources, bindings, backend, name, origin).attributes}
+    for full in list(bindings):
+        item, own = spoken[full], words.get(full.rpartition(".")[2])
+        if item is not None and (item.numeric != (own is None) or (own and not set(own) <= set(item.labels))):
+            del bindings[full]
+    found = _read(sources, bindings, backend, name, origin)
+    conditions = [condition for module in found.modules for condition in module.conditions()]
+    tested = tuple(dict.fromkeys(each for condition in conditions for each in condition.attributes()))
+    bare = {full: {"probe": each["probe"], "unit": each.get("unit", "")} for full, each in bindings.items()}
+    limits = _read(sources, bare, backend, name, origin)
+    return Domain(
+        name,
+        found,
+        {full: each["probe"] for full, each in bindings.items()},
+        tested,
+        {each.name: _representatives(each.item) for each in limits.attributes if each.item is not None},
+        backend,
+    )
+
+
+def _read(
+    sources: list[Path], bindings: Mapping[str, Mapping[str, str]], backend: "Backend", name: str, origin: Path
+) -> "OddDefinition":
+    import openodd
+
+    try:
+        return openodd.load_openodd(*sources, bindings=bindings, backend=backend, name=name)
+    except (openodd.OpenOddError, openodd.UnitError, openodd.GitSourceError) as error:
+        raise InputError(f"{origin}: not OpenODD as openodd-py reads it ({error})") from None
+
+
+def _representatives(item: "CoverItem") -> tuple[float, ...] | tuple[str, ...]:
+    """Return values of an attribute with all that its conditions can tell apart: its words, or limits and between them.
+
+    Without buckets of a binding, the library's buckets end at the limits that conditions name.
+    """
+    if not item.numeric:
+        return tuple(item.labels)
+    edges = sorted(edge for edge in item.edges if math.isfinite(edge))
+    middles = [(low + high) / 2 for low, high in pairwise(edges)]
+    return (*edges, *middles, edges[0] - 1, edges[-1] + 1) if edges else (0.0,)
+
+
+def _section(name: str) -> dict[str, dict[str, str]]:
+    return _own(BINDING)[name]
+
+
+@cache
+def _own(path: Path) -> dict:
+    """Return a file of the package."""
+    document = read_yaml(path)
+    assert isinstance(document, dict)
+    return document
+
+
+def _literals() -> dict[str, list[str]]:
+    """Return the words of each categorical concept of flcav's taxonomy, by leaf name."""
+    taxonomy = _own(TAXONOMY)["TAXONOMY"]
+    leaves = {leaf: kind for group in taxonomy.values() for leaf, kind in group.items()}
+    return {leaf: kind for leaf, kind in leaves.items() if isinstance(kind, list)}
+
+
+def _backend() -> "Backend":
+    """Return the library's backend: a probe per column, which reads a row of measured columns, and no imports."""
+    from openodd import Backend
+
+    def read(column: str) -> "tuple":
+        return (lambda row: row.get(column)), _section("probes")[column].get("unit", "")
+
+    return Backend(name="flcav", probes={column: read(column) for column in _section("probes")}, allow_imports=False)
+
+
+def _documents(path: Path, folder: Path) -> Iterator[dict]:
+    """Yield the OpenODD document in a file and those that it imports."""
+    document = read_yaml(path)
+    if isinstance(document, dict):
+        yield document
+        imports = document.get("IMPORT") or []
+        for name in imports if isinstance(imports, list) else [imports]:
+            if isinstance(name, str):
+                yield from _documents(path_within(folder, name, path), folder)
+
+
+def _refuse_foreign(path: Path, folder: Path, seen: set[Path]) -> None:
+    """Raise `InputError` where a file, or one that it imports, is too large, names code or a source, or leaves its folder."""
+    if path in seen:
+        raise InputError(f"{path}: imports itself")
+    if len(seen) >= MOST_FILES:
+        raise InputError(f"{path}: more than {MOST_FILES} files are imported")
+    if path.is_file() and path.stat().st_size > MOST_BYTES:
+        raise InputError(f"{path}: an ODD of more than {MOST_BYTES} bytes is not read")
+    document = read_yaml(path)
+    for key, value in _pairs(document):
+        if key in REFUSED:
+            raise InputError(f"{path}: '{key}: {shorten(value)}' is refused: {REFUSED[key]}; flcav reads files alone")
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: an OpenODD document is a mapping")
+    imports = document.get("IMPORT") or []
+    for name in imports if isinstance(imports, list) else [imports]:
+        if not isinstance(name, str) or ":" in name:
+            raise InputError(f"{path}: IMPORT of {shorten(name)} is refused: flcav reads files beside an ODD alone")
+        _refuse_foreign(path_within(folder, name, path), folder, seen | {path})
+
+
+def _pairs(value: object) -> Iterator[tuple[str, object]]:
+    """Yield the keys and values of all mappings within a YAML document."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield str(key), each
+            yield from _pairs(each)
+    elif isinstance(value, list):
+        for each in value:
+            yield from _pairs(each)
+
+
+def _refuse_empty(domain: Domain, origin: Path) -> None:
+    """Raise `InputError` where a domain has no modules, or leaves no value of one attribute inside."""
+    from openodd import UNDECIDED
+
+    odd = domain.definition
+    if not odd.modules:
+        raise InputError(f"{origin}: has no modules, so that it bounds nothing")
+    for name in domain.tested:
+        rest = {other: UNDECIDED for other in domain.tested if other != name}
+        values = domain.representatives.get(name, (UNDECIDED,))
+        if not any(odd.evaluate({**rest, name: value}).inside for value in values):
+            raise InputError(f"{origin}: the domain is empty: no value of {name} is inside")
