@@ -10,13 +10,23 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from openodd import (
+    UNDECIDED,
+    Backend,
+    CoverItem,
+    GitSourceError,
+    OddDefinition,
+    OddKnob,
+    OpenOddError,
+    UnitError,
+    knobs_from_mapping,
+    load_openodd,
+)
 
 from flcav.config import InputError, path_within, read_yaml, shorten
 from flcav.interface.wording import suggest
 
-if TYPE_CHECKING:
-    from openodd import Backend, CoverItem, OddDefinition, OddKnob
 
 FOLDER = Path(__file__).parent / "domains"
 TAXONOMY, BINDING = FOLDER / "taxonomy.yaml", FOLDER / "binding.yaml"
@@ -38,11 +48,11 @@ class Domain:
     """An operational design domain, with flcav's binding of its concepts."""
 
     name: str
-    definition: "OddDefinition"
+    definition: OddDefinition
     bound: Mapping[str, str]  # attribute -> column of `flcav.odd.measure` that measures it
     tested: tuple[str, ...]  # attributes that its modules test
-    representatives: Mapping[str, tuple[float, ...] | tuple[str, ...]]  # values between which no condition changes
-    backend: "Backend"
+    limits: Mapping[str, tuple[float, ...]]  # numbers at which a condition on an attribute changes, ascending
+    backend: Backend
 
     @property
     def unbound(self) -> tuple[str, ...]:
@@ -53,12 +63,25 @@ class Domain:
         """Return the value of each bound attribute from measured columns; None where one is missing."""
         return {name: measured.get(column) for name, column in self.bound.items()}
 
-    def knobs(self) -> "dict[str, OddKnob]":
+    def knobs(self) -> dict[str, OddKnob]:
         """Return how a recipe sets each attribute that it can set, by attribute: the knobs of the binding."""
-        from openodd import knobs_from_mapping
-
         given = _section("knobs")
         return knobs_from_mapping({name: given[column] for name, column in self.bound.items() if column in given})
+
+    def allowed(self, name: str) -> list[Value]:
+        """Return values of an attribute that can be inside: of its words, or of its limits and points between them.
+
+        No condition changes between these values. Of an attribute that is not bound nothing is known: one missing value.
+        """
+        item = next(each.item for each in self.definition.attributes if each.name == name)
+        if item is None:
+            return [None]
+        edges = self.limits.get(name, ())
+        between = [(low + high) / 2 for low, high in pairwise(edges)]
+        values = [*edges, *between, edges[0] - 1, edges[-1] + 1] if edges else [0.0]
+        rest = {other: UNDECIDED for other in self.tested if other != name}
+        candidates = values if item.numeric else list(item.labels)
+        return [each for each in candidates if self.definition.evaluate({**rest, name: each}).inside]
 
     def require_bound(self) -> None:
         """Raise `InputError` where the domain tests an attribute that nothing measures."""
@@ -112,38 +135,25 @@ def _load(sources: list[Path], name: str, origin: Path) -> Domain:
     conditions = [condition for module in found.modules for condition in module.conditions()]
     tested = tuple(dict.fromkeys(each for condition in conditions for each in condition.attributes()))
     bare = {full: {"probe": each["probe"], "unit": each.get("unit", "")} for full, each in bindings.items()}
-    limits = _read(sources, bare, backend, name, origin)
+    items = [each.item for each in _read(sources, bare, backend, name, origin).attributes if each.item is not None]
+    limits = {item.name.removeprefix("odd."): item.edges for item in items if item.numeric}  # as conditions name them
     return Domain(
         name,
         found,
         {full: each["probe"] for full, each in bindings.items()},
         tested,
-        {each.name: _representatives(each.item) for each in limits.attributes if each.item is not None},
+        {full: tuple(sorted(filter(math.isfinite, edges))) for full, edges in limits.items()},
         backend,
     )
 
 
 def _read(
-    sources: list[Path], bindings: Mapping[str, Mapping[str, str]], backend: "Backend", name: str, origin: Path
-) -> "OddDefinition":
-    import openodd
-
+    sources: list[Path], bindings: Mapping[str, Mapping[str, str]], backend: Backend, name: str, origin: Path
+) -> OddDefinition:
     try:
-        return openodd.load_openodd(*sources, bindings=bindings, backend=backend, name=name)
-    except (openodd.OpenOddError, openodd.UnitError, openodd.GitSourceError) as error:
+        return load_openodd(*sources, bindings=bindings, backend=backend, name=name)
+    except (OpenOddError, UnitError, GitSourceError) as error:
         raise InputError(f"{origin}: not OpenODD as openodd-py reads it ({error})") from None
-
-
-def _representatives(item: "CoverItem") -> tuple[float, ...] | tuple[str, ...]:
-    """Return values of an attribute with all that its conditions can tell apart: its words, or limits and between them.
-
-    Without buckets of a binding, the library's buckets end at the limits that conditions name.
-    """
-    if not item.numeric:
-        return tuple(item.labels)
-    edges = sorted(edge for edge in item.edges if math.isfinite(edge))
-    middles = [(low + high) / 2 for low, high in pairwise(edges)]
-    return (*edges, *middles, edges[0] - 1, edges[-1] + 1) if edges else (0.0,)
 
 
 def _section(name: str) -> dict[str, dict[str, str]]:
@@ -165,14 +175,31 @@ def _literals() -> dict[str, list[str]]:
     return {leaf: kind for leaf, kind in leaves.items() if isinstance(kind, list)}
 
 
-def _backend() -> "Backend":
-    """Return the library's backend: a probe per column, which reads a row of measured columns, and no imports."""
-    from openodd import Backend
+@dataclass
+class Recordings(Backend):
+    """The library's backend over rows of measured columns, with the agent's position and geolocation where known."""
 
-    def read(column: str) -> "tuple":
+    def position(self, context: Mapping[str, Value]) -> tuple[float, float, float] | None:
+        """Return where the agent is [m]; None where the row does not say."""
+        return _numbers(context, ("x", "y", "z"))
+
+    def geolocation(self, context: Mapping[str, Value]) -> tuple[float, float] | None:
+        """Return latitude and longitude [degrees]; None where the row does not say."""
+        return _numbers(context, ("latitude", "longitude"))
+
+
+def _numbers(row: Mapping[str, Value], names: tuple[str, ...]) -> tuple | None:
+    values = [row.get(name) for name in names]
+    return None if None in values else tuple(values)
+
+
+def _backend() -> Recordings:
+    """Return the library's backend: a probe per column, which reads a row of measured columns, and no imports."""
+
+    def read(column: str) -> tuple:
         return (lambda row: row.get(column)), _section("probes")[column].get("unit", "")
 
-    return Backend(name="flcav", probes={column: read(column) for column in _section("probes")}, allow_imports=False)
+    return Recordings(name="flcav", probes={column: read(column) for column in _section("probes")}, allow_imports=False)
 
 
 def _documents(path: Path, folder: Path) -> Iterator[dict]:
@@ -220,13 +247,8 @@ def _pairs(value: object) -> Iterator[tuple[str, object]]:
 
 def _refuse_empty(domain: Domain, origin: Path) -> None:
     """Raise `InputError` where a domain has no modules, or leaves no value of one attribute inside."""
-    from openodd import UNDECIDED
-
-    odd = domain.definition
-    if not odd.modules:
+    if not domain.definition.modules:
         raise InputError(f"{origin}: has no modules, so that it bounds nothing")
     for name in domain.tested:
-        rest = {other: UNDECIDED for other in domain.tested if other != name}
-        values = domain.representatives.get(name, (UNDECIDED,))
-        if not any(odd.evaluate({**rest, name: value}).inside for value in values):
+        if not domain.allowed(name):
             raise InputError(f"{origin}: the domain is empty: no value of {name} is inside")

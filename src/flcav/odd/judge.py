@@ -6,13 +6,20 @@ OpenODD 1.0 counts what rests on missing values as inside; here it never is.
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
-from flcav.odd.domain import Domain, Value
+from flcav.config import Json
+from flcav.dataset.store import Dataset
+from flcav.interface.wording import plural
+from flcav.odd.domain import Domain
 from flcav.odd.measure import Measurements
 from flcav.statistics.estimates import Estimate, score_interval
+from flcav.storage.exchange import write_table
+from flcav.storage.records import Record
 
 INSIDE, OUTSIDE, UNKNOWN = "inside", "outside", "unknown"
 
@@ -29,21 +36,49 @@ class Verdicts:
         """Return how many frames have that verdict."""
         return int((self.verdict == verdict).sum())
 
+    @property
+    def sentence(self) -> str:
+        """Return the counts in words."""
+        counts = ", ".join(f"{self.count(word)} {word}" for word in (INSIDE, OUTSIDE, UNKNOWN))
+        return f"{plural(len(self.frames), 'frame')}: {counts}"
+
+    def as_json(self) -> dict[str, Json]:
+        """Return the counts as a JSON object."""
+        counts = {word: self.count(word) for word in (INSIDE, OUTSIDE, UNKNOWN)}
+        return {"frames": len(self.frames), **counts, "modules": dict(self.failed)}
+
 
 @dataclass(frozen=True)
-class Agreement:
-    """How often perceived verdicts are right, with intervals: of frames, and not independent within a scene."""
+class Rates(Record):
+    """Precision and recall of one verdict, with Wilson's intervals; None where it was never said, or never true."""
 
-    frames: int  # that truth decides
-    inside: tuple[Estimate | None, Estimate | None]  # precision and recall of "inside"
-    outside: tuple[Estimate | None, Estimate | None]  # of "outside"
+    precision: Estimate | None
+    recall: Estimate | None
+
+
+@dataclass(frozen=True)
+class Agreement(Record):
+    """How often perceived verdicts are right, on the frames that truth decides; these are not independent in a scene."""
+
+    frames: int
+    inside: Rates
+    outside: Rates
     undecided: int  # frames that perception leaves unknown
 
 
-def judge_values(domain: Domain, measured: Mapping[str, Value]) -> str:
-    """Return the verdict on one row of measured columns."""
-    verdict = domain.definition.evaluate(domain.definition.complete(domain.values(measured)))
-    return OUTSIDE if not verdict.inside else UNKNOWN if verdict.assumed else INSIDE
+def describe_agreement(agreement: Agreement) -> list[str]:
+    """Return the agreement in words."""
+    rows = []
+    for name, rates in ((INSIDE, agreement.inside), (OUTSIDE, agreement.outside)):
+        words = ["-" if each is None else each.describe() for each in (rates.precision, rates.recall)]
+        rows.append(f"{name}: precision {words[0]}, recall {words[1]}")
+    return [*rows, f"{plural(agreement.undecided, 'frame')} left unknown of {agreement.frames} that truth decides"]
+
+
+def write_verdicts(data: Dataset, truth: Verdicts, seen: Verdicts | None, path: Path) -> None:
+    """Write a table, CSV or Parquet: frame, verdict, and the perceived verdict where there is one."""
+    columns = {"frame": [data.name(i) for i in truth.frames], "verdict": truth.verdict.tolist()}
+    write_table(pa.table(columns if seen is None else columns | {"perceived": seen.verdict.tolist()}), path)
 
 
 def judge(domain: Domain, measured: Measurements) -> Verdicts:
@@ -69,11 +104,12 @@ def compare_verdicts(truth: Sequence[str], perceived: Sequence[str]) -> Agreemen
     decided = wanted != UNKNOWN
     wanted, found = wanted[decided], found[decided]
 
-    def rate(of: str) -> tuple[Estimate | None, Estimate | None]:
+    def rate(of: str) -> Rates:
         said, is_so = found == of, wanted == of
-        return tuple(
-            score_interval(float((said & is_so).sum() / all_of.sum()), int(all_of.sum())) if all_of.any() else None
-            for all_of in (said, is_so)
-        )  # type: ignore[return-value]
+        shares = (
+            score_interval(float((said & is_so).sum() / every.sum()), int(every.sum())) if every.any() else None
+            for every in (said, is_so)
+        )
+        return Rates(*shares)
 
     return Agreement(int(decided.sum()), rate(INSIDE), rate(OUTSIDE), int((found == UNKNOWN).sum()))

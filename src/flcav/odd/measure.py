@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from flcav.config import InputError, parse_config
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import WEATHER_COLUMNS
+from flcav.interface.wording import plural
 from flcav.odd.domain import Value
 from flcav.odd.scenery import Column, Scenery
 from flcav.sensors.rig import Rig
+from flcav.storage.records import Record
 from flcav.world.weather import NIGHT_DEG, Weather
 
 Array = NDArray[np.float64]
@@ -38,6 +40,40 @@ class Measurements:
         names = list(self.columns)
         plain = [_plain(column) for column in self.columns.values()]
         return [dict(zip(names, row, strict=True)) for row in zip(*plain, strict=True)]
+
+
+@dataclass(frozen=True)
+class Span(Record):
+    """What a recording covers of one attribute."""
+
+    attribute: str
+    low: float | None  # of a number; None where all are missing, and of words
+    high: float | None
+    words: Mapping[str, int]  # word -> frames
+    missing: int  # frames
+
+    @property
+    def sentence(self) -> str:
+        """Return the span in words."""
+        missing = f" ({plural(self.missing, 'frame')} unknown)" if self.missing else ""
+        if self.words:
+            return ", ".join(f"{word}: {count}" for word, count in self.words.items()) + missing
+        return "unknown" if self.low is None else f"{self.low:g} to {self.high:g}{missing}"
+
+
+def summarise(measured: Measurements) -> tuple[Span, ...]:
+    """Return what the frames cover of each attribute, in the order of the columns."""
+    spans = []
+    for name, column in measured.columns.items():
+        if column.dtype.kind == "U":
+            words, counts = np.unique(column[column != ""], return_counts=True)
+            known = {str(word): int(count) for word, count in zip(words, counts, strict=True)}
+            spans.append(Span(name, None, None, known, len(column) - sum(known.values())))
+            continue
+        numbers = column[~np.isnan(column.astype(np.float64))].astype(np.float64)
+        ends = (float(numbers.min()), float(numbers.max())) if len(numbers) else (None, None)
+        spans.append(Span(name, *ends, {}, len(column) - len(numbers)))
+    return tuple(spans)
 
 
 def select_vehicles(data: Dataset) -> tuple[int, ...]:
@@ -154,11 +190,6 @@ def _count_agents(data: Dataset) -> dict[str, Array]:
         name: np.bincount(frame[near & kind], minlength=len(data)).astype(np.float64)
         for name, kind in (("agents", moving), ("pedestrians", moving & walking))
     }
-
-
-def weather_columns(weather: Weather) -> dict[str, Array]:
-    """Return the fields of one weather as columns of one frame, see `describe_weather`."""
-    return {name: np.array([getattr(weather, name)]) for name in WEATHER_COLUMNS}
 
 
 def _plain(column: Column) -> list[Value]:
