@@ -1,5 +1,7 @@
 """`flcav odd`: operational design domains, what of them recordings cover, and recipes for what they do not."""
 
+from collections import Counter
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +15,15 @@ from flcav.machine.threads import use_threads
 if TYPE_CHECKING:
     from flcav.odd.cells import CellErrors
     from flcav.statistics.estimates import Estimate
+
+
+class Draw(StrEnum):
+    """Way to draw samples, see `flcav.odd.sampling`."""
+
+    coverage = "coverage"
+    lhs = "lhs"
+    sobol = "sobol"
+
 
 odd = typer.Typer(
     help="Operational design domains in ASAM OpenODD: check them, judge recordings by them, sample recipes in them.",
@@ -215,6 +226,71 @@ def cover(
     for row in result.cells:
         typer.echo(_describe_cell(row))
     typer.echo(f"{out / 'matrix.html'}: {by}")
+
+
+@odd.command()
+def sample(
+    domain: str = ODD,
+    out: Path = typer.Option(..., "--out", help="New folder for the recipes, and samples.json about them."),
+    count: int = typer.Option(20, "--count", min=1, max=100_000, help="How many recipes."),
+    town: list[str] = typer.Option([], "--town", help="Town to sample in; may be given several times; default: all four."),
+    method: Draw = typer.Option(
+        Draw.coverage, "--method", help="Least covered buckets first, a Latin hypercube, or scrambled Sobol points."
+    ),
+    covered: Path | None = typer.Option(
+        None, "--covered", help="Folder of flcav odd cover: what its runs covered is drawn last."
+    ),
+    seed: int = typer.Option(0, "--seed", min=0, help="Seed of the draws; recipe n has seed + n - 1."),
+    openscenario: bool = typer.Option(
+        False, "--openscenario", help="Also each scenario as OpenSCENARIO XML 1.2, and the towns' maps; extra `towns`."
+    ),
+    as_json: bool = JSON,
+) -> None:
+    """Draw recipes of scenarios inside a domain: straight roads, T-junctions, cross-roads and roundabouts of towns.
+
+    Each has a corner case at its place, in weather of the domain. `flcav record` reads the recipes.
+    """
+    from flcav.cli.options import refuse_unused
+    from flcav.config import InputError
+    from flcav.odd.coverage import load_report
+    from flcav.odd.domain import read_domain
+    from flcav.odd.openscenario import to_openscenario
+    from flcav.odd.recipes import write_recipes
+    from flcav.odd.sampling import Sample, Space, sample_domain
+    from flcav.odd.scenery import Scenery
+    from flcav.sources.recipe import Recipe
+    from flcav.storage.files import check_writable, write_bytes
+    from flcav.world.map.town import TOWNS, load_town
+    from flcav.world.opendrive.exporting import export_town
+
+    if method is not Draw.coverage:
+        refuse_unused(f"odd sample --method {method.value}", "covered")
+    if covered is not None and not (covered / "runs").is_dir():
+        raise InputError(f"{covered}: no folder that flcav odd cover has written: there are no runs in it")
+    check_writable(out)
+    found = read_domain(domain)
+    sceneries = [Scenery(load_town(name)) for name in dict.fromkeys(town or TOWNS)]
+    space = Space(found, sceneries)
+    drawn = sample_domain(space, count, method.value, seed, None if covered is None else load_report(covered))
+
+    def write_scenario(sample: Sample, recipe: Recipe, path: Path) -> None:
+        if openscenario:
+            path.with_suffix(".xosc").write_bytes(to_openscenario(sample, f"{sample.place.town}.xodr"))
+
+    maps = {}
+    if openscenario:
+        used = {each.place.town for each in drawn.samples}
+        maps = {each.town.name: export_town(each.town) for each in sceneries if each.town.name in used}
+    paths = write_recipes(drawn, sceneries, out, seed, write_scenario)
+    for name, text in maps.items():
+        write_bytes(out / f"{name}.xodr", text.encode())
+    if as_json:
+        print_json({"recipes": len(paths), "pairwise": drawn.pairwise, "pairs": drawn.pairs, "possible": drawn.possible})
+        return
+    kinds = Counter(each.place.kind for each in drawn.samples)
+    typer.echo(f"{out}: {plural(len(paths), 'recipe')} in {found.name}, by {method.value}")
+    typer.echo(f"    {', '.join(f'{kind}: {number}' for kind, number in kinds.most_common())}")
+    typer.echo(f"    pairwise coverage {drawn.pairwise:.0%}: {drawn.pairs} of {drawn.possible} pairs of buckets")
 
 
 def _describe_cell(row: "CellErrors") -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from openodd import CoverageCollector, CoverageReport, CoverageView, export_cods, merge_coverage, view
 
-from flcav.config import Json
+from flcav.config import InputError, Json, read_json
 from flcav.dataset.store import Dataset
 from flcav.odd.domain import Domain, Value
 from flcav.odd.measure import Measurements
@@ -73,6 +73,21 @@ def collect_runs(
 def merge_runs(documents: Sequence[Document]) -> CoverageReport:
     """Return the library's report of several runs."""
     return merge_coverage(list(documents))
+
+
+def load_report(folder: Path) -> CoverageReport:
+    """Return the library's report of the runs that `write_runs` wrote; raises `InputError` where there are none."""
+    paths = sorted((folder / "runs").glob("*_coverage.json"))
+    if not paths:
+        raise InputError(f"{folder}: no runs of flcav odd cover")
+    return merge_runs([_document(path) for path in paths])
+
+
+def _document(path: Path) -> Document:
+    document = read_json(path)
+    if not isinstance(document, dict) or not isinstance(document.get("odd"), dict):
+        raise InputError(f"{path}: no coverage of a run")
+    return document
 
 
 def list_covered(report: CoverageReport) -> tuple[Covered, ...]:

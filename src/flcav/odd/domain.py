@@ -4,6 +4,7 @@ A domain is one of `DOMAINS`, or a stranger's OpenODD file. The library would im
 `module:function`, and fetch what an import calls `git:`; of strangers' files both are refused by name before it reads them.
 """
 
+import logging
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ from openodd import (
 from flcav.config import InputError, path_within, read_yaml, shorten
 from flcav.interface.wording import suggest
 
+
+logging.getLogger("openodd").setLevel(logging.ERROR)  # of its warnings commands say what matters in their own words
 
 FOLDER = Path(__file__).parent / "domains"
 TAXONOMY, BINDING = FOLDER / "taxonomy.yaml", FOLDER / "binding.yaml"
@@ -79,9 +82,13 @@ class Domain:
         edges = self.limits.get(name, ())
         between = [(low + high) / 2 for low, high in pairwise(edges)]
         values = [*edges, *between, edges[0] - 1, edges[-1] + 1] if edges else [0.0]
-        rest = {other: UNDECIDED for other in self.tested if other != name}
         candidates = values if item.numeric else list(item.labels)
-        return [each for each in candidates if self.definition.evaluate({**rest, name: each}).inside]
+        return [each for each in candidates if self.can_hold({name: each})]
+
+    def can_hold(self, values: Mapping[str, Value]) -> bool:
+        """Return whether the domain can hold with these values, whatever the other attributes are."""
+        rest = {name: UNDECIDED for name in self.tested if name not in values}
+        return self.definition.evaluate({**rest, **values}).inside
 
     def require_bound(self) -> None:
         """Raise `InputError` where the domain tests an attribute that nothing measures."""

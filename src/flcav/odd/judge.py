@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flcav.config import Json
 from flcav.dataset.store import Dataset
 from flcav.interface.wording import plural
-from flcav.odd.domain import Domain
+from flcav.odd.domain import Domain, Value
 from flcav.odd.measure import Measurements
 from flcav.statistics.estimates import Estimate, score_interval
 from flcav.storage.exchange import write_table
@@ -79,6 +79,12 @@ def write_verdicts(data: Dataset, truth: Verdicts, seen: Verdicts | None, path: 
     """Write a table, CSV or Parquet: frame, verdict, and the perceived verdict where there is one."""
     columns = {"frame": [data.name(i) for i in truth.frames], "verdict": truth.verdict.tolist()}
     write_table(pa.table(columns if seen is None else columns | {"perceived": seen.verdict.tolist()}), path)
+
+
+def judge_values(domain: Domain, measured: Mapping[str, Value]) -> str:
+    """Return the verdict on one row of measured columns; a column that is not there is missing."""
+    verdict = domain.definition.evaluate(domain.definition.complete(domain.values(measured)))
+    return OUTSIDE if not verdict.inside else UNKNOWN if verdict.assumed else INSIDE
 
 
 def judge(domain: Domain, measured: Measurements) -> Verdicts:

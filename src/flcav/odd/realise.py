@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from openodd import UNDECIDED
 
 from flcav.odd.domain import Domain, Value
 from flcav.odd.measure import Measurements, reach_of
 from flcav.odd.scenery import Place, Scenery
-from flcav.sensors.rig import RIGS, Rig
+from flcav.sensors.rig import RIGS
 from flcav.storage.records import Record
 
 SET, FOUND, RIG, TRAFFIC, UNMEASURED = "set", "found", "rig", "traffic", "unmeasured"
@@ -68,13 +67,13 @@ def check_frames(domain: Domain, measured: Measurements) -> tuple[Part, ...]:
     )
 
 
-def choose_rig(domain: Domain) -> Rig | None:
-    """Return the first of `VEHICLE_RIGS` whose field of view and range the domain allows; None where none is."""
+def choose_rig(domain: Domain) -> str | None:
+    """Return the name of the first of `VEHICLE_RIGS` whose field of view and range the domain allows; None where none is."""
     for name in VEHICLE_RIGS:
         reach = reach_of(RIGS[name])
         tested = [each for each in domain.tested if domain.bound.get(each) in OF_RIG]
         if all(_can(domain, each, reach[domain.bound[each]]) for each in tested):
-            return RIGS[name]
+            return name
     return None
 
 
@@ -88,8 +87,7 @@ def find_places(domain: Domain, sceneries: Sequence[Scenery]) -> tuple[tuple[Pla
         for place, row in _describe_places(scenery):
             own = {**row, **GROUND}
             known = {name: own[domain.bound[name]] for name in domain.tested if domain.bound.get(name) in own}
-            rest = {name: UNDECIDED for name in domain.tested if name not in known}
-            if None not in known.values() and domain.definition.evaluate({**rest, **known}).inside:
+            if None not in known.values() and domain.can_hold(known):
                 inside.append((place, own))
     return tuple(inside)
 
@@ -131,6 +129,5 @@ def _can(domain: Domain, name: str, value: Value) -> bool:
     """Return whether the domain can hold with this value of an attribute; a missing one cannot."""
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return False
-    rest = {other: UNDECIDED for other in domain.tested if other != name}
-    return domain.definition.evaluate({**rest, name: value}).inside
+    return domain.can_hold({name: value})
 

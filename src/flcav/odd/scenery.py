@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Point
 from shapely.geometry.base import BaseGeometry
 
-from flcav.world.map.roads import Connection, Lane, RoadNet, read_net
+from flcav.world.map.roads import Connection, RoadNet, read_net
 from flcav.world.map.town import Town
 
 Array = NDArray[np.float64]
@@ -27,6 +27,7 @@ LANE_M = 12.0  # from a place to the middle of the lane that it is on, at most
 TURNED = 10.0  # distance [m] that a lane in the opposite direction counts as farther away, half of it
 SLOPE_M = 5.0  # to either side, over which a gradient is taken
 STRAIGHT_M = 20.0  # to either side of the middle of a straight road
+BEFORE_M = 40.0  # from where a scenario starts to a junction
 BENT = 0.99  # chord by length: a street below it is no straight road
 ARMS = {3: "t_junction", 4: "crossroad"}
 CONTROLS = {"traffic_light": "signalised", "priority": "signed", "allway_stop": "signed"}  # by SUMO's type's beginning
@@ -44,6 +45,7 @@ class Place:
     y: float
     approach: tuple[float, float]  # end of a lane that leads to it; of a straight road the place itself [m]
     yaw: float  # of that lane [rad]
+    start: tuple[float, float, float]  # x, y [m] and yaw [rad] on that lane, up to `BEFORE_M` before its end
     conflicts: int  # conflict points of vehicles
 
 
@@ -132,9 +134,10 @@ class Scenery:
                 if edge.end in inside and edge.start not in inside and edge.lanes_of("driving")
             ]
             if leads:
-                end, yaw = leads[0].shape[-1].tolist(), _yaw_at_end(leads[0])
+                line = LineString(leads[0].shape)
+                start, end = _pose_along(line, line.length - BEFORE_M), _pose_along(line, line.length)
                 points = sum(conflicts[name] for name in inside)
-                yield Place(self.town.name, kind, control, middle.x, middle.y, (end[0], end[1]), yaw, points)
+                yield Place(self.town.name, kind, control, middle.x, middle.y, end[:2], end[2], start, points)
 
     def _straight_places(self) -> Iterator[Place]:
         for edge in self.net.streets:
@@ -142,13 +145,10 @@ class Scenery:
             line = LineString(driving[0].shape) if driving else None
             if line is None or line.length < 2 * STRAIGHT_M:
                 continue
-            ends = [line.interpolate(line.length / 2 + side) for side in (-STRAIGHT_M, STRAIGHT_M)]
-            middle = line.interpolate(line.length / 2)
-            chord = ends[0].distance(ends[1])
-            if chord < BENT * 2 * STRAIGHT_M or len(self._near.query(middle, predicate="within")):
-                continue
-            yaw = float(np.arctan2(ends[1].y - ends[0].y, ends[1].x - ends[0].x))
-            yield Place(self.town.name, "none", "none", middle.x, middle.y, (middle.x, middle.y), yaw, 0)
+            start, here, end = (_pose_along(line, line.length / 2 + side) for side in (-STRAIGHT_M, 0.0, STRAIGHT_M))
+            chord = float(np.hypot(end[0] - start[0], end[1] - start[1]))
+            if chord >= BENT * 2 * STRAIGHT_M and not len(self._near.query(Point(here[:2]), predicate="within")):
+                yield Place(self.town.name, "none", "none", *here[:2], here[:2], here[2], start, 0)
 
 
 def _name_roads(limit: Array) -> NDArray[np.str_]:
@@ -215,6 +215,9 @@ def _path(way: Connection, driving: dict[str, tuple], onward: dict[tuple[str, st
     return LineString(np.concatenate([*points, driving[way.end][1].shape[:1]]))
 
 
-def _yaw_at_end(lane: Lane) -> float:
-    step = lane.shape[-1] - lane.shape[-2]
-    return float(np.arctan2(step[1], step[0]))
+def _pose_along(line: LineString, along: float) -> tuple[float, float, float]:
+    """Return x, y [m] and direction [rad] at a distance along a line, within its ends."""
+    along = min(max(along, 0.0), line.length)
+    here = line.interpolate(along)
+    behind, ahead = line.interpolate(max(along - 1.0, 0.0)), line.interpolate(min(along + 1.0, line.length))
+    return here.x, here.y, float(np.arctan2(ahead.y - behind.y, ahead.x - behind.x))
