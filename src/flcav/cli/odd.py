@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import Device, check_finite
+from flcav.cli.tables import numbers, read_table
 from flcav.cli.terminal import print_json
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
@@ -291,6 +292,54 @@ def sample(
     typer.echo(f"{out}: {plural(len(paths), 'recipe')} in {found.name}, by {method.value}")
     typer.echo(f"    {', '.join(f'{kind}: {number}' for kind, number in kinds.most_common())}")
     typer.echo(f"    pairwise coverage {drawn.pairwise:.0%}: {drawn.pairs} of {drawn.possible} pairs of buckets")
+
+
+@odd.command()
+def tasks(
+    data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
+    out: Path = typer.Option(..., "--out", help="The run recipe to write (.yaml): flcav run reads it."),
+    errors: Path | None = typer.Option(
+        None, "--errors", help="Table of flcav errors: how dense a network's errors are is part of the complexity."
+    ),
+    pretrain: str = typer.Option("suburb", "--pretrain", help="Town of stage I; the other recorded towns federate."),
+    wireless: float = typer.Option(180.0, "--wireless", min=0.001, callback=check_finite, help="Wireless budget [MB]."),
+    wireline: float = typer.Option(110.0, "--wireline", min=0.001, callback=check_finite, help="Wireline budget [MB]."),
+    as_json: bool = JSON,
+) -> None:
+    """Generate tasks, {data, labels, network}, for the scenarios of recordings: more where a scenario is complex.
+
+    The result is a run recipe, in which a task weighs as many of the scenarios as have it.
+    """
+    import yaml
+
+    from flcav.config import InputError
+    from flcav.odd.tasks import generate_tasks, make_run, name_region, town_of
+    from flcav.storage.files import check_writable, write_bytes
+    from flcav.world.map.town import load_town
+
+    if out.suffix.lower() not in (".yaml", ".yml"):
+        raise InputError(f"--out {out}: a run recipe is a YAML file; name it {out.with_suffix('.yaml')}")
+    check_writable(out.parent)
+    load_town(pretrain)
+    found = []
+    if errors is not None:
+        table = read_table(errors, ("x", "y", "scene"), ("scene",))
+        places = numbers(table, ("x", "y"), errors).tolist()
+        found = [(str(scene), *place) for scene, place in zip(table["scene"].to_pylist(), places, strict=True)]
+    scenarios = [each for folder in data for each in generate_tasks(folder, found)]
+    towns = {name_region(town): town for town in map(town_of, data)}
+    recipe = make_run(scenarios, towns, pretrain, wireless, wireline)
+    write_bytes(out, yaml.safe_dump(recipe, sort_keys=False).encode())
+    if as_json:
+        rows = [each.as_json() | {"total": each.complexity.total} for each in scenarios]
+        print_json({"scenarios": rows, "recipe": recipe})
+        return
+    for each in scenarios:
+        parts = ", ".join(f"{name} {value:.2f}" for name, value in each.complexity.as_json().items())
+        named = ", ".join(task.task for task in each.tasks)
+        typer.echo(f"{each.town}, {each.kind}: complexity {each.complexity.total:.2f} ({parts})")
+        typer.echo(f"    {plural(len(each.tasks), 'task')}: {named}")
+    typer.echo(f"{out}: run recipe of {plural(len(recipe['tasks']), 'task')}")
 
 
 def _describe_cell(row: "CellErrors") -> str:
