@@ -42,7 +42,9 @@ def register(app: typer.Typer) -> None:
 @odd.command()
 def check(
     domain: str = ODD,
-    town: str | None = typer.Option(None, "--town", help="A town's name, or its folder: what its places realise; default: flcav's four."),
+    town: str | None = typer.Option(
+        None, "--town", help="Town, by name or folder, whose places are checked; default: flcav's four."
+    ),
     data: Path | None = typer.Option(None, "--data", help="Dataset folder: what its frames realise."),
     as_json: bool = JSON,
 ) -> None:
@@ -79,7 +81,7 @@ def check(
 @odd.command("of")
 def of_(
     data: Path = typer.Argument(help="Dataset folder."),
-    out: Path | None = typer.Option(None, "--out", help="Folder for OpenODD's tables: a COD per run, with its taxonomy."),
+    out: Path | None = typer.Option(None, "--out", help="Folder for OpenODD's tables: a COD per run."),
     as_json: bool = JSON,
 ) -> None:
     """Describe the domain that a recording covers, by its ground truth: the current operational domain (COD)."""
@@ -114,12 +116,12 @@ def inside(
     perceived: bool = typer.Option(
         False,
         "--perceived",
-        help="Also as vehicles perceive it, by the weather network, the detector and its tracks, against ground truth.",
+        help="Also as vehicles perceive it: by the weather network, detections and their tracks.",
     ),
-    weather: Path | None = typer.Option(None, "--weather", help="Weights of the weather network; default: the package's."),
+    weather: Path | None = typer.Option(None, "--weather", help="Weather network; default: the package's."),
     objects: Path | None = typer.Option(None, "--objects", help="Weights of the detector; default: the package's."),
-    device: Device = typer.Option(Device.auto, "--device", help="Where the networks run; auto: a GPU where there is one."),
-    frames: Path | None = typer.Option(None, "--frames", help="Table to write, .csv or .parquet: the verdict of each frame."),
+    device: Device = typer.Option(Device.auto, "--device", help="Where the networks run; auto: a GPU if there is one."),
+    frames: Path | None = typer.Option(None, "--frames", help="Table to write, .csv or .parquet: a frame's verdict."),
     as_json: bool = JSON,
 ) -> None:
     """Judge every frame of a recording's vehicles by a domain: inside, outside, or unknown.
@@ -183,15 +185,19 @@ def cover(
     domain: str = ODD,
     data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
     out: Path = typer.Option(..., "--out", help="Folder for the report, the matrix (HTML) and each run's coverage."),
-    by: str = typer.Option("junction,light", "--by", metavar="X,Y", help="The two attributes of the matrix and its cells."),
+    by: str = typer.Option("junction,light", "--by", metavar="X,Y", help="The two attributes of matrix and cells."),
     detect: bool = typer.Option(
-        False, "--detect", help="Run the detector of objects: AP, errors and the pole that covers most of them, by cell."
+        False,
+        "--detect",
+        help="Run the detector of objects: by cell its AP, errors, and the pole that covers most.",
     ),
     weights: Path | None = typer.Option(None, "--weights", help="Weights of the detector; default: the package's."),
     range_m: float = typer.Option(
         40.0, "--range", min=0.1, max=1e4, callback=check_finite, help="How far a pole's sensor covers errors [m]."
     ),
-    device: Device = typer.Option(Device.auto, "--device", help="Where the detector runs; auto: a GPU where there is one."),
+    device: Device = typer.Option(
+        Device.auto, "--device", help="Where the detector runs; auto: a GPU if there is one."
+    ),
     as_json: bool = JSON,
 ) -> None:
     """Measure how much of a domain recordings cover, and with --detect where in it the detector errs.
@@ -215,7 +221,15 @@ def cover(
     found = read_domain(domain)
     with progress.show_progress("cover") as report:
         result = cover_domain(
-            found, data, out, axes, detect=detect, weights=weights, range_m=range_m, device=device.value, progress=report
+            found,
+            data,
+            out,
+            axes,
+            detect=detect,
+            weights=weights,
+            range_m=range_m,
+            device=device.value,
+            progress=report,
         )
     if as_json:
         print_json(result.as_json())
@@ -234,7 +248,7 @@ def sample(
     domain: str = ODD,
     out: Path = typer.Option(..., "--out", help="New folder for the recipes, and samples.json about them."),
     count: int = typer.Option(20, "--count", min=1, max=100_000, help="How many recipes."),
-    town: list[str] = typer.Option([], "--town", help="Town to sample in; may be given several times; default: all four."),
+    town: list[str] = typer.Option([], "--town", help="Town; may be given several times; default: flcav's four."),
     method: Draw = typer.Option(
         Draw.coverage, "--method", help="Least covered buckets first, a Latin hypercube, or scrambled Sobol points."
     ),
@@ -286,7 +300,9 @@ def sample(
     for name, text in maps.items():
         write_bytes(out / f"{name}.xodr", text.encode())
     if as_json:
-        print_json({"recipes": len(paths), "pairwise": drawn.pairwise, "pairs": drawn.pairs, "possible": drawn.possible})
+        print_json(
+            {"recipes": len(paths), "pairwise": drawn.pairwise, "pairs": drawn.pairs, "possible": drawn.possible}
+        )
         return
     kinds = Counter(each.place.kind for each in drawn.samples)
     typer.echo(f"{out}: {plural(len(paths), 'recipe')} in {found.name}, by {method.value}")
@@ -339,7 +355,7 @@ def tasks(
         named = ", ".join(task.task for task in each.tasks)
         typer.echo(f"{each.town}, {each.kind}: complexity {each.complexity.total:.2f} ({parts})")
         typer.echo(f"    {plural(len(each.tasks), 'task')}: {named}")
-    typer.echo(f"{out}: run recipe of {plural(len(recipe['tasks']), 'task')}")
+    typer.echo(f"{out}: run recipe of {plural(len({task.task for each in scenarios for task in each.tasks}), 'task')}")
 
 
 def _describe_cell(row: "CellErrors") -> str:

@@ -1,4 +1,4 @@
-"""Errors of a detector by cell of a domain: average precision with intervals, misses, and the pole that covers most of them.
+"""Errors of a detector by cell of a domain: average precision with intervals, misses, and the pole that covers most.
 
 A cell is a bucket of each of a few attributes; the frames of a recording are in one each.
 """
@@ -70,7 +70,7 @@ def full_name(domain: Domain, name: str) -> str:
     return item_named(domain, name).name.removeprefix("odd.")
 
 
-def item_named(domain: Domain, name: str):  # noqa: ANN201 - openodd's CoverItem
+def item_named(domain: Domain, name: str):
     """Return the library's buckets of an attribute; raises `InputError` where it has none."""
     known = {item.name.removeprefix("odd."): item for item in domain.definition.cover_items()}
     full = [each for each in known if name in (each, each.rpartition(".")[2])]

@@ -1,7 +1,7 @@
 """Coverage of a domain by recordings: openodd-py's coverage documents, their report, its HTML matrix, and COD tables.
 
-A run is the drive of one vehicle through one scene. A COD, the current operational domain, is OpenODD's table of what was
-observed (ASAM OpenODD 1.0, section 8.3).
+A run is the drive of one vehicle through one scene. A COD, the current operational domain, is OpenODD's table of what
+was observed (ASAM OpenODD 1.0, section 8.3).
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""From a domain to where a network errs to where to look: coverage by recordings, errors by cell, the poles that cover them."""
+"""From a domain to where a network errs to where to look: coverage by recordings, errors by cell, poles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """Operational design domains (ODD) in ASAM OpenODD 1.0: read by openodd-py, with flcav's own binding and no other.
 
 A domain is one of `DOMAINS`, or a stranger's OpenODD file. The library would import what a binding calls
-`module:function`, and fetch what an import calls `git:`; of strangers' files both are refused by name before it reads them.
+`module:function`, and fetch what an import calls `git:`; of strangers' files both are refused before it reads them.
 """
 
 import logging
@@ -15,7 +15,6 @@ from pathlib import Path
 from openodd import (
     UNDECIDED,
     Backend,
-    CoverItem,
     GitSourceError,
     OddDefinition,
     OddKnob,
@@ -27,7 +26,6 @@ from openodd import (
 
 from flcav.config import InputError, path_within, read_yaml, shorten
 from flcav.interface.wording import suggest
-
 
 logging.getLogger("openodd").setLevel(logging.ERROR)  # of its warnings commands say what matters in their own words
 
@@ -74,7 +72,7 @@ class Domain:
     def allowed(self, name: str) -> list[Value]:
         """Return values of an attribute that can be inside: of its words, or of its limits and points between them.
 
-        No condition changes between these values. Of an attribute that is not bound nothing is known: one missing value.
+        No condition changes between these values. Of one that is not bound nothing is known: one missing value.
         """
         item = next(each.item for each in self.definition.attributes if each.name == name)
         if item is None:
@@ -109,8 +107,10 @@ def read_domain(name: str | Path) -> Domain:
     path = FOLDER / f"{name}.yaml" if str(name) in DOMAINS else Path(name)
     if str(name) not in DOMAINS:
         if not path.exists() and not path.suffix:
-            raise InputError(f"unknown domain {shorten(str(name))}; those of flcav: {', '.join(DOMAINS)}, or an OpenODD "
-                             f"file{suggest(str(name), DOMAINS)}")
+            raise InputError(
+                f"unknown domain {shorten(str(name))}; those of flcav: {', '.join(DOMAINS)}, or an OpenODD "
+                f"file{suggest(str(name), DOMAINS)}"
+            )
         _refuse_foreign(path, path.parent, set())
     own = any("TAXONOMY" in document for document in _documents(path, path.parent))
     domain = _load([path] if own else [path, TAXONOMY], path.stem, path)
@@ -221,7 +221,7 @@ def _documents(path: Path, folder: Path) -> Iterator[dict]:
 
 
 def _refuse_foreign(path: Path, folder: Path, seen: set[Path]) -> None:
-    """Raise `InputError` where a file, or one that it imports, is too large, names code or a source, or leaves its folder."""
+    """Raise `InputError` where a file or an import is too large, names code or a source, or leaves its folder."""
     if path in seen:
         raise InputError(f"{path}: imports itself")
     if len(seen) >= MOST_FILES:

@@ -58,7 +58,7 @@ class Rates(Record):
 
 @dataclass(frozen=True)
 class Agreement(Record):
-    """How often perceived verdicts are right, on the frames that truth decides; these are not independent in a scene."""
+    """How often perceived verdicts are right, on the frames that truth decides, dependent as those of a scene are."""
 
     frames: int
     inside: Rates

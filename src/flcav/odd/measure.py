@@ -14,7 +14,7 @@ from flcav.odd.domain import Value
 from flcav.odd.scenery import Column, Scenery
 from flcav.sensors.rig import Rig
 from flcav.storage.records import Record
-from flcav.world.weather import NIGHT_DEG, Weather
+from flcav.world.weather import NIGHT_DEG
 
 Array = NDArray[np.float64]
 
@@ -94,7 +94,9 @@ def measure(data: Dataset, frames: Sequence[int] | None = None, scenery: Scenery
     place = scenery or scenery_of(data)
     weather = _weather(data)
     recorded = data.manifest.imported is None
-    columns: dict[str, Column] = {} if place is None else place.measure(pose[:, :2, 3], np.arctan2(pose[:, 1, 0], pose[:, 0, 0]))
+    columns: dict[str, Column] = (
+        {} if place is None else place.measure(pose[:, :2, 3], np.arctan2(pose[:, 1, 0], pose[:, 0, 0]))
+    )
     columns |= {"surface_type": np.full(len(chosen), "asphalt" if recorded else "")}
     columns |= {name: column[list(chosen)] for name, column in describe_weather(weather).items()}
     columns |= {"ego_speed": _speeds(data)[list(chosen)]}

@@ -1,7 +1,8 @@
 """Scenarios as ASAM OpenSCENARIO XML 1.2: entities, where they start, the weather, and what the corner case does.
 
-The file says what happens to the vehicle under test, `ego`, on one street of the town, whose OpenDRIVE map it names. When
-we record a recipe, its actors are cast from the traffic; here each has a place of its own. docs/odd.md says what is written.
+The file says what happens to the vehicle under test, `ego`, on one street of the town, whose OpenDRIVE map it names.
+When a recipe is recorded, its actors are cast from the traffic; here each has a place of its own. docs/odd.md says what
+is written.
 """
 
 import math
@@ -135,7 +136,10 @@ def _add_entity(entities: ElementTree.Element, actor: Actor) -> None:
 
 def _add_start(actions: ElementTree.Element, sample: Sample, actors: Sequence[Actor]) -> None:
     """Write the weather, and the place and speed of each actor."""
-    weather, sky = sample.weather, _add(_add(_add(actions, "GlobalAction"), "EnvironmentAction"), "Environment", name="sky")
+    weather, sky = (
+        sample.weather,
+        _add(_add(_add(actions, "GlobalAction"), "EnvironmentAction"), "Environment", name="sky"),
+    )
     _add(sky, "TimeOfDay", animation="false", dateTime=DATE)
     share = next((word for most, word in CLOUDS if weather.cloud_cover <= most), "eightOktas")
     air = _add(sky, "Weather", fractionalCloudCover=share)
@@ -182,7 +186,9 @@ def _add_story(board: ElementTree.Element, script: Script) -> None:
             change = _add(_add(private, "LateralAction"), "LaneChangeAction")
             _add(change, "LaneChangeActionDynamics", dynamicsShape="sinusoidal", dynamicsDimension="time",
                  value=action.within_s)  # fmt: skip
-            _add(_add(change, "LaneChangeTarget"), "RelativeTargetLane", entityRef=action.actor, value=str(action.lanes))
+            _add(
+                _add(change, "LaneChangeTarget"), "RelativeTargetLane", entityRef=action.actor, value=str(action.lanes)
+            )
         begins = _add(_add(event, "StartTrigger"), "ConditionGroup")
         if script.near is None:
             _add_time(begins, f"begin_{number}", BEGINS_S)
@@ -200,5 +206,13 @@ def _add_near(group: ElementTree.Element, name: str, actor: str, within_m: float
     condition = _add(group, "Condition", name=name, delay=0.0, conditionEdge="none")
     by = _add(condition, "ByEntityCondition")
     _add(_add(by, "TriggeringEntities", triggeringEntitiesRule="any"), "EntityRef", entityRef="ego")
-    _add(_add(by, "EntityCondition"), "RelativeDistanceCondition", entityRef=actor, relativeDistanceType="euclidianDistance",
-         value=within_m, freespace="false", rule="lessThan", coordinateSystem="entity")  # fmt: skip
+    _add(
+        _add(by, "EntityCondition"),
+        "RelativeDistanceCondition",
+        entityRef=actor,
+        relativeDistanceType="euclidianDistance",
+        value=within_m,
+        freespace="false",
+        rule="lessThan",
+        coordinateSystem="entity",
+    )

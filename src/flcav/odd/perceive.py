@@ -1,8 +1,9 @@
 """Measurement of a domain's attributes as a vehicle perceives them: by its networks, its tracks and its map.
 
-The weather network names the class of each picture. Of rain, sight, clouds and sun it says that they are in that class's
-region; where a limit of the domain lies within the region, the value is missing: the class does not decide. Detections to all sides are tracked: pedestrians, and vehicles that move, are the road users around.
-Scenery is the map's at the vehicle's own pose, and its speed that of its odometry: both as recorded.
+The weather network names the class of each picture. Of rain, sight, clouds and sun it says that they are in the region
+of that class; where a limit of the domain lies within the region, the value is missing: the class does not decide.
+Detections to all sides are tracked: pedestrians, and vehicles that move, are the road users around. Scenery is the
+map's at the vehicle's own pose, and its speed that of its odometry: both as recorded.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,7 +42,7 @@ def perceive(
     objects: Second | None,
     progress: Report = ignore_progress,
 ) -> Measurements:
-    """Return what a vehicle perceives of each attribute in its `frames`; without a network, what it would say is missing.
+    """Return what a vehicle perceives of each attribute in its `frames`; what a network of None would say is missing.
 
     Raises `InputError` where a frame lacks the camera of the weather network, or the LiDAR of the detector.
     """
@@ -58,7 +59,7 @@ def perceive(
 
 
 def _narrow(domain: Domain, low: Mapping[str, Column], high: Mapping[str, Column]) -> dict[str, Column]:
-    """Return the columns (F,) of values between `low` and `high`; missing where a limit of the domain lies between them."""
+    """Return the columns (F,) of values between `low` and `high`; missing where a limit lies between these."""
     limits = {column: domain.limits.get(name, ()) for name, column in domain.bound.items()}
     out: dict[str, Column] = {}
     for name, one in low.items():
@@ -72,7 +73,9 @@ def _narrow(domain: Domain, low: Mapping[str, Column], high: Mapping[str, Column
     return out
 
 
-def _see_weather(network: Classifier, data: Dataset, frames: Sequence[int]) -> tuple[dict[str, Array], dict[str, Array]]:
+def _see_weather(
+    network: Classifier, data: Dataset, frames: Sequence[int]
+) -> tuple[dict[str, Array], dict[str, Array]]:
     """Return the least and the largest fields (F,) of the class that the network sees in each frame's first camera."""
     blind = [i for i in frames if not data.cameras(i)]
     if blind:

@@ -68,7 +68,7 @@ def check_frames(domain: Domain, measured: Measurements) -> tuple[Part, ...]:
 
 
 def choose_rig(domain: Domain) -> str | None:
-    """Return the name of the first of `VEHICLE_RIGS` whose field of view and range the domain allows; None where none is."""
+    """Return the first of `VEHICLE_RIGS` whose field of view and range the domain allows; None where none is."""
     for name in VEHICLE_RIGS:
         reach = reach_of(RIGS[name])
         tested = [each for each in domain.tested if domain.bound.get(each) in OF_RIG]
@@ -96,7 +96,9 @@ def _describe_places(scenery: Scenery) -> list[tuple[Place, dict[str, Value]]]:
     places = scenery.places()
     if not places:
         return []
-    return list(zip(places, Measurements(tuple(range(len(places))), scenery.measure_places(places)).rows(), strict=True))
+    return list(
+        zip(places, Measurements(tuple(range(len(places))), scenery.measure_places(places)).rows(), strict=True)
+    )
 
 
 def _check_part(domain: Domain, name: str, rows: list[dict[str, Value]]) -> Part:
@@ -130,4 +132,3 @@ def _can(domain: Domain, name: str, value: Value) -> bool:
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return False
     return domain.can_hold({name: value})
-

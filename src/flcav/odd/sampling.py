@@ -9,7 +9,7 @@ over the buckets inside the domain, equally, and within a bucket uniformly; sigh
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +84,7 @@ class Sampled:
     samples: tuple[Sample, ...]
     pairs: int  # pairs of buckets of two axes in the samples
     possible: int  # pairs that a sample can have
-    refused: int  # points that were no plausible weather, or outside the domain
+    refused: int  # points that were outside the domain
 
     @property
     def pairwise(self) -> float:
@@ -122,10 +122,10 @@ class Space:
         item = next(each.item for each in self.domain.definition.attributes if each.name == name)
         limits, reach = self.domain.limits.get(name, ()), knob.reach or (-math.inf, math.inf)
         labels, spans = [], []
-        for label, low, high in zip(item.labels, item.edges, item.edges[1:]):
+        for label, low, high in zip(item.labels, item.edges, item.edges[1:], strict=False):
             low, high = max(low, reach[0]), min(high, reach[1])
             cuts = [low, *(limit for limit in limits if low < limit < high), high]
-            parts = [(a, b) for a, b in zip(cuts, cuts[1:]) if b > a and self._is_inside(name, (a + b) / 2)]
+            parts = [(a, b) for a, b in pairwise(cuts) if b > a and self._is_inside(name, (a + b) / 2)]
             if parts:
                 labels.append(label)
                 spans.append(max(parts, key=lambda part: part[1] - part[0]))
@@ -134,7 +134,7 @@ class Space:
         return Axis(name, tuple(labels), tuple(spans), self.domain.bound[name] == "visibility")
 
     def _is_inside(self, name: str, value: float) -> bool:
-        """Return whether the domain can hold with a value of an attribute, and what it implies: of the sun, the light."""
+        """Return whether the domain can hold with a value and what it implies: the sun the light, rain the surface."""
         column = self.domain.bound[name]
         weather = {field: np.full(1, np.nan) for field in Weather.model_fields}
         if column == "sun_elevation":
@@ -149,13 +149,13 @@ class Space:
     def realise(self, values: Mapping[str, Value], case: float, place: float) -> Sample | None:
         """Return the sample with these values, shares in [0, 1) of its cases and places; None if it cannot be.
 
-        A sample is refused where it rains without clouds, and where the domain, with what traffic decides left open, is
-        outside.
+        Where it rains, fewer clouds than `RAIN_CLOUDS` are lifted above it. A sample is refused where the domain is
+        outside, with what traffic decides left open.
         """
         column = {self.domain.bound[name]: value for name, value in values.items()}
         rain, clouds = float(column.get("rainfall") or 0.0), float(column.get("cloud_cover") or 0.0)
         if rain >= RAIN_MM_H and clouds < RAIN_CLOUDS:
-            return None
+            clouds = RAIN_CLOUDS + clouds * (100 - RAIN_CLOUDS) / RAIN_CLOUDS
         kind = str(values[self.kinds])
         every = self.places[kind]
         here, row = every[int(place * len(every))]
@@ -174,13 +174,17 @@ class Space:
             return None
         items = {each.name: each.item for each in self.domain.definition.attributes}
         buckets = {
-            name: item.bucket_of(known[self.domain.bound[name]]) for name in self.knobs if (item := items[name]) is not None
+            name: item.bucket_of(known[self.domain.bound[name]])
+            for name in self.knobs
+            if (item := items[name]) is not None
         }
         return Sample(here, chosen, weather, {**buckets, CASE: chosen}, self.rig, float(row["speed_limit"] or 0.0))
 
     def possible_pairs(self) -> set[tuple[tuple[str, str], tuple[str, str]]]:
         """Return the pairs of buckets, of two axes or of an axis and the corner cases, that a sample can have."""
-        cases = {kind: {case for place, _ in places for case in cases_at(place)} for kind, places in self.places.items()}
+        cases = {
+            kind: {case for place, _ in places for case in cases_at(place)} for kind, places in self.places.items()
+        }
         own = [[(axis.attribute, label) for label in axis.labels] for axis in self.axes]
         own.append([(CASE, case) for case in dict.fromkeys(each for every in cases.values() for each in sorted(every))])
         tops = {(a.attribute, label): span for a in self.axes for label, span in zip(a.labels, a.spans)}
@@ -193,7 +197,11 @@ class Space:
             return rain is None or clouds is None or rain[0] < RAIN_MM_H or clouds[1] >= RAIN_CLOUDS
 
         return {
-            (one, other) for these, those in combinations(own, 2) for one in these for other in those if fits(one, other)
+            (one, other)
+            for these, those in combinations(own, 2)
+            for one in these
+            for other in those
+            if fits(one, other)
         }
 
 
@@ -217,7 +225,11 @@ def sample_domain(
     """
     samples: list[Sample] = []
     refused = 0
-    points = _draw_covering(space, count, seed, covered) if method == "coverage" else _draw_points(space, count, method, seed)
+    points = (
+        _draw_covering(space, count, seed, covered)
+        if method == "coverage"
+        else _draw_points(space, count, method, seed)
+    )
     for values, case, place in points:
         found = space.realise(values, case, place)
         if found is None:
@@ -239,7 +251,7 @@ def sample_domain(
 
 
 def _draw_points(space: Space, count: int, method: str, seed: int) -> Iterator[tuple[dict[str, Value], float, float]]:
-    """Yield values by attribute and the shares of case and place, without end: batch after batch of quasi-random points."""
+    """Yield values by attribute and the shares of case and place, without end, in batches of quasi-random points."""
     axes, rng = space.axes, stream(seed, "odd", method)
     sobol = qmc.Sobol(len(axes) + 2, scramble=True, rng=rng)
     batch = 1 << max(count - 1, 1).bit_length()  # Sobol points are balanced in powers of two

@@ -93,7 +93,7 @@ class Scenery:
 
     def places(self) -> tuple[Place, ...]:
         """Return the places of the town, junctions first: every junction, and the middle of every straight road."""
-        return tuple([*self._junction_places(), *self._straight_places()])
+        return (*self._junction_places(), *self._straight_places())
 
     def measure_places(self, places: Sequence[Place]) -> dict[str, Column]:
         """Return the scenery on the approaches of places, with the kind and control of each: a column per concept."""
@@ -152,7 +152,7 @@ class Scenery:
 
 
 def _name_roads(limit: Array) -> NDArray[np.str_]:
-    """Return (F,) the type of road by its speed limit [km/h]; "" beyond the largest, which may be a motorway or none."""
+    """Return (F,) the type of road by its speed limit [km/h]; "" beyond the largest: that may be a motorway."""
     out = np.full(len(limit), "", dtype="<U16")
     for most, name in ROADS:
         out[limit <= most] = name
@@ -179,7 +179,9 @@ def _junctions(net: RoadNet) -> Iterator[tuple[str, str, BaseGeometry]]:
 
 def _outline(net: RoadNet, name: str) -> BaseGeometry:
     junction = net.junctions[name]
-    return Point(junction.centre).buffer(1.0) if len(junction.shape) < 3 else shapely.Polygon(junction.shape).convex_hull
+    return (
+        Point(junction.centre).buffer(1.0) if len(junction.shape) < 3 else shapely.Polygon(junction.shape).convex_hull
+    )
 
 
 def count_conflicts(net: RoadNet) -> Counter[str]:

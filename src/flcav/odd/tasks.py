@@ -1,8 +1,8 @@
 """Task generation: {data, labels, network} per scenario, more of them where a scenario is complex (Wang et al., 2023).
 
-A scenario is a kind of place of one town. Its complexity is the mean of four components in [0, 1): the occlusion of road
-users, their density, the conflict points of the junction, and the density of a network's errors, if that is known. The
-number of tasks rises with it, and so with each component: one task, and a further one from each of `LEVELS` on.
+A scenario is a kind of place of one town. Its complexity is the mean of four components in [0, 1): the occlusion of
+road users, their density, the conflict points of the junction, and the density of a network's errors, if that is known.
+The number of tasks rises with it, and so with each component: one task, and a further one from each of `LEVELS` on.
 """
 
 import re
@@ -17,9 +17,9 @@ from flcav.config import InputError, Json, parse_config
 from flcav.dataset.store import Dataset
 from flcav.odd.measure import measure, scenery_of
 from flcav.odd.scenery import Scenery
+from flcav.perception.tasks import task_named
 from flcav.pipeline.label_sources import choose_labels
 from flcav.pipeline.recipe import RunRecipe
-from flcav.perception.tasks import task_named
 from flcav.storage.records import Record
 from flcav.world.map.town import PACKAGED
 
@@ -73,7 +73,7 @@ class ScenarioTasks(Record):
 
 
 def count_tasks(complexity: Complexity) -> int:
-    """Return the number of tasks of a scenario: 1 + the levels that its complexity reaches; it falls in no component."""
+    """Return the number of tasks of a scenario: 1 + the levels that its complexity reaches."""
     return 1 + sum(complexity.total >= level for level in LEVELS)
 
 
@@ -94,6 +94,7 @@ def generate_tasks(folder: Path, errors: Sequence[tuple[str, float, float]] = ()
         raise InputError(f"{folder}: its town is not known, so that its scenarios are not")
     measured = measure(data, scenery=scenery)
     kind, frames = measured.columns["junction"], np.array(measured.frames)
+    agents = np.asarray(measured.columns["agents"], dtype=np.float64)
     hidden = _occlusion(data)
     mistaken = _count_errors(data, scenery, errors)
     places = scenery.places()
@@ -103,7 +104,7 @@ def generate_tasks(folder: Path, errors: Sequence[tuple[str, float, float]] = ()
         conflicts = [place.conflicts for place in places if place.kind == name]
         complexity = Complexity(
             float(np.nanmean(hidden[own])) if not np.isnan(hidden[own]).all() else 0.0,
-            saturate(float(np.mean(measured.columns["agents"][kind == name])), HALF_AGENTS),
+            saturate(float(agents[kind == name].mean()), HALF_AGENTS),
             saturate(float(np.mean(conflicts)) if conflicts else 0.0, HALF_CONFLICTS),
             saturate(mistaken.get(name, 0) / len(own), HALF_ERRORS),
         )
@@ -117,9 +118,9 @@ def make_run(
 ) -> dict[str, Json]:
     """Return the fields of a run recipe of all tasks, which `RunRecipe` takes.
 
-    A task's weight in the plan, in the first layer of MLGRA's graph, is the share of the scenarios that have it. `towns`
-    are the recorded ones, which federate, by region; `pretrain` is the town of stage I. Raises `InputError` where no
-    other town than that is recorded.
+    A task's weight in the plan, in the first layer of MLGRA's graph, is the share of the scenarios that have it.
+    `towns` are the recorded ones, which federate, by region; `pretrain` is the town of stage I. Raises `InputError`
+    where no other town than that is recorded.
     """
     federate = {region: town for region, town in towns.items() if region != name_region(pretrain)}
     if not federate:

@@ -1,0 +1,138 @@
+"""Errors by cell: the measure of a part of the frames, failures in the path, poles that cover the errors."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.geometry import transform_points
+from flcav.odd.cells import cells_of, find_failures, measure_cell, measure_cells
+from flcav.odd.coverage import collect_runs, list_covered, load_report, merge_runs, write_cod, write_matrix, write_runs
+from flcav.odd.domain import Domain, everything
+from flcav.odd.measure import measure
+from flcav.odd.scenery import Scenery
+from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError
+from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
+
+
+class Mean:
+    """A measure of which every number is known: the mean of a score per frame."""
+
+    measure_name, redraws = "mean", 400
+
+    def measure(self, outcomes: Outcomes, times: Times) -> Values:
+        return weighted_mean(outcomes.arrays["score"], times)
+
+
+SCENES = np.array(["a", "a", "b", "b", "c"])
+OUTCOMES = Outcomes(SCENES, {"score": np.array([0.2, 0.4, 0.6, 0.8, 1.0])})
+
+
+def error(x: float, y: float, returns: int = 50, kind: str = MISS, track: str = "car1") -> PerceptionError:
+    return PerceptionError(x, y, 1.0, 1.0, kind, "Car", returns, 0.0, "a", track)
+
+
+def test_a_cell_is_measured_on_its_frames_with_an_interval_over_its_scenes():
+    inside = np.array([False, True, True, False, False])
+    found = measure_cell(Mean(), OUTCOMES, inside)  # type: ignore[arg-type]
+    assert found is not None
+    assert found.mean == pytest.approx(0.5)
+    assert (found.low, found.high) == pytest.approx((0.4, 0.6))  # of two scenes: one of them twice at either end
+
+
+def test_one_scene_gives_no_interval_and_no_frame_no_measure():
+    alone = measure_cell(Mean(), OUTCOMES, SCENES == "c")  # type: ignore[arg-type]
+    assert alone is not None
+    assert (alone.mean, alone.low) == (1.0, None)
+    assert measure_cell(Mean(), OUTCOMES, np.zeros(5, np.bool_)) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("ahead", "left", "returns", "kind", "fails"),
+    [
+        (20.0, 0.5, 20, MISS, True),
+        (20.0, 0.5, 19, MISS, False),
+        (20.0, 2.5, 50, MISS, False),
+        (-5.0, 0.0, 50, MISS, False),
+        (41.0, 0.0, 50, MISS, False),
+        (20.0, 0.0, 50, FALSE_POSITIVE, False),
+    ],
+)
+def test_a_failure_is_a_certain_miss_in_the_path(
+    drive: Dataset, ahead: float, left: float, returns: int, kind: str, fails: bool
+):
+    (place,) = transform_points(drive.world_from_agent(2), np.array([[ahead, left, 0.0]]))
+    assert find_failures(drive, {2: [error(*place[:2], returns, kind)]}) == {2: fails}
+
+
+def test_the_pole_nearest_to_a_cells_errors_covers_them(ring: Scenery):
+    pole = ring.town.poles
+    x, y = pole.position[2, :2]
+    ahead = (np.cos(pole.yaw[2]), np.sin(pole.yaw[2]))
+    errors = [error(x + d * ahead[0], y + d * ahead[1], track=f"car{d}") for d in (6, 8, 10)]
+    found = {number: errors if number == 0 else [] for number in range(5)}
+    cells = {number: ("here",) if number < 2 else ("there",) for number in range(5)}
+    failures = dict.fromkeys(range(5), False) | {0: True}
+    first, second = measure_cells(Mean(), OUTCOMES, found, failures, cells, ring.town, 40.0)  # type: ignore[arg-type]
+    assert (first.cell, first.frames, first.errors, first.misses, first.failures) == (("here",), 2, 3, 3, 1)
+    assert first.pole is not None
+    assert first.pole.covered == 3
+    assert (second.errors, second.pole) == (0, None)
+
+
+def test_frames_are_in_the_cell_of_their_values(drive: Dataset, urban: Domain):
+    measured = measure(drive)
+    cells = cells_of(urban, measured, ("junction", "speed_limit"))
+    for (junction, limit), row in zip(cells, measured.rows(), strict=True):
+        assert junction == row["junction"]
+        low, high = (float(end) for end in limit.strip("[])").split(","))
+        assert low <= float(row["speed_limit"] or -1) <= high
+    with pytest.raises(InputError, match="did you mean 'junction'"):
+        cells_of(urban, measured, ("juntion",))
+
+
+def test_coverage_is_read_by_the_library_and_its_own_command(drive: Dataset, urban: Domain, tmp_path: Path):
+    measured = measure(drive)
+    documents = collect_runs(urban, drive, measured, {measured.frames[0]: True})
+    assert len(documents) == 4
+    rows = {row.attribute: row for row in list_covered(merge_runs(list(documents.values())))}
+    seen = {str(word) for word in measured.columns["junction"]}
+    assert set(rows["scenery.junction"].covered) == seen & {"none", "t_junction", "crossroad", "roundabout"}
+    assert rows["scenery.speed_limit"].outside == ("[75, 100)", "[100, 130]")
+    write_runs(documents, tmp_path)
+    assert load_report(tmp_path).runs == 4
+    write_matrix(list(documents.values()), "scenery.junction", "environment.light", "urban", tmp_path / "matrix.html")
+    page = (tmp_path / "matrix.html").read_text()
+    assert "roundabout" in page
+    assert "night" in page
+    assert page.startswith("<!")
+    own = [sys.executable, "-c", "from openodd.report import main; raise SystemExit(main())", str(tmp_path / "runs")]
+    told = subprocess.run(own, capture_output=True, text=True, check=True).stdout
+    assert "scenery.junction" in told
+
+
+def test_a_run_fails_at_its_first_failure_and_equal_recordings_give_equal_documents(drive: Dataset, urban: Domain):
+    measured = measure(drive)
+    failing = {measured.frames[3]: True, measured.frames[4]: True}
+    documents = collect_runs(urban, drive, measured, failing)
+    assert [each["outcome"]["passed"] for each in documents.values()].count(False) >= 1  # type: ignore[index,call-overload]
+    again = collect_runs(urban, drive, measured, failing)
+    assert json.dumps(documents) == json.dumps(again)
+
+
+def test_a_cod_has_a_row_per_frame_that_says_what_was_measured(drive: Dataset, tmp_path: Path):
+    measured = measure(drive)
+    documents = collect_runs(everything(), drive, measured)
+    assert write_cod(documents, tmp_path) == len(measured)
+    rows = [row for path in sorted(tmp_path.glob("*_cod.csv")) for row in csv.DictReader(path.open())]
+    limits = sorted(float(row["scenery.speed_limit;km/h"]) for row in rows)
+    assert limits == sorted(measured.columns["speed_limit"].tolist())
+    latitude = [float(row["SPATIAL_EXTENT"].split()[0]) for row in rows]
+    assert all(abs(each - 49.0) < 0.01 for each in latitude)
+    assert len(list(tmp_path.glob("*_cod_manifest.csv"))) == 4
