@@ -26,6 +26,7 @@ from flcav.sources.recipe import Recipe
 from flcav.world.map.town import TOWNS, load_town
 from flcav.world.weather import Weather
 
+LIDAR = {"channels": 2, "azimuth_steps": 32, "range_m": 100.0}
 DRIVE = {
     "town": "ring",
     "scenes": 2,
@@ -33,7 +34,9 @@ DRIVE = {
     "spins_per_scene": 100,
     "every_s": 0.5,
     "cavs": 8,
-    "vehicle_rig": {"lidars": {"lidar": {"mount": {"z": 1.8}, "settings": {"channels": 2, "azimuth_steps": 32, "range_m": 100.0}}}},
+    "vehicle_rig": {
+        "lidars": {"lidar": {"mount": {"z": 1.8}, "settings": {"channels": 2, "azimuth_steps": 32, "range_m": 100.0}}}
+    },
 }
 READ = 100  # frames that the reference reads
 RECIPES = 1000

@@ -359,7 +359,7 @@ def tasks(
 
 
 def _describe_cell(row: "CellErrors") -> str:
-    covers = "" if row.pole is None else f"; pole {row.pole.pole} covers {row.pole.covered}"
+    covers = "" if row.pole is None else f"; pole {row.pole.pole} of {row.pole.town} covers {row.pole.covered}"
     return (
         f"    {' x '.join(row.cell):<32}{plural(row.frames, 'frame')}, AP50 {_words(row.precision)}, "
         f"{plural(row.errors, 'error')} ({row.misses} missed), {plural(row.failures, 'failure')}{covers}"

@@ -33,8 +33,19 @@ PATH_AHEAD_M, PATH_ASIDE_M = 40.0, 2.0  # the path of a vehicle: so far ahead, a
 class Coverer(Record):
     """The pole that covers most errors of a cell."""
 
+    town: str
     pole: int
     covered: int  # errors within its range and its sight
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A recording whose frames a detector was tested on."""
+
+    town: Town | None
+    cells: Mapping[int, tuple[str, ...]]  # frame -> its cell
+    found: Mapping[int, Sequence[PerceptionError]]  # frame -> errors, in the order of the outcomes
+    failures: Mapping[int, bool]  # frame -> whether it has a failure
 
 
 @dataclass(frozen=True)
@@ -113,43 +124,44 @@ def find_failures(data: Dataset, found: Mapping[int, Sequence[PerceptionError]])
     return {i: any(in_path(i, error) for error in errors) for i, errors in found.items()}
 
 
-def measure_cells(
-    own: Measurable,
-    outcomes: Outcomes,
-    found: Mapping[int, Sequence[PerceptionError]],
-    failures: Mapping[int, bool],
-    cells: Mapping[int, tuple[str, ...]],
-    town: Town | None,
-    range_m: float,
-) -> list[CellErrors]:
-    """Return what a detector does in each cell, the one with most errors per frame first.
+def measure_cells(own: Measurable, outcomes: Outcomes, tested: Sequence[Trial], range_m: float) -> list[CellErrors]:
+    """Return what a detector does in each cell of several recordings, the one with most errors per frame first.
 
-    The units of `outcomes` are the frames of `found`, in its order; `cells` are by frame. range_m: of a pole's sensor.
+    The units of `outcomes` are the frames of `tested`, in their order. range_m: of a pole's sensor.
     """
-    frames = list(found)
+    frames = [(each, i) for each in tested for i in each.found]
     rows = []
-    for cell in dict.fromkeys(cells[i] for i in frames):
-        inside = np.array([cells[i] == cell for i in frames])
-        own_frames = [i for i in frames if cells[i] == cell]
-        errors = keep_first(error for i in own_frames for error in found[i])
+    for cell in dict.fromkeys(each.cells[i] for each, i in frames):
+        inside = np.array([each.cells[i] == cell for each, i in frames])
+        errors = [
+            (each.town, keep_first(e for i in each.found if each.cells[i] == cell for e in each.found[i]))
+            for each in tested
+        ]
+        every = [error for _, own_errors in errors for error in own_errors]
         rows.append(
             CellErrors(
                 cell,
-                len(own_frames),
+                int(inside.sum()),
                 len(np.unique(outcomes.scene[inside])),
                 measure_cell(own, outcomes, inside),
-                len(errors),
-                sum(error.kind == MISS for error in errors),
-                sum(failures[i] for i in own_frames),
-                _cover(errors, town, range_m),
+                len(every),
+                sum(error.kind == MISS for error in every),
+                sum(each.failures[i] for each, i in frames if each.cells[i] == cell),
+                _cover(errors, range_m),
             )
         )
     return sorted(rows, key=lambda row: -row.errors / row.frames)
 
 
-def _cover(errors: Sequence[PerceptionError], town: Town | None, range_m: float) -> Coverer | None:
-    """Return the pole that covers most of the errors, past the town's buildings."""
-    if not errors or town is None or not len(town.poles.id):
-        return None
-    placed = place([(each.x, each.y, each.z) for each in errors], town.poles.position, range_m, 1, town=town)
-    return Coverer(int(town.poles.id[placed.chosen[0]]), placed.covered) if placed.covered else None
+def _cover(errors: Sequence[tuple[Town | None, Sequence[PerceptionError]]], range_m: float) -> Coverer | None:
+    """Return the pole that covers most of the errors in its town, past the town's buildings; None where none does."""
+    by_town: dict[str, tuple[Town, list[PerceptionError]]] = {}
+    for town, own in errors:
+        if town is not None and own and len(town.poles.id):
+            by_town.setdefault(town.name, (town, []))[1].extend(own)
+    best = None
+    for name, (town, own) in by_town.items():
+        placed = place([(each.x, each.y, each.z) for each in own], town.poles.position, range_m, 1, town=town)
+        if placed.covered and (best is None or placed.covered > best.covered):
+            best = Coverer(name, int(town.poles.id[placed.chosen[0]]), placed.covered)
+    return best

@@ -1,6 +1,6 @@
 """From a domain to where a network errs to where to look: coverage by recordings, errors by cell, poles."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,14 +8,16 @@ import numpy as np
 
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
-from flcav.odd.cells import CellErrors, cells_of, find_failures, full_name, measure_cells
+from flcav.odd.cells import CellErrors, Trial, cells_of, find_failures, full_name, measure_cells
 from flcav.odd.coverage import Covered, Document, collect_runs, list_covered, merge_runs, write_matrix, write_runs
 from flcav.odd.domain import Domain
-from flcav.odd.measure import measure, scenery_of
+from flcav.odd.measure import measure
 from flcav.perception.agents import choose_frames
-from flcav.perception.errors import PerceptionError
 from flcav.perception.networks import resolve_network
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.outcomes import join_outcomes
 from flcav.perception.objects.task import OBJECTS
+from flcav.perception.outcomes import Outcomes
 from flcav.storage.files import write_json
 from flcav.storage.records import Record
 
@@ -30,7 +32,7 @@ class Coverage(Record):
     domain: str
     revision: str | None  # digest of the domain's files
     runs: int
-    grade: float  # mean over attributes with buckets
+    grade: float  # mean over these attributes
     attributes: tuple[Covered, ...]
     by: tuple[str, ...]  # the attributes of cells
     cells: tuple[CellErrors, ...]  # empty where no detector ran
@@ -50,25 +52,31 @@ def cover_domain(
 ) -> Coverage:
     """Return how much of a domain recordings cover; writes coverage.json, matrix.html and runs/*.json to `out`.
 
-    With `detect` the detector of objects runs on the vehicles' frames that fit it: AP, errors and failures by cell of
-    the attributes `by`. Poles are those of each recording's own town, so that rows are by cell and recording.
+    Covered are the attributes that the domain tests, and those of `by`. With `detect` the detector of objects runs on
+    the vehicles' frames that fit it: AP, errors and failures by cell of the attributes `by`, over all recordings.
     """
     domain.require_bound()
     axes = [full_name(domain, name) for name in by]
+    network = resolve_network(OBJECTS, weights, device) if detect else None
     documents: dict[str, Document] = {}
-    cells: list[CellErrors] = []
+    tested: list[Trial] = []
+    outcomes: list[Outcomes] = []
     for number, folder in enumerate(folders):
         data = Dataset.open(folder)
-        measured = measure(data, scenery=scenery_of(data))
+        measured = measure(data)
         failures = None
-        if detect:
-            of_frame = dict(zip(measured.frames, cells_of(domain, measured, axes), strict=True))
-            rows, failures = _detect(data, of_frame, weights, device, range_m, progress)
-            cells += rows
-        own = collect_runs(domain, data, measured, failures)
-        documents |= {f"{number}_{name}" if len(folders) > 1 else name: document for name, document in own.items()}
-    covered = list_covered(merge_runs(list(documents.values())))
+        if network is not None:
+            cells = dict(zip(measured.frames, cells_of(domain, measured, axes), strict=True))
+            found, own = _detect(network, data, cells, progress)
+            tested.append(found)
+            outcomes.append(own)
+            failures = found.failures
+        runs = collect_runs(domain, data, measured, failures)
+        documents |= {f"{number}_{name}" if len(folders) > 1 else name: document for name, document in runs.items()}
+    every = list_covered(merge_runs(list(documents.values())))
+    covered = tuple(row for row in every if row.attribute in {*domain.tested, *axes})
     grade = float(np.mean([row.grade for row in covered])) if covered else 0.0
+    cells = measure_cells(OBJECTS, join_outcomes(outcomes), tested, range_m) if tested else []
     result = Coverage(
         domain.name, domain.definition.revision, len(documents), grade, covered, tuple(axes), tuple(cells)
     )
@@ -79,15 +87,9 @@ def cover_domain(
 
 
 def _detect(
-    data: Dataset,
-    cells: dict[int, tuple[str, ...]],
-    weights: Path | None,
-    device: str,
-    range_m: float,
-    progress: Report,
-) -> tuple[list[CellErrors], dict[int, bool]]:
-    """Return a detector's errors by cell, and whether each of the frames that fit it has a failure."""
-    network = resolve_network(OBJECTS, weights, device)
+    network: Second, data: Dataset, cells: Mapping[int, tuple[str, ...]], progress: Report
+) -> tuple[Trial, Outcomes]:
+    """Return a detector's errors on a recording's frames that fit it, and its outcomes there."""
     fitting = set(choose_frames(OBJECTS, network.config, data).frames)
     frames = [i for i in cells if i in fitting]
     total = 2 * len(frames)
@@ -95,6 +97,5 @@ def _detect(
     registry = OBJECTS.register_errors(
         network, data, frames, progress=lambda done, _, note: progress(len(frames) + done, total, note)
     )
-    found: dict[int, Sequence[PerceptionError]] = dict(registry.found or {})
-    failures = find_failures(data, found)
-    return measure_cells(OBJECTS, outcomes, found, failures, cells, data.town(), range_m), failures
+    found = dict(registry.found or {})
+    return Trial(data.town(), cells, found, find_failures(data, found)), outcomes

@@ -160,8 +160,14 @@ def _weather(data: Dataset) -> dict[str, Array]:
 
 
 def _speeds(data: Dataset) -> Array:
-    """Return the speed of the agent of each frame [km/h], by its pose before and after; NaN where both are far off."""
-    place = _poses(data)[:, :3, 3]
+    """Return the speed of the agent of each frame [km/h], by its pose before and after; NaN where both are far off.
+
+    An imported recording whose poses are all that of the world has none.
+    """
+    poses = _poses(data)
+    if data.manifest.imported and (poses == np.eye(4)).all():
+        return np.full(len(data), np.nan)
+    place = poses[:, :3, 3]
     time = np.array([key.time_s for key in data.keys])
     scenes, agents = (np.array([getattr(key, name) for key in data.keys]) for name in ("scene", "agent"))
     order = np.lexsort((time, agents, scenes))

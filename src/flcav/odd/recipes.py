@@ -11,6 +11,7 @@ from flcav.odd.sampling import Sample, Sampled
 from flcav.odd.scenery import Scenery
 from flcav.sources.recipe import Recipe, parse_recipe
 from flcav.storage.files import flush_all, write_json
+from flcav.world.map.town import PACKAGED
 
 WARMUP_S, BEGINS_S = 30.0, 31.0  # of the traffic; from then on the corner case may begin
 SPINS, EVERY_S = 20, 1.0
@@ -27,7 +28,7 @@ def make_recipe(sample: Sample, scenery: Scenery, seed: int, split: str = "train
     lasts = {"lasts_s": 10.0} if sample.case == "stalled_vehicle" else {}
     position = [round(place.x, 1), round(place.y, 1)]
     return {
-        "town": place.town,
+        "town": town.name if town.name in PACKAGED else str(town.net.parent.absolute()),
         "seed": seed,
         "split": split,
         "scenes": 1,

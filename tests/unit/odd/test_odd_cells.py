@@ -12,7 +12,7 @@ import pytest
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.geometry import transform_points
-from flcav.odd.cells import cells_of, find_failures, measure_cell, measure_cells
+from flcav.odd.cells import Trial, cells_of, find_failures, measure_cell, measure_cells
 from flcav.odd.coverage import collect_runs, list_covered, load_report, merge_runs, write_cod, write_matrix, write_runs
 from flcav.odd.domain import Domain, everything
 from flcav.odd.measure import measure
@@ -44,6 +44,35 @@ def test_a_cell_is_measured_on_its_frames_with_an_interval_over_its_scenes():
     assert found is not None
     assert found.mean == pytest.approx(0.5)
     assert (found.low, found.high) == pytest.approx((0.4, 0.6))  # of two scenes: one of them twice at either end
+
+
+def test_tests_are_joined_as_if_they_were_one():
+    from flcav.geometry import Boxes
+    from flcav.perception.metrics import match
+    from flcav.perception.objects.outcomes import CLASSES, HIDDEN, KEPT, join_outcomes
+    from flcav.perception.objects.task import OBJECTS
+
+    rng = np.random.default_rng(2)
+    at = [
+        np.c_[rng.uniform(0, 40, (3, 2)), np.full(3, 0.8), np.tile((4, 2, 1.6), (3, 1)), np.zeros(3)] for _ in range(5)
+    ]
+    truths = [Boxes.from_array(boxes, "Car") for boxes in at]
+    found = [
+        Boxes.from_array(boxes + rng.normal(0, 0.6, boxes.shape) * (1, 1, 0, 0, 0, 0, 0), "Car", rng.random(3))
+        for boxes in at
+    ]
+
+    def outcomes(part: slice) -> Outcomes:
+        arrays = {CLASSES: np.array(["Car"]), HIDDEN: np.array([0])}
+        for key, (kind, overlap) in KEPT.items():
+            matches = match(found[part], truths[part], [Boxes.empty()] * len(found[part]), overlap, kind)
+            arrays |= {f"Car/{key}/{field}": value for field, value in vars(matches).items()}
+        return Outcomes(np.array(["a"] * len(found[part])), arrays)
+
+    whole, joined = outcomes(slice(0, 5)), join_outcomes([outcomes(slice(0, 2)), outcomes(slice(2, 5))])
+    times = rng.integers(0, 3, (20, 5))
+    np.testing.assert_allclose(OBJECTS.measure(joined, times), OBJECTS.measure(whole, times))
+    assert joined.scene.tolist() == ["0/a"] * 2 + ["1/a"] * 3
 
 
 def test_one_scene_gives_no_interval_and_no_frame_no_measure():
@@ -79,10 +108,11 @@ def test_the_pole_nearest_to_a_cells_errors_covers_them(ring: Scenery):
     found = {number: errors if number == 0 else [] for number in range(5)}
     cells = {number: ("here",) if number < 2 else ("there",) for number in range(5)}
     failures = dict.fromkeys(range(5), False) | {0: True}
-    first, second = measure_cells(Mean(), OUTCOMES, found, failures, cells, ring.town, 40.0)  # type: ignore[arg-type]
+    tested = [Trial(ring.town, cells, found, failures)]
+    first, second = measure_cells(Mean(), OUTCOMES, tested, 40.0)  # type: ignore[arg-type]
     assert (first.cell, first.frames, first.errors, first.misses, first.failures) == (("here",), 2, 3, 3, 1)
     assert first.pole is not None
-    assert first.pole.covered == 3
+    assert (first.pole.town, first.pole.covered) == ("ring", 3)
     assert (second.errors, second.pole) == (0, None)
 
 

@@ -1,6 +1,7 @@
 """The commands of domains: what they print, and what they refuse in a sentence."""
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import pyarrow.csv
@@ -8,6 +9,8 @@ import pytest
 
 from flcav.cli.main import run
 from flcav.dataset.store import Dataset
+from flcav.odd.measure import measure
+from flcav.perception.networks import register_errors
 
 
 def answer(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -63,6 +66,22 @@ def test_cover_writes_its_report(drive: Dataset, tmp_path: Path, capsys: pytest.
     assert printed["runs"] == 4
     assert printed["cells"] == []
     assert (out / "matrix.html").is_file()
+
+
+def test_cover_says_where_the_detector_errs(drive: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder, out = str(drive.folder), str(tmp_path / "covered")
+    told = answer(
+        capsys, "cover", "urban", "--data", folder, "--out", out, "--by", "junction,light", "--detect", "--json"
+    )
+    found = json.loads(told)
+    measured = measure(drive)
+    seen = Counter(zip(measured.columns["junction"].tolist(), measured.columns["light"].tolist(), strict=True))
+    assert {tuple(cell["cell"]): cell["frames"] for cell in found["cells"]} == dict(seen)
+    errors = register_errors("objects", drive, agents="vehicles")
+    assert sum(cell["errors"] for cell in found["cells"]) >= len(errors) > 0
+    failed = sum(cell["failures"] for cell in found["cells"])
+    outcomes = [json.loads(path.read_text())["outcome"] for path in (tmp_path / "covered" / "runs").iterdir()]
+    assert (failed > 0) == any(not outcome["passed"] for outcome in outcomes)
 
 
 @pytest.mark.parametrize(
