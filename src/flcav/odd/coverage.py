@@ -80,7 +80,12 @@ def load_report(folder: Path) -> CoverageReport:
     paths = sorted((folder / "runs").glob("*_coverage.json"))
     if not paths:
         raise InputError(f"{folder}: no runs of flcav odd cover")
-    return merge_runs([_document(path) for path in paths])
+    try:
+        return merge_runs([_document(path) for path in paths])
+    except (ValueError, TypeError, KeyError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{folder / 'runs'}: no coverage that openodd-py reads ({error})") from None
 
 
 def _document(path: Path) -> Document:

@@ -84,6 +84,17 @@ def test_cover_says_where_the_detector_errs(drive: Dataset, tmp_path: Path, caps
     assert (failed > 0) == any(not outcome["passed"] for outcome in outcomes)
 
 
+@pytest.mark.parametrize("text", ["{", "[]", '{"odd": {}}', '{"odd": {}, "schema": "x", "items": 3}'])
+def test_damaged_coverage_is_refused(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "a_coverage.json").write_text(text)
+    told = refusal(
+        capsys, "sample", "urban", "--town", "ring", "--covered", str(tmp_path), "--out", str(tmp_path / "drawn")
+    )
+    assert "coverage" in told
+    assert not (tmp_path / "drawn").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
