@@ -17,7 +17,7 @@ from flcav.odd.domain import Domain
 from flcav.odd.measure import Measurements
 from flcav.optimization.placement.place import place
 from flcav.perception.errors import MISS, PerceptionError, keep_first
-from flcav.perception.outcomes import Measurable, Outcomes, Times, Values
+from flcav.perception.outcomes import Measure, Outcomes, Times, Values
 from flcav.statistics.bootstrap import bootstrap_over_scenes
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.streams import stream
@@ -92,7 +92,7 @@ def item_named(domain: Domain, name: str):
     return known[full[0]]
 
 
-def measure_cell(own: Measurable, outcomes: Outcomes, inside: NDArray[np.bool_]) -> Estimate | None:
+def measure_cell(measure: Measure, outcomes: Outcomes, inside: NDArray[np.bool_]) -> Estimate | None:
     """Return the measure on the frames (F,) `inside` a cell, with its interval over the scenes there.
 
     None where it is not defined; no interval of fewer than two scenes.
@@ -101,7 +101,7 @@ def measure_cell(own: Measurable, outcomes: Outcomes, inside: NDArray[np.bool_])
     def of(times: Times) -> Values:
         every = np.zeros((len(times), len(inside)), dtype=np.int64)
         every[:, inside] = times
-        return own.measure(outcomes, every)
+        return measure(outcomes, every)
 
     scenes = outcomes.scene[inside]
     mean = float(of(np.ones((1, len(scenes)), dtype=np.int64))[0]) if len(scenes) else np.nan
@@ -109,7 +109,7 @@ def measure_cell(own: Measurable, outcomes: Outcomes, inside: NDArray[np.bool_])
         return None
     if len(np.unique(scenes)) < 2:
         return Estimate(mean, None, None)
-    low, high = bootstrap_over_scenes(of, scenes, own.redraws, rng=stream(0, "bootstrap"))
+    low, high = bootstrap_over_scenes(of, scenes, rng=stream(0, "bootstrap"))
     return Estimate(mean, None, None) if np.isnan(low) else Estimate(mean, low, high)
 
 
@@ -124,7 +124,7 @@ def find_failures(data: Dataset, found: Mapping[int, Sequence[PerceptionError]])
     return {i: any(in_path(i, error) for error in errors) for i, errors in found.items()}
 
 
-def measure_cells(own: Measurable, outcomes: Outcomes, tested: Sequence[Trial], range_m: float) -> list[CellErrors]:
+def measure_cells(measure: Measure, outcomes: Outcomes, tested: Sequence[Trial], range_m: float) -> list[CellErrors]:
     """Return what a detector does in each cell of several recordings, the one with most errors per frame first.
 
     The units of `outcomes` are the frames of `tested`, in their order. range_m: of a pole's sensor.
@@ -143,7 +143,7 @@ def measure_cells(own: Measurable, outcomes: Outcomes, tested: Sequence[Trial], 
                 cell,
                 int(inside.sum()),
                 len(np.unique(outcomes.scene[inside])),
-                measure_cell(own, outcomes, inside),
+                measure_cell(measure, outcomes, inside),
                 len(every),
                 sum(error.kind == MISS for error in every),
                 sum(each.failures[i] for each, i in frames if each.cells[i] == cell),

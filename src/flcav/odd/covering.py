@@ -76,7 +76,7 @@ def cover_domain(
     every = list_covered(merge_runs(list(documents.values())))
     covered = tuple(row for row in every if row.attribute in {*domain.tested, *axes})
     grade = float(np.mean([row.grade for row in covered])) if covered else 0.0
-    cells = measure_cells(OBJECTS, join_outcomes(outcomes), tested, range_m) if tested else []
+    cells = measure_cells(OBJECTS.measure, join_outcomes(outcomes), tested, range_m) if tested else []
     result = Coverage(
         domain.name, domain.definition.revision, len(documents), grade, covered, tuple(axes), tuple(cells)
     )

@@ -107,8 +107,8 @@ def _check_part(domain: Domain, name: str, rows: list[dict[str, Value]]) -> Part
     if column is None:
         return Part(name, UNMEASURED, "", 0, 0, 1)
     if name in knobs and column != "junction":
-        reach = knobs[name].reach
-        allowed = [v for v in domain.allowed(name) if reach is None or isinstance(v, str) or reach[0] <= v <= reach[1]]
+        low, high = knobs[name].reach or (-np.inf, np.inf)
+        allowed = [value for value in domain.allowed(name) if isinstance(value, float | int) and low <= value <= high]
         return Part(name, SET, knobs[name].key, int(bool(allowed)), int(not allowed), 0)
     if column in ("light", "surface_condition"):
         field = "weather.sun_elevation_deg" if column == "light" else "weather.wetness"

@@ -120,6 +120,7 @@ class Space:
     def _axis(self, name: str, knob: OddKnob) -> Axis:
         """Return the axis of a number: the buckets that the knob reaches, as far as values in them are inside."""
         item = next(each.item for each in self.domain.definition.attributes if each.name == name)
+        assert item is not None, "knobs are of attributes with buckets"
         limits, reach = self.domain.limits.get(name, ()), knob.reach or (-math.inf, math.inf)
         labels, spans = [], []
         for label, low, high in zip(item.labels, item.edges, item.edges[1:], strict=False):

@@ -103,7 +103,7 @@ class Scenery:
 
     def _match(self, position: Array, yaw: Array) -> NDArray[np.int64]:
         """Return (F,) the lane that each place is on, -1 for none: the nearest, and rather one in its direction."""
-        points = shapely.points(position)
+        points = np.asarray(shapely.points(position), dtype=object)
         at, lane = self._tree.query(points, predicate="dwithin", distance=LANE_M)
         lines, own = self._lines[lane], points[at]
         along = shapely.line_locate_point(lines, own)

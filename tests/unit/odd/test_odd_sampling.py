@@ -1,5 +1,6 @@
 """Samples: inside the domain by what is measured of them, balanced, paired, and valid as recipes and scenarios."""
 
+import shutil
 import xml.etree.ElementTree as ElementTree
 from itertools import combinations
 from pathlib import Path
@@ -19,6 +20,7 @@ from flcav.odd.recipes import make_recipe
 from flcav.odd.sampling import CASE, CASES, METHODS, Axis, Sample, Space, sample_domain
 from flcav.odd.scenery import Scenery
 from flcav.sources.recipe import load_recipe, parse_recipe
+from flcav.world.map.town import load_town
 from flcav.world.shapes import SHAPES
 
 
@@ -98,6 +100,14 @@ def test_a_recipe_puts_the_case_at_its_place(space: Space, ring: Scenery):
         assert recipe.scenarios[0].kind == each.case
         assert recipe.weather.at(0.0).rain_mm_h == pytest.approx(each.weather.rain_mm_h, abs=1e-4)
         assert set(recipe.poles) <= set(ring.town.poles.id.tolist())
+
+
+def test_a_recipe_in_a_town_of_ones_own_names_its_folder(urban: Domain, ring: Scenery, tmp_path: Path):
+    shutil.copytree(ring.town.net.parent, tmp_path / "own")
+    own = Scenery(load_town(tmp_path / "own"))
+    (first,) = sample_domain(Space(urban, [own]), 1, "sobol").samples
+    recipe = parse_recipe(make_recipe(first, own, 0), "sample")
+    assert load_town(recipe.town).name == first.place.town == "own"
 
 
 def scenario(space: Space, case: str) -> tuple[Sample, ElementTree.Element]:

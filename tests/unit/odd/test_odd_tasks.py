@@ -1,5 +1,6 @@
 """Tasks per scenario: more where it is complex, never fewer, and a run recipe that the pipeline takes."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,23 @@ def test_the_run_recipe_is_one_of_the_pipeline(drive: Dataset, tmp_path: Path):
         share = sum(any(each.task == name for each in one.tasks) for one in scenarios) / len(scenarios)
         assert task.weight == pytest.approx(share, abs=1e-4)
     assert yaml.safe_load((tmp_path / "run.yaml").read_text())["regions"]["suburb"]["role"] == "pretrain"
+
+
+def test_the_command_counts_the_errors_of_a_table(drive: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    x, y = drive.world_from_agent(0)[:2, 3]
+    table = tmp_path / "errors.csv"
+    table.write_text(f"x,y,z,scene\n{x},{y},1,{drive.keys[0].scene}\n")
+    command = ["odd", "tasks", "--data", str(drive.folder), "--out", str(tmp_path / "run.yaml"), "--json"]
+    with pytest.raises(SystemExit) as ended:
+        run([*command, "--errors", str(table)])
+    assert ended.value.code == 0
+    found = json.loads(capsys.readouterr().out)["scenarios"]
+    assert [each["complexity"]["errors"] > 0 for each in found].count(True) == 1
+    table.write_text(f"x,y\n{x},{y}\n")
+    with pytest.raises(SystemExit) as ended:
+        run([*command, "--errors", str(table)])
+    assert ended.value.code == 2
+    assert "column 'scene' is missing" in capsys.readouterr().err
 
 
 def test_a_run_needs_a_town_that_federates(drive: Dataset):
