@@ -14,8 +14,8 @@ from flcav.storage.files import flush_all, write_json
 from flcav.world.map.town import PACKAGED
 
 WARMUP_S, BEGINS_S = 30.0, 31.0  # of the traffic; from then on the corner case may begin
-SPINS, EVERY_S = 20, 1.0
-CAVS = 3  # the case waits for one of them to come within 50 m of its place
+SPINS, EVERY_S = 20, 2.0
+CAVS = 6  # the case waits for one of them to come within 50 m of its place
 POLE_M = 40.0  # a pole this near to the place records, too
 INDEX = "samples.json"
 
