@@ -170,6 +170,13 @@ class Dataset:
         """Return the (4, 4) pose of the agent in frame `i`, as `frame(i)` has it, without reading measurements."""
         return np.array(self._tables["poses"]["world_from_agent"][i].as_py()).reshape(4, 4)
 
+    def rows(self, name: str) -> tuple[pa.Table, NDArray[np.int64]]:
+        """Return a table of `flcav.dataset.tables`, and (rows,) the number of the frame that each row is of."""
+        table = self._tables[name]
+        if name not in self._first:
+            return table, np.arange(len(self))
+        return table, np.repeat(np.arange(len(self)), np.diff(self._first[name]))
+
     def plane(self, i: int, camera: str, plane: str) -> NDArray:
         """Return one plane ("rgb", "depth_m", "semantic" or "instance") of an image of frame `i`: see `CameraImage`.
 

@@ -96,5 +96,28 @@ def read_matches(outcomes: Outcomes, name: str, key: str = MEASURED) -> Matches:
     return Matches(**{field.name: outcomes.arrays[f"{name}/{key}/{field.name}"] for field in fields(Matches)})
 
 
+def join_outcomes(parts: Sequence[Outcomes]) -> Outcomes:
+    """Return the outcomes of one network on the frames of several tests, one after the other, as of one test.
+
+    Scenes of different parts are different scenes: their names begin with the number of the part.
+    """
+    scenes = np.array([f"{number}/{scene}" for number, each in enumerate(parts) for scene in each.scene])
+    arrays: dict[str, NDArray] = {
+        CLASSES: parts[0].arrays[CLASSES],
+        HIDDEN: np.sum([each.arrays[HIDDEN] for each in parts], axis=0),
+    }
+    before = np.cumsum([0, *(len(each.scene) for each in parts)])
+    for label in parts[0].arrays[CLASSES]:
+        for key in KEPT:
+            own = [read_matches(part, str(label), key) for part in parts]
+            columns = [vars(each) for each in own]
+            joined = {name: np.concatenate([each[name] for each in columns]) for name in columns[0]}
+            joined["frame"] = np.concatenate([each.frame + first for each, first in zip(own, before)])
+            order = np.argsort(-joined["score"], kind="stable")
+            joined |= {name: joined[name][order] for name in ("score", "hit", "turned", "frame")}
+            arrays |= {f"{label}/{key}/{name}": value for name, value in joined.items()}
+    return Outcomes(scenes, arrays)
+
+
 def _number(value: float) -> float | None:
     return None if np.isnan(value) else float(value)

@@ -1,0 +1,370 @@
+"""`flcav odd`: operational design domains, what of them recordings cover, and recipes for what they do not."""
+
+from collections import Counter
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from flcav.cli.options import Device, check_finite
+from flcav.cli.tables import numbers, read_table
+from flcav.cli.terminal import print_json
+from flcav.interface.wording import plural
+from flcav.machine.threads import use_threads
+
+if TYPE_CHECKING:
+    from flcav.odd.cells import CellErrors
+    from flcav.statistics.estimates import Estimate
+
+
+class Draw(StrEnum):
+    """Way to draw samples, see `flcav.odd.sampling`."""
+
+    coverage = "coverage"
+    lhs = "lhs"
+    sobol = "sobol"
+
+
+odd = typer.Typer(
+    help="Operational design domains in ASAM OpenODD: check them, judge recordings by them, sample recipes in them.",
+    no_args_is_help=True,
+)
+ODD = typer.Argument(metavar="ODD", help="urban, rural, campus, mine, port, parking_lot, or an OpenODD file (.yaml).")
+JSON = typer.Option(False, "--json", help="Print one JSON object instead.")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.add_typer(odd, name="odd")
+
+
+@odd.command()
+def check(
+    domain: str = ODD,
+    town: str | None = typer.Option(
+        None, "--town", help="Town, by name or folder, whose places are checked; default: flcav's four."
+    ),
+    data: Path | None = typer.Option(None, "--data", help="Dataset folder: what its frames realise."),
+    as_json: bool = JSON,
+) -> None:
+    """Check which parts of a domain are realised, and which are unknown.
+
+    Each attribute that the domain tests is taken alone, the others left open. What nothing measures is unknown, never
+    inside.
+    """
+    from flcav.config import InputError
+    from flcav.dataset.store import Dataset
+    from flcav.odd.domain import read_domain
+    from flcav.odd.measure import measure
+    from flcav.odd.realise import check_frames, check_towns
+    from flcav.odd.scenery import Scenery
+    from flcav.world.map.town import TOWNS, load_town
+
+    if town is not None and data is not None:
+        raise InputError("--town and --data: one of the two at most")
+    found = read_domain(domain)
+    if data is not None:
+        parts = check_frames(found, measure(Dataset.open(data)))
+    else:
+        parts = check_towns(found, [Scenery(load_town(name)) for name in (TOWNS if town is None else (town,))])
+    if as_json:
+        rows = [part.as_json() | {"realised": part.realised} for part in parts]
+        print_json({"domain": found.name, "revision": found.definition.revision, "parts": rows})
+        return
+    where = f"frames of {data}" if data else f"places of {town or ', '.join(TOWNS)}"
+    typer.echo(f"{found.name}: {plural(len(parts), 'attribute')} tested, against {where}")
+    for part in parts:
+        typer.echo(f"    {part.attribute:<32}{part.sentence}")
+
+
+@odd.command("of")
+def of_(
+    data: Path = typer.Argument(help="Dataset folder."),
+    out: Path | None = typer.Option(None, "--out", help="Folder for OpenODD's tables: a COD per run."),
+    as_json: bool = JSON,
+) -> None:
+    """Describe the domain that a recording covers, by its ground truth: the current operational domain (COD)."""
+    from flcav.dataset.store import Dataset
+    from flcav.odd.coverage import collect_runs, write_cod
+    from flcav.odd.domain import everything
+    from flcav.odd.measure import measure, summarise
+    from flcav.storage.files import check_writable
+
+    if out is not None:
+        check_writable(out)
+    recorded = Dataset.open(data)
+    measured = measure(recorded)
+    spans = summarise(measured)
+    rows = None
+    if out is not None:
+        rows = write_cod(collect_runs(everything(), recorded, measured), out)
+    if as_json:
+        print_json({"frames": len(measured), "rows": rows, "attributes": [span.as_json() for span in spans]})
+        return
+    typer.echo(f"{data}: {plural(len(measured), 'frame')} of vehicles")
+    for span in spans:
+        typer.echo(f"    {span.attribute:<20}{span.sentence}")
+    if rows is not None:
+        typer.echo(f"{out}: {plural(rows, 'row')} of COD tables")
+
+
+@odd.command()
+def inside(
+    data: Path = typer.Argument(help="Dataset folder."),
+    domain: str = ODD,
+    perceived: bool = typer.Option(
+        False,
+        "--perceived",
+        help="Also as vehicles perceive it: by the weather network, detections and their tracks.",
+    ),
+    weather: Path | None = typer.Option(None, "--weather", help="Weather network; default: the package's."),
+    objects: Path | None = typer.Option(None, "--objects", help="Weights of the detector; default: the package's."),
+    device: Device = typer.Option(Device.auto, "--device", help="Where the networks run; auto: a GPU if there is one."),
+    frames: Path | None = typer.Option(None, "--frames", help="Table to write, .csv or .parquet: a frame's verdict."),
+    as_json: bool = JSON,
+) -> None:
+    """Judge every frame of a recording's vehicles by a domain: inside, outside, or unknown.
+
+    A verdict that rests on a missing value is unknown.
+    """
+    use_threads(1)
+    import time
+
+    from flcav.cli.options import refuse_unused
+    from flcav.dataset.store import Dataset
+    from flcav.interface import progress
+    from flcav.odd.domain import read_domain
+    from flcav.odd.judge import compare_verdicts, describe_agreement, judge, write_verdicts
+    from flcav.odd.measure import measure, scenery_of
+    from flcav.storage.exchange import check_ending
+    from flcav.storage.files import check_writable
+
+    if not perceived:
+        refuse_unused("odd inside without --perceived", "weather", "objects", "device")
+    if frames is not None:
+        check_ending(frames)
+        check_writable(frames.parent)
+    found = read_domain(domain)
+    found.require_bound()
+    recorded = Dataset.open(data)
+    scenery = scenery_of(recorded)
+    begun = time.perf_counter()
+    truth = judge(found, measure(recorded, scenery=scenery))
+    rate = len(truth.frames) / (time.perf_counter() - begun)
+    seen, agreement = None, None
+    if perceived:
+        from flcav.odd.perceive import perceive
+        from flcav.perception.networks import resolve_network
+        from flcav.perception.tasks import task_named
+
+        networks = [
+            resolve_network(task_named(name), weights, device.value)
+            for name, weights in (("weather", weather), ("objects", objects))
+        ]
+        with progress.show_progress("perceived") as report:
+            seen = judge(found, perceive(found, recorded, truth.frames, *networks, progress=report))
+        agreement = compare_verdicts(truth.verdict.tolist(), seen.verdict.tolist())
+    if frames is not None:
+        write_verdicts(recorded, truth, seen, frames)
+    if as_json:
+        told = None if agreement is None else agreement.as_json()
+        print_json({"domain": found.name, **truth.as_json(), "frames_per_s": rate, "perceived": told})
+        return
+    typer.echo(f"{found.name}: {truth.sentence}, by ground truth ({rate:,.0f} frames/s)")
+    for module, count in truth.failed.items():
+        typer.echo(f"    {module} puts {plural(count, 'frame')} outside")
+    if seen is not None and agreement is not None:
+        typer.echo(f"{found.name}: {seen.sentence}, as perceived")
+        for line in describe_agreement(agreement):
+            typer.echo(f"    {line}")
+
+
+@odd.command()
+def cover(
+    domain: str = ODD,
+    data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
+    out: Path = typer.Option(..., "--out", help="Folder for the report, the matrix (HTML) and each run's coverage."),
+    by: str = typer.Option("junction,light", "--by", metavar="X,Y", help="The two attributes of matrix and cells."),
+    detect: bool = typer.Option(
+        False,
+        "--detect",
+        help="Run the detector of objects: by cell its AP, errors, and the pole that covers most.",
+    ),
+    weights: Path | None = typer.Option(None, "--weights", help="Weights of the detector; default: the package's."),
+    range_m: float = typer.Option(
+        40.0, "--range", min=0.1, max=1e4, callback=check_finite, help="How far a pole's sensor covers errors [m]."
+    ),
+    device: Device = typer.Option(
+        Device.auto, "--device", help="Where the detector runs; auto: a GPU if there is one."
+    ),
+    as_json: bool = JSON,
+) -> None:
+    """Measure how much of a domain recordings cover, and with --detect where in it the detector errs.
+
+    From a domain to where the network errs to where to look: a cell is a bucket of each of two attributes.
+    """
+    use_threads(1)
+    from flcav.cli.options import refuse_unused
+    from flcav.config import InputError
+    from flcav.interface import progress
+    from flcav.odd.covering import cover_domain
+    from flcav.odd.domain import read_domain
+    from flcav.storage.files import check_writable
+
+    axes = tuple(name.strip() for name in by.split(","))
+    if len(axes) != 2 or axes[0] == axes[1]:
+        raise InputError(f"--by {by}: two attributes are wanted, with a comma between them, as in junction,light")
+    if not detect:
+        refuse_unused("odd cover without --detect", "weights", "range_m", "device")
+    check_writable(out)
+    found = read_domain(domain)
+    with progress.show_progress("cover") as report:
+        result = cover_domain(
+            found,
+            data,
+            out,
+            axes,
+            detect=detect,
+            weights=weights,
+            range_m=range_m,
+            device=device.value,
+            progress=report,
+        )
+    if as_json:
+        print_json(result.as_json())
+        return
+    typer.echo(f"{found.name}: {plural(result.runs, 'run')}, mean coverage {result.grade:.0%} of buckets inside")
+    for row in result.attributes:
+        holes = f"; not covered: {', '.join(row.holes)}" if row.holes else ""
+        typer.echo(f"    {row.attribute:<32}{row.grade:>4.0%}{holes}")
+    for row in result.cells:
+        typer.echo(_describe_cell(row))
+    typer.echo(f"{out / 'matrix.html'}: {by}")
+
+
+@odd.command()
+def sample(
+    domain: str = ODD,
+    out: Path = typer.Option(..., "--out", help="New folder for the recipes, and samples.json about them."),
+    count: int = typer.Option(20, "--count", min=1, max=100_000, help="How many recipes."),
+    town: list[str] = typer.Option([], "--town", help="Town; may be given several times; default: flcav's four."),
+    method: Draw = typer.Option(
+        Draw.coverage, "--method", help="Least covered buckets first, a Latin hypercube, or scrambled Sobol points."
+    ),
+    covered: Path | None = typer.Option(
+        None, "--covered", help="Folder of flcav odd cover: what its runs covered is drawn last."
+    ),
+    seed: int = typer.Option(0, "--seed", min=0, help="Seed of the draws; recipe n has seed + n - 1."),
+    openscenario: bool = typer.Option(
+        False, "--openscenario", help="Also each scenario as OpenSCENARIO XML 1.2, and the towns' maps; extra `towns`."
+    ),
+    as_json: bool = JSON,
+) -> None:
+    """Draw recipes of scenarios inside a domain: straight roads, T-junctions, cross-roads and roundabouts of towns.
+
+    Each has a corner case at its place, in weather of the domain. `flcav record` reads the recipes.
+    """
+    from flcav.cli.options import refuse_unused
+    from flcav.config import InputError
+    from flcav.odd.coverage import load_report
+    from flcav.odd.domain import read_domain
+    from flcav.odd.openscenario import to_openscenario
+    from flcav.odd.recipes import write_recipes
+    from flcav.odd.sampling import Sample, Space, sample_domain
+    from flcav.odd.scenery import Scenery
+    from flcav.sources.recipe import Recipe
+    from flcav.storage.files import check_writable, write_bytes
+    from flcav.world.map.town import TOWNS, load_town
+    from flcav.world.opendrive.exporting import export_town
+
+    if method is not Draw.coverage:
+        refuse_unused(f"odd sample --method {method.value}", "covered")
+    if covered is not None and not (covered / "runs").is_dir():
+        raise InputError(f"{covered}: no folder that flcav odd cover has written: there are no runs in it")
+    check_writable(out)
+    found = read_domain(domain)
+    sceneries = [Scenery(load_town(name)) for name in dict.fromkeys(town or TOWNS)]
+    space = Space(found, sceneries)
+    drawn = sample_domain(space, count, method.value, seed, None if covered is None else load_report(covered))
+
+    def write_scenario(sample: Sample, recipe: Recipe, path: Path) -> None:
+        if openscenario:
+            path.with_suffix(".xosc").write_bytes(to_openscenario(sample, f"{sample.place.town}.xodr"))
+
+    maps = {}
+    if openscenario:
+        used = {each.place.town for each in drawn.samples}
+        maps = {each.town.name: export_town(each.town) for each in sceneries if each.town.name in used}
+    paths = write_recipes(drawn, sceneries, out, seed, write_scenario)
+    for name, text in maps.items():
+        write_bytes(out / f"{name}.xodr", text.encode())
+    if as_json:
+        print_json(
+            {"recipes": len(paths), "pairwise": drawn.pairwise, "pairs": drawn.pairs, "possible": drawn.possible}
+        )
+        return
+    kinds = Counter(each.place.kind for each in drawn.samples)
+    typer.echo(f"{out}: {plural(len(paths), 'recipe')} in {found.name}, by {method.value}")
+    typer.echo(f"    {', '.join(f'{kind}: {number}' for kind, number in kinds.most_common())}")
+    typer.echo(f"    pairwise coverage {drawn.pairwise:.0%}: {drawn.pairs} of {drawn.possible} pairs of buckets")
+
+
+@odd.command()
+def tasks(
+    data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
+    out: Path = typer.Option(..., "--out", help="The run recipe to write (.yaml): flcav run reads it."),
+    errors: Path | None = typer.Option(
+        None, "--errors", help="Table of flcav errors: how dense a network's errors are is part of the complexity."
+    ),
+    pretrain: str = typer.Option("suburb", "--pretrain", help="Town of stage I; the other recorded towns federate."),
+    wireless: float = typer.Option(180.0, "--wireless", min=0.001, callback=check_finite, help="Wireless budget [MB]."),
+    wireline: float = typer.Option(110.0, "--wireline", min=0.001, callback=check_finite, help="Wireline budget [MB]."),
+    as_json: bool = JSON,
+) -> None:
+    """Generate tasks, {data, labels, network}, for the scenarios of recordings: more where a scenario is complex.
+
+    The result is a run recipe, in which a task weighs as many of the scenarios as have it.
+    """
+    import yaml
+
+    from flcav.config import InputError
+    from flcav.odd.tasks import generate_tasks, make_run, name_region, town_of
+    from flcav.storage.files import check_writable, write_bytes
+    from flcav.world.map.town import load_town
+
+    if out.suffix.lower() not in (".yaml", ".yml"):
+        raise InputError(f"--out {out}: a run recipe is a YAML file; name it {out.with_suffix('.yaml')}")
+    check_writable(out.parent)
+    load_town(pretrain)
+    found = []
+    if errors is not None:
+        table = read_table(errors, ("x", "y", "scene"), ("scene",))
+        places = numbers(table, ("x", "y"), errors).tolist()
+        found = [(str(scene), *place) for scene, place in zip(table["scene"].to_pylist(), places, strict=True)]
+    scenarios = [each for folder in data for each in generate_tasks(folder, found)]
+    towns = {name_region(town): town for town in map(town_of, data)}
+    recipe = make_run(scenarios, towns, pretrain, wireless, wireline)
+    write_bytes(out, yaml.safe_dump(recipe, sort_keys=False).encode())
+    if as_json:
+        rows = [each.as_json() | {"total": each.complexity.total} for each in scenarios]
+        print_json({"scenarios": rows, "recipe": recipe})
+        return
+    for each in scenarios:
+        parts = ", ".join(f"{name} {value:.2f}" for name, value in each.complexity.as_json().items())
+        named = ", ".join(task.task for task in each.tasks)
+        typer.echo(f"{each.town}, {each.kind}: complexity {each.complexity.total:.2f} ({parts})")
+        typer.echo(f"    {plural(len(each.tasks), 'task')}: {named}")
+    typer.echo(f"{out}: run recipe of {plural(len({task.task for each in scenarios for task in each.tasks}), 'task')}")
+
+
+def _describe_cell(row: "CellErrors") -> str:
+    covers = "" if row.pole is None else f"; pole {row.pole.pole} of {row.pole.town} covers {row.pole.covered}"
+    return (
+        f"    {' x '.join(row.cell):<32}{plural(row.frames, 'frame')}, AP50 {_words(row.precision)}, "
+        f"{plural(row.errors, 'error')} ({row.misses} missed), {plural(row.failures, 'failure')}{covers}"
+    )
+
+
+def _words(estimate: "Estimate | None") -> str:
+    return "of nothing" if estimate is None else estimate.describe()

@@ -1,0 +1,1 @@
+"""Operational design domains: what recordings cover of them, and scenarios and tasks for what they do not."""

@@ -1,0 +1,141 @@
+"""Coverage of a domain by recordings: openodd-py's coverage documents, their report, its HTML matrix, and COD tables.
+
+A run is the drive of one vehicle through one scene. A COD, the current operational domain, is OpenODD's table of what
+was observed (ASAM OpenODD 1.0, section 8.3).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from openodd import CoverageCollector, CoverageReport, CoverageView, export_cods, merge_coverage, view
+
+from flcav.config import InputError, Json, read_json
+from flcav.dataset.store import Dataset
+from flcav.odd.domain import Domain, Value
+from flcav.odd.measure import Measurements
+from flcav.storage.files import write_bytes, write_json
+from flcav.storage.records import Record
+from flcav.world.geodesy import convert_to_geodetic
+
+BEGINNING = "1970-01-01T00:00:00.000+00:00"  # of every run: recordings have no date
+
+Document = dict[str, Json]  # as openodd-py writes it
+
+
+@dataclass(frozen=True)
+class Covered(Record):
+    """How much of one attribute is covered: its buckets, and those inside the domain that no run was in."""
+
+    attribute: str
+    buckets: tuple[str, ...]
+    covered: tuple[str, ...]
+    holes: tuple[str, ...]
+    outside: tuple[str, ...]
+    grade: float  # share of the buckets inside the domain that are covered
+
+
+def collect_runs(
+    domain: Domain,
+    data: Dataset,
+    measured: Measurements,
+    failures: Mapping[int, bool] | None = None,
+) -> dict[str, Document]:
+    """Return the coverage document of each run of a recording, by its name "SCENE_AGENT".
+
+    failures: frame -> whether it fails, where frames were tested; a run fails at its first frame that does.
+    """
+    domain.require_bound()
+    place = _positions(data, measured.frames)
+    runs: dict[str, list[int]] = {}
+    for row, i in enumerate(measured.frames):
+        runs.setdefault(f"{data.keys[i].scene}_{data.keys[i].agent}", []).append(row)
+    values, documents = measured.rows(), dict[str, Document]()
+    for name, rows in runs.items():
+        rows = sorted(rows, key=lambda row: data.keys[measured.frames[row]].time_s)
+        times = [data.keys[measured.frames[row]].time_s for row in rows]
+        collector = CoverageCollector([], odd=domain.definition, backend=domain.backend)
+        steps = np.diff(times, prepend=times[0] - (times[1] - times[0] if len(times) > 1 else 0.0))
+        collector.start(values[rows[0]] | place[rows[0]], times[0] - float(steps[0]))
+        for row, time_s in zip(rows, times, strict=True):
+            collector.tick(values[row] | place[row], time_s)
+        collector.end(values[rows[-1]] | place[rows[-1]], times[-1])
+        if failures is not None:
+            failed = [time_s for row, time_s in zip(rows, times, strict=True) if failures.get(measured.frames[row])]
+            collector.record_outcome(not failed, failed_at=failed[0] if failed else None)
+        document = collector.to_dict(data.keys[measured.frames[rows[0]]].scene)
+        document["odd"]["started_at"] = BEGINNING
+        documents[name] = document
+    return documents
+
+
+def merge_runs(documents: Sequence[Document]) -> CoverageReport:
+    """Return the library's report of several runs."""
+    return merge_coverage(list(documents))
+
+
+def load_report(folder: Path) -> CoverageReport:
+    """Return the library's report of the runs that `write_runs` wrote; raises `InputError` where there are none."""
+    paths = sorted((folder / "runs").glob("*_coverage.json"))
+    if not paths:
+        raise InputError(f"{folder}: no runs of flcav odd cover")
+    try:
+        return merge_runs([_document(path) for path in paths])
+    except (ValueError, TypeError, KeyError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{folder / 'runs'}: no coverage that openodd-py reads ({error})") from None
+
+
+def _document(path: Path) -> Document:
+    document = read_json(path)
+    if not isinstance(document, dict) or not isinstance(document.get("odd"), dict):
+        raise InputError(f"{path}: no coverage of a run")
+    return document
+
+
+def list_covered(report: CoverageReport) -> tuple[Covered, ...]:
+    """Return the coverage of each attribute with buckets."""
+    return tuple(
+        Covered(
+            entry.name.removeprefix("odd."),
+            tuple(entry.buckets),
+            tuple(entry.covered),
+            tuple(entry.holes),
+            tuple(entry.outside),
+            float(entry.grade),
+        )
+        for entry in report.entries
+    )
+
+
+def write_runs(documents: Mapping[str, Document], out: Path) -> None:
+    """Write each run's document as OUT/runs/NAME_coverage.json, which openodd-py's own commands read."""
+    for name, document in documents.items():
+        write_json(out / "runs" / f"{name}_coverage.json", document, sort=False)
+
+
+def write_matrix(documents: Sequence[Document], x: str, y: str, title: str, path: Path) -> None:
+    """Write the HTML page of the matrix of two attributes, which drills into the cells."""
+    page = view.page(title, CoverageView(list(documents)).explorer_html(x=x, y=y, depth=1))
+    write_bytes(path, page.encode())
+
+
+def write_cod(documents: Mapping[str, Document], out: Path) -> int:
+    """Write each run's COD: table, manifest and taxonomy in OUT; return the number of rows.
+
+    Frames without a place on Earth are left out, as OpenODD's tables need one.
+    """
+    given = [(Path(f"{name}_coverage.json"), document) for name, document in documents.items()]
+    return sum(each.rows for each in export_cods(given, out))
+
+
+def _positions(data: Dataset, frames: Sequence[int]) -> list[dict[str, Value]]:
+    """Return where the agent is in each frame [m], and its latitude and longitude where the town is known."""
+    place = np.array([data.world_from_agent(i)[:3, 3] for i in frames]).reshape(-1, 3)
+    town = data.town()
+    earth = np.full((len(frames), 2), np.nan) if town is None else convert_to_geodetic(town.geo, place)[:, :2]
+    names = ("x", "y", "z", "latitude", "longitude")
+    rows = np.column_stack((place, earth)).tolist()
+    return [dict(zip(names, [None if value != value else value for value in row], strict=True)) for row in rows]

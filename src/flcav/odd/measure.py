@@ -1,0 +1,207 @@
+"""Measurement of a domain's attributes in a recording, by its ground truth: whole columns at once, no sweep is read."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError, parse_config
+from flcav.dataset.store import Dataset
+from flcav.dataset.tables import WEATHER_COLUMNS
+from flcav.interface.wording import plural
+from flcav.odd.domain import Value
+from flcav.odd.scenery import Column, Scenery
+from flcav.sensors.rig import Rig
+from flcav.storage.records import Record
+from flcav.world.weather import NIGHT_DEG
+
+Array = NDArray[np.float64]
+
+AROUND_M = 50.0  # within which road users count
+LOW_LIGHT_DEG = 10.0  # sun elevation below which the light is low
+WET, STANDING = 0.25, 0.9  # wetness of the road from which it is wet, and water stands on it
+SLOWEST_S = 2.0  # between two poses of which a speed is taken, at most
+PARKED = "parked"  # beginning of the track of a parked vehicle
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """The measured columns of F frames: numbers with NaN, or words with "", where a value is missing."""
+
+    frames: tuple[int, ...]  # (F,) numbers in the recording
+    columns: Mapping[str, Column]  # (F,) each, by column of the binding
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def rows(self) -> list[dict[str, Value]]:
+        """Return the values of each frame by column; None where one is missing."""
+        names = list(self.columns)
+        plain = [_plain(column) for column in self.columns.values()]
+        return [dict(zip(names, row, strict=True)) for row in zip(*plain, strict=True)]
+
+
+@dataclass(frozen=True)
+class Span(Record):
+    """What a recording covers of one attribute."""
+
+    attribute: str
+    low: float | None  # of a number; None where all are missing, and of words
+    high: float | None
+    words: Mapping[str, int]  # word -> frames
+    missing: int  # frames
+
+    @property
+    def sentence(self) -> str:
+        """Return the span in words."""
+        missing = f" ({plural(self.missing, 'frame')} unknown)" if self.missing else ""
+        if self.words:
+            return ", ".join(f"{word}: {count}" for word, count in self.words.items()) + missing
+        return "unknown" if self.low is None else f"{self.low:g} to {self.high:g}{missing}"
+
+
+def summarise(measured: Measurements) -> tuple[Span, ...]:
+    """Return what the frames cover of each attribute, in the order of the columns."""
+    spans = []
+    for name, column in measured.columns.items():
+        if column.dtype.kind == "U":
+            words, counts = np.unique(column[column != ""], return_counts=True)
+            known = {str(word): int(count) for word, count in zip(words, counts, strict=True)}
+            spans.append(Span(name, None, None, known, len(column) - sum(known.values())))
+            continue
+        numbers = column[~np.isnan(column.astype(np.float64))].astype(np.float64)
+        ends = (float(numbers.min()), float(numbers.max())) if len(numbers) else (None, None)
+        spans.append(Span(name, *ends, {}, len(column) - len(numbers)))
+    return tuple(spans)
+
+
+def select_vehicles(data: Dataset) -> tuple[int, ...]:
+    """Return the frames of vehicles, the subjects of a domain; raises `InputError` where there are none."""
+    frames = tuple(i for i, key in enumerate(data.keys) if not key.agent.startswith("pole"))
+    if not frames:
+        raise InputError(f"{data.folder}: has no frames of vehicles, which domains are of")
+    return frames
+
+
+def measure(data: Dataset, frames: Sequence[int] | None = None, scenery: Scenery | None = None) -> Measurements:
+    """Return what the ground truth of `frames` (None: all of vehicles) says of each attribute.
+
+    scenery: that of the recording's town, where it has been read before. What a recording does not say is missing.
+    """
+    chosen = select_vehicles(data) if frames is None else tuple(frames)
+    pose = _poses(data)[list(chosen)]
+    place = scenery or scenery_of(data)
+    weather = _weather(data)
+    recorded = data.manifest.imported is None
+    columns: dict[str, Column] = (
+        {} if place is None else place.measure(pose[:, :2, 3], np.arctan2(pose[:, 1, 0], pose[:, 0, 0]))
+    )
+    columns |= {"surface_type": np.full(len(chosen), "asphalt" if recorded else "")}
+    columns |= {name: column[list(chosen)] for name, column in describe_weather(weather).items()}
+    columns |= {"ego_speed": _speeds(data)[list(chosen)]}
+    columns |= {name: column[list(chosen)] for name, column in _count_agents(data).items()}
+    columns |= {name: np.full(len(chosen), number) for name, number in describe_rig(data.manifest.recipe).items()}
+    return Measurements(chosen, columns)
+
+
+def scenery_of(data: Dataset) -> Scenery | None:
+    """Return the scenery of a recording's town; None where the town is not known."""
+    town = data.town()
+    return None if town is None else Scenery(town)
+
+
+def describe_weather(weather: Mapping[str, Array]) -> dict[str, Column]:
+    """Return the environmental conditions (F,) of weathers whose fields are columns (F,); NaN is missing."""
+    sun, wet = weather["sun_elevation_deg"], weather["wetness"]
+    light = np.select([np.isnan(sun), sun < NIGHT_DEG, sun <= LOW_LIGHT_DEG], ["", "night", "low_light"], "day")
+    surface = np.select([np.isnan(wet), wet < WET, wet < STANDING], ["", "dry", "wet"], "standing_water")
+    return {
+        "rainfall": weather["rain_mm_h"],
+        "visibility": weather["visibility_m"],
+        "cloud_cover": 100 * weather["cloud_cover"],
+        "sun_elevation": sun,
+        "light": light,
+        "surface_condition": surface,
+    }
+
+
+def describe_rig(recipe: Mapping[str, object]) -> dict[str, float]:
+    """Return the field of view [deg] and the range [m] of a recipe's vehicle rig; NaN without a recipe."""
+    if "vehicle_rig" not in recipe:
+        return {"field_of_view": np.nan, "sensing_range": np.nan}
+    return reach_of(parse_config(Rig, recipe["vehicle_rig"], "the rig of the recording"))
+
+
+def reach_of(rig: Rig) -> dict[str, float]:
+    """Return the horizontal field of view [deg] and the farthest range [m] of a rig; the range is NaN without LiDAR."""
+    ranges = [lidar.settings.range_m for lidar in rig.lidars.values()]
+    views = [np.degrees(2 * np.arctan2(lens.width / 2, lens.intrinsics()[0, 0]))
+             for lens in (camera.settings for camera in rig.cameras.values())]  # fmt: skip
+    return {
+        "field_of_view": 360.0 if ranges else float(min(sum(views), 360.0)),
+        "sensing_range": max(ranges, default=np.nan),
+    }
+
+
+def _poses(data: Dataset) -> Array:
+    """Return (all frames, 4, 4) the poses of the agents."""
+    table, _ = data.rows("poses")
+    return table["world_from_agent"].combine_chunks().flatten().to_numpy().reshape(-1, 4, 4)
+
+
+def _weather(data: Dataset) -> dict[str, Array]:
+    """Return each field of the weather of all frames, NaN where a frame has none."""
+    table, frame = data.rows("weather")
+    out = {name: np.full(len(data), np.nan) for name in WEATHER_COLUMNS}
+    for name, column in out.items():
+        column[frame] = table[name].to_numpy()
+    return out
+
+
+def _speeds(data: Dataset) -> Array:
+    """Return the speed of the agent of each frame [km/h], by its pose before and after; NaN where both are far off.
+
+    An imported recording whose poses are all that of the world has none.
+    """
+    poses = _poses(data)
+    if data.manifest.imported and (poses == np.eye(4)).all():
+        return np.full(len(data), np.nan)
+    place = poses[:, :3, 3]
+    time = np.array([key.time_s for key in data.keys])
+    scenes, agents = (np.array([getattr(key, name) for key in data.keys]) for name in ("scene", "agent"))
+    order = np.lexsort((time, agents, scenes))
+    same = (scenes[order][1:] == scenes[order][:-1]) & (agents[order][1:] == agents[order][:-1])
+    apart = np.diff(time[order])
+    pace = np.full(len(data) + 1, np.nan)
+    near = same & (apart > 0) & (apart <= SLOWEST_S)
+    pace[1:-1][near] = np.linalg.norm(np.diff(place[order], axis=0)[near], axis=1) / apart[near]
+    both = np.stack((pace[:-1], pace[1:]))
+    known = ~np.isnan(both)
+    speed = np.full(len(data), np.nan)
+    some = known.any(axis=0)
+    speed[order[some]] = 3.6 * np.where(known, both, 0.0).sum(axis=0)[some] / known.sum(axis=0)[some]
+    return speed
+
+
+def _count_agents(data: Dataset) -> dict[str, Array]:
+    """Return how many road users that are not parked, and pedestrians, are within `AROUND_M` in each frame."""
+    table, frame = data.rows("annotations")
+    if data.manifest.imported and "objects" not in data.manifest.labels:
+        missing = np.full(len(data), np.nan)
+        return {"agents": missing, "pedestrians": missing}
+    place = np.column_stack((table["x"].to_numpy(), table["y"].to_numpy()))
+    near = np.linalg.norm(place - _poses(data)[frame, :2, 3], axis=1) <= AROUND_M
+    moving = ~np.char.startswith(table["track"].to_numpy(zero_copy_only=False).astype(np.str_), PARKED)
+    walking = table["category"].to_numpy(zero_copy_only=False).astype(np.str_) == "pedestrian"
+    return {
+        name: np.bincount(frame[near & kind], minlength=len(data)).astype(np.float64)
+        for name, kind in (("agents", moving), ("pedestrians", moving & walking))
+    }
+
+
+def _plain(column: Column) -> list[Value]:
+    values = column.tolist()
+    if column.dtype.kind == "U":
+        return [value or None for value in values]
+    return [None if value != value else value for value in values]

@@ -1,0 +1,218 @@
+"""Scenarios as ASAM OpenSCENARIO XML 1.2: entities, where they start, the weather, and what the corner case does.
+
+The file says what happens to the vehicle under test, `ego`, on one street of the town, whose OpenDRIVE map it names.
+When a recipe is recorded, its actors are cast from the traffic; here each has a place of its own. docs/odd.md says what
+is written.
+"""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from flcav.odd.sampling import Sample
+from flcav.world.scenarios.scenario import Kind
+from flcav.world.shapes import SHAPES
+from flcav.world.weather import NO_FOG_M
+
+REVISION = (1, 2)
+DATE = "1970-01-01T00:00:00"  # the same scenario gives the same bytes
+BEGINS_S, ENDS_S = 2.0, 20.0
+LANE_M = 3.4  # from a lane's middle to that of the next
+AXLE_M = 0.32  # height of an axle: half of a wheel's diameter
+LUX = 120_000.0  # of the sun at the zenith
+CLOUDS = ((0.125, "oneOktas"), (0.5, "fourOktas"), (0.8, "sixOktas"), (1.0, "eightOktas"))  # up to this share
+
+Pose = tuple[float, float, float]  # ahead of and left of the ego's start [m], heading to the ego's [rad]
+
+
+@dataclass(frozen=True)
+class Actor:
+    """An entity of a scenario beside the ego."""
+
+    name: str
+    category: str
+    shape: str
+    start: Pose
+    speed: float  # [m/s]
+
+
+@dataclass(frozen=True)
+class Speed:
+    """An actor goes over to a speed [m/s] at a rate [m/s^2]."""
+
+    actor: str
+    target: float
+    rate: float
+
+
+@dataclass(frozen=True)
+class Aside:
+    """An actor moves sideways to a lane, by so many lanes to the left, within so many seconds."""
+
+    actor: str
+    lanes: int
+    within_s: float
+
+
+@dataclass(frozen=True)
+class Script:
+    """What happens in a corner case: actors, and actions that begin together when the trigger fires."""
+
+    actors: tuple[Actor, ...]
+    actions: tuple[Speed | Aside, ...]
+    near: str | None = None  # fires when the ego is within `within_m` of this actor; None: at `BEGINS_S`
+    within_m: float = 0.0
+
+
+def write_script(case: Kind, limit: float) -> Script:
+    """Return the script of a corner case on a street with that speed limit [m/s]."""
+    back = math.pi
+    if case == "stalled_vehicle":
+        return Script((Actor("stalled", "car", "sedan", (25.0, 0.0, 0.0), limit),), (Speed("stalled", 0.0, 4.0),))
+    if case == "crash":
+        ahead, behind = (Actor(f"car_{n}", "car", "sedan", (at, 0.0, 0.0), limit) for n, at in ((1, 38.0), (2, 28.0)))
+        return Script((ahead, behind), (Speed("car_1", 0.0, 9.0),))
+    if case == "cut_in":
+        car = Actor("neighbour", "car", "hatchback", (8.0, LANE_M, 0.0), 0.9 * limit)
+        return Script((car,), (Aside("neighbour", -1, 2.2),))
+    if case == "overtaking":
+        slow = Actor("slow", "truck", "box_truck", (70.0, LANE_M, back), 0.5 * limit)
+        fast = Actor("overtaking", "car", "sedan", (85.0, LANE_M, back), limit)
+        return Script((slow, fast), (Aside("overtaking", 1, 2.5), Speed("overtaking", 1.2 * limit, 2.0)))
+    if case == "pedestrian_behind_van":
+        van = Actor("van", "van", "high_van", (24.0, -2.6, 0.0), 0.0)
+        walker = Actor("walker", "pedestrian", "child", (28.5, -3.2, math.pi / 2), 0.0)
+        return Script((van, walker), (Speed("walker", 2.6, 4.0),), near="walker", within_m=22.0)
+    runner = Actor("runner", "car", "hatchback", (48.0, -35.0, math.pi / 2), 9.0)
+    return Script((runner,), (Speed("runner", 12.0, 2.0),), near="runner", within_m=45.0)
+
+
+def to_openscenario(sample: Sample, map_file: str) -> bytes:
+    """Return the scenario of a sample as OpenSCENARIO XML 1.2, with `map_file` as its OpenDRIVE map."""
+    limit = max(sample.limit_kmh / 3.6, 1.0)
+    script = write_script(sample.case, limit)
+    ego = Actor("ego", "car", "compact", (0.0, 0.0, 0.0), limit)
+    root = ElementTree.Element("OpenSCENARIO")
+    major, minor = map(str, REVISION)
+    told = f"{sample.case} at a {sample.place.kind} of {sample.place.town}"
+    _add(root, "FileHeader", revMajor=major, revMinor=minor, date=DATE, description=told, author="flcav")
+    _add(root, "CatalogLocations")
+    _add(_add(root, "RoadNetwork"), "LogicFile", filepath=map_file)
+    entities = _add(root, "Entities")
+    for actor in (ego, *script.actors):
+        _add_entity(entities, actor)
+    board = _add(root, "Storyboard")
+    _add_start(_add(_add(board, "Init"), "Actions"), sample, (ego, *script.actors))
+    _add_story(board, script)
+    _add_time(_add(_add(board, "StopTrigger"), "ConditionGroup"), "end", ENDS_S)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+
+
+def _add(parent: ElementTree.Element, tag: str, **attributes: str | float) -> ElementTree.Element:
+    texts = {name: value if isinstance(value, str) else f"{value:.6g}" for name, value in attributes.items()}
+    return ElementTree.SubElement(parent, tag, texts)
+
+
+def _add_entity(entities: ElementTree.Element, actor: Actor) -> None:
+    shape = next(each for each in SHAPES[actor.category] if each.name == actor.shape)
+    named = _add(entities, "ScenarioObject", name=actor.name)
+    if actor.category == "pedestrian":
+        body = _add(named, "Pedestrian", name=shape.name, pedestrianCategory="pedestrian", mass=45.0)
+    else:
+        body = _add(named, "Vehicle", name=shape.name, vehicleCategory=actor.category, mass=1500.0)
+    box = _add(body, "BoundingBox")
+    _add(box, "Center", x=0.0, y=0.0, z=shape.height / 2)
+    _add(box, "Dimensions", width=shape.width, length=shape.length, height=shape.height)
+    if actor.category != "pedestrian":
+        _add(body, "Performance", maxSpeed=60.0, maxAcceleration=5.0, maxDeceleration=10.0)
+        axles = _add(body, "Axles")
+        for tag, steering, at in (("FrontAxle", 0.6, 0.3), ("RearAxle", 0.0, -0.3)):
+            _add(axles, tag, maxSteering=steering, wheelDiameter=2 * AXLE_M, trackWidth=0.85 * shape.width,
+                 positionX=at * shape.length, positionZ=AXLE_M)  # fmt: skip
+    _add(body, "Properties")
+
+
+def _add_start(actions: ElementTree.Element, sample: Sample, actors: Sequence[Actor]) -> None:
+    """Write the weather, and the place and speed of each actor."""
+    weather, sky = (
+        sample.weather,
+        _add(_add(_add(actions, "GlobalAction"), "EnvironmentAction"), "Environment", name="sky"),
+    )
+    _add(sky, "TimeOfDay", animation="false", dateTime=DATE)
+    share = next((word for most, word in CLOUDS if weather.cloud_cover <= most), "eightOktas")
+    air = _add(sky, "Weather", fractionalCloudCover=share)
+    up = math.radians(weather.sun_elevation_deg)
+    east_of_north = math.radians(weather.sun_azimuth_deg)
+    _add(air, "Sun", azimuth=east_of_north % math.tau, elevation=up, illuminance=LUX * max(math.sin(up), 0.0))
+    _add(air, "Fog", visualRange=min(weather.visibility_m, NO_FOG_M))
+    kind = "rain" if weather.rain_mm_h > 0 else "dry"
+    _add(air, "Precipitation", precipitationType=kind, precipitationIntensity=weather.rain_mm_h)
+    _add(sky, "RoadCondition", frictionScaleFactor=1.0 - 0.4 * weather.wetness, wetness=_wet_word(weather.wetness))
+    x, y, yaw = sample.place.start
+    for actor in actors:
+        ahead, left, turned = actor.start
+        private = _add(actions, "Private", entityRef=actor.name)
+        at = _add(_add(_add(private, "PrivateAction"), "TeleportAction"), "Position")
+        place_x = x + ahead * math.cos(yaw) - left * math.sin(yaw)
+        place_y = y + ahead * math.sin(yaw) + left * math.cos(yaw)
+        _add(at, "WorldPosition", x=f"{place_x:.3f}", y=f"{place_y:.3f}", z="0", h=f"{yaw + turned:.6f}")
+        _add_speed(_add(private, "PrivateAction"), actor.speed, "step", "time", 0.0)
+
+
+def _wet_word(wetness: float) -> str:
+    levels = ((0.1, "dry"), (0.4, "moist"), (0.7, "wetWithPuddles"), (0.9, "lowFlooded"))
+    return next((word for most, word in levels if wetness < most), "highFlooded")
+
+
+def _add_speed(action: ElementTree.Element, target: float, shape: str, dimension: str, value: float) -> None:
+    speed = _add(_add(action, "LongitudinalAction"), "SpeedAction")
+    _add(speed, "SpeedActionDynamics", dynamicsShape=shape, dynamicsDimension=dimension, value=value)
+    _add(_add(speed, "SpeedActionTarget"), "AbsoluteTargetSpeed", value=target)
+
+
+def _add_story(board: ElementTree.Element, script: Script) -> None:
+    act = _add(_add(board, "Story", name="corner_case"), "Act", name="act")
+    for number, action in enumerate(script.actions, start=1):
+        group = _add(act, "ManeuverGroup", maximumExecutionCount="1", name=f"group_{number}")
+        _add(_add(group, "Actors", selectTriggeringEntities="false"), "EntityRef", entityRef=action.actor)
+        event = _add(_add(group, "Maneuver", name=f"manoeuvre_{number}"), "Event", name=f"event_{number}",
+                     priority="override", maximumExecutionCount="1")  # fmt: skip
+        private = _add(_add(event, "Action", name=f"action_{number}"), "PrivateAction")
+        if isinstance(action, Speed):
+            _add_speed(private, action.target, "linear", "rate", action.rate)
+        else:
+            change = _add(_add(private, "LateralAction"), "LaneChangeAction")
+            _add(change, "LaneChangeActionDynamics", dynamicsShape="sinusoidal", dynamicsDimension="time",
+                 value=action.within_s)  # fmt: skip
+            _add(
+                _add(change, "LaneChangeTarget"), "RelativeTargetLane", entityRef=action.actor, value=str(action.lanes)
+            )
+        begins = _add(_add(event, "StartTrigger"), "ConditionGroup")
+        if script.near is None:
+            _add_time(begins, f"begin_{number}", BEGINS_S)
+        else:
+            _add_near(begins, f"near_{number}", script.near, script.within_m)
+    _add_time(_add(_add(act, "StartTrigger"), "ConditionGroup"), "start", 0.0)
+
+
+def _add_time(group: ElementTree.Element, name: str, at_s: float) -> None:
+    condition = _add(group, "Condition", name=name, delay=0.0, conditionEdge="none")
+    _add(_add(condition, "ByValueCondition"), "SimulationTimeCondition", value=at_s, rule="greaterOrEqual")
+
+
+def _add_near(group: ElementTree.Element, name: str, actor: str, within_m: float) -> None:
+    condition = _add(group, "Condition", name=name, delay=0.0, conditionEdge="none")
+    by = _add(condition, "ByEntityCondition")
+    _add(_add(by, "TriggeringEntities", triggeringEntitiesRule="any"), "EntityRef", entityRef="ego")
+    _add(
+        _add(by, "EntityCondition"),
+        "RelativeDistanceCondition",
+        entityRef=actor,
+        relativeDistanceType="euclidianDistance",
+        value=within_m,
+        freespace="false",
+        rule="lessThan",
+        coordinateSystem="entity",
+    )

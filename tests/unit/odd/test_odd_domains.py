@@ -1,0 +1,112 @@
+"""Domains: the six of the package, those of strangers, and what of these is refused before the library sees it."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from flcav.cli.main import run
+from flcav.config import InputError
+from flcav.odd import domain as reading
+from flcav.odd.domain import DOMAINS, everything, read_domain
+
+REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[4] / "shared" / "data")) / "odd"
+Write = Callable[..., Path]
+
+
+@pytest.mark.parametrize("name", DOMAINS)
+def test_a_domain_of_the_package_is_bound_whole_and_has_a_revision(name: str):
+    found = read_domain(name)
+    assert found.unbound == ()
+    assert len(found.tested) >= 8
+    assert found.definition.version == "1.0"
+    assert len(found.definition.revision or "") == 64
+
+
+def test_the_binding_measures_every_concept_of_the_taxonomy():
+    whole = everything()
+    assert {each.name for each in whole.definition.attributes} == set(whole.bound)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("IMPORT: [{git: 'https://example.invalid/a.git', rev: v1, path: t.yaml}]\nMODULES: {}", "git"),
+        ("IMPORT: ['git:https://example.invalid/a.git']\nMODULES: {}", "git:"),
+        ("openodd: [a.yaml]\nprobes: {rainfall: {probe: 'os:getcwd'}}", "openodd"),
+        ("MODULES: {m: {INCLUDE_AND: {rainfall: '<= 1 mm/h'}}}\nprobes: {rainfall: {probe: 'os:getcwd'}}", "probes"),
+        ("MODULES: {m: {METADATA: {probe: 'os:getcwd'}}}", "probe"),
+        ("IMPORT: [../../etc/passwd]\nMODULES: {}", "no name of a file"),
+        ("IMPORT: [/etc/passwd]\nMODULES: {}", "no name of a file"),
+        ("IMPORT: [own.yaml]\nMODULES: {}", "imports itself"),
+    ],
+)
+def test_code_and_sources_of_strangers_never_reach_the_library(
+    text: str, said: str, odd_file: Write, monkeypatch: pytest.MonkeyPatch
+):
+    path = odd_file(text)
+    monkeypatch.setattr(reading, "load_openodd", lambda *_, **__: pytest.fail("the library was called"))
+    with pytest.raises(InputError, match=said):
+        read_domain(path)
+
+
+def test_an_imported_file_is_looked_through_too(odd_file: Write):
+    odd_file("IMPORT: [{git: 'https://example.invalid/a.git', rev: v1, path: t.yaml}]", "inner.yaml")
+    with pytest.raises(InputError, match=r"inner\.yaml: 'git"):
+        read_domain(odd_file("IMPORT: [inner.yaml]\nMODULES: {}"))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("MODULES: {m: {INCLUDE_AND: {rainfall: '<= 1 m'}}}", "'m' measures length, not precipitation_rate"),
+        (
+            "TAXONOMY: {speed_limit: float length}\nMODULES: {m: {INCLUDE_AND: {speed_limit: '<= 1 m'}}}",
+            "cannot convert 'm'",
+        ),
+        (
+            "MODULES: {m: {INCLUDE_AND: {rainfall: '<= 1 mm/h'}, EXCLUDE_AND: {rainfall: '<= 2 mm/h'}}}",
+            "the domain is empty: no value of environment.rainfall is inside",
+        ),
+        ("MODULES: {m: {INCLUDE_AND: {light: [day]}, EXCLUDE_AND: {light: [day]}}}", "no value of environment.light"),
+        ("TAXONOMY: {wind: float velocity}", "has no modules, so that it bounds nothing"),
+        ("MODULES: {m: {INCLUDE_AND: {snowfall: '<= 1 mm/h'}}}", "snowfall is neither a concept"),
+        ("- a list", "a mapping"),
+    ],
+)
+def test_bad_domains_are_refused_in_a_sentence(text: str, said: str, odd_file: Write):
+    with pytest.raises(InputError, match=said):
+        read_domain(odd_file(text))
+
+
+def test_units_are_converted(odd_file: Write):
+    found = read_domain(odd_file("MODULES: {m: {INCLUDE_AND: {visibility: '>= 0.5 km'}}}"))
+    assert found.limits["environment.visibility"] == (500.0,)
+
+
+def test_a_concept_of_other_words_is_unbound_and_not_outside_by_mistake(odd_file: Write):
+    text = (
+        "TAXONOMY: {junction: [cross_road, tee], wind: float velocity}\n"
+        "MODULES: {m: {INCLUDE_AND: {junction: [cross_road], wind: '<= 5 m/s'}}}"
+    )
+    found = read_domain(odd_file(text))
+    assert found.unbound == ("junction", "wind")
+    with pytest.raises(InputError, match="measures 'junction' \\(and 1 more\\)"):
+        found.require_bound()
+
+
+def test_a_huge_file_is_not_read(odd_file: Write, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(reading, "MOST_BYTES", 10)
+    with pytest.raises(InputError, match="more than 10 bytes"):
+        read_domain(odd_file("MODULES: {m: {INCLUDE_AND: {rainfall: '<= 1 mm/h'}}}"))
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"Autoware's ODD files are not at {REAL}; set FLCAV_REAL_DATA")
+@pytest.mark.parametrize("name", ["ODD_Dense_Urban", "Domain_Concepts_Definition_ISO_34503"])
+def test_autowares_files_are_refused_in_one_sentence(name: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ended:
+        run(["odd", "check", str(REAL / f"{name}.yaml")])
+    told = capsys.readouterr()
+    assert (ended.value.code, told.out, told.err.count("\n")) == (2, "", 1)
+    assert "cannot read the type '>= 0 m'" in told.err
