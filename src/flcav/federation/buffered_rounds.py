@@ -107,7 +107,7 @@ def take_turns(clients: Sequence[str], size: int, rounds: int) -> Buffers:
 
 
 def count_participations(records: Sequence[tuple[Sequence[str], Sequence[str]]]) -> dict[str, int]:
-    """Return by client in how many rounds it took part or was lost: of each round, its clients and those that failed."""
+    """Return by client in how many rounds it took part or failed; records: of each, its clients, and those that did."""
     return dict(Counter(name for clients, failed in records for name in {*clients, *failed}))
 
 

@@ -8,6 +8,7 @@ from flcav.config import InputError
 from flcav.federation.checks import check_rules
 from flcav.federation.privacy import affordable_rounds, find_noise
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
+from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, needs_known_number
 from flcav.federation.trainable import statistics_names
@@ -147,6 +148,8 @@ def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
     cloud = of_servers(edge) if how.cloud_strategy is None else strategy_named(how.cloud_strategy)
     if isinstance(cloud, Corrects):
         raise InputError(f"cloud_strategy: {type(cloud).__name__} corrects local steps, and edge servers take none")
+    if isinstance(cloud, FedBuff):
+        raise InputError("cloud_strategy: fedbuff does not wait for clients, and the cloud waits for all edge servers")
     if isinstance(cloud, FedMD):
         raise InputError(
             "cloud_strategy: FedMD shares frames among vehicles, and edge servers have no networks of their own"
@@ -179,6 +182,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
     how = setting.federation
     edge, cloud = find_strategies(how)
     selection, privacy = how.selection, how.privacy
+    if isinstance(edge, FedBuff) and setting.central is None:
+        _check_buffers(recipe, setting)
     if how.network is not None and selection.rule == "importance":
         raise InputError("federation.network: importance selection draws the clients after they have trained")
     if how.network is not None and selection.unbiased:
@@ -238,6 +243,16 @@ def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> N
         raise InputError(f"{why}, and noise is for one number{instead}")
     if needs_known_number(strategy):
         raise InputError(f"{why}, and {type(strategy).__name__} needs a known one{instead}")
+
+
+def _check_buffers(recipe: RunRecipe, setting: Setting) -> None:
+    """Raise `InputError` where an arm's rounds are buffers, and no clock is theirs, or something goes by rounds."""
+    if setting.federation.network is None:
+        raise InputError("strategy fedbuff: vehicles go on at their own pace, by the clock of 'federation.network'")
+    if _plans_joiners(recipe, setting):
+        raise InputError("strategy fedbuff: nobody joins rounds by a plan; leave out horizon_s")
+    if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
+        raise InputError("strategy fedbuff: labels 'road-average' are made anew before a round that all begin together")
 
 
 def _check_bare_labels(setting: Setting) -> None:

@@ -83,6 +83,12 @@ def sends_outputs(spec: Spec) -> bool:
     return name in STRATEGIES and issubclass(STRATEGIES[name], FedMD)
 
 
+def fills_buffers(spec: Spec) -> bool:
+    """Return whether rounds of one of `STRATEGIES` are buffers that fill by a clock; see `exchanges_more`."""
+    name = spec if isinstance(spec, str) else next(iter(spec), "")
+    return name in STRATEGIES and issubclass(STRATEGIES[name], FedBuff)
+
+
 def of_servers(strategy: Strategy) -> Strategy:
     """Return the strategy among edge servers, which federate with the cloud, where vehicles have `strategy`.
 

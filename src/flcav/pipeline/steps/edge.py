@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from flcav.federation.buffered_rounds import Buffers, afford_buffers
 from flcav.federation.privacy import count_affordable
 from flcav.federation.rounds import BeforeRound, Schedule, federate
 from flcav.federation.rules import Rules
@@ -14,6 +15,7 @@ from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Trainable, Weights
 from flcav.interface.progress import Report
@@ -27,6 +29,7 @@ from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.plan.updates import follow_plan
+from flcav.pipeline.radio.buffered import drive_buffers
 from flcav.pipeline.radio.driving import DrivenRounds
 from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
 from flcav.pipeline.results.plans import Plan, TaskPlan
@@ -37,6 +40,8 @@ from flcav.pipeline.steps.regions import (
     drive_region,
     label_samples,
     learn_by_distillation,
+    open_buffered_fleet,
+    save_clock,
     score_labels,
 )
 from flcav.pipeline.steps.settings import (
@@ -89,10 +94,12 @@ class EdgeFederation:
         reached = load_round_network(task, self.network, self.folder, round_, averaged, self.start_share)
         return {name: score_network(task, reached, own.data, own.vehicles) for name, own in self.validation.items()}
 
-    def afford(self, rules: Rules, rounds: int) -> int:
+    def afford(self, rules: Rules, rounds: int, buffers: Buffers | None = None) -> int:
         """Return as many of `rounds` as the privacy budget affords; without one all."""
         if rules.privacy is None:
             return rounds
+        if buffers is not None:
+            return min(rounds, afford_buffers(buffers, rules.privacy))
         return count_affordable(rules.privacy, rules.selection, [*self.clients], rounds, self.earlier)
 
     def prepare(self, clients: Mapping[str, Trainable], where: Runtime | None, number: int, weights: Weights) -> None:
@@ -108,15 +115,17 @@ def federate_edge(
     rules: Rules,
     outages: Mapping[tuple[int, str], Outage] = {},
     *,
+    buffers: Buffers | None = None,
     processes: int = 1,
     runtime: str = "embedded",
     timed: bool = False,
 ) -> tuple[float | None, ...]:
     """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
 
-    A privacy budget may end it before the schedule's end. Vehicles train in so many `processes` of a `runtime` of
-    `RUNTIMES`, to the same weights; where that is `timed`, their times are kept, see `read_times`, unless nobody is to
-    know who was drawn. The vehicles that `outages` name by round are lost in it.
+    A privacy budget may end it before the schedule's end, and of asynchronous rounds, `buffers`, each budget. Vehicles
+    train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights; where that is `timed`, their times
+    are kept, see `read_times`, unless nobody is to know who was drawn. The vehicles that `outages` name by round are
+    lost in it.
     """
     own, learning, state = federation, federation.learning, FederationState()
     checkpoints = FederationCheckpoints(
@@ -138,7 +147,7 @@ def federate_edge(
     if timed and not rules.hides_draws:
         clients = time_clients(clients, own.folder)
     with checkpoints.refusals(), open_runtime(runtime, clients, processes) as where:
-        if done < own.afford(rules, own.schedule.rounds):
+        if done < own.afford(rules, own.schedule.rounds, buffers):
             federate(
                 clients,
                 start,
@@ -153,6 +162,7 @@ def federate_edge(
                 on_round=checkpoints.save,
                 runtime=where,
                 distiller=own.shared,
+                buffers=buffers,
             )
     return checkpoints.finish(own.network, learning.training.average_rounds, own.start_share)
 
@@ -193,9 +203,9 @@ def edge_step(
     own, k = plan.tasks[settings.learning.task], settings.federation.edge_rounds_per_cloud_round
     rounds = _plan_private(settings, plan).edge if stage == EDGE else own.cloud_rounds * k
     federation = _open_federation(work, settings, labelled, rounds, book)
-    driven = _drive(work, settings, federation, own, rounds)
+    driven = _drive(work, settings, federation, own)
     where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
-    losses = federate_edge(federation, driven.rules, driven.outages, **where)
+    losses = federate_edge(federation, driven.rules, driven.outages, buffers=driven.buffers, **where)
     clients, labels = federation.clients, None
     if settings.scored and stage == EDGE:
         labels = score_labels(work, inputs, federation.network.config, labelled.samples)
@@ -254,9 +264,11 @@ def _open_federation(
     start = load_stage_network(learning.task, work.inputs[inputs.edge or inputs.pretrain])
     clients = make_clients(learning, start.config, samples)
     earlier = 0 if inputs.edge is None else StageResult.load(work.inputs[inputs.edge]).rounds
-    names = (settings.stage, inputs.region)
+    names, (strategy, _) = (settings.stage, inputs.region), find_strategies(settings.federation)
+    if isinstance(strategy, FedBuff):
+        strategy.check_buffer(len(clients))
+        rounds = strategy.count_rounds(rounds, len(clients))
     schedule = learning.schedule(rounds, learning.training.local_steps, *names, earlier=earlier)
-    strategy, _ = find_strategies(settings.federation)
     watched = {name: Frames.open(work.inputs[step]) for name, step in settings.validation.items()}
     federation = EdgeFederation(
         learning=learning,
@@ -290,9 +302,14 @@ def _share_with_vehicles(
     return shown.samples
 
 
-def _drive(work: Work, settings: EdgeSettings, federation: EdgeFederation, plan: TaskPlan, rounds: int) -> DrivenRounds:
+def _drive(work: Work, settings: EdgeSettings, federation: EdgeFederation, plan: TaskPlan) -> DrivenRounds:
     """Return what the radio network makes of the rounds of a plan."""
-    own, inputs = federation, settings.inputs
+    own, inputs, network, rounds = federation, settings.inputs, settings.federation.network, federation.schedule.rounds
+    if isinstance(own.strategy, FedBuff) and network is not None:
+        fleet = open_buffered_fleet(work, settings, own.learning, inputs, [*own.clients])
+        driven = drive_buffers(fleet, own.strategy, network, settings.federation, rounds)
+        save_clock(driven, work, inputs.region)
+        return driven
     seeds = [own.schedule.work(number).seed for number in range(1, rounds + 1)]
     rules = follow_plan(settings.federation, plan, after_edge=bool(own.earlier))
     return drive_region(work, settings, own.learning, inputs, [*own.clients], own.earlier, rules, seeds)
