@@ -15,9 +15,9 @@ from flcav.config import InputError, Json, read_json
 from flcav.experiments import run_tables, seed_tables
 from flcav.experiments.arms import tables as arms_tables
 from flcav.experiments.arms.run import ArmsResult
-from flcav.experiments.attacks import tables as attack_tables
 from flcav.experiments.asynchrony.run import AsynchronyResult
 from flcav.experiments.asynchrony.tables import asynchrony_tables
+from flcav.experiments.attacks import tables as attack_tables
 from flcav.experiments.attacks.faults import FaultsResult
 from flcav.experiments.attacks.leakage import LeakageResult
 from flcav.experiments.corner_cases.run import CornerCaseResult

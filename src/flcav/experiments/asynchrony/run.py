@@ -94,14 +94,16 @@ class AsynchronyResult(Record):
     def sentences(self) -> list[str]:
         """Return the differences in words."""
         judged = judge_means(self.claims)
-        return [f"{name} - waiting: {mean.describe(sign=True)}, {judged[name].describe()}"
-                for name, mean in self.claims.items()]
+        return [
+            f"{name} - waiting: {mean.describe(sign=True)}, {judged[name].describe()}"
+            for name, mean in self.claims.items()
+        ]
 
 
 def compare_asynchrony(
     out: Path, seeds: int, progress: Report = ignore_progress
 ) -> tuple[AsynchronyResult, dict[str, bytes]]:
-    """Record the drives into `out`, and federate once for each setting, seed and rival; return numbers and a picture."""
+    """Record the drives into `out`, and federate by each setting, seed and rival; return numbers and a picture."""
     drives = record_drives(out, progress)
     scenes = Dataset.open(out / "train")
     right: dict[tuple[str, str, str], list[NDArray[np.float64]]] = {}
@@ -151,9 +153,9 @@ def schedule_all(fleet: Fleet, links: list[RadioLinks]) -> dict[str, Scheduled]:
         if isinstance(rival.strategy, FedBuff):
             found[name] = schedule_buffers(rival.strategy, fleet, links, until_s, sent)
         elif name != WAITS:
-            rounds = ROUNDS
-            while (own := schedule_rounds(rival, fleet, links, rounds)).end_s[-1] <= until_s or sum(own.up_bytes) <= sent:
-                rounds += ROUNDS
+            rounds, own = ROUNDS, waits
+            while own.end_s[-1] <= until_s or sum(own.up_bytes) <= sent:
+                own = schedule_rounds(rival, fleet, links, rounds := rounds + ROUNDS)
             found[name] = own
     return found
 
@@ -200,9 +202,9 @@ def follow(
     elif own.outages:
         stale = stale[: len(stale) - sum(number <= ends[SECONDS] for number, _ in own.outages)]
     trajectory = Trajectory(
-        seconds=(0.0, *own.end_s),
-        up_mb=(0.0, *(sent / BYTES_PER_MB).tolist()),
-        accuracy=tuple(float(each.mean()) for each in right),
+        seconds=(0.0, *(round(each, 3) for each in own.end_s)),
+        up_mb=(0.0, *np.round(sent / BYTES_PER_MB, 4).tolist()),
+        accuracy=tuple(round(float(each.mean()), 5) for each in right),
         updates=len(stale),
         staleness=float(np.mean(stale)) if stale else 0.0,
         at={measure: float(right[end].mean()) for measure, end in ends.items()},

@@ -79,11 +79,8 @@ def schedule_buffers(
     while not timings or timings[-1].end_s <= seconds or sum(map(_sum_bytes, timings)) <= up_bytes:
         timings.append(clock.fill())
     driven = own.read(Rules(), timings)
-    return Scheduled(
-        tuple(each.end_s for each in timings), tuple(map(_sum_bytes, timings)), buffers=driven.buffers
-    )
+    return Scheduled(tuple(each.end_s for each in timings), tuple(map(_sum_bytes, timings)), buffers=driven.buffers)
 
 
 def _sum_bytes(timing: BufferTiming) -> int:
     return sum(client.uploaded_bytes for client in (*timing.updates, *timing.broken))
-

@@ -15,8 +15,11 @@ def asynchrony_tables(results: AsynchronyResult) -> dict[str, str]:
             own = [seed[rival] for seed in results.trajectories[setting].values()]
             means = [of_setting[measure][rival].describe() for measure in MEASURES]
             took = [f"{np.mean([each.took[measure] for each in own]):.2f}" for measure in (MEGABYTES, SECONDS)]
-            rest = [f"{np.mean([each.updates for each in own]):.0f}", f"{np.mean([each.staleness for each in own]):.2f}"]
-            accuracy.append([setting, rival, means[0], took[0], means[1], took[1], *rest])
+            updates, stale = (
+                float(np.mean(each)) for each in zip(*((t.updates, t.staleness) for t in own), strict=True)
+            )
+            rest = [means[0], took[0], means[1], took[1], f"{updates:.0f}", f"{stale:.2f}"]
+            accuracy.append([setting, rival, *rest])
             for measure in MEASURES if rival != WAITS else ():
                 one, name = results.differences[setting][measure][rival], f"{setting}, {measure}: {rival}"
                 verdict = judged[name]
