@@ -88,7 +88,7 @@ class Setting:
     @property
     def edge_federation(self) -> Federation:
         """Return the federation without what decides stage III alone."""
-        of_cloud = ("personal", "cloud_strategy", "cloud_rate", "replay", "score_statistics")
+        of_cloud = ("personal", "cloud_strategy", "cloud_rate", "replay", "score_statistics", "cloud_topics")
         return self.federation.model_copy(update={name: Federation.model_fields[name].default for name in of_cloud})
 
 
@@ -195,6 +195,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
         )
     if how.replay and (how.personal or isinstance(edge, FedMD)):
         raise InputError("federation.replay: the cloud's own training goes with whole networks, not personal or fedmd")
+    if how.replay and how.cloud_topics:
+        raise InputError("federation.replay: the cloud's own training, which no topic is for; leave out 'cloud_topics'")
     if setting.fault is not None and not all(LABEL_SOURCES[kind].tracked for kind in setting.labels.values()):
         raise InputError(f"fault: '{setting.fault}' is one of labels by tracks; choose 'tracks' or 'road+tracks'")
     _check_numbers(recipe, setting, edge)

@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes.ros_names import ROS_NAMESPACE
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.clock.rounds import NetworkSettings
@@ -35,6 +36,7 @@ Fault = Literal["missed", "unsure", "false", "boxes"]  # see `flcav.pipeline.lab
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_]*$")]
 Count = Annotated[int, Field(ge=0, le=10**6)]
 Positive = Annotated[float, Field(gt=0)]
+RosNamespace = Annotated[str, Field(pattern=ROS_NAMESPACE)]
 
 SPLITS_OF: Mapping[Role, tuple[SplitName, ...]] = {  # splits of a region, by its role
     "pretrain": ("pool", "validation", "test"),
@@ -265,6 +267,7 @@ class Federation(Rules):
     )  # weight in the cloud's averages of its own training on the samples of stage I, which it has
     score_statistics: bool = False  # validate stage III also with each region's own statistics of batch normalisation
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
+    cloud_topics: RosNamespace | None = None  # edge servers and cloud exchange parameters by ROS 2 topics below it
 
 
 def _name_replanning(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from flcav.experiments.asynchrony.run import MEASURES, MEGABYTES, RIVALS, SECONDS, WAITS, AsynchronyResult
+from flcav.experiments.asynchrony.run import MEASURES, MEGABYTES, RIVALS, SECONDS, SETTINGS, WAITS, AsynchronyResult
 from flcav.statistics.verdicts import judge_means
 from flcav.storage.markdown import format_table
 
@@ -10,7 +10,8 @@ from flcav.storage.markdown import format_table
 def asynchrony_tables(results: AsynchronyResult) -> dict[str, str]:
     """Return Markdown by name: accuracy, differences."""
     judged, accuracy, differences = judge_means(results.claims), [], []
-    for setting, of_setting in results.accuracy.items():
+    for setting in SETTINGS:
+        of_setting = results.accuracy[setting]
         for rival in RIVALS:
             own = [seed[rival] for seed in results.trajectories[setting].values()]
             means = [of_setting[measure][rival].describe() for measure in MEASURES]
@@ -36,5 +37,5 @@ def asynchrony_tables(results: AsynchronyResult) -> dict[str, str]:
         "their staleness",
     )
     more = "if undecided: seeds that detect a difference of the observed size"
-    told = ("vehicles", "at", "rounds", "accuracy - that of waiting", "p, corrected", "verdict", more)
+    told = ("vehicles", "at", "rounds", "accuracy - that of waiting", "p, corrected", "claim that it is positive", more)
     return {"accuracy": format_table(heads, accuracy), "differences": format_table(told, differences)}

@@ -24,6 +24,7 @@ from flwr.proto.recorddict_pb2 import RecordDict as ProtoRecords
 from flcav.config import InputError
 from flcav.federation.runtimes.bag import BagWriter
 from flcav.federation.runtimes.embedded import CLIENT_APP_RAISED, EmbeddedGrid
+from flcav.federation.runtimes.ros_names import ROS_NAMESPACE, join_names
 from flcav.federation.state import ClientStates
 from flcav.federation.trainable import Trainable
 from flcav.interface.extras import format_install_command
@@ -32,7 +33,6 @@ TYPE, HASH = "std_msgs/msg/UInt8MultiArray", "RIHS01_5687e861b8d307a5e48b7515467
 RECORDS, FAILED = "flwr.RecordDict", "error"  # labels of the dimension: what the data are
 DISCOVERY_S, DELIVERY_S = 20.0, 120.0
 MOST_BYTES = 2**31  # of a message's data
-NAMESPACE = re.compile(r"/[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class RosTopics:
     bag: Path | None = None  # new folder of a ROS 2 bag with every message; None: none is written
 
     def __post_init__(self) -> None:
-        if not NAMESPACE.fullmatch(self.namespace):
+        if not re.match(ROS_NAMESPACE, self.namespace):
             raise InputError(f"namespace '{self.namespace}': a ROS name such as /flcav/weather is wanted")
         if not 0 <= self.number <= 232:
             raise InputError(f"DDS domain {self.number}: 0 to 232 are possible")
@@ -65,7 +65,7 @@ class RosTopics:
 
     def name(self, client: str, way: str) -> str:
         """Return the ROS name of a client's topic, `way` being down or up."""
-        return f"{self.namespace}/{re.sub(r'[^A-Za-z0-9_]', '_', client)}/{way}"
+        return join_names(self.namespace, client, way)
 
     @contextlib.contextmanager
     def open(

@@ -1,10 +1,11 @@
 """Stage III of a task: edge servers federate with the cloud, vehicles with edge servers."""
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flcav.federation.buffered_rounds import Buffers, afford_buffers
 from flcav.federation.divergence import RoundDivergence, measure_divergence
@@ -15,6 +16,7 @@ from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.runtimes.link import open_processes
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.processes import ClientProcesses
+from flcav.federation.runtimes.ros_names import join_names
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
@@ -62,6 +64,10 @@ from flcav.pipeline.training.private_rounds import take_noise
 from flcav.pipeline.training.records import read_rounds
 from flcav.pipeline.training.statistics import keep_statistics, score_statistics
 
+if TYPE_CHECKING:
+    from flcav.federation.runtimes.topics import RosTopics
+
+BAG = "bag-from-round"  # begins the names of the folders of ROS 2 bags
 REPLAY = "cloud-replay"  # the cloud's own training among the edge servers; no region has a hyphen in its name
 
 
@@ -103,6 +109,7 @@ class CloudFederation:
     rate: float | None = None  # of the first round, where it is restarted
     replay: TaskClient | None = None  # the cloud's own training on the samples of stage I
     replay_share: float = 0.0  # of it in each of the cloud's averages
+    topics: str | None = None  # ROS namespace by which edge servers and cloud exchange messages; None: in memory
 
     def afford(self, rules: Rules, rounds: int, buffers: Mapping[str, Buffers]) -> int:
         """Return as many of `rounds` as the privacy budget affords in every region; without one all."""
@@ -124,6 +131,16 @@ class CloudFederation:
         steps = self.learning.training.local_steps
         samples = sum(each.count_samples(steps) for own in self.regions.values() for each in own.clients.values())
         return {REPLAY: Replay(self.replay, max(round(samples * self.replay_share / (1 - self.replay_share)), 1))}
+
+    def open_topics(self, done: int) -> "RosTopics | None":
+        """Return the topics of the rounds after `done`, and their bag; None where messages stay in memory."""
+        if self.topics is None:
+            return None
+        from flcav.federation.runtimes.topics import RosTopics
+
+        bag = self.folder / f"{BAG}{done + 1}"
+        shutil.rmtree(bag, ignore_errors=True)  # of rounds that a kill undid
+        return RosTopics(join_names(self.topics, f"seed{self.learning.seed}", self.folder.name), bag=bag)
 
     def vehicles(self, region: str) -> Mapping[str, Trainable]:
         """Return the clients of a region's edge server, by name."""
@@ -211,6 +228,7 @@ def federate_cloud(
             state=state,
             done=done,
             on_round=partial(_keep_round, own, servers, state, checkpoints),
+            runtime=own.open_topics(done),
         )
     losses = checkpoints.finish(own.network, learning.training.average_rounds)
     if rules.personal:
@@ -369,6 +387,7 @@ def _open_federation(
         rate=settings.federation.cloud_rate,
         replay=_open_replay(work, settings, learning, start.config) if settings.federation.replay else None,
         replay_share=settings.federation.replay,
+        topics=settings.federation.cloud_topics,
     )
 
 

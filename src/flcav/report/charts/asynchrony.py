@@ -28,7 +28,7 @@ class Reached(Protocol):
 @style.styled
 def draw_trajectories(found: Mapping[str, Mapping[str, Mapping[str, Reached]]], names: Sequence[str]) -> Figure:
     """Return the mean accuracy over seeds by time, a panel per setting; `found` is by setting, seed and name."""
-    figure = style.canvas(7.2, 3.2)
+    figure = style.canvas(7.2, 3.4)
     panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
     for panel, (setting, seeds) in zip(panels, found.items(), strict=True):
         until = min(each.seconds[-1] for own in seeds.values() for each in own.values())
@@ -38,7 +38,7 @@ def draw_trajectories(found: Mapping[str, Mapping[str, Mapping[str, Reached]]], 
             panel.plot(grid, np.mean(rows, axis=0), color=colour, label=name, linewidth=1.4)
         panel.set(xlabel="seconds on the network", title=setting)
     panels[0].set(ylabel="accuracy")
-    style.key(figure, panels[0].get_legend_handles_labels()[0])
+    style.key(figure, panels[0].get_legend_handles_labels()[0], ncols=3)
     return figure
 
 
