@@ -184,6 +184,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
     selection, privacy = how.selection, how.privacy
     if isinstance(edge, FedBuff) and setting.central is None:
         _check_buffers(recipe, setting)
+    if how.requests is not None and setting.central is None:
+        _check_requests(recipe, setting, edge)
     if how.network is not None and selection.rule == "importance":
         raise InputError("federation.network: importance selection draws the clients after they have trained")
     if how.network is not None and selection.unbiased:
@@ -255,6 +257,21 @@ def _check_buffers(recipe: RunRecipe, setting: Setting) -> None:
         raise InputError("strategy fedbuff: nobody joins rounds by a plan; leave out horizon_s")
     if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
         raise InputError("strategy fedbuff: labels 'road-average' are made anew before a round that all begin together")
+
+
+def _check_requests(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
+    """Raise `InputError` where an arm's groups on request do not go with its strategy, rules or labels."""
+    how, told = setting.federation, "requests: how many vehicles a group has is not known before"
+    if isinstance(strategy, FedBuff | FedMD) or needs_known_number(strategy):
+        raise InputError(f"{told}, and {type(strategy).__name__} needs a known roster")
+    if how.selection.rule != "all" or how.least_clients is not None or how.secure is not None:
+        raise InputError(f"{told}; leave out 'selection', 'least_clients' and 'secure'")
+    if how.privacy is not None:
+        raise InputError("privacy: requests and offers tell of a vehicle's data, and no noise covers them")
+    if _plans_joiners(recipe, setting):
+        raise InputError("requests: nobody joins rounds by a plan; leave out horizon_s")
+    if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
+        raise InputError("requests: vehicles check the network by labels of their own, not by those of 'road-average'")
 
 
 def _check_bare_labels(setting: Setting) -> None:

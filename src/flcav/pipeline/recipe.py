@@ -130,6 +130,21 @@ def draw_stragglers(how: Stragglers, vehicles: Sequence[str], seed: int, region:
     return {vehicles[number]: 1 / how.slower for number in sorted(drawn[: round(how.share * len(vehicles))])}
 
 
+class Requests(Config):
+    """Groups on request instead of a fixed roster, in stage II: who asks, who is called, and when a group dissolves."""
+
+    excess: float = Field(
+        default=1.5, gt=0, le=1000
+    )  # a vehicle asks whose loss on held-back frames is above so many times that at the end of pretraining
+    held_back: float = Field(default=0.25, gt=0, lt=1)  # share of its labelled frames that a vehicle does not train on
+    range_m: float = Field(default=300.0, gt=0, le=10_000)  # of V2X, between vehicles and from them to an edge server
+    most: int | None = Field(default=None, ge=1, le=1000)  # members at most, with those that ask; default: all
+    least_quality: float = Field(default=0.5, ge=0, le=1)  # of a member's data, relative to the best that are offered
+    link_s: float = Field(default=10.0, gt=0)  # longest time of an update alone on the air, where there is a network
+    patience: int = Field(default=2, ge=1, le=1000)  # rounds by which the loss on held-back frames has to fall
+    least_gain: float = Field(default=0.01, ge=0, lt=1)  # share of the loss that these have to gain
+
+
 class FixedPlan(Config):
     """A task's plan, given by hand instead of computed."""
 
@@ -256,7 +271,7 @@ class Federation(Rules):
 
     strategy: StrategySpec = "fedavg"  # name, or {name: settings}; module:NAME of your own
     cloud_strategy: StrategySpec | None = (
-        None  # of the cloud; default: `strategy`, or fedavg where that corrects local steps or is fedmd
+        None  # of the cloud; default: `strategy`, or fedavg where that corrects local steps, is fedmd or fedbuff
     )
     edge_rounds_per_cloud_round: int = Field(default=1, ge=1, le=100)  # in every region
     cloud_rate: float | None = Field(
@@ -267,6 +282,7 @@ class Federation(Rules):
     )  # weight in the cloud's averages of its own training on the samples of stage I, which it has
     score_statistics: bool = False  # validate stage III also with each region's own statistics of batch normalisation
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
+    requests: Requests | None = None  # stage II with groups on request; default: all vehicles of a region
     cloud_topics: RosNamespace | None = None  # edge servers and cloud exchange parameters by ROS 2 topics below it
 
 

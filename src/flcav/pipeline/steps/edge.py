@@ -1,10 +1,13 @@
 """Stage II of a task in a region, and its further edge rounds: the vehicles federate with their edge server."""
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+from safetensors.numpy import load_file
 
 from flcav.federation.buffered_rounds import Buffers, afford_buffers
 from flcav.federation.privacy import count_affordable
@@ -34,6 +37,7 @@ from flcav.pipeline.radio.driving import DrivenRounds
 from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
+from flcav.pipeline.steps.groups import call_group
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.regions import (
     LabelledSamples,
@@ -52,7 +56,8 @@ from flcav.pipeline.steps.settings import (
     read_entries,
     share_plan_budget,
 )
-from flcav.pipeline.training.checkpoints import FederationCheckpoints, load_round_network
+from flcav.pipeline.training.checkpoints import FederationCheckpoints, load_round_network, round_path
+from flcav.pipeline.training.groups import GroupWatch, Levelled
 from flcav.pipeline.training.learning import (
     Learning,
     describe_federation,
@@ -82,6 +87,7 @@ class EdgeFederation:
     validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
     relabel: BeforeRound | None = None  # changes the clients' labels before each round
+    watch: GroupWatch | None = None  # over a group, which dissolves when its loss has levelled off
 
     @property
     def start_share(self) -> float:
@@ -146,7 +152,16 @@ def federate_edge(
         clients = give_outputs(own.clients, own.shared, to_arrays(own.network))
     if timed and not rules.hides_draws:
         clients = time_clients(clients, own.folder)
-    with checkpoints.refusals(), open_runtime(runtime, clients, processes) as where:
+    if own.watch is not None:
+        for number in range(1, done + 1):
+            own.watch.note(load_file(round_path(own.folder, number)))
+    with (
+        checkpoints.refusals(),
+        open_runtime(runtime, clients, processes) as where,
+        contextlib.suppress(Levelled),
+    ):
+        if own.watch is not None and own.watch.over:
+            raise Levelled
         if done < own.afford(rules, own.schedule.rounds, buffers):
             federate(
                 clients,
@@ -159,12 +174,23 @@ def federate_edge(
                 done=done,
                 earlier=own.earlier,
                 before_round=partial(own.prepare, clients, where),
-                on_round=checkpoints.save,
+                on_round=partial(_keep_round, own.watch, checkpoints),
                 runtime=where,
                 distiller=own.shared,
                 buffers=buffers,
             )
     return checkpoints.finish(own.network, learning.training.average_rounds, own.start_share)
+
+
+def _keep_round(
+    watch: GroupWatch | None, checkpoints: FederationCheckpoints, number: int, weights: Weights, loss: float | None
+) -> None:
+    """Keep a round; raises `Levelled` where the group is to dissolve."""
+    checkpoints.save(number, weights, loss)
+    if watch is not None:
+        watch.note(weights)
+        if watch.over:
+            raise Levelled
 
 
 class EdgeSettings(FederationSettings):
@@ -196,18 +222,25 @@ def edge_step(
     inputs, stage, plan = settings.inputs, settings.stage, Plan.load(work.inputs[settings.inputs.plan])
     book = _open_book(work, settings, plan)
     before, labelled = len(book.entries), label_samples(work, settings, inputs, book, EDGE)
+    called = None
+    if stage == EDGE and settings.federation.requests is not None:
+        called = call_group(work, settings, inputs, settings.federation.requests, labelled.samples, book)
+        labelled = replace(labelled, samples=called.samples)
     if stage == MORE_EDGE and isinstance(labelled.samples, RoadAverageLabels):
         _label_once(work, settings, plan, labelled.samples)
     noise = _find_noise(work, settings, plan)
     settings = settings.model_copy(update={"federation": take_noise(settings.federation, noise)})
     own, k = plan.tasks[settings.learning.task], settings.federation.edge_rounds_per_cloud_round
     rounds = _plan_private(settings, plan).edge if stage == EDGE else own.cloud_rounds * k
+    if called is not None and not called.samples:
+        rounds = 0
     federation = _open_federation(work, settings, labelled, rounds, book)
+    federation = federation if called is None else replace(federation, watch=called.watch)
     driven = _drive(work, settings, federation, own)
     where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
     losses = federate_edge(federation, driven.rules, driven.outages, buffers=driven.buffers, **where)
     clients, labels = federation.clients, None
-    if settings.scored and stage == EDGE:
+    if settings.scored and stage == EDGE and clients:
         labels = score_labels(work, inputs, federation.network.config, labelled.samples)
     StageResult(
         stage=stage,
@@ -221,6 +254,7 @@ def edge_step(
         records=read_rounds(work.folder, inputs.region, before, {inputs.region: driven.seconds}),
         labels=labels,
         noise=noise,
+        group=None if called is None else called.dissolve(work.folder, rounds),
     ).save(work.folder)
 
 
