@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from flcav.interface.wording import plural
 from flcav.storage.records import Record
 
 
@@ -43,11 +44,12 @@ class Group(Record):
             return f"nobody asked: the largest loss on held-back frames is {worst:.3f}, and {self.limit:.3f} the limit"
         told = [
             f"{', '.join(self.asked)} asked, with a loss above {self.limit:.3f} on frames held back",
-            f"{self.lead} led {len(self.members)} vehicles for {len(self.losses) - 1} of {self.most_rounds} rounds",
+            f"{self.lead} led {plural(len(self.members), 'vehicle')} for {max(len(self.losses) - 1, 0)} of "
+            f"{plural(self.most_rounds, 'round')}",
             f"{self.request_bytes} bytes of requests and offers",
         ]
         for name in self.asked:
             own = self.vehicles[name]
             told.append(f"{name} {own.before:.3f} to {own.after:.3f}" if own.after is not None else name)
         told += [f"{name} stayed ({why})" for name, why in self.stayed.items()]
-        return "; ".join([*told, self.dissolved])
+        return "; ".join([*told, *([self.dissolved] if self.dissolved else [])])
