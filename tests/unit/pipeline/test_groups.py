@@ -11,7 +11,9 @@ from safetensors.numpy import load
 
 from flcav.config import InputError
 from flcav.federation.trainable import LocalUpdate
+from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.perception.weather.samples import Sample
+from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.arms import check_federations, resolve_settings
 from flcav.pipeline.recipe import Requests, RunRecipe
 from flcav.pipeline.results.groups import Checked, Group
@@ -102,6 +104,15 @@ def test_a_group_dissolves_when_rounds_gain_too_little() -> None:
     assert has_levelled([1.0, 1.5, 2.0], how)  # or gets worse
     watch = GroupWatch(None, None, 1, how, {"a": Picked([1], [])}, [1.0, 1.0, 1.0])  # type: ignore[arg-type]
     assert not watch.over  # of nobody who holds something back
+
+
+def test_losses_that_members_tell_are_in_the_ledger_and_held_to_the_budget() -> None:
+    watch = GroupWatch(WEATHER, None, 1, Requests(), {"grid/a": Picked([1], [0]), "grid/b": Picked([1], [])})
+    book = Ledger(LinkMegabytes(1e-4, 0.0))
+    watch.tell(book, 3)
+    assert [(each.client, each.round, each.direction) for each in book] == [("grid/a", 3, "up")]
+    with pytest.raises(BudgetExceeded):
+        watch.tell(book, 4)
 
 
 def test_labels_are_counted_by_class_and_sketches_keep_angles() -> None:

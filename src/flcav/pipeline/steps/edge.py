@@ -186,11 +186,12 @@ def _keep_round(
     watch: GroupWatch | None, checkpoints: FederationCheckpoints, number: int, weights: Weights, loss: float | None
 ) -> None:
     """Keep a round; raises `Levelled` where the group is to dissolve."""
-    checkpoints.save(number, weights, loss)
     if watch is not None:
         watch.note(weights)
-        if watch.over:
-            raise Levelled
+        watch.tell(checkpoints.book, number)
+    checkpoints.save(number, weights, loss)
+    if watch is not None and watch.over:
+        raise Levelled
 
 
 class EdgeSettings(FederationSettings):

@@ -15,12 +15,13 @@ import torch
 from numpy.typing import NDArray
 
 from flcav.federation.trainable import Weights
-from flcav.network.messages import from_names, pack
+from flcav.network.ledger import Ledger
+from flcav.network.messages import from_names, pack, send
 from flcav.optimization.quality import data_quality, gradient_novelty, label_distribution_distance
 from flcav.perception.client import TaskClient
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays
-from flcav.pipeline.recipe import Requests
+from flcav.pipeline.recipe import EDGE, Requests
 from flcav.statistics.streams import stream
 
 Array = NDArray[np.float64]
@@ -217,6 +218,14 @@ class GroupWatch:
         """Note the mean loss of the members."""
         found = self.measure(weights)
         self.losses.append(float(np.mean([*found.values()])) if found else 0.0)
+
+    def tell(self, book: Ledger, round_: int) -> None:
+        """Enter the members' messages of their losses after a round; raises `BudgetExceeded`."""
+        message = pack({"loss": np.zeros(1, np.float32)})
+        for name, own in self.held.items():
+            if len(own):
+                about: Any = {"stage": EDGE, "task": self.task.name, "link": "wireless", "direction": "up"}
+                send(book, message, client=name, round_=round_, **about)
 
     @property
     def over(self) -> bool:
