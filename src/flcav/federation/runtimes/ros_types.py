@@ -1,6 +1,7 @@
 """`std_msgs/msg/UInt8MultiArray` as DDS has it, by the mapping of ROS 2's interfaces to IDL (design.ros2.org)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import sequence, uint8, uint32
@@ -33,12 +34,16 @@ class UInt8MultiArray_(IdlStruct, typename="std_msgs.msg.dds_.UInt8MultiArray_")
     @classmethod
     def of(cls, label: str, data: bytes) -> "UInt8MultiArray_":
         """Return an array of one dimension."""
-        size = len(data)
-        return cls(MultiArrayLayout_([MultiArrayDimension_(label, size, size)], 0), data)
+        size: Any = len(data)
+        dimensions: Any = [MultiArrayDimension_(label, size, size)]
+        content: Any = data  # cyclonedds takes any sequence
+        return cls(MultiArrayLayout_(dimensions, 0), content)
 
     def read(self) -> tuple[str, bytes]:
         """Return the label of an array of one dimension, and its bytes; raises OSError for another one."""
-        dimensions, data = self.layout.dim, bytes(self.data)
+        dimensions: Any = self.layout.dim
+        content: Any = self.data
+        data = bytes(content)
         if len(dimensions) != 1 or dimensions[0].size != len(data) or self.layout.data_offset:
             raise OSError("an array of another form than one dimension of bytes")
         return dimensions[0].label, data

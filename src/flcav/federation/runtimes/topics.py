@@ -86,7 +86,9 @@ class RosTopics:
         with contextlib.ExitStack() as stack:
             wires = stack.enter_context(_open_wires(self, names))
             bag = stack.enter_context(writing)
-            yield stack.enter_context(TopicGrid(make_app(clients), names, states, wires, bag))
+            grid = TopicGrid(make_app(clients), names, states, wires, bag)
+            stack.enter_context(grid)
+            yield grid
 
 
 class Topic:

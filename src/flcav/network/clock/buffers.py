@@ -56,7 +56,9 @@ def chain_links(scenes: Sequence[RadioLinks]) -> tuple[RadioLinks, float]:
         columns = [names.index(name) for name in links.vehicle]
         distance[:, columns], state[:, columns] = links.distance_m[:-1], links.state[:-1]
         loss[:, columns] = links.loss_db[:-1]
-        distances.append(distance), states.append(state), losses.append(loss)
+        distances.append(distance)
+        states.append(state)
+        losses.append(loss)
     joined = (np.concatenate(each) for each in (distances, states, losses))
     return RadioLinks(first.radio, np.concatenate(times), names, first.unit, *joined), sum(spans)
 

@@ -102,7 +102,7 @@ def call_group(
     lead = find_lead(positions, present, find_servers(split, placed, inputs), how.range_m)
     where: Any = {"stage": EDGE, "task": task.name, "link": "wireless", "direction": "up"}
     for name in present:
-        about = {"position": positions[name].astype(np.float32), "loss": np.float32([vehicles[name].before])}
+        about = {"position": positions[name].astype(np.float32), "loss": np.array([vehicles[name].before], np.float32)}
         send(book, pack(about), client=name, **where)
     near = find_in_range(positions, present, how.range_m)
     linked = find_linked(settings, learning, split, placed, scene, inputs.region, near, how.link_s)
