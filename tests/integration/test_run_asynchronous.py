@@ -95,7 +95,7 @@ def test_a_group_that_asked_trains_and_goes_on_after_a_stop(
 
 
 def test_a_budget_that_is_too_small_ends_the_buffers(buffered: tuple[Path, RunRecipe, Run]) -> None:
-    folder, recipe, result = buffered
+    folder, recipe, _ = buffered
     sent = Ledger.load(folder / "ledgers/main.parquet")
     pretraining = sent.used_mb("wireless", stage="pretrain")
     edge = sent.used_mb("wireless", stage=EDGE)
