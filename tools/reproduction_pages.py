@@ -15,6 +15,8 @@ from flcav.config import InputError, Json, read_json
 from flcav.experiments import run_tables, seed_tables
 from flcav.experiments.arms import tables as arms_tables
 from flcav.experiments.arms.run import ArmsResult
+from flcav.experiments.asynchrony.run import AsynchronyResult
+from flcav.experiments.asynchrony.tables import asynchrony_tables
 from flcav.experiments.attacks import tables as attack_tables
 from flcav.experiments.attacks.faults import FaultsResult
 from flcav.experiments.attacks.leakage import LeakageResult
@@ -69,6 +71,7 @@ def _of_study(
 
 
 TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of (content of its result.json, path)
+    "asynchrony": _told(AsynchronyResult, asynchrony_tables),
     "corner-cases": _told(CornerCaseResult, corner_case_tables),
     "demo": _told(ArmsResult, arms_tables.tables),
     "gap": _told(GapResult, gap_tables),

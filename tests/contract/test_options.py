@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from flcav.cli.main import app, run
-from flcav.cli.reproduce import ATTACKS, RECORDED, TARGETS
+from flcav.cli.reproduce import DRIVES, RECORDED, TARGETS
 from flcav.config import InputError
 from flcav.dataset.formats.formats import EXPORTS, IMPORTS
 from flcav.perception.errors import RegistersErrors
@@ -19,7 +19,7 @@ from flcav.perception.tasks import TASKS, task_named
 
 ALWAYS = "always"
 SCORED = tuple(name for name in TASKS if isinstance(task_named(name), Scores))
-SINGLE = ("fig1b", "fig3a", "sim-to-real", *map(str, (*RECORDED, *ATTACKS)))  # are no studies
+SINGLE = ("fig1b", "fig3a", "sim-to-real", *map(str, (*RECORDED, *DRIVES)))  # are no studies
 STUDIES = tuple(target for target in TARGETS if target not in SINGLE)
 # command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
 CHOICES: dict[str, dict[str, str]] = {
@@ -128,7 +128,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         ALWAYS,
     ),
     "reproduce": {
-        "--seeds": (*STUDIES, *map(str, ATTACKS)),
+        "--seeds": (*STUDIES, *map(str, DRIVES)),
         "--scale": STUDIES,
         "--jobs": (*STUDIES, "sim-to-real"),
         **dict.fromkeys(("--engine", "--stale"), (*STUDIES, "sim-to-real")),

@@ -80,7 +80,8 @@ def _describe(result: "StageResult") -> str:
     seconds = [record.seconds for record in records if record.seconds is not None]
     told += f", {sum(seconds):.1f} s on the network" if seconds else ""
     failures = describe_failures([record.failed for record in records])
-    return f"{told}, {failures}" if failures else told
+    told = f"{told}, {failures}" if failures else told
+    return told if result.group is None else f"{told}; {result.group.describe()}"
 
 
 def _telling(notify: "Notify") -> "Notify":

@@ -36,6 +36,7 @@ class Target(StrEnum):
     corner_cases = "corner-cases"
     demo_arms = "demo-arms"
     distillation = "distillation"
+    federation_asynchrony = "federation-asynchrony"
     federation_exchange = "federation-exchange"
     federation_exchange_objects = "federation-exchange-objects"
     federation_faults = "federation-faults"
@@ -65,7 +66,11 @@ EXCHANGES: Mapping[str, str] = {  # recipe of each
     Target.federation_exchange: "exchange",
     Target.federation_exchange_objects: "exchange_objects",
 }
-ATTACKS = (Target.federation_faults, Target.federation_leakage)  # one recording, several seeds
+DRIVES = (  # one recording, several seeds
+    Target.federation_asynchrony,
+    Target.federation_faults,
+    Target.federation_leakage,
+)
 
 
 class Scale(StrEnum):
@@ -81,11 +86,11 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig1b: (),
     Target.fig3a: (),
     **dict.fromkeys(RECORDED, ()),
-    **dict.fromkeys(ATTACKS, ("seeds",)),
+    **dict.fromkeys(DRIVES, ("seeds",)),
     Target.sim_to_real: (*RUN, *REAL),
 }
 SEEDS: Mapping[str, int] = {
-    **dict.fromkeys((Target.corner_cases, Target.demo_arms, *EXCHANGES, *ATTACKS), 5),
+    **dict.fromkeys((Target.corner_cases, Target.demo_arms, *EXCHANGES, *DRIVES), 5),
     **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
 }
 
@@ -145,8 +150,8 @@ def reproduce(
         _sim_to_real(out, kitti or data or Path(), weights, around, jobs, engine, stale)
         return
     count = seeds or SEEDS.get(target, COMMON_SEEDS)
-    if target in ATTACKS:
-        _attack(Target(target), out, count)
+    if target in DRIVES:
+        _repeat_drives(Target(target), out, count)
         return
     numbers = range(1, count + 1)
     quick = scale == Scale.quick
@@ -200,11 +205,13 @@ def _record_and_draw(target: Target, out: Path) -> None:
 
 
 @when_interrupted()
-def _attack(target: Target, out: Path, seeds: int) -> None:
+def _repeat_drives(target: Target, out: Path, seeds: int) -> None:
     from flcav.interface import progress
 
     with progress.show_progress(target.value) as report:
-        if target == Target.federation_faults:
+        if target == Target.federation_asynchrony:
+            from flcav.experiments.asynchrony.run import compare_asynchrony as repeat
+        elif target == Target.federation_faults:
             from flcav.experiments.attacks.faults import repeat_faults as repeat
         else:
             from flcav.experiments.attacks.leakage import repeat_leakage as repeat

@@ -31,6 +31,7 @@ class Attendance:
     lost: set[str] = field(default_factory=set)  # those of them whom the network lost
     shortage: ClientFailed | TooFewClients | None = None  # why there is no update
     few: bool = False  # whether fewer take part than the rules need
+    spent: bool = False  # whether a budget kept some from sending, in the last round of buffers
 
     def note(self, event: Lost | TimedOut) -> None:
         """Note a client that is lost, or has not answered: the latter with the reason of an earlier failure, if any."""
@@ -64,6 +65,8 @@ class Attendance:
         those who were to send; who was away does not count. Where fewer are left than `strategy` needs, the round has
         no update, and so where fewer take part than the rules need, unless a client failed.
         """
+        if self.spent:
+            return
         reasons = "; ".join(f"{name}: {reason}" for name, reason in self.failed.items())
         if self.few:
             if self.failed.keys() - self.lost:

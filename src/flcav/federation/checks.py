@@ -6,6 +6,7 @@ from flcav.config import InputError
 from flcav.federation.client import check_arguments
 from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
 from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust, needs_known_number
 from flcav.federation.trainable import Counts, Trainable
@@ -58,6 +59,8 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
         )
     if isinstance(strategy, FedMD):
         _check_outputs(rules)
+    if isinstance(strategy, FedBuff):
+        _check_buffers(strategy, rules, len(names))
     if isinstance(rules.personal, RegionalModels) and isinstance(strategy, Corrects):
         raise InputError(f"{told} corrects local steps, and so does the pull of regional models, 'personal'")
     if rules.privacy is not None and planned:
@@ -89,6 +92,20 @@ def _check_outputs(rules: Rules) -> None:
         raise InputError("FedMD's vehicles have networks of their own, which regional models, 'personal', cannot pull")
     if rules.privacy is not None:
         raise InputError("FedMD sends class probabilities, and noise is for changes of weights")
+
+
+def _check_buffers(strategy: FedBuff, rules: Rules, clients: int) -> None:
+    strategy.check_buffer(clients)
+    if rules.selection.rule != "all":
+        raise InputError(f"FedBuff: all clients train, at their own pace, and {rules.selection.rule} selects some")
+    if rules.secure is not None:
+        raise InputError("FedBuff: masks cancel in a round that all begin together, and clients of a buffer do not")
+    if isinstance(rules.least_clients, int) and rules.least_clients > strategy.buffer:
+        raise InputError(f"FedBuff: least_clients {rules.least_clients}, and a buffer has {strategy.buffer} updates")
+    if isinstance(rules.personal, RegionalModels):
+        raise InputError("FedBuff: regional models, 'personal', are pulled to the cloud's round by round")
+    if rules.privacy is not None and rules.privacy.noise is None:
+        raise InputError("FedBuff: how often a client takes part is known with the clock alone; give 'privacy.noise'")
 
 
 def _check_secure(told: str, rules: Rules, secure: SecureAggregation, chosen: int, single: bool) -> None:

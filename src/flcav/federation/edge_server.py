@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from flcav.federation.buffered_rounds import Buffers
 from flcav.federation.privacy import count_affordable
 from flcav.federation.rounds import EVERYBODY, Schedule, federate
 from flcav.federation.rules import RegionalModels, Rules
@@ -35,6 +36,7 @@ class EdgeServer:
     earlier: int = 0  # rounds of stage II, which a privacy budget counts
     runtime: ClientProcesses | None = None  # where the vehicles train; None: in this process
     distiller: Distiller | None = None  # where vehicles send outputs
+    buffers: Buffers | None = None  # of `FedBuff`, the region's rounds by a clock
     begun: Weights = field(default_factory=dict)  # that its last cloud round began with
     trained: Weights = field(default_factory=dict)  # that the edge rounds of that came to
 
@@ -70,6 +72,7 @@ class EdgeServer:
             runtime=self.runtime,
             centre=centre,
             distiller=self.distiller,
+            buffers=self.buffers,
         )
         self.begun, self.trained = start, found.weights
         names = [*found.weights] if regional else name_like(found.weights, self.rules.personal_arrays)

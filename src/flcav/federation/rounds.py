@@ -17,6 +17,7 @@ from flwr.serverapp import Grid
 
 from flcav.config import InputError
 from flcav.federation.attendance import Attendance, ClientFailed, Intake
+from flcav.federation.buffered_rounds import Buffering, Buffers, afford_buffers, is_spent, take_turns
 from flcav.federation.checks import check_federation
 from flcav.federation.client import kept_records
 from flcav.federation.masked_rounds import SecureRound
@@ -51,6 +52,7 @@ from flcav.federation.secure.parties import SumLost
 from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.fedavg import average_inversely
+from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Exchanges, Stateful, find_weigher
 from flcav.federation.trainable import Distiller, LocalUpdate, Trainable, Weights, forms_of, learned_names
@@ -102,6 +104,7 @@ def federate(
     runtime: Runtime | None = None,
     centre: Weights | None = None,
     distiller: Distiller | None = None,
+    buffers: Buffers | None = None,
 ) -> LocalUpdate:
     """Run rounds `done + 1 .. schedule.rounds` of a federation, by default of federated averaging.
 
@@ -131,6 +134,8 @@ def federate(
         centre: weights that clients are pulled to by the `personal` of the rules.
         distiller: the server's network under `FedMD`, whose clients send outputs: after a round it learns from their
             mean, which is sent down in the next one; in the first it sends its own.
+        buffers: of `FedBuff`, the rounds by a clock; None: clients are equally fast, and messages take no time. It ends
+            where an update would exceed a budget, which is not sent.
 
     Returns:
         The weights after the last round, and of that round the number of samples of all clients and their mean training
@@ -158,7 +163,14 @@ def federate(
     state, account, rounds, names = state or FederationState(), account or open_account(), schedule.rounds, [*clients]
     sent = _find_sent(weights, state, distiller)
     rules.upload.check_layers(sent)
-    if rules.privacy is not None:
+    buffering = None
+    if isinstance(strategy, FedBuff):
+        buffers = buffers or take_turns(names, strategy.buffer, rounds)
+        buffering = Buffering(strategy, buffers, account)
+        rounds = min(rounds, afford_buffers(buffers, rules.privacy))
+        if is_spent(state):
+            return LocalUpdate(weights, 0, 0.0)
+    elif rules.privacy is not None:
         privacy = find_noise(rules.privacy, rules.selection, len(names), earlier + rounds)
         rules = rules.model_copy(update={"privacy": privacy})
         rounds = affordable_rounds(privacy, rules.selection, names, rounds, earlier)
@@ -166,10 +178,10 @@ def federate(
         return LocalUpdate(weights, 0, 0.0)
     kept, account = kept_records(strategy, rules), replace(account, concealed=rules.hides_draws)
     secrets = {party: state.keep_secret(party) for party in rules.secret_parties(names) if party in clients}
-    spent = least_participations(rules.selection, len(names), earlier)
+    spent = least_participations(rules.selection, len(names), earlier) if buffers is None else buffers.least_before
     with open_link(clients, runtime, account, strategy, rules, state.clients, secrets, spent) as link:
         server = Server(
-            link.grid, link.names, strategy, rules, schedule.work, state, earlier, centre, account.find_away
+            link.grid, link.names, strategy, rules, schedule.work, state, earlier, centre, account.find_away, buffering
         )
         for number in range(done + 1, rounds + 1):
             before_round(number, weights)
@@ -182,6 +194,8 @@ def federate(
                 state.server = {name: np.asarray(array) for name, array in combined.items()}
             on_round(number, weights, state.records[-1].loss)
             sent = combined
+            if buffering is not None and is_spent(state):
+                break
     last = state.records[-1]
     return LocalUpdate(weights, last.samples, last.loss or 0.0)
 
@@ -226,6 +240,7 @@ class Server:
     earlier: int = 0  # rounds of federations before
     centre: Weights | None = None  # that clients are pulled to
     away: Callable[[int], Mapping[str, str]] = lambda _: {}  # by client why it is not there when a round begins
+    buffering: Buffering | None = None  # of a strategy whose rounds are buffers
 
     def run_round(self, number: int, start: Weights) -> Weights:
         """Return the weights after round `number`, which begins with `start`; a record is added to the state.
@@ -252,6 +267,9 @@ class Server:
     def _call(self, number: int, start: Weights) -> Round:
         """Return the round with the clients that are chosen for it, and those of them that are away."""
         work, selection, clients = self.work(number), self.rules.selection, [*self.names.values()]
+        if self.buffering is not None:
+            self.state.server = self.buffering.keep_version(number, start, self.state.server)
+            return Round(work, start, self.buffering.attend(number, clients), Expected(self.rules, start, {}), {})
         sent = self.strategy.send(self.state.server) if isinstance(self.strategy, Exchanges) else {}
         seed = int.from_bytes(self._key("selection", work), "little") if self.rules.hides_draws else work.seed
         chosen = selection.choose(clients, number, seed, self.earlier)
@@ -270,6 +288,9 @@ class Server:
         part than `least_clients`, nobody is asked to send an update.
         """
         here, selection, local = round_.here, self.rules.selection, {CONFIG: round_.work.record()}
+        if self.buffering is not None:
+            kept, number = self.state.server, round_.work.round
+            return self.buffering.collect(number, here, round_.start, kept, self.rules, self.work, self._ask)
         records = {ARRAYS: to_arrays(round_.start)} | ({EXTRA: to_arrays(round_.sent)} if round_.sent else {})
         if self.centre is not None:
             records[CENTRE] = to_arrays({name: self.centre[name] for name in learned_names(self.centre)})
@@ -371,7 +392,11 @@ class Server:
     def _keep(self, round_: Round, received: Intake) -> None:
         """Add the record of a round to the state; where who was drawn is to stay secret, it has nothing of clients."""
         number, epsilon = round_.work.round, None
-        if self.rules.privacy is not None:
+        if self.buffering is not None:
+            self.state.server = self.buffering.keep_version(number + 1, {}, self.state.server)
+        if self.rules.privacy is not None and self.buffering is not None:
+            epsilon = self.buffering.buffers.epsilon(self.rules.privacy, number)
+        elif self.rules.privacy is not None:
             rounds, names = self.earlier + number, [*self.names.values()]
             epsilon = account_epsilon(self.rules.privacy, self.rules.selection, names, rounds)
         record = RoundRecord(number, (), epsilon=epsilon)

@@ -25,7 +25,7 @@ from flcav.pipeline.steps.edge import EdgeSettings, edge_step
 from flcav.pipeline.steps.graph import Graph
 from flcav.pipeline.steps.settings import make_step
 from flcav.pipeline.training.checkpoints import LAST, LOSS, Checkpoint
-from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings
+from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings, count_private_rounds
 from flcav.pipeline.training.timing import TrainTimes, read_times, summarise_times
 from flcav.storage.files import atomic_path
 from flcav.storage.records import LEFT_OUT
@@ -94,8 +94,11 @@ def federate_regions(
     run_steps([*before, *alone.values()], out / WORK, jobs=1, notify=tell, stale=stale)
     found = tuple(_collect(graph, out, name, about[1]) for name, about in asked.items())
     trained = [each.result for each in found]
-    trainings = [PrivateTraining(own.region or "", own.clients, own.rounds, own.noise) for own in trained]
-    spent = compose_trainings(graph.settings[arm].federation, trainings)
+    how = graph.settings[arm].federation
+    rounds = [count_private_rounds(how, {EDGE: own}, own.region or "") for own in trained]
+    about = zip(trained, rounds, strict=True)
+    trainings = [PrivateTraining(own.region or "", own.clients, number, own.noise) for own, number in about]
+    spent = compose_trainings(how, trainings)
     results = Federations(recipe, arm, found, provenance(recipe.seed), spent)
     results.save(out, name_results(arm))
     return results

@@ -8,6 +8,7 @@ from flcav.config import InputError
 from flcav.federation.checks import check_rules
 from flcav.federation.privacy import affordable_rounds, find_noise
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
+from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, needs_known_number
 from flcav.federation.trainable import statistics_names
@@ -87,7 +88,7 @@ class Setting:
     @property
     def edge_federation(self) -> Federation:
         """Return the federation without what decides stage III alone."""
-        of_cloud = ("personal", "cloud_strategy", "cloud_rate", "replay", "score_statistics")
+        of_cloud = ("personal", "cloud_strategy", "cloud_rate", "replay", "score_statistics", "cloud_topics")
         return self.federation.model_copy(update={name: Federation.model_fields[name].default for name in of_cloud})
 
 
@@ -147,6 +148,8 @@ def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
     cloud = of_servers(edge) if how.cloud_strategy is None else strategy_named(how.cloud_strategy)
     if isinstance(cloud, Corrects):
         raise InputError(f"cloud_strategy: {type(cloud).__name__} corrects local steps, and edge servers take none")
+    if isinstance(cloud, FedBuff):
+        raise InputError("cloud_strategy: fedbuff does not wait for clients, and the cloud waits for all edge servers")
     if isinstance(cloud, FedMD):
         raise InputError(
             "cloud_strategy: FedMD shares frames among vehicles, and edge servers have no networks of their own"
@@ -179,6 +182,10 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
     how = setting.federation
     edge, cloud = find_strategies(how)
     selection, privacy = how.selection, how.privacy
+    if isinstance(edge, FedBuff) and setting.central is None:
+        _check_buffers(recipe, setting)
+    if how.requests is not None and setting.central is None:
+        _check_requests(recipe, setting, edge)
     if how.network is not None and selection.rule == "importance":
         raise InputError("federation.network: importance selection draws the clients after they have trained")
     if how.network is not None and selection.unbiased:
@@ -190,6 +197,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
         )
     if how.replay and (how.personal or isinstance(edge, FedMD)):
         raise InputError("federation.replay: the cloud's own training goes with whole networks, not personal or fedmd")
+    if how.replay and how.cloud_topics:
+        raise InputError("federation.replay: the cloud's own training, which no topic is for; leave out 'cloud_topics'")
     if setting.fault is not None and not all(LABEL_SOURCES[kind].tracked for kind in setting.labels.values()):
         raise InputError(f"fault: '{setting.fault}' is one of labels by tracks; choose 'tracks' or 'road+tracks'")
     _check_numbers(recipe, setting, edge)
@@ -238,6 +247,31 @@ def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> N
         raise InputError(f"{why}, and noise is for one number{instead}")
     if needs_known_number(strategy):
         raise InputError(f"{why}, and {type(strategy).__name__} needs a known one{instead}")
+
+
+def _check_buffers(recipe: RunRecipe, setting: Setting) -> None:
+    """Raise `InputError` where an arm's rounds are buffers, and no clock is theirs, or something goes by rounds."""
+    if setting.federation.network is None:
+        raise InputError("strategy fedbuff: vehicles go on at their own pace, by the clock of 'federation.network'")
+    if _plans_joiners(recipe, setting):
+        raise InputError("strategy fedbuff: nobody joins rounds by a plan; leave out horizon_s")
+    if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
+        raise InputError("strategy fedbuff: labels 'road-average' are made anew before a round that all begin together")
+
+
+def _check_requests(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
+    """Raise `InputError` where an arm's groups on request do not go with its strategy, rules or labels."""
+    how, told = setting.federation, "requests: how many vehicles a group has is not known before"
+    if isinstance(strategy, FedBuff | FedMD) or needs_known_number(strategy):
+        raise InputError(f"{told}, and {type(strategy).__name__} needs a known roster")
+    if how.selection.rule != "all" or how.least_clients is not None or how.secure is not None:
+        raise InputError(f"{told}; leave out 'selection', 'least_clients' and 'secure'")
+    if how.privacy is not None:
+        raise InputError("privacy: requests and offers tell of a vehicle's data, and no noise covers them")
+    if _plans_joiners(recipe, setting):
+        raise InputError("requests: nobody joins rounds by a plan; leave out horizon_s")
+    if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
+        raise InputError("requests: vehicles check the network by labels of their own, not by those of 'road-average'")
 
 
 def _check_bare_labels(setting: Setting) -> None:

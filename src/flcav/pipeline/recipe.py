@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes.ros_names import ROS_NAMESPACE
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.clock.rounds import NetworkSettings
@@ -35,6 +36,7 @@ Fault = Literal["missed", "unsure", "false", "boxes"]  # see `flcav.pipeline.lab
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_]*$")]
 Count = Annotated[int, Field(ge=0, le=10**6)]
 Positive = Annotated[float, Field(gt=0)]
+RosNamespace = Annotated[str, Field(pattern=ROS_NAMESPACE)]
 
 SPLITS_OF: Mapping[Role, tuple[SplitName, ...]] = {  # splits of a region, by its role
     "pretrain": ("pool", "validation", "test"),
@@ -126,6 +128,21 @@ def draw_stragglers(how: Stragglers, vehicles: Sequence[str], seed: int, region:
     """Return the speed of each straggler among a region's vehicles; others have 1."""
     drawn: list[int] = stream(seed, "stragglers", region).permutation(len(vehicles)).tolist()
     return {vehicles[number]: 1 / how.slower for number in sorted(drawn[: round(how.share * len(vehicles))])}
+
+
+class Requests(Config):
+    """Groups on request instead of a fixed roster, in stage II: who asks, who is called, and when a group dissolves."""
+
+    excess: float = Field(
+        default=1.5, gt=0, le=1000
+    )  # a vehicle asks whose loss on held-back frames is above so many times that at the end of pretraining
+    held_back: float = Field(default=0.25, gt=0, lt=1)  # share of its labelled frames that a vehicle does not train on
+    range_m: float = Field(default=300.0, gt=0, le=10_000)  # of V2X, between vehicles and from them to an edge server
+    most: int | None = Field(default=None, ge=1, le=1000)  # members at most, with those that ask; default: all
+    least_quality: float = Field(default=0.5, ge=0, le=1)  # of a member's data, relative to the best that are offered
+    link_s: float = Field(default=10.0, gt=0)  # longest time of an update alone on the air, where there is a network
+    patience: int = Field(default=2, ge=1, le=1000)  # rounds by which the loss on held-back frames has to fall
+    least_gain: float = Field(default=0.01, ge=0, lt=1)  # share of the loss that these have to gain
 
 
 class FixedPlan(Config):
@@ -254,7 +271,7 @@ class Federation(Rules):
 
     strategy: StrategySpec = "fedavg"  # name, or {name: settings}; module:NAME of your own
     cloud_strategy: StrategySpec | None = (
-        None  # of the cloud; default: `strategy`, or fedavg where that corrects local steps or is fedmd
+        None  # of the cloud; default: `strategy`, or fedavg where that corrects local steps, is fedmd or fedbuff
     )
     edge_rounds_per_cloud_round: int = Field(default=1, ge=1, le=100)  # in every region
     cloud_rate: float | None = Field(
@@ -265,6 +282,8 @@ class Federation(Rules):
     )  # weight in the cloud's averages of its own training on the samples of stage I, which it has
     score_statistics: bool = False  # validate stage III also with each region's own statistics of batch normalisation
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
+    requests: Requests | None = None  # stage II with groups on request; default: all vehicles of a region
+    cloud_topics: RosNamespace | None = None  # edge servers and cloud exchange parameters by ROS 2 topics below it
 
 
 def _name_replanning(value: Any) -> Any:

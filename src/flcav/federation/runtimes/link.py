@@ -27,9 +27,10 @@ from flcav.interface.wording import suggest
 
 if TYPE_CHECKING:
     from flcav.federation.runtimes.simulation import RaySimulation
+    from flcav.federation.runtimes.topics import RosTopics
 
 RUNTIMES = "embedded", "ray"
-Runtime = Union[ClientProcesses, "RaySimulation"]  # where clients train, other than in this process
+Runtime = Union[ClientProcesses, "RaySimulation", "RosTopics"]  # where clients train, and how messages reach them
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from flcav.config import InputError, Json, shorten
 from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavg import FedAvg
 from flcav.federation.strategies.fedavgm import FedAvgM
+from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.fedprox import FedProx
 from flcav.federation.strategies.fedyogi import FedYogi
@@ -27,6 +28,7 @@ STRATEGIES: dict[str, type[Strategy]] = {
     "fedyogi": FedYogi,
     "scaffold": Scaffold,
     "fedmd": FedMD,
+    "fedbuff": FedBuff,
     "median": Median,
     "trimmed-mean": TrimmedMean,
     "krum": Krum,
@@ -81,10 +83,16 @@ def sends_outputs(spec: Spec) -> bool:
     return name in STRATEGIES and issubclass(STRATEGIES[name], FedMD)
 
 
+def fills_buffers(spec: Spec) -> bool:
+    """Return whether rounds of one of `STRATEGIES` are buffers that fill by a clock; see `exchanges_more`."""
+    name = spec if isinstance(spec, str) else next(iter(spec), "")
+    return name in STRATEGIES and issubclass(STRATEGIES[name], FedBuff)
+
+
 def of_servers(strategy: Strategy) -> Strategy:
     """Return the strategy among edge servers, which federate with the cloud, where vehicles have `strategy`.
 
     It is the same one, unless it is about vehicles alone: edge servers take no local steps whose gradients could be
-    corrected, and share no samples. Then it is FedAvg.
+    corrected, share no samples, and the cloud waits for all of them. Then it is FedAvg.
     """
-    return FEDAVG if isinstance(strategy, Corrects | FedMD) else strategy
+    return FEDAVG if isinstance(strategy, Corrects | FedMD | FedBuff) else strategy

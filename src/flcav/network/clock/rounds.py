@@ -53,14 +53,15 @@ class Phase(IntEnum):
     OVER = 3
 
 
-class _Round:
-    """State of the K clients of a round: phase, what is left of it, and the time spent in each phase."""
+class ClientPhases:
+    """State of K clients on the clock: phase, what is left of it, and the time spent in each phase."""
 
     def __init__(
         self, links: RadioLinks, work: Sequence[ClientWork], number: int, start_s: float, rules: RoundRules
     ) -> None:
         self.links, self.work, self.number, self.rules = links, tuple(work), number, rules
-        self.start_s = self.time_s = start_s
+        self.time_s = start_s
+        self.start_s = np.full(len(work), start_s)  # (K,) of each client
         self.column = np.array([links.vehicle.index(each.client) for each in work], dtype=np.int64)
         self.received = links.received_dbm[:, self.column]  # (T, K, U)
         self.amount = np.array([(8 * w.download_bytes, w.compute_s, 8 * w.upload_bytes) for w in work], np.float64)
@@ -77,6 +78,16 @@ class _Round:
         """The latest instant of the trace."""
         return int(np.searchsorted(self.links.time_s, self.time_s + TIE, side="right")) - 1
 
+    @property
+    def until_next_s(self) -> float:
+        """The time until the next instant of the trace [s]."""
+        return float(self.links.time_s[self.instant + 1]) - self.time_s
+
+    @property
+    def ends(self) -> bool:
+        """Whether the trace ends here."""
+        return self.instant == len(self.links.time_s) - 1
+
     def run(self) -> tuple[ClientTiming, ...]:
         """Go from event to event until every client's update has arrived or is given up."""
         while True:
@@ -84,25 +95,25 @@ class _Round:
             active = self.phase < Phase.OVER
             if not active.any():
                 return tuple(map(self._timing, range(len(self.work))))
-            transfers = active & (self.phase != Phase.COMPUTE)
-            rates = shared_rates_bps(self.received[self.instant], self.server, transfers, self.links.radio)
-            speed = np.where(self.phase == Phase.COMPUTE, 1.0, rates)  # bit/s, or seconds a second
-            self.stalled_since[~(transfers & (speed == 0))] = np.inf
-            self.stalled_since[transfers & (speed == 0) & np.isinf(self.stalled_since)] = self.time_s
-            self._advance(active, speed)
+            self._advance(active)
 
-    def _advance(self, active: NDArray[np.bool_], speed: Array) -> None:
-        """Let the active clients go on at `speed` (K,) until the next event, and end the phases that are done."""
+    def _advance(self, active: NDArray[np.bool_]) -> None:
+        """Let the active clients, one or more, go on until the next event, and end the phases that are done."""
+        transfers = active & (self.phase != Phase.COMPUTE)
+        rates = shared_rates_bps(self.received[self.instant], self.server, transfers, self.links.radio)
+        speed = np.where(self.phase == Phase.COMPUTE, 1.0, rates)  # (K,) bit/s, or seconds a second
+        self.stalled_since[~(transfers & (speed == 0))] = np.inf
+        self.stalled_since[transfers & (speed == 0) & np.isinf(self.stalled_since)] = self.time_s
         rows = np.flatnonzero(active)
         left = self.left[rows, self.phase[rows]]
         with np.errstate(divide="ignore", invalid="ignore"):
             seconds = np.where(left > 0, left / speed[rows], 0.0)
         deadline_s = np.inf if self.rules.deadline_s is None else self.rules.deadline_s
         events = (
-            float(self.links.time_s[self.instant + 1]) - self.time_s,
+            self.until_next_s,
             float(seconds.min()),
             float(self.stalled_since.min()) + self.rules.outage_s - self.time_s,
-            self.start_s + deadline_s - self.time_s,
+            float(self.start_s[rows].min()) + deadline_s - self.time_s,
         )
         span = max(min(events), 0.0)
         done = seconds <= span + TIE
@@ -123,8 +134,8 @@ class _Round:
             LEFT_TOWN: ~self.links.present[n, self.column],
             NEARER: distance.min(axis=1) + rules.handover_margin_m < own,
             NO_COVERAGE: self.stalled_since + rules.outage_s <= self.time_s + TIE,
-            DEADLINE: np.full(len(self.work), late),
-            TRACE_ENDS: np.full(len(self.work), n == len(self.links.time_s) - 1),
+            DEADLINE: late,
+            TRACE_ENDS: np.full(len(self.work), self.ends),
         }
         for reason, holds in reasons.items():
             for k in np.flatnonzero(holds & (self.phase < Phase.OVER)).tolist():
@@ -137,7 +148,7 @@ class _Round:
             client=self.work[k].client,
             server=self.links.unit[self.server[k]],
             round=self.number,
-            start_s=self.start_s,
+            start_s=float(self.start_s[k]),
             download_s=float(self.spent[k, Phase.DOWNLOAD]),
             compute_s=float(self.spent[k, Phase.COMPUTE]),
             upload_s=float(self.spent[k, Phase.UPLOAD]),
@@ -169,7 +180,7 @@ def time_clients(
     here = links.present[instant]
     if away := [name for name in names if not here[links.vehicle.index(name)]]:
         raise InputError(f"round {number}: '{away[0]}' is not in the town at {start_s:g} s")
-    return _Round(links, work, number, start_s, rules).run()
+    return ClientPhases(links, work, number, start_s, rules).run()
 
 
 def simulate_rounds(

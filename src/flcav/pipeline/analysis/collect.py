@@ -26,7 +26,7 @@ from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import Pretrained, StageResult, Watched
 from flcav.pipeline.rigs import compare_rigs
 from flcav.pipeline.steps.graph import Graph
-from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings
+from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings, count_private_rounds
 
 
 def collect_results(graph: Graph, work: Path) -> Run:
@@ -115,14 +115,13 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
 
 def list_trainings(graph: Graph, work: Path, arm: Setting) -> Iterator[PrivateTraining]:
     """Yield the trainings of every task with a region's vehicles, an arm's retrainings included."""
-    per_cloud_round = arm.federation.edge_rounds_per_cloud_round
     for name in (name_repeat(arm.name, number) for number in (0, *number_retrainings(graph))):
         for region in arm.regions:
             for task in graph.recipe.tasks:
                 stages = {
                     stage: StageResult.load(work / graph.names.stage(name, stage, region, task)) for stage in arm.stages
                 }
-                rounds = sum(own.rounds * (per_cloud_round if at == CLOUD else 1) for at, own in stages.items())
+                rounds = count_private_rounds(arm.federation, stages, region)
                 yield PrivateTraining(region, stages[EDGE].clients, rounds, stages[EDGE].noise)
 
 

@@ -6,11 +6,12 @@ with most traffic.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from flcav.config import InputError
+from flcav.federation.buffered_rounds import Buffers
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Outage
 from flcav.federation.selection import Selection
@@ -37,6 +38,7 @@ class DrivenRounds:
     rules: Rules
     outages: Mapping[tuple[int, str], Outage]  # by round, from 1, and client
     records: tuple[RoundTiming, ...]  # on the clock of the region's rounds, from 0 s
+    buffers: Buffers | None = None  # of asynchronous rounds: which version each update began with
 
     @property
     def seconds(self) -> list[float]:
@@ -138,6 +140,7 @@ class DrivenCloud:
     rules: Rules
     outages: Mapping[tuple[int, str], Outage]  # by edge round, from 1, and client
     seconds: Mapping[str, Sequence[float]]  # of each round, by server
+    buffers: Mapping[str, Buffers] = field(default_factory=dict)  # of asynchronous rounds, by region
 
 
 def join_regions(

@@ -8,6 +8,7 @@ import numpy as np
 
 from flcav.federation.divergence import RoundDivergence
 from flcav.federation.privacy import SEEDED
+from flcav.pipeline.results.groups import Group
 from flcav.pipeline.results.saved import Saved
 from flcav.storage.records import LEFT_OUT, Record
 
@@ -120,6 +121,7 @@ class StageResult(Saved):
     labels: Annotated[tuple[LabelQuality, ...] | None, LEFT_OUT] = None  # before each round; None: not measured
     noise: Annotated[float | None, LEFT_OUT] = None  # that the privacy budget gave for the planned rounds; None: none
     statistics: Annotated[tuple[StatisticsScore, ...] | None, LEFT_OUT] = None  # of stage III; None: not asked for
+    group: Annotated[Group | None, LEFT_OUT] = None  # of stage II on request; None: all vehicles federate
 
 
 def diverges(losses: Sequence[float | None]) -> bool:

@@ -1,11 +1,13 @@
 """Stage III of a task: edge servers federate with the cloud, vehicles with edge servers."""
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from flcav.federation.buffered_rounds import Buffers, afford_buffers
 from flcav.federation.divergence import RoundDivergence, measure_divergence
 from flcav.federation.edge_server import EdgeServer, afford_cloud_rounds, edge_seeds
 from flcav.federation.rounds import federate
@@ -14,11 +16,15 @@ from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.runtimes.link import open_processes
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.processes import ClientProcesses
+from flcav.federation.runtimes.ros_names import join_names
 from flcav.federation.state import FederationState
+from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
+from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Trainable, Update, Weights
 from flcav.interface.progress import Report
+from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger
 from flcav.perception.client import TaskClient
 from flcav.perception.distillation import SharedSamples
@@ -28,12 +34,20 @@ from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.plan.updates import follow_plan
+from flcav.pipeline.radio.buffered import drive_cloud_buffers
 from flcav.pipeline.radio.driving import DrivenCloud, join_regions
 from flcav.pipeline.recipe import CLOUD, EDGE
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult, StatisticsScore
 from flcav.pipeline.steps.outline import Outline
-from flcav.pipeline.steps.regions import drive_region, label_samples, learn_by_distillation, load_uploads
+from flcav.pipeline.steps.regions import (
+    drive_region,
+    label_samples,
+    learn_by_distillation,
+    load_uploads,
+    open_buffered_fleet,
+    save_clock,
+)
 from flcav.pipeline.steps.settings import FederationSettings, RegionInputs, make_step, read_entries, share_plan_budget
 from flcav.pipeline.training.checkpoints import FederationCheckpoints
 from flcav.pipeline.training.learning import (
@@ -50,6 +64,10 @@ from flcav.pipeline.training.private_rounds import take_noise
 from flcav.pipeline.training.records import read_rounds
 from flcav.pipeline.training.statistics import keep_statistics, score_statistics
 
+if TYPE_CHECKING:
+    from flcav.federation.runtimes.topics import RosTopics
+
+BAG = "bag-from-round"  # begins the names of the folders of ROS 2 bags
 REPLAY = "cloud-replay"  # the cloud's own training among the edge servers; no region has a hyphen in its name
 
 
@@ -81,7 +99,7 @@ class CloudFederation:
     learning: Learning
     network: Any  # that the cloud begins with
     regions: Mapping[str, RegionStart]
-    edge_rounds: int  # of an edge server in a cloud round
+    edge_rounds: Mapping[str, int]  # of each edge server in a cloud round, by region
     strategies: Strategies
     book: Ledger
     folder: Path  # of checkpoints, weights and ledger
@@ -91,11 +109,16 @@ class CloudFederation:
     rate: float | None = None  # of the first round, where it is restarted
     replay: TaskClient | None = None  # the cloud's own training on the samples of stage I
     replay_share: float = 0.0  # of it in each of the cloud's averages
+    topics: str | None = None  # ROS namespace by which edge servers and cloud exchange messages; None: in memory
 
-    def afford(self, rules: Rules, rounds: int) -> int:
+    def afford(self, rules: Rules, rounds: int, buffers: Mapping[str, Buffers]) -> int:
         """Return as many of `rounds` as the privacy budget affords in every region; without one all."""
-        for own in self.regions.values() if rules.privacy is not None else ():
-            rounds = min(rounds, afford_cloud_rounds(rules, [*own.clients], rounds, self.edge_rounds, own.earlier))
+        for region, own in self.regions.items() if rules.privacy is not None else ():
+            k = self.edge_rounds[region]
+            if region in buffers:
+                rounds = min(rounds, afford_buffers(buffers[region], rules.privacy) // k)
+            else:
+                rounds = min(rounds, afford_cloud_rounds(rules, [*own.clients], rounds, k, own.earlier))
         return rounds
 
     def open_replay(self) -> dict[str, Trainable]:
@@ -109,6 +132,16 @@ class CloudFederation:
         samples = sum(each.count_samples(steps) for own in self.regions.values() for each in own.clients.values())
         return {REPLAY: Replay(self.replay, max(round(samples * self.replay_share / (1 - self.replay_share)), 1))}
 
+    def open_topics(self, done: int) -> "RosTopics | None":
+        """Return the topics of the rounds after `done`, and their bag; None where messages stay in memory."""
+        if self.topics is None:
+            return None
+        from flcav.federation.runtimes.topics import RosTopics
+
+        bag = self.folder / f"{BAG}{done + 1}"
+        shutil.rmtree(bag, ignore_errors=True)  # of rounds that a kill undid
+        return RosTopics(join_names(self.topics, f"seed{self.learning.seed}", self.folder.name), bag=bag)
+
     def vehicles(self, region: str) -> Mapping[str, Trainable]:
         """Return the clients of a region's edge server, by name."""
         own = self.regions[region]
@@ -121,6 +154,7 @@ class CloudFederation:
         done: int,
         states: Mapping[str, FederationState],
         runtime: ClientProcesses | None,
+        buffers: Mapping[str, Buffers] = {},
     ) -> dict[str, EdgeServer]:
         """Return the edge servers by region, after `done` cloud rounds; `states` are their own.
 
@@ -129,7 +163,7 @@ class CloudFederation:
         return {
             region: EdgeServer(
                 self.vehicles(region),
-                self.edge_rounds,
+                self.edge_rounds[region],
                 account,
                 own.weights,
                 cloud_rounds_done=done,
@@ -139,6 +173,7 @@ class CloudFederation:
                 earlier=own.earlier,
                 runtime=runtime,
                 distiller=self.shared,
+                buffers=buffers.get(region),
             )
             for region, own in self.regions.items()
         }
@@ -150,6 +185,7 @@ def federate_cloud(
     rules: Rules,
     outages: Mapping[tuple[int, str], Outage] = {},
     *,
+    buffers: Mapping[str, Buffers] = {},
     processes: int = 1,
 ) -> tuple[float | None, ...]:
     """Run stage III; write weights and ledger, return each round's loss.
@@ -161,7 +197,7 @@ def federate_cloud(
     """
     own, learning, task = federation, federation.learning, federation.learning.task
     state, states = FederationState(), {region: FederationState() for region in federation.regions}
-    rounds = own.afford(rules, rounds)
+    rounds = own.afford(rules, rounds, buffers)
     checkpoints = FederationCheckpoints(
         task,
         own.folder,
@@ -181,7 +217,7 @@ def federate_cloud(
     wireless = Account(own.book, CLOUD, task.name, "wireless", outages)
     everybody = {name: client for region in own.regions for name, client in own.vehicles(region).items()}
     with checkpoints.refusals(), open_processes(everybody, processes) as runtime:
-        servers = own.open_servers(rules, wireless, done, states, runtime)
+        servers = own.open_servers(rules, wireless, done, states, runtime, buffers)
         federate(
             {**servers, **own.open_replay()},
             start,
@@ -192,6 +228,7 @@ def federate_cloud(
             state=state,
             done=done,
             on_round=partial(_keep_round, own, servers, state, checkpoints),
+            runtime=own.open_topics(done),
         )
     losses = checkpoints.finish(own.network, learning.training.average_rounds)
     if rules.personal:
@@ -288,7 +325,9 @@ def cloud_step(work: Work, settings: CloudSettings, processes: int = 1) -> None:
     servers = _open_servers(work, settings, learning, start.config, rounds, book)
     federation = _open_federation(work, settings, learning, start, servers, book)
     driven = _drive(work, settings, federation, plan.tasks[task])
-    losses = federate_cloud(federation, rounds, driven.rules, driven.outages, processes=processes)
+    losses = federate_cloud(
+        federation, rounds, driven.rules, driven.outages, buffers=driven.buffers, processes=processes
+    )
     StageResult(
         stage=CLOUD,
         task=task,
@@ -338,7 +377,7 @@ def _open_federation(
         learning=learning,
         network=start,
         regions=servers.starts,
-        edge_rounds=settings.federation.edge_rounds_per_cloud_round,
+        edge_rounds=_count_edge_rounds(settings, strategies.edge, servers),
         strategies=strategies,
         book=book,
         folder=work.folder,
@@ -348,7 +387,22 @@ def _open_federation(
         rate=settings.federation.cloud_rate,
         replay=_open_replay(work, settings, learning, start.config) if settings.federation.replay else None,
         replay_share=settings.federation.replay,
+        topics=settings.federation.cloud_topics,
     )
+
+
+def _count_edge_rounds(settings: CloudSettings, strategy: Strategy, servers: _Servers) -> dict[str, int]:
+    """Return the rounds of each region in a cloud round; of buffers as many as have the updates of these, one at least.
+
+    Raises `InputError` where a region has fewer vehicles than a buffer has updates.
+    """
+    k, found = settings.federation.edge_rounds_per_cloud_round, dict[str, int]()
+    for region, own in servers.starts.items():
+        found[region] = k
+        if isinstance(strategy, FedBuff):
+            strategy.check_buffer(len(own.clients))
+            found[region] = max(strategy.count_rounds(k, len(own.clients)), 1)
+    return found
 
 
 def _open_replay(work: Work, settings: CloudSettings, learning: Learning, config: Any) -> TaskClient:
@@ -367,7 +421,10 @@ def _score_statistics(work: Work, settings: CloudSettings, federation: CloudFede
 
 def _drive(work: Work, settings: CloudSettings, federation: CloudFederation, plan: TaskPlan) -> DrivenCloud:
     """Return what the radio network makes of the cloud rounds of a plan."""
-    own, k, how, numbers = federation, federation.edge_rounds, settings.federation, range(1, plan.cloud_rounds + 1)
+    own, how, numbers = federation, settings.federation, range(1, plan.cloud_rounds + 1)
+    if isinstance(own.strategies.edge, FedBuff) and how.network is not None:
+        return _drive_buffers(work, settings, own, own.strategies.edge, how.network, plan.cloud_rounds)
+    k = how.edge_rounds_per_cloud_round
     schedule = own.learning.schedule(plan.cloud_rounds, own.learning.training.local_steps, CLOUD, "")
     rules, driven = follow_plan(how, plan, after_edge=True), {}
     for name, at in own.regions.items():
@@ -375,6 +432,25 @@ def _drive(work: Work, settings: CloudSettings, federation: CloudFederation, pla
         about = (own.learning, settings.regions[name], [*at.clients], at.earlier)
         driven[name] = drive_region(work, settings, *about, rules, seeds)
     return join_regions(driven, k, how.network, update_bytes(to_arrays(own.network)))
+
+
+def _drive_buffers(
+    work: Work,
+    settings: CloudSettings,
+    federation: CloudFederation,
+    strategy: FedBuff,
+    network: NetworkSettings,
+    rounds: int,
+) -> DrivenCloud:
+    own, size = federation, update_bytes(to_arrays(federation.network))
+    fleets = {
+        name: open_buffered_fleet(work, settings, own.learning, settings.regions[name], [*at.clients])
+        for name, at in own.regions.items()
+    }
+    driven, cloud = drive_cloud_buffers(fleets, strategy, network, settings.federation, own.edge_rounds, rounds, size)
+    for region, each in driven.items():
+        save_clock(each, work, region)
+    return cloud
 
 
 def make_cloud_step(outline: Outline, arm: Setting, task: str) -> Step:

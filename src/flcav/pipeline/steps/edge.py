@@ -1,11 +1,15 @@
 """Stage II of a task in a region, and its further edge rounds: the vehicles federate with their edge server."""
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from safetensors.numpy import load_file
+
+from flcav.federation.buffered_rounds import Buffers, afford_buffers
 from flcav.federation.privacy import count_affordable
 from flcav.federation.rounds import BeforeRound, Schedule, federate
 from flcav.federation.rules import Rules
@@ -14,6 +18,7 @@ from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Trainable, Weights
 from flcav.interface.progress import Report
@@ -27,16 +32,20 @@ from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.plan.updates import follow_plan
+from flcav.pipeline.radio.buffered import drive_buffers
 from flcav.pipeline.radio.driving import DrivenRounds
 from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
+from flcav.pipeline.steps.groups import call_group
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.regions import (
     LabelledSamples,
     drive_region,
     label_samples,
     learn_by_distillation,
+    open_buffered_fleet,
+    save_clock,
     score_labels,
 )
 from flcav.pipeline.steps.settings import (
@@ -47,7 +56,8 @@ from flcav.pipeline.steps.settings import (
     read_entries,
     share_plan_budget,
 )
-from flcav.pipeline.training.checkpoints import FederationCheckpoints, load_round_network
+from flcav.pipeline.training.checkpoints import FederationCheckpoints, load_round_network, round_path
+from flcav.pipeline.training.groups import GroupWatch, Levelled
 from flcav.pipeline.training.learning import (
     Learning,
     describe_federation,
@@ -77,6 +87,7 @@ class EdgeFederation:
     validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
     relabel: BeforeRound | None = None  # changes the clients' labels before each round
+    watch: GroupWatch | None = None  # over a group, which dissolves when its loss has levelled off
 
     @property
     def start_share(self) -> float:
@@ -89,10 +100,12 @@ class EdgeFederation:
         reached = load_round_network(task, self.network, self.folder, round_, averaged, self.start_share)
         return {name: score_network(task, reached, own.data, own.vehicles) for name, own in self.validation.items()}
 
-    def afford(self, rules: Rules, rounds: int) -> int:
+    def afford(self, rules: Rules, rounds: int, buffers: Buffers | None = None) -> int:
         """Return as many of `rounds` as the privacy budget affords; without one all."""
         if rules.privacy is None:
             return rounds
+        if buffers is not None:
+            return min(rounds, afford_buffers(buffers, rules.privacy))
         return count_affordable(rules.privacy, rules.selection, [*self.clients], rounds, self.earlier)
 
     def prepare(self, clients: Mapping[str, Trainable], where: Runtime | None, number: int, weights: Weights) -> None:
@@ -108,15 +121,17 @@ def federate_edge(
     rules: Rules,
     outages: Mapping[tuple[int, str], Outage] = {},
     *,
+    buffers: Buffers | None = None,
     processes: int = 1,
     runtime: str = "embedded",
     timed: bool = False,
 ) -> tuple[float | None, ...]:
     """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
 
-    A privacy budget may end it before the schedule's end. Vehicles train in so many `processes` of a `runtime` of
-    `RUNTIMES`, to the same weights; where that is `timed`, their times are kept, see `read_times`, unless nobody is to
-    know who was drawn. The vehicles that `outages` name by round are lost in it.
+    A privacy budget may end it before the schedule's end, and of asynchronous rounds, `buffers`, each budget. Vehicles
+    train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights; where that is `timed`, their times
+    are kept, see `read_times`, unless nobody is to know who was drawn. The vehicles that `outages` name by round are
+    lost in it.
     """
     own, learning, state = federation, federation.learning, FederationState()
     checkpoints = FederationCheckpoints(
@@ -137,8 +152,17 @@ def federate_edge(
         clients = give_outputs(own.clients, own.shared, to_arrays(own.network))
     if timed and not rules.hides_draws:
         clients = time_clients(clients, own.folder)
-    with checkpoints.refusals(), open_runtime(runtime, clients, processes) as where:
-        if done < own.afford(rules, own.schedule.rounds):
+    if own.watch is not None:
+        for number in range(1, done + 1):
+            own.watch.note(load_file(round_path(own.folder, number)))
+    with (
+        checkpoints.refusals(),
+        open_runtime(runtime, clients, processes) as where,
+        contextlib.suppress(Levelled),
+    ):
+        if own.watch is not None and own.watch.over:
+            raise Levelled
+        if done < own.afford(rules, own.schedule.rounds, buffers):
             federate(
                 clients,
                 start,
@@ -150,11 +174,24 @@ def federate_edge(
                 done=done,
                 earlier=own.earlier,
                 before_round=partial(own.prepare, clients, where),
-                on_round=checkpoints.save,
+                on_round=partial(_keep_round, own.watch, checkpoints),
                 runtime=where,
                 distiller=own.shared,
+                buffers=buffers,
             )
     return checkpoints.finish(own.network, learning.training.average_rounds, own.start_share)
+
+
+def _keep_round(
+    watch: GroupWatch | None, checkpoints: FederationCheckpoints, number: int, weights: Weights, loss: float | None
+) -> None:
+    """Keep a round; raises `Levelled` where the group is to dissolve."""
+    if watch is not None:
+        watch.note(weights)
+        watch.tell(checkpoints.book, number)
+    checkpoints.save(number, weights, loss)
+    if watch is not None and watch.over:
+        raise Levelled
 
 
 class EdgeSettings(FederationSettings):
@@ -186,18 +223,25 @@ def edge_step(
     inputs, stage, plan = settings.inputs, settings.stage, Plan.load(work.inputs[settings.inputs.plan])
     book = _open_book(work, settings, plan)
     before, labelled = len(book.entries), label_samples(work, settings, inputs, book, EDGE)
+    called = None
+    if stage == EDGE and settings.federation.requests is not None:
+        called = call_group(work, settings, inputs, settings.federation.requests, labelled.samples, book)
+        labelled = replace(labelled, samples=called.samples)
     if stage == MORE_EDGE and isinstance(labelled.samples, RoadAverageLabels):
         _label_once(work, settings, plan, labelled.samples)
     noise = _find_noise(work, settings, plan)
     settings = settings.model_copy(update={"federation": take_noise(settings.federation, noise)})
     own, k = plan.tasks[settings.learning.task], settings.federation.edge_rounds_per_cloud_round
     rounds = _plan_private(settings, plan).edge if stage == EDGE else own.cloud_rounds * k
+    if called is not None and not called.samples:
+        rounds = 0
     federation = _open_federation(work, settings, labelled, rounds, book)
-    driven = _drive(work, settings, federation, own, rounds)
+    federation = federation if called is None else replace(federation, watch=called.watch)
+    driven = _drive(work, settings, federation, own)
     where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
-    losses = federate_edge(federation, driven.rules, driven.outages, **where)
+    losses = federate_edge(federation, driven.rules, driven.outages, buffers=driven.buffers, **where)
     clients, labels = federation.clients, None
-    if settings.scored and stage == EDGE:
+    if settings.scored and stage == EDGE and clients:
         labels = score_labels(work, inputs, federation.network.config, labelled.samples)
     StageResult(
         stage=stage,
@@ -211,6 +255,7 @@ def edge_step(
         records=read_rounds(work.folder, inputs.region, before, {inputs.region: driven.seconds}),
         labels=labels,
         noise=noise,
+        group=None if called is None else called.dissolve(work.folder, rounds),
     ).save(work.folder)
 
 
@@ -254,9 +299,11 @@ def _open_federation(
     start = load_stage_network(learning.task, work.inputs[inputs.edge or inputs.pretrain])
     clients = make_clients(learning, start.config, samples)
     earlier = 0 if inputs.edge is None else StageResult.load(work.inputs[inputs.edge]).rounds
-    names = (settings.stage, inputs.region)
+    names, (strategy, _) = (settings.stage, inputs.region), find_strategies(settings.federation)
+    if isinstance(strategy, FedBuff):
+        strategy.check_buffer(len(clients))
+        rounds = strategy.count_rounds(rounds, len(clients))
     schedule = learning.schedule(rounds, learning.training.local_steps, *names, earlier=earlier)
-    strategy, _ = find_strategies(settings.federation)
     watched = {name: Frames.open(work.inputs[step]) for name, step in settings.validation.items()}
     federation = EdgeFederation(
         learning=learning,
@@ -290,9 +337,14 @@ def _share_with_vehicles(
     return shown.samples
 
 
-def _drive(work: Work, settings: EdgeSettings, federation: EdgeFederation, plan: TaskPlan, rounds: int) -> DrivenRounds:
+def _drive(work: Work, settings: EdgeSettings, federation: EdgeFederation, plan: TaskPlan) -> DrivenRounds:
     """Return what the radio network makes of the rounds of a plan."""
-    own, inputs = federation, settings.inputs
+    own, inputs, network, rounds = federation, settings.inputs, settings.federation.network, federation.schedule.rounds
+    if isinstance(own.strategy, FedBuff) and network is not None:
+        fleet = open_buffered_fleet(work, settings, own.learning, inputs, [*own.clients])
+        driven = drive_buffers(fleet, own.strategy, network, settings.federation, rounds)
+        save_clock(driven, work, inputs.region)
+        return driven
     seeds = [own.schedule.work(number).seed for number in range(1, rounds + 1)]
     rules = follow_plan(settings.federation, plan, after_edge=bool(own.earlier))
     return drive_region(work, settings, own.learning, inputs, [*own.clients], own.earlier, rules, seeds)

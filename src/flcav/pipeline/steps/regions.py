@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from flcav.federation.buffered_rounds import count_participations
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.strategies import exchanges_more
 from flcav.fusion.distillation import Distillation
 from flcav.network.clock.records import save_rounds
+from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger
+from flcav.network.radio.links import RadioLinks
 from flcav.perception.objects.distillation.loss import DistillationTerms, DistilledObjects
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.engine import Work
@@ -28,11 +31,14 @@ from flcav.pipeline.labels.quality import measure_labels, read_history
 from flcav.pipeline.labels.road_average import RoadAverageLabels
 from flcav.pipeline.labels.tracks import label_tracked, load_tracks
 from flcav.pipeline.poles import find_sites
+from flcav.pipeline.radio.buffered import BufferedFleet
 from flcav.pipeline.radio.driving import CLOCK, DrivenRounds, Fleet, drive_rounds, link_scenes
 from flcav.pipeline.results.plans import Placed
-from flcav.pipeline.results.training import LabelQuality, Pretrained
+from flcav.pipeline.results.training import LabelQuality, Pretrained, StageResult
 from flcav.pipeline.steps.settings import FederationSettings, RegionInputs
 from flcav.pipeline.training.learning import Learning, load_stage_network
+
+ALL_SCENES = 10**6  # more than there are
 
 
 @dataclass(frozen=True)
@@ -144,16 +150,43 @@ def drive_region(
 
     `seeds` are those of the rounds, which follow `earlier` ones. Without a network no client is lost.
     """
-    how, network = settings.federation, settings.federation.network
+    network = settings.federation.network
     if network is None:
         return DrivenRounds(rules, {}, ())
-    weights = to_arrays(learning.build_network())
+    fleet = open_fleet(settings, learning, inputs.region, clients)
+    scenes = _link_scenes(work, inputs, network, earlier + len(seeds), learning.seed)
+    driven = drive_rounds(fleet, scenes, network, rules, seeds, earlier)
+    save_clock(driven, work, inputs.region)
+    return driven
+
+
+def open_fleet(settings: FederationSettings, learning: Learning, region: str, clients: Sequence[str]) -> Fleet:
+    """Return the vehicles of a region with the work of each of their rounds."""
+    how, weights = settings.federation, to_arrays(learning.build_network())
     both = isinstance(how.personal, RegionalModels)  # the region's and the global model go down together
     down = update_bytes(weights, exchanging=both)
     up = update_bytes(weights, how.upload, exchanging=exchanges_more(how.strategy))
-    fleet = Fleet(inputs.region, tuple(clients), down, up, settings.train_s, settings.speeds)
+    return Fleet(region, tuple(clients), down, up, settings.train_s, settings.speeds)
+
+
+def open_buffered_fleet(
+    work: Work, settings: FederationSettings, learning: Learning, inputs: RegionInputs, clients: Sequence[str]
+) -> BufferedFleet:
+    """Return the vehicles of a region that fill buffers, in all scenes of its training data."""
+    network, before = settings.federation.network, ()
+    assert network is not None  # of recipes that are checked
+    if inputs.edge is not None:
+        before = StageResult.load(work.inputs[inputs.edge]).records or ()
+    scenes = _link_scenes(work, inputs, network, ALL_SCENES, learning.seed)
+    took_part = count_participations([(each.clients, [*each.failed]) for each in before])
+    return BufferedFleet(open_fleet(settings, learning, inputs.region, clients), scenes, took_part)
+
+
+def _link_scenes(work: Work, inputs: RegionInputs, network: NetworkSettings, most: int, seed: int) -> list[RadioLinks]:
     split, placed = Frames.open(work.inputs[inputs.frames]), Placed.load(work.inputs[inputs.place])
-    scenes = link_scenes(split, placed, network, earlier + len(seeds), learning.seed)
-    driven = drive_rounds(fleet, scenes, network, rules, seeds, earlier)
-    save_rounds(driven.records, work.folder / f"{CLOCK}-{inputs.region}.parquet")
-    return driven
+    return link_scenes(split, placed, network, most, seed)
+
+
+def save_clock(driven: DrivenRounds, work: Work, region: str) -> None:
+    """Write the clock of a region's rounds."""
+    save_rounds(driven.records, work.folder / f"{CLOCK}-{region}.parquet")

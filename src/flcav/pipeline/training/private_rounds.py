@@ -1,12 +1,15 @@
 """Privacy of a run: rounds that a budget affords, and what a vehicle spends in all trainings with its data."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
+from flcav.federation.buffered_rounds import count_participations
 from flcav.federation.privacy import affordable_rounds, compose_epsilon, find_noise
 from flcav.federation.rules import Rules
-from flcav.pipeline.results.training import PrivacySpent
+from flcav.federation.strategies import fills_buffers
+from flcav.pipeline.recipe import CLOUD, Federation
+from flcav.pipeline.results.training import PrivacySpent, StageResult
 
 RulesT = TypeVar("RulesT", bound=Rules)
 
@@ -64,6 +67,19 @@ def take_noise(rules: RulesT, noise: float | None) -> RulesT:
     if rules.privacy is None or noise is None:
         return rules
     return rules.model_copy(update={"privacy": rules.privacy.model_copy(update={"noise": noise})})
+
+
+def count_private_rounds(how: Federation, results: Mapping[str, StageResult], region: str) -> int:
+    """Return the edge rounds of a region in which a vehicle took part that took part in all, from `results` by stage.
+
+    Where rounds are buffers, those of the vehicle that took part most often in each stage.
+    """
+    k = how.edge_rounds_per_cloud_round
+    if not fills_buffers(how.strategy):
+        return sum(own.rounds * (k if stage == CLOUD else 1) for stage, own in results.items())
+    of_region = [[each for each in own.records or () if each.server == region] for own in results.values()]
+    counts = [count_participations([(each.clients, [*each.failed]) for each in own]) for own in of_region]
+    return sum(max(each.values(), default=0) for each in counts)
 
 
 def compose_trainings(rules: Rules, trainings: Iterable[PrivateTraining]) -> PrivacySpent | None:

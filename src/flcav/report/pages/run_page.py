@@ -113,6 +113,12 @@ def page(run: Run) -> dict[str, Any]:
         "seeded": SEEDED if recipe.federation.privacy and recipe.federation.privacy.seeded else None,
         "together": TOGETHER,
         "spent": {arm: result.privacy.describe() for arm, result in run.arms.items() if result.privacy is not None},
+        "groups": [
+            (arm, stage.region, stage.group.describe())
+            for arm, result in run.arms.items()
+            for stage in result.stages
+            if stage.group is not None
+        ],
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,

@@ -1,0 +1,15 @@
+"""Names of ROS 2's topics, for whoever does without DDS."""
+
+import re
+
+ROS_NAMESPACE = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"  # such as /flcav/weather
+
+
+def join_names(namespace: str, *parts: str) -> str:
+    """Return a ROS name below a namespace; what no name may have is an underscore in it.
+
+    >>> join_names("/flcav", "cloud-fl-weather", "1st")
+    '/flcav/cloud_fl_weather/_1st'
+    """
+    clean = (re.sub(r"[^A-Za-z0-9_]", "_", part) for part in parts)
+    return "/".join([namespace, *(f"_{part}" if part[:1].isdigit() else part for part in clean)])

@@ -1,0 +1,166 @@
+"""Clock of buffered asynchronous rounds: clients begin again as soon as they may, and a round ends with a full buffer.
+
+Every client downloads the newest version of the weights, trains, uploads, and waits until a buffer with its update is
+full: so no version is trained on twice by a client, and no two updates of a buffer are of one client (the algorithm of
+Nguyen et al., AISTATS 2022, leaves that open). A client that is lost on the network begins again as soon as it is in
+the town and in coverage.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.network.clock.records import ClientTiming, RoundTiming
+from flcav.network.clock.rounds import TIE, ClientPhases, Phase, RoundRules
+from flcav.network.clock.work import ClientWork
+from flcav.network.radio.links import RadioLinks
+
+PATIENCE = 10  # passes through all scenes, with the longest training each, in which one update has to arrive
+
+
+@dataclass(frozen=True)
+class BufferTiming:
+    """A buffer that filled: when, whose updates, by which version of the weights, and what broke off meanwhile."""
+
+    number: int  # from 1; the version of the weights that it leads to
+    start_s: float  # when the buffer before was full
+    end_s: float
+    updates: tuple[ClientTiming, ...]  # in the order in which they arrived
+    versions: Mapping[str, int]  # that each update began with, by client
+    broken: tuple[ClientTiming, ...]  # attempts, some of them of one client
+
+    def as_round(self) -> RoundTiming:
+        """Return it as a round, in which clients may have begun before it did."""
+        return RoundTiming(self.number, self.start_s, self.end_s, 0.0, 0.0, (*self.updates, *self.broken))
+
+
+def chain_links(scenes: Sequence[RadioLinks]) -> tuple[RadioLinks, float]:
+    """Return the links of scenes that follow one another without a gap, and how long they last together [s].
+
+    The clock begins at 0 s. A vehicle that is not in a scene is absent in it. Raises `InputError` where all scenes
+    have one instant, or other units.
+    """
+    names = tuple(dict.fromkeys(name for links in scenes for name in links.vehicle))
+    first, spans = scenes[0], [float(links.time_s[-1] - links.time_s[0]) for links in scenes]
+    if not sum(spans):
+        raise InputError("scenes of one instant: vehicles that go on at their own pace need time to pass")
+    if any(links.unit != first.unit for links in scenes):
+        raise InputError("scenes with other roadside units")
+    times, distances, states, losses = [], [], [], []
+    for number, links in enumerate(scenes):
+        times.append(links.time_s[:-1] - links.time_s[0] + sum(spans[:number]))
+        shape = (len(links.time_s) - 1, len(names), len(first.unit))
+        distance, state, loss = np.full(shape, np.nan), np.full(shape, -1, np.int8), np.full(shape, np.inf)
+        columns = [names.index(name) for name in links.vehicle]
+        distance[:, columns], state[:, columns] = links.distance_m[:-1], links.state[:-1]
+        loss[:, columns] = links.loss_db[:-1]
+        distances.append(distance)
+        states.append(state)
+        losses.append(loss)
+    joined = (np.concatenate(each) for each in (distances, states, losses))
+    return RadioLinks(first.radio, np.concatenate(times), names, first.unit, *joined), sum(spans)
+
+
+class BufferClock(ClientPhases):
+    """Clock of a region's clients, who train at their own pace and fill buffers; the scenes repeat in order."""
+
+    def __init__(self, scenes: Sequence[RadioLinks], work: Sequence[ClientWork], size: int, rules: RoundRules) -> None:
+        """Begin at 0 s, with updates of `size` clients in a buffer; `work` is that of each time.
+
+        Clients that no scene has are left out. Raises `InputError` as `chain_links`, and where fewer than `size` are
+        left.
+        """
+        links, self._period_s = chain_links(scenes)
+        there = [each for each in work if each.client in links.vehicle]
+        if len(there) < size:
+            raise InputError(f"a buffer of {size} updates, and {len(there)} vehicles on the network")
+        super().__init__(links, there, 0, 0.0, rules)
+        self._size, self._version, self._ended_s, self._limit_s = size, 0, 0.0, np.inf
+        self._reach = links.rate_bps[:, self.column] > 0  # (T, K, U)
+        self._longest_s = PATIENCE * (self._period_s + max(each.compute_s for each in there))
+        self.phase[:] = Phase.OVER
+        self._waits = np.zeros(len(there), bool)  # whether an update is in the buffer
+        self._begun = np.zeros(len(there), np.int64)  # version
+        self._arrived: list[int] = []  # clients, in the order of their updates
+        self._broken: list[ClientTiming] = []
+
+    @property
+    def instant(self) -> int:
+        """The latest instant of the scenes."""
+        return int(np.searchsorted(self.links.time_s, self._phase_s, side="right")) - 1
+
+    @property
+    def _phase_s(self) -> float:
+        """The time in the present pass through the scenes [s], and what counts as the same time."""
+        return (self.time_s + TIE) % self._period_s
+
+    @property
+    def until_next_s(self) -> float:
+        """The time until the next instant, or until the clock is to stop [s]."""
+        n = self.instant
+        following = float(self.links.time_s[n + 1]) if n + 1 < len(self.links.time_s) else self._period_s
+        return min(following - self._phase_s + TIE, self._limit_s - self.time_s)
+
+    @property
+    def ends(self) -> bool:
+        """Whether the trace ends here: scenes repeat."""
+        return False
+
+    def fill(self) -> BufferTiming:
+        """Let time go on until the buffer is full, and return it; raises `InputError` where no update arrives."""
+        last_s = self.time_s
+        while len(self._arrived) < self._size:
+            before = len(self._arrived)
+            self._step(begin=True)
+            last_s = self.time_s if len(self._arrived) > before else last_s
+            if self.time_s - last_s > self._longest_s:
+                raise InputError(f"no vehicle's update arrives within {self._longest_s:g} s on the network")
+        full, self._arrived = self._arrived[: self._size], self._arrived[self._size :]
+        number = self._version + 1
+        updates = tuple(replace(self._timing(k), round=number) for k in full)
+        versions = {self.work[k].client: int(self._begun[k]) for k in full}
+        broken = tuple(replace(each, round=number) for each in self._broken)
+        found = BufferTiming(number, self._ended_s, self.time_s, updates, versions, broken)
+        self._version, self._ended_s, self._broken, self._waits[full] = number, self.time_s, [], False
+        return found
+
+    def hold(self, until_s: float) -> None:
+        """Let time go on to `until_s` [s]: updates arrive, and no client begins, as the server is to have new weights.
+
+        In a time that is over nothing happens.
+        """
+        self._limit_s = until_s
+        while self.time_s < until_s - TIE:
+            self._step(begin=False)
+        self._limit_s = np.inf
+
+    def _step(self, *, begin: bool) -> None:
+        """Go on to the next event."""
+        under_way = self.phase < Phase.OVER
+        self._drop()
+        self._broken += [self._timing(k) for k in np.flatnonzero(under_way & (self.phase == Phase.OVER)).tolist()]
+        if begin:
+            self._begin()
+        active = self.phase < Phase.OVER
+        if not active.any():
+            self.time_s += max(self.until_next_s, 0.0)
+            return
+        self._advance(active)
+        for k in np.flatnonzero(active & (self.phase == Phase.OVER)).tolist():
+            self._arrived.append(k)
+            self._waits[k] = True
+
+    def _begin(self) -> None:
+        """Let clients begin that neither train nor wait, and are in the town and in coverage."""
+        n = self.instant
+        distance = np.nan_to_num(self.links.distance_m[n, self.column], nan=np.inf)
+        nearest = distance.argmin(axis=1)
+        here = self.links.present[n, self.column] & self._reach[n, np.arange(len(self.work)), nearest]
+        rows = np.flatnonzero((self.phase == Phase.OVER) & ~self._waits & here)
+        self.phase[rows], self.start_s[rows], self.server[rows] = Phase.DOWNLOAD, self.time_s, nearest[rows]
+        self.left[rows], self.spent[rows], self.stalled_since[rows] = self.amount[rows], 0.0, np.inf
+        self._begun[rows] = self._version
+        for k in rows.tolist():
+            self.dropped[k] = ""

@@ -1,0 +1,55 @@
+"""Records of groups: who asked for federated learning and why, who was called and came, what it cost and mended."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from flcav.interface.wording import plural
+from flcav.storage.records import Record
+
+
+@dataclass(frozen=True)
+class Checked(Record):
+    """A vehicle's check of the network that drives, on labelled frames that it holds back."""
+
+    held_back: int  # frames
+    before: float  # loss of the network that drives
+    after: float | None = None  # of the group's network; None: it is in no group
+    asks: bool = False  # whether `before` is above the limit, so that it sends a request
+
+
+@dataclass(frozen=True)
+class Group(Record):
+    """The group of a region: its request, its members, and how it dissolved."""
+
+    limit: float  # of the loss, above which a vehicle asks
+    vehicles: Mapping[str, Checked]  # by client
+    lead: str  # edge server, e.g. "pole3", or the vehicle that leads ad hoc; "" without a request
+    members: tuple[str, ...] = ()  # clients, those that asked first
+    quality: Mapping[str, float] = field(default_factory=dict)  # of the data of those who made an offer
+    stayed: Mapping[str, str] = field(default_factory=dict)  # by client why it is no member
+    request_bytes: int = 0  # of requests and offers
+    most_rounds: int = 0  # of the plan
+    losses: tuple[float, ...] = ()  # on the members' held-back frames, mean: before the first round, and after each
+    dissolved: str = ""  # why
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Return the clients that sent a request."""
+        return tuple(name for name, each in self.vehicles.items() if each.asks)
+
+    def describe(self) -> str:
+        """Return the group in words."""
+        if not self.asked:
+            worst = max((each.before for each in self.vehicles.values()), default=0.0)
+            return f"nobody asked: the largest loss on held-back frames is {worst:.3f}, and {self.limit:.3f} the limit"
+        told = [
+            f"{', '.join(self.asked)} asked, with a loss above {self.limit:.3f} on frames held back",
+            f"{self.lead} led {plural(len(self.members), 'vehicle')} for {max(len(self.losses) - 1, 0)} of "
+            f"{plural(self.most_rounds, 'round')}",
+            f"{self.request_bytes} bytes of requests and offers",
+        ]
+        for name in self.asked:
+            own = self.vehicles[name]
+            told.append(f"{name} {own.before:.3f} to {own.after:.3f}" if own.after is not None else name)
+        told += [f"{name} stayed ({why})" for name, why in self.stayed.items()]
+        return "; ".join([*told, *([self.dissolved] if self.dissolved else [])])
