@@ -1,4 +1,4 @@
-"""Links of a federation's server to its clients, by runtime: in this process, with client processes, or on Ray.
+"""Links of a federation's server to its clients, by runtime: this process, client processes, Ray, or a deployed fleet.
 
 What crosses a link is lost where the network loses it, held to the budget where it leaves, and entered in the ledger.
 """
@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Union
 
 from flwr.serverapp import Grid
@@ -26,10 +27,11 @@ from flcav.federation.trainable import Trainable
 from flcav.interface.wording import suggest
 
 if TYPE_CHECKING:
+    from flcav.federation.runtimes.deployed import Deployment
     from flcav.federation.runtimes.simulation import RaySimulation
 
-RUNTIMES = "embedded", "ray"
-Runtime = Union[ClientProcesses, "RaySimulation"]  # where clients train, other than in this process
+RUNTIMES = "embedded", "ray", "flower"
+Runtime = Union[ClientProcesses, "RaySimulation", "Deployment"]  # where clients train, other than in this process
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,10 @@ def open_link(
         opened = EmbeddedGrid(make_app(timed), names, states)
     elif isinstance(runtime, ClientProcesses):
         opened = EmbeddedGrid(make_app(RemoteClients(clients, runtime, limit_s)), names, states, runtime.count)
+    elif runtime.deployed is True:
+        from flcav.federation.runtimes.deployed import Agreement
+
+        opened = runtime.open(clients, Agreement(strategy, rules, secrets, spent), states, account)
     else:
         timing = (lambda each: each) if limit_s is None else (lambda each: TimedClients(each, limit_s))
         opened = runtime.open(clients, lambda each: make_app(timing(each)), states)
@@ -92,11 +98,14 @@ def open_processes(clients: Mapping[str, Trainable], count: int) -> Iterator[Cli
 
 
 @contextlib.contextmanager
-def open_runtime(name: str, clients: Mapping[str, Trainable], count: int) -> Iterator[Runtime | None]:
+def open_runtime(
+    name: str, clients: Mapping[str, Trainable], count: int, fleet: Path | None = None
+) -> Iterator[Runtime | None]:
     """Yield what `federate` takes as its `runtime`.
 
     embedded: messages within this process, and clients in `count` processes where these are several. ray: Flower's
-    simulation with `count` actors. Raises `InputError` for another name.
+    simulation with `count` actors. flower: vehicles of the `fleet` that is up in this folder, or one that is brought up on
+    this machine for as long. Raises `InputError` for another name.
     """
     match name:
         case "embedded":
@@ -106,5 +115,13 @@ def open_runtime(name: str, clients: Mapping[str, Trainable], count: int) -> Ite
             from flcav.federation.runtimes.simulation import RaySimulation
 
             yield RaySimulation(count)
+        case "flower":
+            from flcav.federation.runtimes.deployed import Deployment, start_fleet
+
+            if fleet is not None:
+                yield Deployment(fleet)
+            else:
+                with start_fleet(len(clients)) as deployment:
+                    yield deployment
         case _:
             raise InputError(f"runtime '{name}': choose one of {', '.join(RUNTIMES)}{suggest(name, RUNTIMES)}")

@@ -111,6 +111,7 @@ def federate_edge(
     processes: int = 1,
     runtime: str = "embedded",
     timed: bool = False,
+    fleet: Path | None = None,
 ) -> tuple[float | None, ...]:
     """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
 
@@ -137,7 +138,7 @@ def federate_edge(
         clients = give_outputs(own.clients, own.shared, to_arrays(own.network))
     if timed and not rules.hides_draws:
         clients = time_clients(clients, own.folder)
-    with checkpoints.refusals(), open_runtime(runtime, clients, processes) as where:
+    with checkpoints.refusals(), open_runtime(runtime, clients, processes, fleet) as where:
         if done < own.afford(rules, own.schedule.rounds):
             federate(
                 clients,
@@ -177,7 +178,12 @@ class EdgeSettings(FederationSettings):
 
 
 def edge_step(
-    work: Work, settings: EdgeSettings, processes: int = 1, runtime: str = "embedded", timed: int = 0
+    work: Work,
+    settings: EdgeSettings,
+    processes: int = 1,
+    runtime: str = "embedded",
+    timed: int = 0,
+    fleet: str = "",
 ) -> None:
     """Run stage II of a task in a region, or its further edge rounds: as many as the region has in stage III.
 
@@ -195,6 +201,7 @@ def edge_step(
     federation = _open_federation(work, settings, labelled, rounds, book)
     driven = _drive(work, settings, federation, own, rounds)
     where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
+    where["fleet"] = Path(fleet) if fleet else None
     losses = federate_edge(federation, driven.rules, driven.outages, **where)
     clients, labels = federation.clients, None
     if settings.scored and stage == EDGE:
