@@ -73,7 +73,8 @@ class FleetProxy:
             return
         done = await relay(self._client, scope, receive, send)
         connection: Connection = state[CONNECTION]
-        self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes())
+        answered = done.status == httpx.codes.OK
+        self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), answered)
         self._changed = True
 
     async def _refuse(self, send: Send, status: int, who: str | bytes | None, why: str) -> None:

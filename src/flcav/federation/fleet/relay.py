@@ -13,11 +13,11 @@ TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 
 @dataclass
 class Relayed:
-    """Sizes of the bodies of one exchange [bytes], and whether the other server answered."""
+    """Sizes of the bodies of one exchange [bytes], and its answer."""
 
     up: int = 0
     down: int = 0
-    answered: bool = False
+    status: int = 0  # of the answer; 0: the other server gave none
 
 
 async def answer(send: Send, status: int, text: str) -> None:
@@ -66,7 +66,7 @@ async def relay(client: httpx.AsyncClient, scope: Scope, receive: Receive, send:
                 done.down += len(piece)
                 await send({"type": "http.response.body", "body": piece, "more_body": True})
             await send({"type": "http.response.body", "body": b""})
-            done.answered = True
+            done.status = response.status_code
         finally:
             await response.aclose()
     except httpx.TransportError as error:

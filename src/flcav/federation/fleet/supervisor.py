@@ -39,9 +39,15 @@ class _Supervised:
     starts: int = 0
 
 
-def supervise(folder: Path, processes: Mapping[str, Callable[[], None]], tick: Callable[[], None]) -> None:
-    """Run `processes`, by name, until this process gets SIGTERM or SIGINT; `tick` is called about ten times a second.
+def supervise(
+    folder: Path,
+    processes: Mapping[str, Callable[[], None]],
+    later: Mapping[str, Callable[[], None]] = {},
+    is_up: Callable[[], bool] = lambda: True,
+) -> None:
+    """Run `processes`, by name, until this process gets SIGTERM or SIGINT, and those for `later` once the others are up.
 
+    `is_up` is called about ten times a second, and tells.
     Their output goes to `folder`/logs, their ids to processes.json there. This process must have one thread alone.
     """
     ended = False
@@ -51,7 +57,7 @@ def supervise(folder: Path, processes: Mapping[str, Callable[[], None]], tick: C
         ended = True
 
     before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
-    all_ = {name: _Supervised(do) for name, do in processes.items()}
+    all_, waiting = {name: _Supervised(do) for name, do in processes.items()}, dict(later)
     try:
         while not ended:
             changed = _reap(all_)
@@ -62,7 +68,9 @@ def supervise(folder: Path, processes: Mapping[str, Callable[[], None]], tick: C
             if changed:
                 told = {name: {"pid": own.pid, "starts": own.starts} for name, own in all_.items()}
                 write_bytes(folder / PROCESSES, json.dumps(told).encode())
-            tick()
+            if is_up() and waiting:
+                all_ |= {name: _Supervised(do) for name, do in waiting.items()}
+                waiting = {}
             time.sleep(TICK_S)
     finally:
         _end(all_)

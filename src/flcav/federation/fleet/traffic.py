@@ -32,13 +32,16 @@ class Traffic:
     vehicles: dict[str, Crossed] = field(default_factory=dict)
     refused: list[str] = field(default_factory=list)
 
-    def count(self, vehicle: str, call: str, up: int, down: int, socket: tuple[int, int]) -> None:
-        """Count one call with the sizes of its bodies, and the bytes that crossed the socket since the last one."""
+    def count(self, vehicle: str, call: str, up: int, down: int, socket: tuple[int, int], answered: bool) -> None:
+        """Count one call with the sizes of its bodies, and the bytes that crossed the socket since the last one.
+
+        answered: whether the SuperLink answered without an error.
+        """
         own = self.vehicles.setdefault(vehicle, Crossed())
         own.calls += 1
         own.socket_up += socket[0]
         own.socket_down += socket[1]
-        own.activations += call == "activate-node"
+        own.activations += answered and call == "activate-node"
         if call in CONTENT:
             own.content_up += up
             own.content_down += down

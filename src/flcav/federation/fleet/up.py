@@ -18,6 +18,7 @@ from flcav.federation.fleet.proxy import run_proxy
 from flcav.federation.fleet.superlink import DATABASE, SECRET, SuperLink, SuperLinkLost
 from flcav.federation.fleet.supervisor import supervise
 from flcav.federation.fleet.vehicle import SETTINGS, Prepare, VehicleSettings, vehicle_processes
+from flcav.interface.wording import plural
 from flcav.storage.files import write_bytes, write_json
 
 READY, VEHICLES, LOCK = "ready.json", "vehicles", "up.lock"
@@ -105,17 +106,22 @@ def run_fleet(
             "superlink": lambda: run_superlink(folder, superlink),
             "proxy": lambda: run_proxy(folder, host, int(proxy.rpartition(":")[2]), superlink),
         }
+        later: dict[str, Callable[[], None]] = {}
         for name in name_vehicles(vehicles):
             own = vehicle_processes(folder / VEHICLES / name, prepare)
-            processes |= {f"{name}-{kind}": do for kind, do in own.items()}
+            later |= {f"{name}-{kind}": do for kind, do in own.items()}
 
-        def tick() -> None:
-            if state.update(link) and not (folder / READY).exists():
+        def is_up() -> bool:
+            up = state.update(link)
+            if up and not (folder / READY).exists():
                 write_json(folder / READY, asdict(Ready(proxy, superlink, os.getpid(), int(time.time()))))
-                report(f"{folder}: up at {proxy}, with {vehicles} vehicles on this machine")
+                report(f"{folder}: up at {proxy}, with {plural(vehicles, 'vehicle')} on this machine")
+            return up
 
+        (folder / READY).unlink(missing_ok=True)
+        import_flower()
         try:
-            supervise(folder, processes, tick)
+            supervise(folder, processes, later, is_up)
         finally:
             (folder / READY).unlink(missing_ok=True)
 
@@ -125,7 +131,8 @@ def run_vehicle(folder: Path, prepare: Prepare) -> None:
     if not (folder / SETTINGS).exists():
         raise InputError(f"{folder}: is no vehicle's folder, without {SETTINGS}")
     with _alone(folder):
-        supervise(folder, vehicle_processes(folder, prepare), lambda: None)
+        import_flower()
+        supervise(folder, vehicle_processes(folder, prepare))
 
 
 def run_superlink(folder: Path, address: str) -> None:
@@ -144,6 +151,15 @@ def run_superlink(folder: Path, address: str) -> None:
         *("--isolation", "process", "--superexec-auth-secret-file", str(folder / SECRET)),
     ]
     flower_superlink()
+
+
+def import_flower() -> None:
+    """Import what SuperLink and SuperNodes need, so that the forks of this process have it."""
+    import flwr.superlink.cli.flower_superlink
+    import flwr.superlink.main
+    import flwr.supernode.cli.flower_supernode
+    import flwr.supernode.main
+    import flwr.supernode.runtime.run_clientapp  # noqa: F401
 
 
 class _Enrolment:
