@@ -35,7 +35,7 @@ def check_same(embedded, deployed):
 
 @pytest.mark.parametrize("name", [name for name in STRATEGIES if name != "fedmd"])
 def test_strategies(name, clients, weights, deployment):
-    settings = {"krum": {"krum": {"attackers": 0}}}.get(name, name)
+    settings = {"krum": {"krum": {"byzantine": 0}}}.get(name, name)
     check_same(*both(clients, weights, deployment, strategy=strategy_named(settings)))
 
 
@@ -43,7 +43,7 @@ def test_strategies(name, clients, weights, deployment):
     "rules",
     [
         Rules(upload=Upload(compression="top-k")),
-        Rules(privacy=Privacy(noise=1.0, clip=0.5, local=True, seeded=True)),
+        Rules(privacy=Privacy(noise=1.0, clip=0.5, where="local", seeded=True)),
     ],
     ids=["top-k", "local-noise"],
 )

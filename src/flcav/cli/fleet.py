@@ -148,6 +148,39 @@ def list_vehicles(
 
 
 @fleet.command()
+def status(
+    folder: Path = FLEET,
+    page: int | None = typer.Option(
+        None, "--page", min=0, max=65535, help="Serve a page that follows the fleet, on this port of this host; 0: any."
+    ),
+    as_json: bool = JSON,
+) -> None:
+    """Tell who is in, the rounds of the federation, bytes against budgets, failures and refusals."""
+    from flcav.federation.fleet.status import read_status
+
+    if page is not None:
+        from flcav.federation.fleet.page import serve_page
+
+        serve_page(folder, page, typer.echo)
+        return
+    found = read_status(folder)
+    if as_json:
+        print_json(found.as_json())
+        return
+    typer.echo("not up" if found.proxy is None else f"up at {found.proxy}, {plural(len(found.processes), 'process')}")
+    for own in found.vehicles:
+        there = "online" if own.online else "offline"
+        typer.echo(
+            f"{own.name}: {own.state}, {there}; {own.socket_up} bytes up and {own.socket_down} down crossed its "
+            f"sockets, {own.content_up} and {own.content_down} of them content"
+        )
+    if found.federation is not None:
+        typer.echo(found.federation.describe())
+    for each in found.refused:
+        typer.echo(f"refused: {each}")
+
+
+@fleet.command()
 def up(
     folder: Path = FLEET,
     vehicles: int = typer.Option(0, "--vehicles", min=0, max=64, help="Vehicles on this machine beside."),

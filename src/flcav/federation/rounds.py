@@ -180,6 +180,7 @@ def federate(
             else:
                 weights = _imitate(distiller, strategy, weights, combined, schedule.work(number))
                 state.server = {name: np.asarray(array) for name, array in combined.items()}
+            link.follow(state.records[-1])
             on_round(number, weights, state.records[-1].loss)
             sent = combined
     last = state.records[-1]

@@ -65,7 +65,7 @@ class Authority:
         key = make_key()
         name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "server")])
         valid = self.certificate.not_valid_after_utc - datetime.now(UTC)
-        made = certificate_of(key.public_key(), name, self.certificate.subject, valid, hosts)
+        made = certificate_of(key.public_key(), name, self.certificate.subject, valid, hosts, self.key.public_key())
         made = made.add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
         write_private(self.folder / SERVER_KEY, private_pem(key))
         signed = made.sign(self.key, hashes.SHA384())
@@ -76,7 +76,7 @@ class Authority:
         key = asked.public_key()
         assert isinstance(key, ec.EllipticCurvePublicKey)
         name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, vehicle)])
-        made = certificate_of(key, name, self.certificate.subject, valid)
+        made = certificate_of(key, name, self.certificate.subject, valid, (), self.key.public_key())
         for extension, critical in (
             (x509.BasicConstraints(False, None), True),
             (x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH]), False),

@@ -138,11 +138,17 @@ def certificate_of(
     issuer: x509.Name,
     valid: timedelta,
     hosts: tuple[str, ...] = (),
-    since: datetime | None = None,
+    issuer_key: ec.EllipticCurvePublicKey | None = None,
 ) -> x509.CertificateBuilder:
-    """Return a certificate (X.509) of a key to be signed, valid from `since` (None: now) on; `hosts` make it a server's."""
-    begin = (since or datetime.now(UTC)).replace(microsecond=0)
+    """Return a certificate (X.509) of a key to be signed by its issuer's (None: the key itself), valid from now on.
+
+    Servers are named by `hosts`.
+    """
+    begin = datetime.now(UTC).replace(microsecond=0)
     made = x509.CertificateBuilder(issuer, subject, key, x509.random_serial_number(), begin, begin + valid)
+    made = made.add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+    by = x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key or key)
+    made = made.add_extension(by, critical=False)
     if hosts:
         names = [x509.IPAddress(ip) if (ip := _address(host)) else x509.DNSName(host) for host in hosts]
         made = made.add_extension(x509.SubjectAlternativeName(names), critical=False)

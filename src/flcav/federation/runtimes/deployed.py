@@ -23,6 +23,7 @@ from flwr.serverapp import Grid
 from flcav.config import InputError
 from flcav.federation.fleet.authority import found_authority, open_registry
 from flcav.federation.fleet.registry import Vehicle
+from flcav.federation.fleet.status import Followed, FollowedRound
 from flcav.federation.fleet.superlink import Run, SuperLink, SuperLinkLost
 from flcav.federation.fleet.supervisor import LOGS
 from flcav.federation.fleet.traffic import read_traffic
@@ -34,7 +35,7 @@ from flcav.federation.runtimes.embedded import keep_identity
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.vehicle_app import Assignment
 from flcav.federation.runtimes.wrapped import WrappedGrid
-from flcav.federation.state import ClientStates
+from flcav.federation.state import ClientStates, RoundRecord
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable
 from flcav.network.ledger import BudgetExceeded
@@ -119,6 +120,7 @@ class DeployedGrid(WrappedGrid):
     ) -> None:
         """Reach nodes with the clients' `names`, which are `vehicles` of the registry."""
         self._deployment, self.names, self._vehicles, self._account = deployment, names, vehicles, account
+        self._rounds: tuple[FollowedRound, ...] = ()
         self._begin()
 
     def _begin(self) -> None:
@@ -138,6 +140,14 @@ class DeployedGrid(WrappedGrid):
                 if time.monotonic() > end:
                     raise
                 time.sleep(PAUSE_S)
+
+    def follow(self, record: RoundRecord) -> None:
+        """Write a round that has ended to the fleet's folder, where `flcav fleet status` reads it."""
+        about = time.time(), len(record.clients), record.failed, record.loss, record.epsilon
+        self._rounds = (*self._rounds, FollowedRound(record.round, *about))
+        account, link = self._account, self._account.link
+        used, left = account.ledger.used_mb(link, "up"), account.ledger.left_mb(link)
+        Followed(account.stage, account.task, link, used, left, self._rounds).save(self._deployment.folder)
 
     def end(self, failed: bool = False) -> None:
         """End the run."""

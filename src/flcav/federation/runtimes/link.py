@@ -4,7 +4,7 @@ What crosses a link is lost where the network loses it, held to the budget where
 """
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, BudgetedGrid, MeteredGrid
 from flcav.federation.runtimes.outages import LossyGrid
 from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
-from flcav.federation.state import ClientStates, ReadStates
+from flcav.federation.state import ClientStates, ReadStates, RoundRecord
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable
 from flcav.interface.wording import suggest
@@ -41,6 +41,7 @@ class Link:
     grid: Grid
     names: Mapping[int, str]  # of the clients, by node
     read_states: ReadStates  # of what clients keep between rounds
+    follow: Callable[[RoundRecord], None] = lambda _: None  # called with the record of each round that has ended
 
 
 @contextlib.contextmanager
@@ -83,7 +84,8 @@ def open_link(
     with opened as inner:
         lossy = LossyGrid(inner, account, inner.names) if account.outages else inner
         metered = MeteredGrid(BudgetedGrid(lossy, account, inner.names), account, inner.names)
-        yield Link(metered, inner.names, inner.read_states)
+        follow = getattr(inner, "follow", lambda _: None)
+        yield Link(metered, inner.names, inner.read_states, follow)
 
 
 @contextlib.contextmanager
