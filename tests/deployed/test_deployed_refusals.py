@@ -56,9 +56,7 @@ def signed_headers(key: ec.EllipticCurvePrivateKey) -> dict[str, str]:
     from cryptography.hazmat.primitives import hashes
     from flwr.supercore.date import now
 
-    public = key.public_key().public_bytes(
-        serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo
-    )
+    public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
     stamp = now().isoformat()
     signature = key.sign(stamp.encode(), ec.ECDSA(hashes.SHA256()))
     encode = lambda data: base64.b64encode(data).decode()  # noqa: E731
@@ -67,9 +65,7 @@ def signed_headers(key: ec.EllipticCurvePrivateKey) -> dict[str, str]:
 
 def activate(client, key):
     """Return the answer to a node's first call, with Flower's signature by `key`."""
-    public = key.public_key().public_bytes(
-        serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo
-    )
+    public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
     asked = ActivateNodeRequest(public_key=public, heartbeat_interval=30.0)
     return client.post("/v1/fleet/activate-node", content=asked.SerializeToString(), headers=signed_headers(key))
 
@@ -154,9 +150,7 @@ def test_call_of_another_vehicle(deployment):
     key, body = load_key(deployment.folder / VEHICLES / "vehicle-001" / KEY), PullMessagesRequest()
     body.node.CopyFrom(node_of(deployment, "vehicle-001"))
     with reach(deployment, deployment.folder / VEHICLES / "vehicle-002") as client:
-        answer = client.post(
-            "/v1/fleet/pull-messages", content=body.SerializeToString(), headers=signed_headers(key)
-        )
+        answer = client.post("/v1/fleet/pull-messages", content=body.SerializeToString(), headers=signed_headers(key))
     assert (answer.status_code, answer.text) == (401, "the node's key is not the certificate's")
 
 

@@ -35,7 +35,9 @@ def check_same(embedded, deployed):
 
 @pytest.mark.parametrize("name", [name for name in STRATEGIES if name != "fedmd"])
 def test_strategies(name, clients, weights, deployment):
-    settings = {"krum": {"krum": {"byzantine": 0}}}.get(name, name)
+    settings = {"krum": {"krum": {"byzantine": 0}}, "trimmed-mean": {"trimmed-mean": {"fraction": 0.34}}}.get(
+        name, name
+    )
     check_same(*both(clients, weights, deployment, strategy=strategy_named(settings)))
 
 

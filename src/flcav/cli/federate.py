@@ -30,7 +30,9 @@ def federate(
     arm: str = typer.Option("main", "--arm", help="Arm of the recipe; by default what the recipe itself describes."),
     jobs: int = typer.Option(2, "--jobs", min=1, help="Processes that vehicles train in, of one thread each."),
     runtime: Runtime = typer.Option(
-        Runtime.embedded, "--runtime", help="Processes here, Flower's simulation on Ray, or a deployed Flower federation."
+        Runtime.embedded,
+        "--runtime",
+        help="Processes here, Flower's simulation on Ray, or a deployed Flower federation.",
     ),
     fleet: Path | None = typer.Option(
         None, "--fleet", help="flower: folder of a fleet that is up; by default one is brought up here, for as long."

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from flcav.cli.options import check_finite
 from flcav.cli.terminal import print_json
 from flcav.interface.wording import plural
 
@@ -16,7 +17,9 @@ fleet = typer.Typer(
 )
 FLEET = typer.Argument(help="Folder of the fleet's authority.")
 REQUEST = typer.Argument(help="Signing request of the vehicle (PKCS #10), made by flcav fleet key.")
-DAYS = typer.Option(365.0, "--days", min=0.0001, max=3650.0, help="Days until the certificate expires.")
+DAYS = typer.Option(
+    365.0, "--days", min=0.0001, max=3650.0, callback=check_finite, help="Days until the certificate expires."
+)
 CERTIFICATE = typer.Option(..., "--out", help="File of the certificate (PEM), which goes to the vehicle.")
 JSON = typer.Option(False, "--json", help="Print one JSON object instead.")
 
@@ -125,7 +128,9 @@ def list_vehicles(
             print_json({"audit": [asdict(each) for each in entries]})
             return
         for each in entries:
-            typer.echo(f"{_date(each.time)} {each.action} {each.vehicle} {each.fingerprint[:16]} {each.reason}".rstrip())
+            typer.echo(
+                f"{_date(each.time)} {each.action} {each.vehicle} {each.fingerprint[:16]} {each.reason}".rstrip()
+            )
         return
     found = registry.list_vehicles()
     if as_json:

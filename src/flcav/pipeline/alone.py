@@ -70,8 +70,9 @@ def federate_regions(
 
     In every federating region and for every task vehicles train in `jobs` processes of one thread each, or actors where
     the `runtime`, one of `RUNTIMES`, is "ray", or on the vehicles of a deployed `fleet` (None: one that is brought up
-    for as long) where it is "flower". The weights do not depend on that, on Ray up to rounding. Others are those of `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not
-    federate, `ClientFailed` where fewer vehicles are left in a round than are wanted.
+    for as long) where it is "flower". The weights do not depend on that, on Ray up to rounding. Others are those of
+    `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not federate,
+    `ClientFailed` where fewer vehicles are left in a round than are wanted.
     """
     out, graph = Path(out), Graph(recipe, Path(beside or "."))
     if arm not in graph.settings:

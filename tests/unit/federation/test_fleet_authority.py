@@ -51,7 +51,12 @@ def test_openssl_accepts_the_certificates(authority, vehicle):
     for purpose, certificate in (("sslclient", vehicle / CERTIFICATE), ("sslserver", authority.folder / "server.crt")):
         assert openssl("verify", "-x509_strict", "-CAfile", ca, "-purpose", purpose, certificate).returncode == 0
     assert openssl("verify", "-CAfile", ca, "-purpose", "sslserver", vehicle / CERTIFICATE).returncode != 0
-    assert openssl("verify", "-CAfile", ca, "-verify_hostname", "fleet.example", authority.folder / "server.crt").returncode == 0
+    assert (
+        openssl(
+            "verify", "-CAfile", ca, "-verify_hostname", "fleet.example", authority.folder / "server.crt"
+        ).returncode
+        == 0
+    )
     text = openssl("x509", "-in", vehicle / CERTIFICATE, "-noout", "-subject", "-fingerprint", "-sha256").stdout
     assert "CN = cav-1" in text or "CN=cav-1" in text
     found = authority.registry.find(text.rpartition("=")[2].strip().replace(":", "").lower())
@@ -167,7 +172,7 @@ def test_certificate_for_another_key(authority, vehicle, tmp_path):
 
 
 def test_ten_thousand_vehicles(authority):
-    """A register, a revoke and a look-up take milliseconds, and so does a list of a thousand; bounds for a busy machine."""
+    """A register, a revoke and a look-up take milliseconds; the bounds are for a busy machine."""
     registry, end = authority.registry, int(time.time()) + 1000
     make = lambda i: Vehicle(f"v{i:05d}", f"{i:064x}", i.to_bytes(8, "big"), 0, end)  # noqa: E731
     with registry._change() as cursor:

@@ -54,7 +54,7 @@ class Authority:
         return made.public_bytes(serialization.Encoding.PEM)
 
     def rotate(self, request: Path, days: float = VEHICLE_DAYS) -> bytes:
-        """Return the certificate (PEM) of a registered vehicle's new key; the certificate it had is refused from now on."""
+        """Return the certificate (PEM) of a registered vehicle's new key; the one it had is refused from now on."""
         asked = read_request(request)
         made = self._certify(asked, timedelta(days=days))
         self.registry.rotate(_describe(made, asked))

@@ -14,7 +14,7 @@ from flcav.storage.files import write_bytes
 
 
 def install_vehicle(folder: Path, certificate: Path, authority: Path, trusted: Path, server: str) -> None:
-    """Put what came from the authority into a vehicle's folder; raises `InputError` where a part is not what it should be.
+    """Put what came from the authority into a vehicle's folder; raises `InputError` where a part is something else.
 
     server: host:port of the fleet's proxy.
     """

@@ -71,7 +71,8 @@ def public_der(key: ec.EllipticCurvePublicKey) -> bytes:
 def request_certificate(folder: Path, vehicle: str) -> Path:
     """Make a vehicle's key in `folder`, and return the path of its signing request (PKCS #10), which goes up.
 
-    Where the vehicle has a certificate already, the new key and its request lie in `folder`/next until `take_certificate`.
+    Where the vehicle has a certificate already, the new key and its request lie in `folder`/next until
+    `take_certificate`.
     """
     check_identifier(vehicle)
     at = folder / NEXT if (folder / CERTIFICATE).exists() else folder
@@ -80,15 +81,13 @@ def request_certificate(folder: Path, vehicle: str) -> Path:
     request = x509.CertificateSigningRequestBuilder().subject_name(name).sign(key, hashes.SHA384())
     write_private(at / KEY, private_pem(key))
     openssh = serialization.PrivateFormat.OpenSSH
-    write_private(
-        at / FLOWER_KEY, key.private_bytes(serialization.Encoding.PEM, openssh, serialization.NoEncryption())
-    )
+    write_private(at / FLOWER_KEY, key.private_bytes(serialization.Encoding.PEM, openssh, serialization.NoEncryption()))
     write_bytes(at / REQUEST, request.public_bytes(serialization.Encoding.PEM))
     return at / REQUEST
 
 
 def take_certificate(folder: Path, certificate: bytes, authority: bytes) -> None:
-    """Put the certificate of a vehicle's key, and the authority's, both PEM, into its `folder`; a new key comes into use.
+    """Put the certificate of a vehicle's key, and the authority's, both PEM, into its `folder`; a new key is then used.
 
     Raises `InputError` where the certificate is for another key.
     """

@@ -35,7 +35,10 @@ class Connection:
             return 0, 0
         if len(info) < INFO_BYTES:
             return 0, 0
-        (received,), (sent, again) = struct.unpack_from("=Q", info, RECEIVED_AT), struct.unpack_from("=QQ", info, SENT_AT)
+        (received,), (sent, again) = (
+            struct.unpack_from("=Q", info, RECEIVED_AT),
+            struct.unpack_from("=QQ", info, SENT_AT),
+        )
         before, self._counted = self._counted, (received, sent - again)
         return received - before[0], sent - again - before[1]
 
@@ -44,6 +47,7 @@ class CertifiedProtocol(HttpToolsProtocol):
     """HTTP/1.1 of uvicorn, with the client's certificate and connection in the state of each request."""
 
     def connection_made(self, transport: Any) -> None:  # type: ignore[override]
+        """Begin a connection, whose TLS handshake is over."""
         super().connection_made(transport)
         tls = transport.get_extra_info("ssl_object")
         certificate = tls.getpeercert(binary_form=True) if tls is not None else None

@@ -31,11 +31,15 @@ th { border-bottom: 1px solid; } td.n { text-align: right; font-variant-numeric:
 <h2>Refused</h2><ul id="refused"></ul>
 <script>
 const at = id => document.getElementById(id);
-const cell = (text, kind) => { const c = document.createElement("td"); c.textContent = text; c.className = kind || ""; return c; };
+const cell = (text, kind) => {
+  const c = document.createElement("td"); c.textContent = text; c.className = kind || ""; return c;
+};
 const fill = (table, heads, rows) => {
   const head = document.createElement("tr");
   for (const each of heads) { const h = document.createElement("th"); h.textContent = each; head.append(h); }
-  table.replaceChildren(head, ...rows.map(cells => { const r = document.createElement("tr"); r.append(...cells); return r; }));
+  table.replaceChildren(head, ...rows.map(cells => {
+    const r = document.createElement("tr"); r.append(...cells); return r;
+  }));
 };
 const number = value => value === null ? "" : value.toPrecision(4);
 async function follow() {
@@ -50,7 +54,9 @@ async function follow() {
       s.vehicles.map(v => [cell(v.name), cell(v.state, v.state == "registered" ? "" : "bad"),
         cell(v.online ? "online" : "offline", v.online ? "" : "off"), cell(v.socket_up, "n"), cell(v.socket_down, "n"),
         cell(v.content_up, "n"), cell(v.content_down, "n")]));
-    at("refused").replaceChildren(...s.refused.map(r => { const i = document.createElement("li"); i.textContent = r; return i; }));
+    at("refused").replaceChildren(...s.refused.map(r => {
+      const i = document.createElement("li"); i.textContent = r; return i;
+    }));
   } catch (error) { at("state").textContent = `no answer: ${error}`; }
   setTimeout(follow, 1000);
 }

@@ -100,7 +100,9 @@ def find_caller(registry: Registry, certificate: bytes | None, now: float | None
         return "the certificate is not registered"
     now = time.time() if now is None else now
     state = found.describe_state(now)
-    return found if state == "registered" and now >= found.issued - 60 else f"the certificate of {found.name} is {state}"
+    return (
+        found if state == "registered" and now >= found.issued - 60 else f"the certificate of {found.name} is {state}"
+    )
 
 
 def node_key(header: bytes) -> bytes:

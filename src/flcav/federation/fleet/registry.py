@@ -1,7 +1,7 @@
 """The registry of a fleet's vehicles (SQLite): who has which certificate, and an audit trail of every change.
 
-A row of `certificates` is one certificate. It is in force, or revoked, or replaced by that of a newer key; expiry is its
-own. Each change and its entry in `audit` are one transaction; entries are never changed.
+A row of `certificates` is one certificate. It is in force, or revoked, or replaced by that of a newer key; it expires
+by itself. Each change and its entry in `audit` are one transaction; entries are never changed.
 """
 
 import sqlite3
@@ -113,7 +113,9 @@ class Registry:
         with self._change() as cursor:
             known = cursor.execute("SELECT 1 FROM certificates WHERE vehicle = ?", (vehicle.name,)).fetchone()
             if known:
-                raise InputError(f"vehicle '{vehicle.name}': is registered already; flcav fleet rotate gives it a new key")
+                raise InputError(
+                    f"vehicle '{vehicle.name}': is registered already; flcav fleet rotate gives it a new key"
+                )
             self._insert(cursor, vehicle, "register")
 
     def rotate(self, vehicle: Vehicle) -> None:
@@ -130,7 +132,7 @@ class Registry:
             self._insert(cursor, vehicle, "rotate")
 
     def revoke(self, name: str, reason: str = "") -> None:
-        """Revoke the certificate of a vehicle, which is refused from now on; raises `InputError` where none is in force."""
+        """Revoke a vehicle's certificate, which is refused from now on; raises `InputError` where none is in force."""
         with self._change() as cursor:
             row = cursor.execute(
                 "SELECT fingerprint FROM certificates WHERE vehicle = ? AND state = 'registered'", (name,)
@@ -143,8 +145,13 @@ class Registry:
     def set_node(self, fingerprint: str, node: int | None) -> None:
         """Note the id that a certificate's key has at the SuperLink; None: it is enrolled no more."""
         with self._change() as cursor:
-            cursor.execute("UPDATE certificates SET node = ? WHERE fingerprint = ?", (None if node is None else str(node), fingerprint))
-            name = cursor.execute("SELECT vehicle FROM certificates WHERE fingerprint = ?", (fingerprint,)).fetchone()[0]
+            cursor.execute(
+                "UPDATE certificates SET node = ? WHERE fingerprint = ?",
+                (None if node is None else str(node), fingerprint),
+            )
+            name = cursor.execute("SELECT vehicle FROM certificates WHERE fingerprint = ?", (fingerprint,)).fetchone()[
+                0
+            ]
             self._note(cursor, "enrol" if node is not None else "strike", name, fingerprint, "")
 
     def find(self, fingerprint: str) -> Vehicle | None:

@@ -1,4 +1,4 @@
-"""What a fleet is doing: who is registered and in, the rounds of its federation, bytes against budgets, and refusals."""
+"""What a fleet is doing: who is registered and in, rounds of its federation, bytes against budgets, and refusals."""
 
 import contextlib
 import json
@@ -46,7 +46,6 @@ class Followed(Record):
     def save(self, folder: Path) -> None:
         """Write it to the fleet's folder."""
         write_bytes(folder / PROGRESS, json.dumps(self.as_json()).encode())
-
 
     def describe(self) -> str:
         """Return it in a sentence."""

@@ -1,8 +1,8 @@
-"""Flower's SuperLink as its operator uses it: nodes are enrolled, runs begin, and this process is the server app of one.
+"""Flower's SuperLink as its operator uses it: nodes are enrolled, runs begin, this process is the server app of one.
 
 With `embedded`, the only module that uses private parts of Flower (pinned to 1.42): the clients of its control and
-runtime interfaces, and its table of app bundles. The control side asks nobody for a credential, so the SuperLink listens
-on the loopback of the operator's host; the secret of the executor is in a file that its owner alone can read.
+runtime interfaces, and its table of app bundles. The control side asks nobody for a credential, so the SuperLink
+listens on the loopback of the operator's host; the secret of the executor is in a file that its owner alone can read.
 """
 
 import contextlib
@@ -80,7 +80,7 @@ class SuperLink:
             yield client
 
     def enrol(self, registry: Registry) -> None:
-        """Make the nodes of the SuperLink those of the registry's vehicles in force: enrol new ones, strike out others."""
+        """Make the SuperLink's nodes those of the registry's vehicles in force: enrol new ones, strike out others."""
         wanted = {own.fingerprint: own for own in registry.list_vehicles() if own.describe_state() == "registered"}
         with self._control() as control:
             there = {node.node_id for node in control.ListNodes(ListNodesRequest()).nodes_info}
@@ -97,20 +97,16 @@ class SuperLink:
     def list_online(self) -> set[int]:
         """Return the ids of the nodes that are online."""
         with self._control() as control:
-            return {
-                node.node_id for node in control.ListNodes(ListNodesRequest()).nodes_info if node.status == ONLINE
-            }
+            return {node.node_id for node in control.ListNodes(ListNodesRequest()).nodes_info if node.status == ONLINE}
 
     def begin(self, bundle: bytes | None = None, signature: dict[str, str] | None = None) -> "Run":
-        """Begin a run with a bundle (None: the vehicles' app, signed by the fleet's publisher); return its server's end."""
+        """Begin a run with a bundle (None: the vehicles' app, signed by the publisher); return its server's end."""
         bundle = build_bundle() if bundle is None else bundle
         signature = sign_bundle(self.folder, bundle) if signature is None else signature
         certificate = (self.folder / AUTHORITY).read_bytes()
         interceptors = [
             RuntimeVersionHttpInterceptor(component_name="SuperExec"),
-            SuperExecAuthHttpInterceptor(
-                master_secret=(self.folder / SECRET).read_bytes(), protected_methods=ACQUIRE
-            ),
+            SuperExecAuthHttpInterceptor(master_secret=(self.folder / SECRET).read_bytes(), protected_methods=ACQUIRE),
         ]
         with (
             _locked(self.folder / f"{SECRET}.lock"),  # so that the task which is pending is this run's
@@ -119,7 +115,9 @@ class SuperLink:
         ):
             number = control.StartRun(StartRunRequest(fab=Fab(content=bundle))).run_id
             self._attach(bundle, signature)
-            while not (task := runtime.AcquireTask(AcquireTaskRequest(supported_task_types=[TaskType.SERVER_APP]))).token:
+            while not (
+                task := runtime.AcquireTask(AcquireTaskRequest(supported_task_types=[TaskType.SERVER_APP]))
+            ).token:
                 time.sleep(0.05)
         if task.task.run_id != number:
             raise OSError(f"the SuperLink at {self.address} runs apps of somebody else")

@@ -1,4 +1,4 @@
-"""Supervision of a fleet's processes: forks of one process that has imported what they need, started again when they end.
+"""Supervision of a fleet's processes: forks of one that has imported what they need, started again when they end.
 
 They end with the supervisor. A process that ends at once is started again later and later, up to half a minute: a node
 that was refused, for its clock or its certificate, comes back when that is corrected.
@@ -45,7 +45,7 @@ def supervise(
     later: Mapping[str, Callable[[], None]] = {},
     is_up: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Run `processes`, by name, until this process gets SIGTERM or SIGINT, and those for `later` once the others are up.
+    """Run `processes`, by name, until this process gets SIGTERM or SIGINT; those for `later` once the others are up.
 
     `is_up` is called about ten times a second, and tells.
     Their output goes to `folder`/logs, their ids to processes.json there. This process must have one thread alone.
@@ -80,7 +80,7 @@ def supervise(
 
 
 def read_processes(folder: Path) -> dict[str, int]:
-    """Return the ids of the processes that are supervised in `folder`, by name; those that are not running have none."""
+    """Return the ids of the processes that are supervised in `folder`, by name; of those alone that are running."""
     try:
         return {name: own["pid"] for name, own in json.loads((folder / PROCESSES).read_bytes()).items() if own["pid"]}
     except FileNotFoundError:

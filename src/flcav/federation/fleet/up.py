@@ -13,7 +13,14 @@ from pathlib import Path
 from flcav.config import InputError
 from flcav.federation.fleet.authority import SERVER, SERVER_KEY, VEHICLE_DAYS, Authority, open_authority, open_registry
 from flcav.federation.fleet.bundle import PUBLISHER_KEY, TRUSTED, make_publisher
-from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, REQUEST, request_certificate, take_certificate, write_private
+from flcav.federation.fleet.keys import (
+    AUTHORITY,
+    CERTIFICATE,
+    REQUEST,
+    request_certificate,
+    take_certificate,
+    write_private,
+)
 from flcav.federation.fleet.proxy import run_proxy
 from flcav.federation.fleet.superlink import DATABASE, SECRET, SuperLink, SuperLinkLost
 from flcav.federation.fleet.supervisor import supervise
@@ -50,10 +57,10 @@ def name_vehicles(count: int) -> list[str]:
 
 
 def prepare_fleet(folder: Path, host: str, port: int, vehicles: int) -> tuple[Authority, str, str]:
-    """Make what `run_fleet` needs in the authority's folder; return the authority, and addresses of proxy and SuperLink.
+    """Make what `run_fleet` needs in the authority's folder; return it, and addresses of proxy and SuperLink.
 
     port: of the proxy; 0: any that is free. vehicles: whose keys and certificates are made on this machine. Raises
-    `InputError` where the port is in use, the folder is another authority's, or a vehicle's certificate is not in force.
+    `InputError` where the port is in use, the folder is another authority's, or a certificate is not in force.
     """
     if not 0 <= vehicles <= MOST_VEHICLES:
         raise InputError(f"--vehicles {vehicles}: 0 to {MOST_VEHICLES} on one machine")
@@ -81,7 +88,9 @@ def prepare_vehicle(authority: Authority, name: str, proxy: str, days: float = V
     found = next((each for each in authority.registry.list_vehicles() if each.name == name), None)
     state = "not registered with this authority" if found is None else found.describe_state()
     if state != "registered":
-        raise InputError(f"{own / CERTIFICATE}: the certificate of '{name}' is {state}; flcav fleet rotate gives another")
+        raise InputError(
+            f"{own / CERTIFICATE}: the certificate of '{name}' is {state}; flcav fleet rotate gives another"
+        )
     write_bytes(own / TRUSTED, (authority.folder / TRUSTED).read_bytes())
     VehicleSettings(proxy, check_port("127.0.0.1", 0), check_port("127.0.0.1", 0)).save(own)
     return own

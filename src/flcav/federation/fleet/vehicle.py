@@ -1,4 +1,4 @@
-"""A vehicle's own processes: its forwarder, Flower's SuperNode, and an executor that its app runs in, one fork a message.
+"""A vehicle's own processes: its forwarder, Flower's SuperNode, and an executor of its app, one fork a message.
 
 Flower starts a process for every message, which imports everything anew. Here the executor imports once, and forks.
 """
@@ -91,13 +91,10 @@ def run_executor(folder: Path, node: str, prepare: Prepare) -> None:
     from flwr.supercore.constant import TaskType
     from flwr.supercore.interceptors import RuntimeVersionHttpInterceptor, SuperExecAuthHttpInterceptor
     from flwr.supercore.runtime import RuntimeHttpClient
-    from flwr.supernode.runtime import run_clientapp  # noqa: F401: imported once, before the forks
 
     os.environ[FOLDER] = str(folder)
     parent = os.getppid()
-    secret = SuperExecAuthHttpInterceptor(
-        master_secret=(folder / SECRET).read_bytes(), protected_methods=ACQUIRE
-    )
+    secret = SuperExecAuthHttpInterceptor(master_secret=(folder / SECRET).read_bytes(), protected_methods=ACQUIRE)
     version = RuntimeVersionHttpInterceptor(component_name="SuperExec")
     with RuntimeHttpClient.from_server_address(node, True, None, [version, secret]) as client:
         while os.getppid() == parent:

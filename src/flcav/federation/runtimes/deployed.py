@@ -24,7 +24,7 @@ from flcav.config import InputError
 from flcav.federation.fleet.authority import found_authority, open_registry
 from flcav.federation.fleet.registry import Vehicle
 from flcav.federation.fleet.status import Followed, FollowedRound
-from flcav.federation.fleet.superlink import Run, SuperLink, SuperLinkLost
+from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
 from flcav.federation.fleet.supervisor import LOGS
 from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.fleet.up import READY, VEHICLES, read_ready
@@ -146,7 +146,7 @@ class DeployedGrid(WrappedGrid):
         about = time.time(), len(record.clients), record.failed, record.loss, record.epsilon
         self._rounds = (*self._rounds, FollowedRound(record.round, *about))
         account, link = self._account, self._account.link
-        used, left = account.ledger.used_mb(link, "up"), account.ledger.left_mb(link)
+        used, left = account.ledger.used_mb(link), account.ledger.left_mb(link)
         Followed(account.stage, account.task, link, used, left, self._rounds).save(self._deployment.folder)
 
     def end(self, failed: bool = False) -> None:

@@ -106,8 +106,8 @@ def open_runtime(
     """Yield what `federate` takes as its `runtime`.
 
     embedded: messages within this process, and clients in `count` processes where these are several. ray: Flower's
-    simulation with `count` actors. flower: vehicles of the `fleet` that is up in this folder, or one that is brought up on
-    this machine for as long. Raises `InputError` for another name.
+    simulation with `count` actors. flower: vehicles of the `fleet` that is up in this folder, or one that is brought
+    up on this machine for as long. Raises `InputError` for another name.
     """
     match name:
         case "embedded":
