@@ -40,7 +40,7 @@ def init(
     from flcav.federation.fleet.authority import found_authority
     from flcav.federation.fleet.bundle import make_publisher
 
-    found_authority(folder, ("127.0.0.1", "localhost", *host))
+    found_authority(folder, tuple(host))
     make_publisher(folder)
     typer.echo(f"{folder}: authority, registry, and the key that apps are signed by")
 

@@ -31,6 +31,7 @@ from flcav.storage.files import write_bytes
 AUTHORITY_KEY, REGISTRY = "ca.key", "registry.sqlite"
 SERVER, SERVER_KEY = "server.crt", "server.key"
 AUTHORITY_YEARS, VEHICLE_DAYS = 10, 365
+LOOPBACK_HOSTS = "127.0.0.1", "localhost"
 DAY = timedelta(days=1)
 
 
@@ -91,8 +92,8 @@ def _describe(made: x509.Certificate, asked: x509.CertificateSigningRequest) -> 
     return Vehicle(requested_name(asked), made.fingerprint(hashes.SHA256()).hex(), spki, begin, end)
 
 
-def found_authority(folder: Path, hosts: tuple[str, ...] = ("127.0.0.1", "localhost")) -> Authority:
-    """Make an authority in `folder`, whose servers are reached by `hosts`; return it.
+def found_authority(folder: Path, hosts: tuple[str, ...] = ()) -> Authority:
+    """Make an authority in `folder`, whose servers are reached by `hosts` beside the loopback; return it.
 
     Raises `InputError` where the folder has one already.
     """
@@ -120,7 +121,7 @@ def found_authority(folder: Path, hosts: tuple[str, ...] = ("127.0.0.1", "localh
     write_bytes(folder / AUTHORITY, certificate.public_bytes(serialization.Encoding.PEM))
     registry = Registry.create(folder / REGISTRY, certificate.fingerprint(hashes.SHA256()).hex())
     authority = Authority(folder, key, certificate, registry)
-    authority.certify_server(hosts)
+    authority.certify_server((*LOOPBACK_HOSTS, *hosts))
     return authority
 
 

@@ -110,6 +110,13 @@ def _end(all_: Mapping[str, _Supervised]) -> None:
             time.sleep(0.02)
 
 
+def end_with_parent(parent: int, how: signal.Signals) -> None:
+    """Have this process, a fork of `parent`, get a signal when that ends (Linux); ends it where that has ended."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, how)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
 def _fork(folder: Path, name: str, do: Callable[[], None]) -> int:
     parent = os.getpid()
     child = os.fork()
@@ -117,9 +124,7 @@ def _fork(folder: Path, name: str, do: Callable[[], None]) -> int:
         return child
     code = 1
     try:
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() != parent:
-            os._exit(1)
+        end_with_parent(parent, signal.SIGTERM)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, signal.SIG_DFL)
         own = folder / LOGS / name

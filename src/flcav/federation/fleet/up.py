@@ -23,12 +23,13 @@ from flcav.federation.fleet.keys import (
 )
 from flcav.federation.fleet.proxy import run_proxy
 from flcav.federation.fleet.superlink import DATABASE, SECRET, SuperLink, SuperLinkLost
-from flcav.federation.fleet.supervisor import supervise
+from flcav.federation.fleet.supervisor import LOGS, supervise
 from flcav.federation.fleet.vehicle import SETTINGS, Prepare, VehicleSettings, vehicle_processes
 from flcav.interface.wording import plural
 from flcav.storage.files import write_bytes, write_json
 
 READY, VEHICLES, LOCK = "ready.json", "vehicles", "up.lock"
+SILENT_S = 60.0  # after which is said that something is wrong
 CHECK_S = 1.0  # between looks at the registry
 MOST_VEHICLES = 64  # on this machine
 
@@ -120,8 +121,14 @@ def run_fleet(
             own = vehicle_processes(folder / VEHICLES / name, prepare)
             later |= {f"{name}-{kind}": do for kind, do in own.items()}
 
+        begun, silent = time.monotonic(), True
+
         def is_up() -> bool:
+            nonlocal silent
             up = state.update(link)
+            if not up and silent and time.monotonic() > begun + SILENT_S:
+                silent = False
+                report(f"{folder}: the SuperLink does not answer ({state.wrong}); see {folder / LOGS}")
             if up and not (folder / READY).exists():
                 write_json(folder / READY, asdict(Ready(proxy, superlink, os.getpid(), int(time.time()))))
                 report(f"{folder}: up at {proxy}, with {plural(vehicles, 'vehicle')} on this machine")
@@ -176,6 +183,7 @@ class _Enrolment:
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._seen, self._next = folder, -1, 0.0
+        self.wrong = ""  # why it is not so
 
     def update(self, link: SuperLink) -> bool:
         """Enrol where there is something to; return whether the nodes are the registry's vehicles."""
@@ -187,8 +195,8 @@ class _Enrolment:
             if registry.count_changes() != self._seen:
                 link.enrol(registry)
                 self._seen = registry.count_changes()
-        except SuperLinkLost:
-            pass  # not there yet, or not now
+        except SuperLinkLost as error:  # not there yet, or not now
+            self.wrong = str(error)
         finally:
             registry.close()
         return self._seen >= 0

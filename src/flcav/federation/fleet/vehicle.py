@@ -16,6 +16,7 @@ from flcav.config import InputError
 from flcav.federation.fleet.bundle import TRUSTED
 from flcav.federation.fleet.keys import FLOWER_KEY, LOOPBACK, LOOPBACK_KEY, make_loopback, write_private
 from flcav.federation.fleet.superlink import ACQUIRE, SECRET
+from flcav.federation.fleet.supervisor import end_with_parent
 from flcav.storage.files import write_json
 
 SETTINGS, FOLDER = "vehicle.json", "FLCAV_VEHICLE"  # the second: environment variable of the app
@@ -112,11 +113,12 @@ def run_executor(folder: Path, node: str, prepare: Prepare) -> None:
 
 def _fork(node: str, token: str) -> int:
     """Return the id of a process that runs the app for one message."""
-    child = os.fork()
+    parent, child = os.getpid(), os.fork()
     if child:
         return child
     code = 1
     try:
+        end_with_parent(parent, signal.SIGKILL)
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         from flwr.supernode.runtime.run_clientapp import run_clientapp
 
