@@ -21,4 +21,4 @@ def walk(runtime, count, rounds, log=None, lasts_s=0.0):
 
 if __name__ == "__main__":
     fleet, count, rounds, log, out = sys.argv[1:]
-    np.savez(out, **walk(Deployment(Path(fleet)), int(count), int(rounds), Path(log), 2.0))
+    np.save(out, walk(Deployment(Path(fleet)), int(count), int(rounds), Path(log), 2.0)["w"])

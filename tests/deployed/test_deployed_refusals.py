@@ -3,6 +3,7 @@
 import base64
 import ssl
 import time
+from datetime import timedelta
 
 import httpx
 import numpy as np
@@ -51,29 +52,31 @@ def reach(deployment, folder=None, authority=None):
     return httpx.Client(base_url=f"https://{read_ready(deployment.folder).proxy}", verify=context, trust_env=False)
 
 
-def signed_headers(key: ec.EllipticCurvePrivateKey) -> dict[str, str]:
-    """Return Flower's headers of a node, as its SuperNode signs them."""
+def signed_headers(key: ec.EllipticCurvePrivateKey, late_s: float = 0.0) -> dict[str, str]:
+    """Return Flower's headers of a node, as its SuperNode signs them where its clock is `late_s` behind."""
     from cryptography.hazmat.primitives import hashes
     from flwr.supercore.date import now
 
     public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
-    stamp = now().isoformat()
+    stamp = (now() - timedelta(seconds=late_s)).isoformat()
     signature = key.sign(stamp.encode(), ec.ECDSA(hashes.SHA256()))
     encode = lambda data: base64.b64encode(data).decode()  # noqa: E731
     return {**PROTOBUF, "flwr-public-key": encode(public), "flwr-signature": encode(signature), "flwr-timestamp": stamp}
 
 
-def activate(client, key):
+def activate(client, key, late_s=0.0):
     """Return the answer to a node's first call, with Flower's signature by `key`."""
     public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
     asked = ActivateNodeRequest(public_key=public, heartbeat_interval=30.0)
-    return client.post("/v1/fleet/activate-node", content=asked.SerializeToString(), headers=signed_headers(key))
+    return client.post(
+        "/v1/fleet/activate-node", content=asked.SerializeToString(), headers=signed_headers(key, late_s)
+    )
 
 
 def node_of(deployment, name):
     """Return Flower's node of a vehicle."""
     vehicles = open_authority(deployment.folder).registry.list_vehicles()
-    return Node(node_id=next(own.node for own in vehicles if own.name == name))
+    return Node(node_id=next(own.node for own in vehicles if own.name == name) or 0)
 
 
 def wait_enrolled(deployment, name):
@@ -98,6 +101,17 @@ def test_registered_vehicle_comes_in_and_a_revoked_one_is_out_at_once(deployment
     assert (again.status_code, again.text) == (401, "the certificate of in-and-out is revoked")
     time.sleep(0.7)
     assert any("in-and-out is revoked" in each for each in read_traffic(deployment.folder).refused)
+
+
+@pytest.mark.parametrize(("late_s", "told"), [(86400, "86400 s behind"), (-86400, "86400 s ahead")])
+def test_clock_that_is_off_is_named_and_comes_in_once_corrected(late_s, told, deployment):
+    own = deployment.folder / VEHICLES / "vehicle-003"
+    with reach(deployment, own) as client:
+        assert activate(client, load_key(own / KEY), late_s).status_code == 401
+        assert activate(client, load_key(own / KEY)).status_code == 200
+    time.sleep(0.8)
+    refused = read_traffic(deployment.folder).refused
+    assert any(each.startswith("vehicle-003: ") and each.endswith(told) for each in refused)
 
 
 def test_expired(deployment, authority, tmp_path):

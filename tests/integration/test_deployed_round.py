@@ -1,6 +1,7 @@
 """One deployed round: SuperLink, proxy and two vehicles, to the weights of the federation in this process."""
 
 import os
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ CLIENTS = Path(__file__).parents[1] / "deployed"  # `make test-deployed` has the
 def test_a_deployed_round_ends_with_the_embedded_weights(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(CLIENTS), os.environ.get("PYTHONPATH", "")]).rstrip(":"))
     monkeypatch.syspath_prepend(str(CLIENTS))
-    from fleet_clients import Walker
+    Walker = import_module("fleet_clients").Walker
 
     clients = {"town/cav0": Walker(1), "town/cav1": Walker(3)}
     weights, schedule = {"w": np.arange(3000, dtype=np.float32)}, Schedule(1, 2, 0.1, 0.1, 5)

@@ -7,6 +7,7 @@ import subprocess
 import time
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from flcav.config import InputError
 from flcav.federation.fleet.authority import found_authority, open_authority, open_registry
@@ -74,6 +75,7 @@ def test_private_keys_stay_with_their_owner(authority, vehicle):
     from cryptography.hazmat.primitives.serialization import load_ssh_private_key
 
     flower = load_ssh_private_key((vehicle / FLOWER_KEY).read_bytes(), None)
+    assert isinstance(flower, ec.EllipticCurvePrivateKey)
     assert flower.private_numbers() == load_key(vehicle / KEY).private_numbers()
 
 

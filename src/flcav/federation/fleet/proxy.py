@@ -10,6 +10,7 @@ import base64
 import binascii
 import hashlib
 import time
+from datetime import datetime
 from pathlib import Path
 
 import httpx
@@ -40,6 +41,8 @@ CALLS = frozenset(
     }
 )  # of a node; registering one is the authority's
 NODE_KEY = b"flwr-public-key"  # header: of the node, PEM in base 64
+SIGNED_AT = b"flwr-timestamp"  # header: when the node signed
+OLDEST_S = 300.0  # of a signature that Flower accepts
 SAVE_S = 0.5  # between savings of what was counted
 
 
@@ -72,6 +75,8 @@ class FleetProxy:
             await self._refuse(send, 401, vehicle.name, "the node's key is not the certificate's")
             return
         done = await relay(self._client, scope, receive, send)
+        if done.status == httpx.codes.UNAUTHORIZED:
+            self._traffic.refuse(vehicle.name, describe_clock(dict(scope["headers"]).get(SIGNED_AT, b"")))
         connection: Connection = state[CONNECTION]
         answered = done.status == httpx.codes.OK
         self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), answered)
@@ -103,6 +108,19 @@ def find_caller(registry: Registry, certificate: bytes | None, now: float | None
     return (
         found if state == "registered" and now >= found.issued - 60 else f"the certificate of {found.name} is {state}"
     )
+
+
+def describe_clock(signed_at: bytes, now: float | None = None) -> str:
+    """Return in words why Flower refused a node's signature: most often its clock; `signed_at` is its header."""
+    try:
+        late = (time.time() if now is None else now) - datetime.fromisoformat(signed_at.decode("ascii")).timestamp()
+    except (ValueError, OverflowError):
+        return "the SuperLink refuses its signature, which has no time"
+    if abs(late) >= OLDEST_S:
+        return (
+            f"the SuperLink refuses its signature: its clock is {abs(late):.0f} s {'behind' if late > 0 else 'ahead'}"
+        )
+    return "the SuperLink refuses its signature, or does not know its key"
 
 
 def node_key(header: bytes) -> bytes:
