@@ -5,6 +5,7 @@ while it has none, and for the app's answer every half second.
 """
 
 import base64
+import os
 import statistics
 import subprocess
 import sys
@@ -28,6 +29,7 @@ from flwr.proto.node_pb2 import Node
 from flcav.federation.fleet.authority import found_authority, open_registry
 from flcav.federation.fleet.forwarder import vehicle_tls
 from flcav.federation.fleet.keys import AUTHORITY, KEY, LOOPBACK, load_key, request_certificate
+from flcav.federation.fleet.supervisor import read_processes
 from flcav.federation.fleet.up import VEHICLES
 from flcav.federation.fleet.vehicle import load_settings
 from flcav.federation.messages.records import to_arrays
@@ -77,6 +79,15 @@ def measure_registry(folder: Path) -> None:
     print(f"list all: {1e3 * seconds(authority.registry.list_vehicles, 5):.0f} ms")
 
 
+def cpu_seconds(folder: Path) -> dict[str, float]:
+    """Return the CPU time that each process of a fleet, and its children that have ended, have taken [s]."""
+    found = {}
+    for name, pid in read_processes(folder).items():
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        found[name] = sum(int(each) for each in fields[11:15]) / os.sysconf("SC_CLK_TCK")
+    return found
+
+
 def headers(key: ec.EllipticCurvePrivateKey) -> dict[str, str]:
     """Return Flower's headers of a node."""
     pem = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
@@ -123,6 +134,11 @@ def measure_relays(deployment: Deployment) -> tuple[float, float]:
 
 def main() -> None:
     """Print all figures."""
+    import bench_fleet  # so that vehicles can import its client, too
+
+    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]).rstrip(
+        ":"
+    )
     with tempfile.TemporaryDirectory() as folder:
         measure_registry(Path(folder))
     weights = {"w": np.random.default_rng(0).normal(size=int(MEGABYTES * 1e6 / 4)).astype(np.float32)}
@@ -137,12 +153,15 @@ def main() -> None:
         ended: list[float] = []
         schedule = Schedule(ROUNDS, 1, 0.1, 0.1, 0)
         about = {"runtime": deployment, "on_round": lambda *_: ended.append(time.perf_counter())}
-        federate({"cav0": Still()}, weights, schedule, **about)
+        before = cpu_seconds(deployment.folder)
+        federate({"cav0": bench_fleet.Still()}, weights, schedule, **about)
+        spent = {name: each - before[name] for name, each in cpu_seconds(deployment.folder).items()}
         took = statistics.median(np.diff(ended))
     print(f"a round of one vehicle that does nothing with {MEGABYTES:g} MB: {took:.1f} s")
-    print(
-        f"forwarder and proxy: {100 * (12 * small + 2 * large) / took:.1f} % of it (12 small calls, 2 with the model)"
-    )
+    print(f"forwarder and proxy: {100 * (12 * small + 2 * large) / took:.1f} % of it (12 small calls, 2 of the model)")
+    print("CPU time a round: " + ", ".join(f"{name} {each / ROUNDS:.2f} s" for name, each in spent.items()))
+    ours = spent["proxy"] + spent["vehicle-001-forwarder"]
+    print(f"forwarder and proxy: {100 * ours / (sum(spent.values()) - ours):.0f} % of the other processes' CPU time")
 
 
 if __name__ == "__main__":

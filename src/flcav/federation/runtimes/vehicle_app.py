@@ -65,7 +65,7 @@ def load_assignment(folder: Path) -> Assignment:
 
 def prepare(folder: Path) -> None:
     """Read a vehicle's assignment, if there is one, so that forks of this process have it, and the modules it needs."""
-    with contextlib.suppress(FileNotFoundError):
+    with contextlib.suppress(Exception):  # the app says what is wrong, in the place of its answer
         load_assignment(folder)
 
 
