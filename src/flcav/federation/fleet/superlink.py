@@ -1,8 +1,9 @@
 """Flower's SuperLink as its operator uses it: nodes are enrolled, runs begin, this process is the server app of one.
 
-With `embedded`, the only module that uses private parts of Flower (pinned to 1.42): the clients of its control and
-runtime interfaces, and its table of app bundles. The control side asks nobody for a credential, so the SuperLink
-listens on the loopback of the operator's host; the secret of the executor is in a file that its owner alone can read.
+Uses private parts of Flower (pinned to 1.42): the clients of its control and runtime interfaces, and its table of app
+bundles; so do `vehicle`, for its node and executor, and `runtimes.vehicle_app` and `runtimes.embedded`, for messages.
+The control side asks nobody for a credential, so the SuperLink listens on the loopback of the operator's host; the
+secret of the executor is in a file that its owner alone can read.
 """
 
 import contextlib

@@ -73,14 +73,13 @@ class Deployment:
         """Yield the grid of vehicles that `clients` are assigned to, in the order of the vehicles' identifiers.
 
         states: what clients have kept from earlier rounds. account: by which vehicles are granted bytes. Raises
-        `InputError` where there are fewer vehicles than clients, or they cannot import these, `OSError` where they do not
-        come in.
+        `InputError` where there are fewer vehicles than clients, or they cannot import these, `OSError` where they do
+        not come in.
         """
         for name, client in clients.items():
             if type(client).__module__ == "__main__":
-                raise InputError(
-                    f"{name}: vehicles cannot import {type(client).__name__} from a script; put it in a module"
-                )
+                kind = type(client).__name__
+                raise InputError(f"{name}: vehicles cannot import {kind} from a script; put it in a module")
         vehicles = self._wait([*clients])
         federation = os.urandom(8).hex()
         for (name, client), vehicle in zip(clients.items(), vehicles, strict=True):
