@@ -49,7 +49,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "fleet key": {"--vehicle": ALWAYS},
     "fleet register": {"--days": ALWAYS},
     "fleet rotate": {"--days": ALWAYS},
-    "fleet install": dict.fromkeys(("--authority", "--trusted", "--server"), ALWAYS),
+    "fleet install": dict.fromkeys(("--authority", "--trusted", "--server", "--client"), ALWAYS),
     "fleet revoke": {"--reason": ALWAYS},
     "fleet list": {"--audit": ALWAYS},
     "fleet status": {"--page": ALWAYS},

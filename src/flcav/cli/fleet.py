@@ -89,11 +89,16 @@ def install(
     authority: Path = typer.Option(..., "--authority", help="The authority's certificate, ca.crt of the fleet."),
     trusted: Path = typer.Option(..., "--trusted", help="Who signs apps, trusted.yaml of the fleet."),
     server: str = typer.Option(..., "--server", help="Where the proxy is reached: HOST:PORT."),
+    client: str = typer.Option(
+        "",
+        "--client",
+        help="Its own part in a federation, module:NAME; by default the one that is put into its folder.",
+    ),
 ) -> None:
     """On a vehicle: put its certificate to use, and set where the fleet is reached."""
     from flcav.federation.fleet.install import install_vehicle
 
-    install_vehicle(folder, certificate, authority, trusted, server)
+    install_vehicle(folder, certificate, authority, trusted, server, client)
     typer.echo(f"{folder}: ready; flcav fleet vehicle {folder} runs it")
 
 

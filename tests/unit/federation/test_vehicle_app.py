@@ -8,6 +8,8 @@ import pytest
 from flwr.app import ConfigRecord, Context, Message, MessageType, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
+from flcav.config import InputError
+from flcav.federation.fleet.vehicle import VehicleSettings
 from flcav.federation.messages.records import (
     ARRAYS,
     CONFIG,
@@ -98,6 +100,21 @@ def test_answer_over_the_grant_stays(folder):
         if not sent:
             assert answer.error.code == OVER_BUDGET
     assert len(TRAINED) == 1
+
+
+def test_own_client_of_a_vehicle(tmp_path, monkeypatch):
+    """A vehicle's own module says what it takes part in; nothing is read from its folder."""
+    source = (
+        "from test_vehicle_app import *\nPART = Assignment('f', 'cav', Counting(), strategy_named('fedavg'), Rules())\n"
+    )
+    (tmp_path / "own_part.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    VehicleSettings("192.0.2.1:9443", 1, 2, "own_part:PART").save(tmp_path / "cav")
+    assert ask(tmp_path / "cav", 1).content.metric_records["metrics"]["num-examples"] == 3
+    VehicleSettings("192.0.2.1:9443", 1, 2, "own_part:NOTHING").save(tmp_path / "cav")
+    with pytest.raises(InputError, match="has no 'NOTHING'"):
+        ask(tmp_path / "cav", 2)
 
 
 def test_another_assignment_begins_with_its_own_state(folder):

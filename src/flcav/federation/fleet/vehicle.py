@@ -25,11 +25,12 @@ POLL_S = 0.1  # between looks for a message
 
 @dataclass(frozen=True)
 class VehicleSettings:
-    """Addresses of a vehicle."""
+    """Addresses of a vehicle, and its own client."""
 
     server: str  # host:port of the fleet's proxy
     forwarder_port: int  # on the vehicle's loopback
     node_port: int
+    client: str = ""  # module:NAME of its own part in a federation; "": the one in its folder
 
     def save(self, folder: Path) -> None:
         """Write them to a vehicle's folder, with the secrets that its processes know each other by."""

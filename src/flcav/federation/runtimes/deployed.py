@@ -85,7 +85,8 @@ class Deployment:
         for (name, client), vehicle in zip(clients.items(), vehicles, strict=True):
             secret, state = agreed.secrets.get(name), states.get(name, {})
             own = Assignment(federation, name, client, agreed.strategy, agreed.rules, secret, agreed.spent, dict(state))
-            own.save(self.folder / VEHICLES / vehicle.name)
+            if (self.folder / VEHICLES / vehicle.name).is_dir():  # others have their own client
+                own.save(self.folder / VEHICLES / vehicle.name)
         names = {vehicle.node or 0: name for vehicle, name in zip(vehicles, clients, strict=True)}
         of_nodes = {vehicle.node or 0: vehicle.name for vehicle in vehicles}
         with keep_identity():
@@ -102,9 +103,8 @@ class Deployment:
         end = time.monotonic() + STARTING_S
         while True:
             registry = open_registry(self.folder)
-            here = [own for own in registry.list_vehicles() if (self.folder / VEHICLES / own.name).is_dir()]
+            able = [own for own in registry.list_vehicles() if own.describe_state() == "registered"]
             registry.close()
-            able = [own for own in here if own.describe_state() == "registered"]
             if len(able) < len(clients):
                 raise InputError(f"{self.folder}: {len(able)} vehicles, and the federation has {len(clients)} clients")
             with contextlib.suppress(*SuperLinkLost):

@@ -20,7 +20,7 @@ from flwr.proto.recorddict_pb2 import RecordDict as ProtoRecordDict
 
 from flcav.federation.client import PARTITION, client_app
 from flcav.federation.fleet.keys import write_private
-from flcav.federation.fleet.vehicle import FOLDER
+from flcav.federation.fleet.vehicle import FOLDER, SETTINGS, load_settings
 from flcav.federation.messages.conduct import Requests
 from flcav.federation.messages.records import GRANT, GRANTED, OVER_BUDGET, to_arrays
 from flcav.federation.noise import Secret
@@ -29,6 +29,7 @@ from flcav.federation.runtimes.deadline import TimedClients
 from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable, Weights
+from flcav.plugins import load_named
 
 ASSIGNMENT, STATE = "assignment.pickle", "state.bin"
 HEAD = struct.Struct(">32sQ")  # digest of the last request, bytes of the state; then the state and the last answer
@@ -36,7 +37,10 @@ HEAD = struct.Struct(">32sQ")  # digest of the last request, bytes of the state;
 
 @dataclass(frozen=True)
 class Assignment:
-    """What a vehicle takes part in: its own data, and the rules that it holds the server to."""
+    """What a vehicle takes part in: its own data, and the rules that it holds the server to.
+
+    The name of the federation is another one in each: a round is answered once in a federation.
+    """
 
     federation: str  # identifier
     client: str  # name, of which the seed of its training is derived
@@ -58,7 +62,12 @@ def _load(path: Path, changed_ns: int, size: int) -> Assignment:
 
 
 def load_assignment(folder: Path) -> Assignment:
-    """Return what the vehicle in `folder` takes part in; it is read once a process, unless it has changed."""
+    """Return what the vehicle in `folder` takes part in: its own client, or what lies in its folder.
+
+    It is read once a process, unless it has changed. Raises `InputError` where its own client is none.
+    """
+    if (folder / SETTINGS).exists() and (own := load_settings(folder).client):
+        return load_named("client", own, {}, Assignment)
     found = (folder / ASSIGNMENT).stat()
     return _load(folder / ASSIGNMENT, found.st_mtime_ns, found.st_size)
 
