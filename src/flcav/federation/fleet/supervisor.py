@@ -111,7 +111,7 @@ def _end(all_: Mapping[str, _Supervised]) -> None:
 
 
 def end_with_parent(parent: int, how: signal.Signals) -> None:
-    """Have this process, a fork of `parent`, get a signal when that ends (Linux); ends it where that has ended."""
+    """Have this process, a fork of `parent`, get a signal when that ends (Linux); end it where that has ended."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, how)
     if os.getppid() != parent:
         os._exit(1)

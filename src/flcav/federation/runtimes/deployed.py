@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -25,7 +26,7 @@ from flcav.federation.fleet.authority import found_authority, open_registry
 from flcav.federation.fleet.registry import Vehicle
 from flcav.federation.fleet.status import Followed, FollowedRound
 from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
-from flcav.federation.fleet.supervisor import LOGS
+from flcav.federation.fleet.supervisor import LOGS, end_with_parent
 from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.fleet.up import READY, VEHICLES, read_ready
 from flcav.federation.messages.records import ARRAYS, GRANT, GRANTED, LOST_BY_NETWORK, OVER_BUDGET, read_arrays
@@ -277,7 +278,9 @@ def fleet_up(folder: Path, vehicles: int, *options: str) -> Iterator[subprocess.
     (folder / LOGS).mkdir(exist_ok=True)
     command = [sys.executable, "-m", "flcav", "fleet", "up", str(folder), "--vehicles", str(vehicles), *options]
     with (folder / LOGS / "up.log").open("ab") as log:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
+        ending = partial(end_with_parent, os.getpid(), signal.SIGTERM)  # however this process ends
+        streams = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": log}
+        process = subprocess.Popen(command, **streams, start_new_session=True, preexec_fn=ending)
     try:
         end = time.monotonic() + STARTING_S
         while not (folder / READY).exists():
