@@ -279,8 +279,9 @@ def fleet_up(folder: Path, vehicles: int, *options: str) -> Iterator[subprocess.
     command = [sys.executable, "-m", "flcav", "fleet", "up", str(folder), "--vehicles", str(vehicles), *options]
     with (folder / LOGS / "up.log").open("ab") as log:
         ending = partial(end_with_parent, os.getpid(), signal.SIGTERM)  # however this process ends
-        streams = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": log}
-        process = subprocess.Popen(command, **streams, start_new_session=True, preexec_fn=ending)
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, preexec_fn=ending
+        )
     try:
         end = time.monotonic() + STARTING_S
         while not (folder / READY).exists():
