@@ -10,6 +10,8 @@ import pytest
 import uvicorn
 
 from flcav.cli.main import run as command
+from flcav.federation.fleet.authority import open_authority
+from flcav.federation.fleet.keys import request_certificate, take_certificate
 from flcav.federation.fleet.page import make_page
 from flcav.federation.fleet.traffic import Traffic
 
@@ -91,12 +93,10 @@ def test_what_is_refused_in_a_sentence(flcav, fleet, tmp_path):
 
 
 def test_expired_certificate_of_a_vehicle_on_this_machine(flcav, fleet):
-    own = fleet / "vehicles/vehicle-001"
-    assert flcav("key", own, "--vehicle", "vehicle-001")[0] == 0
-    assert flcav("register", fleet, own / "vehicle.csr", "--out", own / "vehicle.crt", "--days", 0.0001)[0] == 0
-    import time
-
-    time.sleep(9)
+    own, authority = fleet / "vehicles/vehicle-001", open_authority(fleet)
+    given = authority.register(request_certificate(own, "vehicle-001"), days=1 / 86400)
+    take_certificate(own, given, (fleet / "ca.crt").read_bytes())
+    threading.Event().wait(1.1)
     code, _, said = flcav("up", fleet, "--vehicles", 1)
     assert code == 2
     assert "the certificate of 'vehicle-001' is expired; flcav fleet rotate gives another" in said
