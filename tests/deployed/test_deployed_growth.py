@@ -1,4 +1,4 @@
-"""Sixteen vehicles for twenty rounds: neither the processes' memory nor the files of the fleet grow."""
+"""Over the rounds neither the processes' memory nor the files of a fleet grow."""
 
 import os
 from pathlib import Path
@@ -10,7 +10,7 @@ from flcav.federation.fleet.supervisor import LOGS, read_processes
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.deployed import start_fleet
 
-COUNT, ROUNDS, SETTLED = 16, 20, 6  # from the last on, everything that is kept is there
+COUNT, ROUNDS, SETTLED = 4, 10, 4  # from the last on, everything that is kept is there
 
 
 def measure(folder: Path) -> tuple[float, int, float]:
@@ -23,7 +23,7 @@ def measure(folder: Path) -> tuple[float, int, float]:
     return memory / 1e6, len(files), sum(path.stat().st_size for path in kept) / 1e6
 
 
-def test_sixteen_vehicles_for_twenty_rounds():
+def test_nothing_grows():
     clients = {f"town/cav{number:02d}": Walker(number + 1) for number in range(COUNT)}
     weights = {"w": np.arange(100_000, dtype=np.float32)}
     schedule, found = Schedule(ROUNDS, 1, 0.1, 0.05, 3), {}

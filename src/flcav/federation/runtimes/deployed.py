@@ -42,6 +42,7 @@ from flcav.federation.trainable import Trainable
 from flcav.network.ledger import BudgetExceeded
 
 STARTING_S = 120.0  # for a fleet to be up, its vehicles to be in, and a SuperLink to come back
+STARTING_VEHICLE_S = 15.0  # more for each vehicle, which may all be on a busy machine
 REJOIN_S = 180.0  # that a vehicle is waited for which the network lost
 POLL_S, PAUSE_S = 0.1, 1.0  # between looks for answers; before a vehicle that was not there is asked again
 TRANSPORT = (3, 4, 5, 8)  # Flower's error codes of messages and nodes that are not available, and of a crashed app
@@ -101,7 +102,8 @@ class Deployment:
 
     def _wait(self, clients: list[str]) -> list[Vehicle]:
         """Return as many vehicles as `clients`, once they are in."""
-        end = time.monotonic() + STARTING_S
+        seconds = STARTING_S + STARTING_VEHICLE_S * len(clients)
+        end = time.monotonic() + seconds
         while True:
             registry = open_registry(self.folder)
             able = [own for own in registry.list_vehicles() if own.describe_state() == "registered"]
@@ -114,7 +116,7 @@ class Deployment:
                 if len(found) >= len(clients):
                     return found[: len(clients)]
             if time.monotonic() > end:
-                raise OSError(f"{self.folder}: fewer than {len(clients)} vehicles are in after {STARTING_S:g} s")
+                raise OSError(f"{self.folder}: fewer than {len(clients)} vehicles are in after {seconds:g} s")
             time.sleep(POLL_S)
 
 
