@@ -7,7 +7,7 @@ unexport PYTHONDONTWRITEBYTECODE # each of many processes would compile all modu
 STAMP := .venv/.installed
 BIN := .venv/bin
 
-.PHONY: demo test test-carla test-peers test-ray lint docs check bench bench-peers format clean
+.PHONY: demo test test-carla test-deployed test-peers test-ray lint docs check bench bench-peers format clean
 demo: $(STAMP)
 	$(BIN)/flcav demo --out out/demo
 
@@ -22,6 +22,11 @@ test-peers: $(STAMP)
 # own, out/carla; they and the maps are in the folder of FLCAV_REAL_DATA, and without it these tests are skipped: docs/carla.md.
 test-carla: $(STAMP)
 	$(BIN)/python -m pytest -n 0 -rs tests/carla_clients
+
+# A fleet that is up: its refusals, its kills, its weights; docs/fleet.md. Tests of several hosts make network namespaces,
+# and are skipped where that is not permitted.
+test-deployed: $(STAMP)
+	$(BIN)/python -m pytest -n 0 -rs tests/deployed
 
 # What runs on Ray beside what runs without it, in an environment of its own with the extra 'ray', below out/ray.
 test-ray:

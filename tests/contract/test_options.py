@@ -35,6 +35,7 @@ CHOICES: dict[str, dict[str, str]] = {
         task: f"{task} --data none --out errors.csv" for task in TASKS if isinstance(task_named(task), RegistersErrors)
     },
     "fit": {model: f"none --model {model}" for model in ("additive", "effective", "federated")},
+    "federate": {name: f"none --out out --runtime {name}" for name in ("embedded", "ray", "flower")},
     "reproduce": {target: f"{target} --out out" for target in TARGETS},
 }
 RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads", "--device"), ALWAYS)
@@ -43,7 +44,17 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "run": dict.fromkeys(("--dry", "--jobs", "--seeds", "--engine", "--stale"), ALWAYS),
     "demo": dict.fromkeys(("--seed", "--recipe", "--seeds", "--jobs", "--engine", "--stale"), ALWAYS),
     "compare": dict.fromkeys(("--data", "--task", "--agents"), ALWAYS),
-    "federate": dict.fromkeys(("--arm", "--jobs", "--runtime", "--stale"), ALWAYS),
+    "federate": {**dict.fromkeys(("--arm", "--jobs", "--runtime", "--stale"), ALWAYS), "--fleet": ("flower",)},
+    "fleet init": {"--host": ALWAYS},
+    "fleet key": {"--vehicle": ALWAYS},
+    "fleet register": {"--days": ALWAYS},
+    "fleet rotate": {"--days": ALWAYS},
+    "fleet install": dict.fromkeys(("--authority", "--trusted", "--server", "--client"), ALWAYS),
+    "fleet revoke": {"--reason": ALWAYS},
+    "fleet list": {"--audit": ALWAYS},
+    "fleet status": {"--page": ALWAYS},
+    "fleet up": dict.fromkeys(("--vehicles", "--host", "--port"), ALWAYS),
+    "fleet vehicle": {},
     "towns list": {},
     "towns show": {"--poles": ALWAYS},
     "towns import": {},

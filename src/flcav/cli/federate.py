@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import STALE, Runtime, Stale
+from flcav.cli.options import STALE, Runtime, Stale, refuse_unused
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
@@ -30,7 +30,12 @@ def federate(
     arm: str = typer.Option("main", "--arm", help="Arm of the recipe; by default what the recipe itself describes."),
     jobs: int = typer.Option(2, "--jobs", min=1, help="Processes that vehicles train in, of one thread each."),
     runtime: Runtime = typer.Option(
-        Runtime.embedded, "--runtime", help="Processes here, or Flower's simulation on Ray."
+        Runtime.embedded,
+        "--runtime",
+        help="Processes here, Flower's simulation on Ray, or a deployed Flower federation.",
+    ),
+    fleet: Path | None = typer.Option(
+        None, "--fleet", help="flower: folder of a fleet that is up; by default one is brought up here, for as long."
     ),
     stale: Stale = STALE,
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead of sentences."),
@@ -41,6 +46,8 @@ def federate(
     federation-ARM.json for another arm, and the weights of each federation as safetensors. At the end it prints each
     task's train_s, the CPU time that a vehicle trained in a round, in the median; times.json has each vehicle's.
     """
+    if runtime is not Runtime.flower:
+        refuse_unused(f"--runtime {runtime.value}", "fleet")
     use_threads(1)
     from flcav.cli.steps import live_steps
     from flcav.pipeline.alone import TRAIN_TIMES, federate_regions, measure_times, name_results
@@ -54,7 +61,7 @@ def federate(
     asked = load_run_recipe(found)
     with live_steps("federate") as notify:
         told = notify if as_json else _telling(notify)
-        how = {"beside": found.parent, "jobs": jobs, "runtime": runtime.value, "stale": stale.value}
+        how = {"beside": found.parent, "jobs": jobs, "runtime": runtime.value, "fleet": fleet, "stale": stale.value}
         results = federate_regions(asked, out, arm=arm, notify=told, **how)
     times = measure_times(results, out)
     if as_json:

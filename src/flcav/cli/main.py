@@ -10,7 +10,7 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import carla, federate, odd, reproduce, towns
+from flcav.cli import carla, federate, fleet, odd, reproduce, towns
 from flcav.cli import (
     run as run_command,
 )
@@ -75,6 +75,7 @@ for command in (
     rounds,
     odd,
     carla,
+    fleet,
     reproduce,
 ):
     command.register(app)

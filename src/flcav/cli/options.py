@@ -54,6 +54,7 @@ class Runtime(StrEnum):
 
     embedded = "embedded"
     ray = "ray"
+    flower = "flower"
 
 
 class Stale(StrEnum):

@@ -192,6 +192,7 @@ def federate(
             else:
                 weights = _imitate(distiller, strategy, weights, combined, schedule.work(number))
                 state.server = {name: np.asarray(array) for name, array in combined.items()}
+            link.follow(state.records[-1])
             on_round(number, weights, state.records[-1].loss)
             sent = combined
             if buffering is not None and is_spent(state):

@@ -62,15 +62,17 @@ def federate_regions(
     beside: Path | str | None = None,
     jobs: int = 2,
     runtime: str = "embedded",
+    fleet: Path | None = None,
     notify: Notify = print_steps,
     stale: Stale = "refuse",
 ) -> Federations:
     """Run or finish stage II of a recipe's arm in the folder `out`; return its results, see `name_results`.
 
     In every federating region and for every task vehicles train in `jobs` processes of one thread each, or actors where
-    the `runtime`, one of `RUNTIMES`, is "ray". The weights do not depend on that, on Ray up to rounding. Others
-    are those of `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not
-    federate, `ClientFailed` where fewer vehicles are left in a round than are wanted.
+    the `runtime`, one of `RUNTIMES`, is "ray", or on the vehicles of a deployed `fleet` (None: one that is brought up
+    for as long) where it is "flower". The weights do not depend on that, on Ray up to rounding. Others are those of
+    `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not federate,
+    `ClientFailed` where fewer vehicles are left in a round than are wanted.
     """
     out, graph = Path(out), Graph(recipe, Path(beside or "."))
     if arm not in graph.settings:
@@ -79,10 +81,12 @@ def federate_regions(
         raise InputError(f"--arm {arm}: it trains centrally, without a federation")
     check_federations(recipe, graph.settings.values())
     if runtime != "embedded" and any(LABEL_SOURCES[kind].averaged for kind in graph.settings[arm].labels.values()):
-        raise InputError("labels 'road-average' are renewed between rounds, and Ray's actors get them once; not on Ray")
+        raise InputError(
+            f"labels 'road-average' are renewed between rounds, and clients elsewhere get them once; not on '{runtime}'"
+        )
     tell_rigs([graph], notify)
     asked = list_federations(graph, arm)
-    means = {"processes": jobs, "runtime": runtime, "timed": 1}
+    means = {"processes": jobs, "runtime": runtime, "timed": 1, "fleet": "" if fleet is None else str(fleet)}
     alone = {name: _federation_step(graph, *about, means) for name, about in asked.items()}
     before = list_needed(graph.steps, alone.values())
     run_steps(before, out / WORK, jobs=jobs, notify=notify, stale=stale)

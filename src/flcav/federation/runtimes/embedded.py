@@ -1,7 +1,7 @@
 """A Flower grid within one process: a message reaches the client app by a function call, without sockets or daemons.
 
-The only module that uses private parts of Flower (pinned to 1.42): the process-wide task identity, the empty run
-record, the id of a message, and the serialised form of a record and of an array.
+Uses private parts of Flower (pinned to 1.42): the process-wide task identity, the empty run record, the id of a
+message, and the serialised form of a record and of an array. Those of a deployment are in `fleet.superlink`.
 """
 
 import contextlib

@@ -1,12 +1,13 @@
-"""Links of a federation's server to its clients, by runtime: in this process, with client processes, or on Ray.
+"""Links of a federation's server to its clients, by runtime: this process, client processes, Ray, or a deployed fleet.
 
 What crosses a link is lost where the network loses it, held to the budget where it leaves, and entered in the ledger.
 """
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Union
 
 from flwr.serverapp import Grid
@@ -20,17 +21,19 @@ from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account, BudgetedGrid, MeteredGrid
 from flcav.federation.runtimes.outages import LossyGrid
 from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
-from flcav.federation.state import ClientStates, ReadStates
+from flcav.federation.state import ClientStates, ReadStates, RoundRecord
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable
 from flcav.interface.wording import suggest
 
 if TYPE_CHECKING:
+    from flcav.federation.runtimes.deployed import Deployment
     from flcav.federation.runtimes.simulation import RaySimulation
     from flcav.federation.runtimes.topics import RosTopics
 
-RUNTIMES = "embedded", "ray"
-Runtime = Union[ClientProcesses, "RaySimulation", "RosTopics"]  # where clients train, and how messages reach them
+RUNTIMES = "embedded", "ray", "flower"
+# where clients train, and how messages reach them
+Runtime = Union[ClientProcesses, "RaySimulation", "Deployment", "RosTopics"]
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Link:
     grid: Grid
     names: Mapping[int, str]  # of the clients, by node
     read_states: ReadStates  # of what clients keep between rounds
+    follow: Callable[[RoundRecord], None] = lambda _: None  # called with the record of each round that has ended
 
 
 @contextlib.contextmanager
@@ -72,13 +76,18 @@ def open_link(
         opened = EmbeddedGrid(make_app(timed), names, states)
     elif isinstance(runtime, ClientProcesses):
         opened = EmbeddedGrid(make_app(RemoteClients(clients, runtime, limit_s)), names, states, runtime.count)
+    elif runtime.deployed is True:
+        from flcav.federation.runtimes.deployed import Agreement
+
+        opened = runtime.open(clients, Agreement(strategy, rules, secrets, spent), states, account)
     else:
         timing = (lambda each: each) if limit_s is None else (lambda each: TimedClients(each, limit_s))
         opened = runtime.open(clients, lambda each: make_app(timing(each)), states)
     with opened as inner:
         lossy = LossyGrid(inner, account, inner.names) if account.outages else inner
         metered = MeteredGrid(BudgetedGrid(lossy, account, inner.names), account, inner.names)
-        yield Link(metered, inner.names, inner.read_states)
+        follow = getattr(inner, "follow", lambda _: None)
+        yield Link(metered, inner.names, inner.read_states, follow)
 
 
 @contextlib.contextmanager
@@ -93,11 +102,14 @@ def open_processes(clients: Mapping[str, Trainable], count: int) -> Iterator[Cli
 
 
 @contextlib.contextmanager
-def open_runtime(name: str, clients: Mapping[str, Trainable], count: int) -> Iterator[Runtime | None]:
+def open_runtime(
+    name: str, clients: Mapping[str, Trainable], count: int, fleet: Path | None = None
+) -> Iterator[Runtime | None]:
     """Yield what `federate` takes as its `runtime`.
 
     embedded: messages within this process, and clients in `count` processes where these are several. ray: Flower's
-    simulation with `count` actors. Raises `InputError` for another name.
+    simulation with `count` actors. flower: vehicles of the `fleet` that is up in this folder, or one that is brought
+    up on this machine for as long. Raises `InputError` for another name.
     """
     match name:
         case "embedded":
@@ -107,5 +119,13 @@ def open_runtime(name: str, clients: Mapping[str, Trainable], count: int) -> Ite
             from flcav.federation.runtimes.simulation import RaySimulation
 
             yield RaySimulation(count)
+        case "flower":
+            from flcav.federation.runtimes.deployed import Deployment, start_fleet
+
+            if fleet is not None:
+                yield Deployment(fleet)
+            else:
+                with start_fleet(len(clients)) as deployment:
+                    yield deployment
         case _:
             raise InputError(f"runtime '{name}': choose one of {', '.join(RUNTIMES)}{suggest(name, RUNTIMES)}")

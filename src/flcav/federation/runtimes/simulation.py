@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, Literal
 
 from flwr.app import Context, Message, MessageType, RecordDict
 from flwr.clientapp import ClientApp
@@ -30,6 +30,8 @@ STARTING_S = 120.0  # for the nodes to be there
 
 class RaySimulation:
     """`count` Ray actors of one thread each, in which clients train."""
+
+    deployed: Literal[False] = False
 
     def __init__(self, count: int) -> None:
         self.count = count

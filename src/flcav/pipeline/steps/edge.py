@@ -125,6 +125,7 @@ def federate_edge(
     processes: int = 1,
     runtime: str = "embedded",
     timed: bool = False,
+    fleet: Path | None = None,
 ) -> tuple[float | None, ...]:
     """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
 
@@ -157,7 +158,7 @@ def federate_edge(
             own.watch.note(load_file(round_path(own.folder, number)))
     with (
         checkpoints.refusals(),
-        open_runtime(runtime, clients, processes) as where,
+        open_runtime(runtime, clients, processes, fleet) as where,
         contextlib.suppress(Levelled),
     ):
         if own.watch is not None and own.watch.over:
@@ -214,7 +215,12 @@ class EdgeSettings(FederationSettings):
 
 
 def edge_step(
-    work: Work, settings: EdgeSettings, processes: int = 1, runtime: str = "embedded", timed: int = 0
+    work: Work,
+    settings: EdgeSettings,
+    processes: int = 1,
+    runtime: str = "embedded",
+    timed: int = 0,
+    fleet: str = "",
 ) -> None:
     """Run stage II of a task in a region, or its further edge rounds: as many as the region has in stage III.
 
@@ -239,6 +245,7 @@ def edge_step(
     federation = federation if called is None else replace(federation, watch=called.watch)
     driven = _drive(work, settings, federation, own)
     where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
+    where["fleet"] = Path(fleet) if fleet else None
     losses = federate_edge(federation, driven.rules, driven.outages, buffers=driven.buffers, **where)
     clients, labels = federation.clients, None
     if settings.scored and stage == EDGE and clients:

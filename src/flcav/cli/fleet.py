@@ -1,0 +1,231 @@
+"""`flcav fleet`: the authority of a fleet, and the fleet up and running."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from flcav.cli.options import check_finite
+from flcav.cli.terminal import print_json
+from flcav.interface.wording import plural
+
+if TYPE_CHECKING:
+    from flcav.federation.fleet.registry import Registry, Vehicle
+
+fleet = typer.Typer(
+    help="A deployed fleet: its registered vehicles, its servers, and what they do.", no_args_is_help=True
+)
+FLEET = typer.Argument(help="Folder of the fleet's authority.")
+REQUEST = typer.Argument(help="Signing request of the vehicle (PKCS #10), made by flcav fleet key.")
+DAYS = typer.Option(
+    365.0, "--days", min=0.0001, max=3650.0, callback=check_finite, help="Days until the certificate expires."
+)
+CERTIFICATE = typer.Option(..., "--out", help="File of the certificate (PEM), which goes to the vehicle.")
+JSON = typer.Option(False, "--json", help="Print one JSON object instead.")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.add_typer(fleet, name="fleet")
+
+
+@fleet.command()
+def init(
+    folder: Path = typer.Argument(help="New folder, on the operator's host."),
+    host: list[str] = typer.Option(
+        [], "--host", help="Name or address that vehicles reach the proxy by; may be given several times."
+    ),
+) -> None:
+    """Make the authority of a new fleet: its key and certificate, its registry, and the servers' certificate."""
+    from flcav.federation.fleet.authority import found_authority
+    from flcav.federation.fleet.bundle import make_publisher
+
+    found_authority(folder, tuple(host))
+    make_publisher(folder)
+    typer.echo(f"{folder}: authority, registry, and the key that apps are signed by")
+
+
+@fleet.command()
+def key(
+    folder: Path = typer.Argument(help="Folder of the vehicle, on the vehicle."),
+    vehicle: str = typer.Option(..., "--vehicle", help="Unique identifier of the vehicle: a-z 0-9 . _ -"),
+) -> None:
+    """On a vehicle: make its key, which never leaves the folder, and the signing request that goes to the authority."""
+    from flcav.federation.fleet.keys import request_certificate
+
+    typer.echo(f"{request_certificate(folder, vehicle)}: signing request of {vehicle}")
+
+
+@fleet.command("register")
+def register_vehicle(
+    folder: Path = FLEET, request: Path = REQUEST, out: Path = CERTIFICATE, days: float = DAYS
+) -> None:
+    """Register a vehicle by its signing request, and certify its key."""
+    from flcav.federation.fleet.authority import open_authority
+    from flcav.storage.files import write_bytes
+
+    authority = open_authority(folder)
+    certificate = authority.register(request, days)
+    write_bytes(out, certificate)
+    typer.echo(f"{out}: {_describe_new(authority.registry, certificate)}")
+
+
+@fleet.command()
+def rotate(folder: Path = FLEET, request: Path = REQUEST, out: Path = CERTIFICATE, days: float = DAYS) -> None:
+    """Certify a registered vehicle's new key; its certificate before is refused from now on."""
+    from flcav.federation.fleet.authority import open_authority
+    from flcav.storage.files import write_bytes
+
+    authority = open_authority(folder)
+    certificate = authority.rotate(request, days)
+    write_bytes(out, certificate)
+    typer.echo(f"{out}: {_describe_new(authority.registry, certificate)}")
+
+
+@fleet.command()
+def install(
+    folder: Path = typer.Argument(help="Folder of the vehicle, on the vehicle."),
+    certificate: Path = typer.Argument(help="Certificate that the authority gave (PEM)."),
+    authority: Path = typer.Option(..., "--authority", help="The authority's certificate, ca.crt of the fleet."),
+    trusted: Path = typer.Option(..., "--trusted", help="Who signs apps, trusted.yaml of the fleet."),
+    server: str = typer.Option(..., "--server", help="Where the proxy is reached: HOST:PORT."),
+    client: str = typer.Option(
+        "",
+        "--client",
+        help="Its own part in a federation, module:NAME; by default the one that is put into its folder.",
+    ),
+) -> None:
+    """On a vehicle: put its certificate to use, and set where the fleet is reached."""
+    from flcav.federation.fleet.install import install_vehicle
+
+    install_vehicle(folder, certificate, authority, trusted, server, client)
+    typer.echo(f"{folder}: ready; flcav fleet vehicle {folder} runs it")
+
+
+@fleet.command()
+def revoke(
+    folder: Path = FLEET,
+    vehicle: str = typer.Argument(help="Identifier of the vehicle."),
+    reason: str = typer.Option("", "--reason", help="Kept in the audit trail."),
+) -> None:
+    """Revoke a vehicle's certificate: it is refused from its next call on."""
+    from flcav.federation.fleet.authority import open_registry
+
+    open_registry(folder).revoke(vehicle, reason)
+    typer.echo(f"{vehicle}: revoked")
+
+
+@fleet.command("list")
+def list_vehicles(
+    folder: Path = FLEET,
+    audit: bool = typer.Option(False, "--audit", help="List the changes of the registry instead."),
+    as_json: bool = JSON,
+) -> None:
+    """List the registered vehicles with the state and expiry of their certificates."""
+    from dataclasses import asdict
+
+    from flcav.federation.fleet.authority import open_registry
+
+    registry = open_registry(folder)
+    if audit:
+        entries = registry.list_audit()
+        if as_json:
+            print_json({"audit": [asdict(each) for each in entries]})
+            return
+        for each in entries:
+            typer.echo(
+                f"{_date(each.time)} {each.action} {each.vehicle} {each.fingerprint[:16]} {each.reason}".rstrip()
+            )
+        return
+    found = registry.list_vehicles()
+    if as_json:
+        rows = [
+            {
+                "name": own.name,
+                "state": own.describe_state(),
+                "fingerprint": own.fingerprint,
+                "issued": own.issued,
+                "expires": own.expires,
+                "node": own.node,
+            }
+            for own in found
+        ]
+        print_json({"vehicles": rows})
+        return
+    for own in found:
+        typer.echo(_describe(own))
+    typer.echo(plural(len(found), "vehicle"))
+
+
+@fleet.command()
+def status(
+    folder: Path = FLEET,
+    page: int | None = typer.Option(
+        None, "--page", min=0, max=65535, help="Serve a page that follows the fleet, on this port of this host; 0: any."
+    ),
+    as_json: bool = JSON,
+) -> None:
+    """Tell who is in, the rounds of the federation, bytes against budgets, failures and refusals."""
+    from flcav.federation.fleet.status import read_status
+
+    if page is not None:
+        from flcav.federation.fleet.page import serve_page
+
+        serve_page(folder, page, typer.echo)
+        return
+    found = read_status(folder)
+    if as_json:
+        print_json(found.as_json())
+        return
+    typer.echo("not up" if found.proxy is None else f"up at {found.proxy}, {plural(len(found.processes), 'process')}")
+    for own in found.vehicles:
+        there = "online" if own.online else "offline"
+        typer.echo(
+            f"{own.name}: {own.state}, {there}; {own.socket_up} bytes up and {own.socket_down} down crossed its "
+            f"sockets, {own.content_up} and {own.content_down} of them content"
+        )
+    if found.federation is not None:
+        typer.echo(found.federation.describe())
+    for each in found.refused:
+        typer.echo(f"refused: {each}")
+
+
+@fleet.command()
+def up(
+    folder: Path = FLEET,
+    vehicles: int = typer.Option(0, "--vehicles", min=0, max=64, help="Vehicles on this machine beside."),
+    host: str = typer.Option("127.0.0.1", "--host", help="Address that the proxy listens on."),
+    port: int = typer.Option(0, "--port", min=0, max=65535, help="Port of the proxy; 0: a free one."),
+) -> None:
+    """Run the SuperLink and the proxy of a fleet until interrupted, and vehicles on this machine."""
+    from flcav.federation.fleet.up import run_fleet
+    from flcav.federation.runtimes.vehicle_app import prepare
+
+    run_fleet(folder, host, port, vehicles, prepare, typer.echo)
+
+
+@fleet.command("vehicle")
+def run_vehicle(folder: Path = typer.Argument(help="Folder of the vehicle, on the vehicle.")) -> None:
+    """On a vehicle: run its forwarder, its node and its app until interrupted."""
+    from flcav.federation.fleet.up import run_vehicle as run
+    from flcav.federation.runtimes.vehicle_app import prepare
+
+    run(folder, prepare)
+
+
+def _describe_new(registry: "Registry", certificate: bytes) -> str:
+    from flcav.federation.fleet.keys import fingerprint_of
+
+    own = registry.find(fingerprint_of(certificate))
+    assert own is not None
+    return _describe(own)
+
+
+def _describe(own: "Vehicle") -> str:
+    return f"{own.name} {own.describe_state()}, until {_date(own.expires)}, SHA-256 {own.fingerprint[:16]}"
+
+
+def _date(seconds: int) -> str:
+    from datetime import UTC, datetime
+
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

@@ -1,0 +1,45 @@
+"""A vehicle's forwarder: Flower's SuperNode, which knows no client certificates, reaches the fleet's proxy through it.
+
+It listens on the vehicle's loopback alone, and passes calls on with the vehicle's certificate.
+"""
+
+import ssl
+from pathlib import Path
+
+import httpx
+from starlette.types import Receive, Scope, Send
+
+from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, KEY, LOOPBACK, LOOPBACK_KEY
+from flcav.federation.fleet.mutual_tls import serve_https
+from flcav.federation.fleet.relay import TIMEOUT, keep_alive, relay
+
+
+class Forwarder:
+    """ASGI app on a vehicle's loopback."""
+
+    def __init__(self, client: httpx.AsyncClient) -> None:
+        self._client = client
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a call on."""
+        if scope["type"] == "lifespan":
+            while not await keep_alive(receive, send):
+                pass
+            return
+        await relay(self._client, scope, receive, send)
+
+
+def vehicle_tls(folder: Path) -> ssl.SSLContext:
+    """Return the TLS settings of a vehicle: its certificate, and the authority that it knows servers by."""
+    context = ssl.create_default_context(cafile=str(folder / AUTHORITY))
+    context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    return context
+
+
+def run_forwarder(folder: Path, port: int, server: str) -> None:
+    """Run the forwarder of the vehicle in `folder` until the process is ended; `server` is host:port of the proxy."""
+    client = httpx.AsyncClient(
+        base_url=f"https://{server}", verify=vehicle_tls(folder), timeout=TIMEOUT, trust_env=False
+    )
+    serve_https(Forwarder(client), "127.0.0.1", port, folder / LOOPBACK, folder / LOOPBACK_KEY).run()

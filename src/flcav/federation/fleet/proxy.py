@@ -1,0 +1,141 @@
+"""The fleet's proxy: the one door of vehicles to Flower's SuperLink, for registered certificates and fleet calls alone.
+
+A call passes where its path is one of a node's under `/v1/fleet/`, its TLS connection has the certificate of a vehicle
+that is in the registry, neither revoked nor replaced nor expired at that moment, and Flower's node key is that
+vehicle's. The control side of the SuperLink listens on the operator's host alone.
+"""
+
+import asyncio
+import base64
+import binascii
+import hashlib
+import time
+from datetime import datetime
+from pathlib import Path
+
+import httpx
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import load_pem_public_key
+from starlette.types import Receive, Scope, Send
+
+from flcav.federation.fleet.authority import SERVER, SERVER_KEY, open_registry
+from flcav.federation.fleet.keys import AUTHORITY, public_der
+from flcav.federation.fleet.mutual_tls import CERTIFICATE, CONNECTION, Connection, serve_https
+from flcav.federation.fleet.registry import Registry, Vehicle
+from flcav.federation.fleet.relay import TIMEOUT, answer, keep_alive, relay
+from flcav.federation.fleet.traffic import Traffic, read_traffic
+
+FLEET = "/v1/fleet/"
+CALLS = frozenset(
+    {
+        "activate-node",
+        "deactivate-node",
+        "send-node-heartbeat",
+        "pull-messages",
+        "push-messages",
+        "get-run",
+        "get-fab",
+        "push-object",
+        "pull-object",
+        "confirm-message-received",
+    }
+)  # of a node; registering one is the authority's
+NODE_KEY = b"flwr-public-key"  # header: of the node, PEM in base 64
+SIGNED_AT = b"flwr-timestamp"  # header: when the node signed
+OLDEST_S = 300.0  # of a signature that Flower accepts
+SAVE_S = 0.5  # between savings of what was counted
+
+
+class FleetProxy:
+    """ASGI app in front of a SuperLink."""
+
+    def __init__(self, registry: Registry, client: httpx.AsyncClient, folder: Path) -> None:
+        self._registry, self._client, self._folder = registry, client, folder
+        self._traffic, self._changed = read_traffic(folder), False
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a vehicle's call on, or refuse it: 401 for who calls, 403 for what is called."""
+        if scope["type"] == "lifespan":
+            saving = asyncio.create_task(self._save())
+            while not await keep_alive(receive, send):
+                pass
+            saving.cancel()
+            self._traffic.save(self._folder)
+            return
+        state, path = scope["state"], scope["path"]
+        vehicle = find_caller(self._registry, state[CERTIFICATE])
+        if isinstance(vehicle, str):
+            await self._refuse(send, 401, state[CERTIFICATE], vehicle)
+            return
+        call = path.removeprefix(FLEET)
+        if scope["method"] != "POST" or path != FLEET + call or call not in CALLS:
+            await self._refuse(send, 403, vehicle.name, f"{scope['method']} {path[:100]} is no call of a vehicle's")
+            return
+        if node_key(dict(scope["headers"]).get(NODE_KEY, b"")) != vehicle.public_key:
+            await self._refuse(send, 401, vehicle.name, "the node's key is not the certificate's")
+            return
+        done = await relay(self._client, scope, receive, send)
+        if done.status == httpx.codes.UNAUTHORIZED:
+            self._traffic.refuse(vehicle.name, describe_clock(dict(scope["headers"]).get(SIGNED_AT, b"")))
+        connection: Connection = state[CONNECTION]
+        answered = done.status == httpx.codes.OK
+        self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), answered)
+        self._changed = True
+
+    async def _refuse(self, send: Send, status: int, who: str | bytes | None, why: str) -> None:
+        told = who if isinstance(who, str) else "nobody" if who is None else hashlib.sha256(who).hexdigest()[:16]
+        self._traffic.refuse(told, why)
+        self._changed = True
+        await answer(send, status, why)
+
+    async def _save(self) -> None:
+        while True:
+            await asyncio.sleep(SAVE_S)
+            if self._changed:
+                self._changed = False
+                await asyncio.to_thread(Traffic(dict(self._traffic.vehicles), self._traffic.refused).save, self._folder)
+
+
+def find_caller(registry: Registry, certificate: bytes | None, now: float | None = None) -> Vehicle | str:
+    """Return the vehicle whose certificate (DER) is in force, or in words why nobody's is."""
+    if certificate is None:
+        return "a certificate is wanted"
+    found = registry.find(hashlib.sha256(certificate).hexdigest())
+    if found is None:
+        return "the certificate is not registered"
+    now = time.time() if now is None else now
+    state = found.describe_state(now)
+    return (
+        found if state == "registered" and now >= found.issued - 60 else f"the certificate of {found.name} is {state}"
+    )
+
+
+def describe_clock(signed_at: bytes, now: float | None = None) -> str:
+    """Return in words why Flower refused a node's signature: most often its clock; `signed_at` is its header."""
+    try:
+        late = (time.time() if now is None else now) - datetime.fromisoformat(signed_at.decode("ascii")).timestamp()
+    except (ValueError, OverflowError):
+        return "the SuperLink refuses its signature, which has no time"
+    if abs(late) >= OLDEST_S:
+        return (
+            f"the SuperLink refuses its signature: its clock is {abs(late):.0f} s {'behind' if late > 0 else 'ahead'}"
+        )
+    return "the SuperLink refuses its signature, or does not know its key"
+
+
+def node_key(header: bytes) -> bytes:
+    """Return the public key in Flower's header as DER; empty where it has none."""
+    try:
+        key = load_pem_public_key(base64.b64decode(header, validate=True))
+    except (ValueError, binascii.Error):
+        return b""
+    return public_der(key) if isinstance(key, ec.EllipticCurvePublicKey) else b""
+
+
+def run_proxy(folder: Path, host: str, port: int, superlink: str) -> None:
+    """Run the proxy of the fleet in `folder` until the process is ended; `superlink` is host:port of the SuperLink."""
+    client = httpx.AsyncClient(
+        base_url=f"https://{superlink}", verify=str(folder / AUTHORITY), timeout=TIMEOUT, trust_env=False
+    )
+    app = FleetProxy(open_registry(folder), client, folder)
+    serve_https(app, host, port, folder / SERVER, folder / SERVER_KEY, folder / AUTHORITY).run()

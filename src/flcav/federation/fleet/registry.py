@@ -1,0 +1,209 @@
+"""The registry of a fleet's vehicles (SQLite): who has which certificate, and an audit trail of every change.
+
+A row of `certificates` is one certificate. It is in force, or revoked, or replaced by that of a newer key; it expires
+by itself. Each change and its entry in `audit` are one transaction; entries are never changed.
+"""
+
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from flcav.config import InputError
+
+State = Literal["registered", "revoked", "replaced"]
+SCHEMA = """
+CREATE TABLE authority (fingerprint TEXT NOT NULL);
+CREATE TABLE certificates (
+    fingerprint TEXT PRIMARY KEY,  -- SHA-256 of the certificate, hexadecimal
+    vehicle TEXT NOT NULL,
+    public_key BLOB NOT NULL UNIQUE,  -- SubjectPublicKeyInfo, DER
+    issued INTEGER NOT NULL,  -- seconds since 1970, UTC
+    expires INTEGER NOT NULL,
+    state TEXT NOT NULL CHECK (state IN ('registered', 'revoked', 'replaced')),
+    node TEXT  -- a number below 2^64, of Flower's SuperLink, where the key is enrolled
+);
+CREATE UNIQUE INDEX in_force ON certificates (vehicle) WHERE state = 'registered';
+CREATE INDEX of_vehicle ON certificates (vehicle);
+CREATE TABLE audit (
+    number INTEGER PRIMARY KEY AUTOINCREMENT,
+    time INTEGER NOT NULL,
+    action TEXT NOT NULL,
+    vehicle TEXT NOT NULL,
+    fingerprint TEXT NOT NULL,
+    reason TEXT NOT NULL
+);
+CREATE TRIGGER audit_stays BEFORE UPDATE ON audit BEGIN SELECT RAISE(ABORT, 'an audit trail is not changed'); END;
+CREATE TRIGGER audit_is_kept BEFORE DELETE ON audit BEGIN SELECT RAISE(ABORT, 'an audit trail is not changed'); END;
+"""
+BUSY_S = 10.0  # that another process may hold the registry
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """A vehicle's certificate as it is registered."""
+
+    name: str  # unique identifier
+    fingerprint: str  # SHA-256 of the certificate, hexadecimal
+    public_key: bytes  # SubjectPublicKeyInfo, DER
+    issued: int  # seconds since 1970, UTC
+    expires: int
+    state: State = "registered"
+    node: int | None = None  # id at the SuperLink
+
+    def describe_state(self, now: float | None = None) -> str:
+        """Return the state in a word; a registered certificate may have expired."""
+        expired = (time.time() if now is None else now) >= self.expires
+        return "expired" if expired and self.state == "registered" else self.state
+
+
+@dataclass(frozen=True)
+class AuditEntry:
+    """One change of the registry."""
+
+    number: int
+    time: int  # seconds since 1970, UTC
+    action: str
+    vehicle: str
+    fingerprint: str
+    reason: str
+
+
+class Registry:
+    """The registry in a file; every call is a transaction of its own, so several processes may use it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._connection = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+
+    @classmethod
+    def create(cls, path: Path, authority: str) -> "Registry":
+        """Return a new, empty registry of the authority with this fingerprint."""
+        made = cls(path)
+        made._connection.execute("PRAGMA journal_mode=WAL")
+        made._connection.executescript(f"BEGIN; {SCHEMA} COMMIT;")
+        with made._change() as cursor:
+            cursor.execute("INSERT INTO authority VALUES (?)", (authority,))
+            made._note(cursor, "found", "", authority, "")
+        return made
+
+    @classmethod
+    def open(cls, path: Path, authority: str) -> "Registry":
+        """Return the registry at `path`; raises `InputError` where it is none, or that of another authority."""
+        if not path.exists():
+            raise InputError(f"{path}: no such registry")
+        found = cls(path)
+        try:
+            row = found._connection.execute("SELECT fingerprint FROM authority").fetchone()
+        except sqlite3.DatabaseError:
+            raise InputError(f"{path}: is no registry of a fleet") from None
+        if row != (authority,):
+            raise InputError(f"{path}: is the registry of another authority than {path.parent / 'ca.crt'}")
+        return found
+
+    def close(self) -> None:
+        """Close the file."""
+        self._connection.close()
+
+    def register(self, vehicle: Vehicle) -> None:
+        """Enter a new vehicle; raises `InputError` where its identifier or its key is in the registry."""
+        with self._change() as cursor:
+            known = cursor.execute("SELECT 1 FROM certificates WHERE vehicle = ?", (vehicle.name,)).fetchone()
+            if known:
+                raise InputError(
+                    f"vehicle '{vehicle.name}': is registered already; flcav fleet rotate gives it a new key"
+                )
+            self._insert(cursor, vehicle, "register")
+
+    def rotate(self, vehicle: Vehicle) -> None:
+        """Enter the certificate of a vehicle's new key in the place of the one in force, or of a revoked one.
+
+        Raises `InputError` where the vehicle is not registered, or the key is known.
+        """
+        with self._change() as cursor:
+            if not cursor.execute("SELECT 1 FROM certificates WHERE vehicle = ?", (vehicle.name,)).fetchone():
+                raise InputError(f"vehicle '{vehicle.name}': is not registered")
+            cursor.execute(
+                "UPDATE certificates SET state = 'replaced' WHERE vehicle = ? AND state = 'registered'", (vehicle.name,)
+            )
+            self._insert(cursor, vehicle, "rotate")
+
+    def revoke(self, name: str, reason: str = "") -> None:
+        """Revoke a vehicle's certificate, which is refused from now on; raises `InputError` where none is in force."""
+        with self._change() as cursor:
+            row = cursor.execute(
+                "SELECT fingerprint FROM certificates WHERE vehicle = ? AND state = 'registered'", (name,)
+            ).fetchone()
+            if row is None:
+                raise InputError(f"vehicle '{name[:80]}': has no certificate in force")
+            cursor.execute("UPDATE certificates SET state = 'revoked' WHERE fingerprint = ?", row)
+            self._note(cursor, "revoke", name, row[0], reason)
+
+    def set_node(self, fingerprint: str, node: int | None) -> None:
+        """Note the id that a certificate's key has at the SuperLink; None: it is enrolled no more."""
+        with self._change() as cursor:
+            cursor.execute(
+                "UPDATE certificates SET node = ? WHERE fingerprint = ?",
+                (None if node is None else str(node), fingerprint),
+            )
+            name = cursor.execute("SELECT vehicle FROM certificates WHERE fingerprint = ?", (fingerprint,)).fetchone()[
+                0
+            ]
+            self._note(cursor, "enrol" if node is not None else "strike", name, fingerprint, "")
+
+    def find(self, fingerprint: str) -> Vehicle | None:
+        """Return whose certificate has this SHA-256 fingerprint; None: nobody's here."""
+        found = [*self._select("WHERE fingerprint = ?", (fingerprint,))]
+        return found[0] if found else None
+
+    def list_vehicles(self) -> list[Vehicle]:
+        """Return the latest certificate of each vehicle, by identifier."""
+        latest = "WHERE rowid IN (SELECT max(rowid) FROM certificates GROUP BY vehicle) ORDER BY vehicle"
+        return [*self._select(latest)]
+
+    def list_enrolled(self) -> list[Vehicle]:
+        """Return every certificate whose key has a node at the SuperLink, in force or not."""
+        return [*self._select("WHERE node IS NOT NULL")]
+
+    def count_changes(self) -> int:
+        """Return how many changes the registry has seen."""
+        return self._connection.execute("SELECT coalesce(max(number), 0) FROM audit").fetchone()[0]
+
+    def list_audit(self, vehicle: str | None = None) -> list[AuditEntry]:
+        """Return the audit trail, of one vehicle or of all, the oldest entry first."""
+        rows = self._connection.execute(
+            "SELECT * FROM audit WHERE ?1 IS NULL OR vehicle = ?1 ORDER BY number", (vehicle,)
+        )
+        return [AuditEntry(*row) for row in rows]
+
+    def _select(self, where: str, values: tuple[str, ...] = ()) -> Iterator[Vehicle]:
+        columns = "vehicle, fingerprint, public_key, issued, expires, state, node"
+        for *row, node in self._connection.execute(f"SELECT {columns} FROM certificates {where}", values):
+            yield Vehicle(*row, node=None if node is None else int(node))
+
+    @contextmanager
+    def _change(self) -> Iterator[sqlite3.Cursor]:
+        cursor = self._connection.cursor()
+        cursor.execute("BEGIN IMMEDIATE")
+        try:
+            yield cursor
+            cursor.execute("COMMIT")
+        except BaseException:
+            cursor.execute("ROLLBACK")
+            raise
+
+    def _insert(self, cursor: sqlite3.Cursor, own: Vehicle, action: str) -> None:
+        row = (own.fingerprint, own.name, own.public_key, own.issued, own.expires, "registered", None)
+        try:
+            cursor.execute("INSERT INTO certificates VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        except sqlite3.IntegrityError:
+            raise InputError(f"vehicle '{own.name}': its key is in the registry already; make a new one") from None
+        self._note(cursor, action, own.name, own.fingerprint, "")
+
+    @staticmethod
+    def _note(cursor: sqlite3.Cursor, action: str, vehicle: str, fingerprint: str, reason: str) -> None:
+        entry = int(time.time()), action, vehicle, fingerprint, reason[:500]
+        cursor.execute("INSERT INTO audit (time, action, vehicle, fingerprint, reason) VALUES (?, ?, ?, ?, ?)", entry)

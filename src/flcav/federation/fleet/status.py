@@ -1,0 +1,114 @@
+"""What a fleet is doing: who is registered and in, rounds of its federation, bytes against budgets, and refusals."""
+
+import contextlib
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from flcav.config import InputError
+from flcav.federation.fleet.authority import open_registry
+from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
+from flcav.federation.fleet.supervisor import read_processes
+from flcav.federation.fleet.traffic import Crossed, read_traffic
+from flcav.federation.fleet.up import read_ready
+from flcav.interface.wording import plural
+from flcav.storage.files import write_bytes
+from flcav.storage.records import Record
+
+PROGRESS = "federation.json"  # in the fleet's folder, written by the server of a federation
+
+
+@dataclass(frozen=True)
+class FollowedRound(Record):
+    """One round as its server tells of it while the federation goes on."""
+
+    round: int
+    time: float  # when it ended [s since 1970]
+    clients: int  # whose updates were combined; 0 where nobody is to know who was drawn
+    failed: Mapping[str, str] = field(default_factory=dict)  # by client what was wrong
+    loss: float | None = None
+    epsilon: float | None = None  # of all rounds so far
+
+
+@dataclass(frozen=True)
+class Followed(Record):
+    """The federation that a fleet serves, or has served last."""
+
+    stage: str
+    task: str
+    link: str
+    used_mb: float  # of the uplink, by the ledger
+    left_mb: float
+    rounds: tuple[FollowedRound, ...] = ()
+
+    def save(self, folder: Path) -> None:
+        """Write it to the fleet's folder."""
+        write_bytes(folder / PROGRESS, json.dumps(self.as_json()).encode())
+
+    def describe(self) -> str:
+        """Return it in a sentence."""
+        bytes_ = f"{self.used_mb:.3g} MB on the {self.link} uplink"
+        bytes_ += f", {self.left_mb:.3g} MB left" if self.left_mb < 1e9 else ""
+        told = f"{self.stage} of {self.task}: {plural(len(self.rounds), 'round')}, {bytes_}"
+        failed = sum(len(each.failed) for each in self.rounds)
+        told += f", {plural(failed, 'failure')}" if failed else ""
+        if self.rounds and self.rounds[-1].epsilon is not None:
+            told += f", epsilon {self.rounds[-1].epsilon:.3g}"
+        return told
+
+
+@dataclass(frozen=True)
+class VehicleStatus(Record):
+    """A vehicle: its certificate, whether its node is in, and the bytes that crossed the proxy's sockets."""
+
+    name: str
+    state: str  # of the certificate
+    expires: int  # [s since 1970]
+    online: bool
+    socket_up: int  # [bytes], TLS included
+    socket_down: int
+    content_up: int  # [bytes] of what its app sent and got, in Flower's serialisation
+    content_down: int
+
+
+@dataclass(frozen=True)
+class FleetStatus(Record):
+    """A fleet."""
+
+    proxy: str | None  # host:port; None: it is not up
+    processes: Mapping[str, int]  # ids by name, of those that run on this machine
+    vehicles: tuple[VehicleStatus, ...]
+    refused: tuple[str, ...]  # who, and why; the latest last
+    federation: Followed | None
+    time: float  # [s since 1970]
+
+
+def read_status(folder: Path) -> FleetStatus:
+    """Return what the fleet of `folder` is doing; raises `InputError` where there is none."""
+    registry = open_registry(folder)
+    try:
+        registered = registry.list_vehicles()
+    finally:
+        registry.close()
+    traffic, online = read_traffic(folder), set[int]()
+    try:
+        ready = read_ready(folder)
+    except InputError:
+        ready = None
+    if ready is not None:
+        with contextlib.suppress(*SuperLinkLost):
+            online = SuperLink(folder, ready.superlink).list_online()
+    vehicles = []
+    for own in registered:
+        crossed = traffic.vehicles.get(own.name, Crossed())
+        counted = crossed.socket_up, crossed.socket_down, crossed.content_up, crossed.content_down
+        vehicles.append(VehicleStatus(own.name, own.describe_state(), own.expires, own.node in online, *counted))
+    try:
+        federation = Followed.from_json(json.loads((folder / PROGRESS).read_bytes()), str(folder / PROGRESS))
+    except FileNotFoundError:
+        federation = None
+    proxy = None if ready is None else ready.proxy
+    refused = tuple(traffic.refused[-20:])
+    return FleetStatus(proxy, read_processes(folder), tuple(vehicles), refused, federation, time.time())

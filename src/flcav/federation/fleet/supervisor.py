@@ -1,0 +1,149 @@
+"""Supervision of a fleet's processes: forks of one that has imported what they need, started again when they end.
+
+They end with the supervisor. A process that ends at once is started again later and later, up to half a minute: a node
+that was refused, for its clock or its certificate, comes back when that is corrected.
+"""
+
+import contextlib
+import ctypes
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from flcav.storage.files import write_bytes
+
+PROCESSES, LOGS = "processes.json", "logs"
+TICK_S, LONGEST_S, ENDING_S = 0.1, 30.0, 5.0
+STEADY_S = 10.0  # after which a process is taken to run well
+FLOWER = {
+    "FLWR_TELEMETRY_ENABLED": "0",
+    "FLWR_DISABLE_UPDATE_CHECK": "1",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+PR_SET_PDEATHSIG = 1  # prctl(2)
+
+
+@dataclass
+class _Supervised:
+    do: Callable[[], None]
+    pid: int = 0
+    started: float = 0.0
+    pause_s: float = 0.0
+    starts: int = 0
+
+
+def supervise(
+    folder: Path,
+    processes: Mapping[str, Callable[[], None]],
+    later: Mapping[str, Callable[[], None]] = {},
+    is_up: Callable[[], bool] = lambda: True,
+) -> None:
+    """Run `processes`, by name, until this process gets SIGTERM or SIGINT; those for `later` once the others are up.
+
+    `is_up` is called about ten times a second, and tells.
+    Their output goes to `folder`/logs, their ids to processes.json there. This process must have one thread alone.
+    """
+    ended = False
+
+    def end(*_: object) -> None:
+        nonlocal ended
+        ended = True
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
+    all_, waiting = {name: _Supervised(do) for name, do in processes.items()}, dict(later)
+    try:
+        while not ended:
+            changed = _reap(all_)
+            for name, own in all_.items():
+                if not own.pid and time.monotonic() >= own.started + own.pause_s:
+                    own.pid, own.started, own.starts = _fork(folder, name, own.do), time.monotonic(), own.starts + 1
+                    changed = True
+            if changed:
+                told = {name: {"pid": own.pid, "starts": own.starts} for name, own in all_.items()}
+                write_bytes(folder / PROCESSES, json.dumps(told).encode())
+            if is_up() and waiting:
+                all_ |= {name: _Supervised(do) for name, do in waiting.items()}
+                waiting = {}
+            time.sleep(TICK_S)
+    finally:
+        _end(all_)
+        (folder / PROCESSES).unlink(missing_ok=True)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def read_processes(folder: Path) -> dict[str, int]:
+    """Return the ids of the processes that are supervised in `folder`, by name; of those alone that are running."""
+    try:
+        return {name: own["pid"] for name, own in json.loads((folder / PROCESSES).read_bytes()).items() if own["pid"]}
+    except FileNotFoundError:
+        return {}
+
+
+def _reap(all_: Mapping[str, _Supervised]) -> bool:
+    """Note which processes have ended; return whether one has."""
+    changed = False
+    for own in all_.values():
+        if own.pid and os.waitpid(own.pid, os.WNOHANG)[0]:
+            steady = time.monotonic() - own.started > STEADY_S
+            own.pause_s = 0.0 if steady else min(max(2 * own.pause_s, 1.0), LONGEST_S)
+            own.pid, changed = 0, True
+    return changed
+
+
+def _end(all_: Mapping[str, _Supervised]) -> None:
+    for how in (signal.SIGTERM, signal.SIGKILL):
+        for own in all_.values():
+            if own.pid:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(own.pid, how)
+        end = time.monotonic() + ENDING_S
+        while any(own.pid for own in all_.values()) and time.monotonic() < end:
+            _reap(all_)
+            time.sleep(0.02)
+
+
+def end_with_parent(parent: int, how: signal.Signals) -> None:
+    """Have this process, a fork of `parent`, get a signal when that ends (Linux); end it where that has ended."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, how)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def _fork(folder: Path, name: str, do: Callable[[], None]) -> int:
+    parent = os.getpid()
+    child = os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        end_with_parent(parent, signal.SIGTERM)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.SIG_DFL)
+        own = folder / LOGS / name
+        own.parent.mkdir(parents=True, exist_ok=True)
+        log = os.open(own.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+        for stream in (1, 2):
+            os.dup2(log, stream)
+        sys.stdout, sys.stderr = os.fdopen(1, "w", buffering=1), os.fdopen(2, "w", buffering=1)
+        os.environ.update(FLOWER)
+        os.environ["FLWR_HOME"] = str(folder / "flower" / name)
+        do()
+        code = 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code & 255)

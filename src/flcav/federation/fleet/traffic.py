@@ -1,0 +1,67 @@
+"""What crossed the proxy, by vehicle: bytes of the socket beside those of Flower's calls, and who was refused."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from flcav.storage.files import write_bytes
+
+TRAFFIC = "traffic.json"
+CONTENT = ("push-object", "pull-object")  # calls that carry what an app sends; all others are Flower's own
+MOST_REFUSALS = 200  # that are kept
+
+
+@dataclass
+class Crossed:
+    """Bytes of one vehicle, up from it and down to it."""
+
+    socket_up: int = 0  # that crossed the TCP socket, TLS included
+    socket_down: int = 0
+    content_up: int = 0  # bodies of the calls in `CONTENT`
+    content_down: int = 0
+    other_up: int = 0  # bodies of Flower's other calls: polls, heartbeats, app bundles
+    other_down: int = 0
+    calls: int = 0
+    activations: int = 0  # of its SuperNode: how often it has come in
+
+
+@dataclass
+class Traffic:
+    """Bytes by vehicle, and the latest refusals."""
+
+    vehicles: dict[str, Crossed] = field(default_factory=dict)
+    refused: list[str] = field(default_factory=list)
+
+    def count(self, vehicle: str, call: str, up: int, down: int, socket: tuple[int, int], answered: bool) -> None:
+        """Count one call with the sizes of its bodies, and the bytes that crossed the socket since the last one.
+
+        answered: whether the SuperLink answered without an error.
+        """
+        own = self.vehicles.setdefault(vehicle, Crossed())
+        own.calls += 1
+        own.socket_up += socket[0]
+        own.socket_down += socket[1]
+        own.activations += answered and call == "activate-node"
+        if call in CONTENT:
+            own.content_up += up
+            own.content_down += down
+        else:
+            own.other_up += up
+            own.other_down += down
+
+    def refuse(self, who: str, why: str) -> None:
+        """Note a refusal."""
+        self.refused = [*self.refused, f"{who}: {why}"][-MOST_REFUSALS:]
+
+    def save(self, folder: Path) -> None:
+        """Write it to `folder`."""
+        write_bytes(folder / TRAFFIC, json.dumps(asdict(self)).encode())
+
+
+def read_traffic(folder: Path) -> Traffic:
+    """Return what the proxy of a fleet has counted; nothing where it has not yet."""
+    try:
+        found = json.loads((folder / TRAFFIC).read_bytes())
+    except FileNotFoundError:
+        return Traffic()
+    return Traffic({name: Crossed(**own) for name, own in found["vehicles"].items()}, found["refused"])

@@ -1,0 +1,301 @@
+"""The deployed runtime: clients are vehicles of a fleet that is up, reached through Flower's SuperLink.
+
+This process is the server app of a run. Where the SuperLink was killed, Flower gives the run up; then the server begins
+another one, and asks those again whose answers have not come. A vehicle whose node came back is asked again, too. Since
+vehicles keep their last answer, the weights are those of a federation that nothing happened to.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from flwr.app import ConfigRecord, Error, Message, MessageType, RecordDict
+from flwr.serverapp import Grid
+
+from flcav.config import InputError
+from flcav.federation.fleet.authority import found_authority, open_registry
+from flcav.federation.fleet.registry import Vehicle
+from flcav.federation.fleet.status import Followed, FollowedRound
+from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
+from flcav.federation.fleet.supervisor import LOGS, end_with_parent
+from flcav.federation.fleet.traffic import read_traffic
+from flcav.federation.fleet.up import READY, VEHICLES, read_ready
+from flcav.federation.messages.records import ARRAYS, GRANT, GRANTED, LOST_BY_NETWORK, OVER_BUDGET, read_arrays
+from flcav.federation.noise import Secret
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.embedded import keep_identity
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.runtimes.vehicle_app import Assignment
+from flcav.federation.runtimes.wrapped import WrappedGrid
+from flcav.federation.state import ClientStates, RoundRecord
+from flcav.federation.strategies import Strategy
+from flcav.federation.trainable import Trainable
+from flcav.network.ledger import BudgetExceeded
+
+STARTING_S = 120.0  # for a fleet to be up, its vehicles to be in, and a SuperLink to come back
+STARTING_VEHICLE_S = 15.0  # more for each vehicle, which may all be on a busy machine
+REJOIN_S = 180.0  # that a vehicle is waited for which the network lost
+POLL_S, PAUSE_S = 0.1, 1.0  # between looks for answers; before a vehicle that was not there is asked again
+TRANSPORT = (3, 4, 5, 8)  # Flower's error codes of messages and nodes that are not available, and of a crashed app
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What all clients of a federation agree on."""
+
+    strategy: Strategy
+    rules: Rules
+    secrets: Mapping[str, Secret]  # of each, that it draws local noise by
+    spent: int
+
+
+class Deployment:
+    """A fleet that is up, in the folder of its authority."""
+
+    deployed: Literal[True] = True
+
+    def __init__(self, folder: Path) -> None:
+        """Find the fleet of `folder`; raises `InputError` where it is not up."""
+        self.folder = folder
+        self.link = SuperLink(folder, read_ready(folder).superlink)
+
+    @contextlib.contextmanager
+    def open(
+        self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
+    ) -> Iterator["DeployedGrid"]:
+        """Yield the grid of vehicles that `clients` are assigned to, in the order of the vehicles' identifiers.
+
+        states: what clients have kept from earlier rounds. account: by which vehicles are granted bytes. Raises
+        `InputError` where there are fewer vehicles than clients, or they cannot import these, `OSError` where they do
+        not come in.
+        """
+        for name, client in clients.items():
+            if type(client).__module__ == "__main__":
+                kind = type(client).__name__
+                raise InputError(f"{name}: vehicles cannot import {kind} from a script; put it in a module")
+        vehicles = self._wait([*clients])
+        federation = os.urandom(8).hex()
+        for (name, client), vehicle in zip(clients.items(), vehicles, strict=True):
+            secret, state = agreed.secrets.get(name), states.get(name, {})
+            own = Assignment(federation, name, client, agreed.strategy, agreed.rules, secret, agreed.spent, dict(state))
+            if (self.folder / VEHICLES / vehicle.name).is_dir():  # others have their own client
+                own.save(self.folder / VEHICLES / vehicle.name)
+        names = {vehicle.node or 0: name for vehicle, name in zip(vehicles, clients, strict=True)}
+        of_nodes = {vehicle.node or 0: vehicle.name for vehicle in vehicles}
+        with keep_identity():
+            grid = DeployedGrid(self, names, of_nodes, account)
+            try:
+                yield grid
+            except BaseException:
+                grid.end(failed=True)
+                raise
+            grid.end()
+
+    def _wait(self, clients: list[str]) -> list[Vehicle]:
+        """Return as many vehicles as `clients`, once they are in."""
+        seconds = STARTING_S + STARTING_VEHICLE_S * len(clients)
+        end = time.monotonic() + seconds
+        while True:
+            registry = open_registry(self.folder)
+            able = [own for own in registry.list_vehicles() if own.describe_state() == "registered"]
+            registry.close()
+            if len(able) < len(clients):
+                raise InputError(f"{self.folder}: {len(able)} vehicles, and the federation has {len(clients)} clients")
+            with contextlib.suppress(*SuperLinkLost):
+                online = self.link.list_online()
+                found = [own for own in able if own.node in online]
+                if len(found) >= len(clients):
+                    return found[: len(clients)]
+            if time.monotonic() > end:
+                raise OSError(f"{self.folder}: fewer than {len(clients)} vehicles are in after {seconds:g} s")
+            time.sleep(POLL_S)
+
+
+class DeployedGrid(WrappedGrid):
+    """Grid of deployed vehicles, which begins another run where Flower has given the one before up."""
+
+    def __init__(
+        self, deployment: Deployment, names: Mapping[int, str], vehicles: Mapping[int, str], account: Account
+    ) -> None:
+        """Reach nodes with the clients' `names`, which are `vehicles` of the registry."""
+        self._deployment, self.names, self._vehicles, self._account = deployment, names, vehicles, account
+        self._rounds: tuple[FollowedRound, ...] = ()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._deployment.link.wait(STARTING_S)
+        self._run = self._deployment.link.begin()
+        self._run.identify()
+        self._grid: Grid = self._run.grid
+
+    def _renew(self) -> None:
+        """Begin another run, as soon as the SuperLink lets us."""
+        self._run.end(failed=True)
+        end = time.monotonic() + STARTING_S
+        while True:
+            try:
+                return self._begin()
+            except SuperLinkLost:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(PAUSE_S)
+
+    def follow(self, record: RoundRecord) -> None:
+        """Write a round that has ended to the fleet's folder, where `flcav fleet status` reads it."""
+        about = time.time(), len(record.clients), record.failed, record.loss, record.epsilon
+        self._rounds = (*self._rounds, FollowedRound(record.round, *about))
+        account, link = self._account, self._account.link
+        used, left = account.ledger.used_mb(link), account.ledger.left_mb(link)
+        Followed(account.stage, account.task, link, used, left, self._rounds).save(self._deployment.folder)
+
+    def end(self, failed: bool = False) -> None:
+        """End the run."""
+        self._run.end(failed)
+
+    def get_node_ids(self) -> list[int]:
+        """Return the ids of the nodes, in the order of the clients."""
+        return [*self.names]
+
+    def read_states(self, keys: Iterable[str]) -> ClientStates:
+        """Return the arrays that clients keep between rounds under these records, by client and record."""
+        found: ClientStates = {}
+        for reply in self.send_and_receive(Message(RecordDict(), node, MessageType.QUERY) for node in self.names):
+            if reply.has_content():
+                own = {key: read_arrays(reply.content, key) for key in keys if key in reply.content}
+                found |= {self.names[reply.metadata.src_node_id]: own} if own else {}
+        return {name: found[name] for name in self.names.values() if name in found}
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
+        """Yield the replies in the order of the messages; raises `BudgetExceeded` where one was kept for its size."""
+        asked = {message.metadata.dst_node_id: message for message in messages}
+        exchange = _Exchange(self._count_activations())
+        answers: dict[int, Message] = {}
+        end = time.monotonic() + (timeout or float("inf"))
+        for node, message in asked.items():
+            while node not in answers:
+                try:
+                    due = [own for own in asked if own not in answers and exchange.is_due(own)]
+                    if due:
+                        self._push(exchange, {own: asked[own] for own in due})
+                    self._pull(exchange, asked, answers)
+                except SuperLinkLost:
+                    self._renew()
+                    exchange = _Exchange(self._count_activations())
+                if node not in answers:
+                    if time.monotonic() > end:
+                        return
+                    exchange.notice(self._count_activations())
+                    time.sleep(POLL_S)
+            reply = answers.pop(node)
+            answers[node] = message  # answered; only its place is looked at
+            if reply.has_error() and reply.error.code == OVER_BUDGET:
+                raise BudgetExceeded(f"{self.names[node]}: {reply.error.reason} on the {self._account.link} uplink")
+            yield reply
+
+    def _push(self, exchange: "_Exchange", due: Mapping[int, Message]) -> None:
+        """Send requests to nodes, with the bytes that their answers may have."""
+        left = max(0, int(self._account.ledger.left_mb(self._account.link) * 1e6))
+        grant = ConfigRecord({GRANTED: min(left, 2**62)})
+        sent = []
+        for node, message in due.items():
+            content = {**message.content}
+            if ARRAYS in content or message.metadata.message_type == MessageType.TRAIN:
+                content[GRANT] = grant
+            sent.append(Message(RecordDict(content), node, message.metadata.message_type))
+        for identifier, node in zip(self._grid.push_messages(sent), due, strict=True):
+            exchange.sent(node, identifier)
+
+    def _pull(self, exchange: "_Exchange", asked: Mapping[int, Message], answers: dict[int, Message]) -> None:
+        """Add the answers that have come; a node that was not available is asked again later."""
+        if not exchange.nodes:
+            return
+        for reply in self._grid.pull_messages([*exchange.nodes]):
+            node = exchange.nodes.pop(reply.metadata.reply_to_message_id, None)
+            if node is None or node in answers:
+                continue
+            if reply.has_error() and reply.error.code in TRANSPORT and not exchange.is_late(node):
+                exchange.lost(node)
+            elif reply.has_error() and reply.error.code in TRANSPORT:
+                answers[node] = Message(Error(LOST_BY_NETWORK, str(reply.error.reason)), reply_to=asked[node])
+            else:
+                answers[node] = reply
+
+    def _count_activations(self) -> dict[int, int]:
+        vehicles = read_traffic(self._deployment.folder).vehicles
+        return {node: vehicles[name].activations for node, name in self._vehicles.items() if name in vehicles}
+
+
+class _Exchange:
+    """Who was asked in a run, by which message, and who is to be asked again when."""
+
+    def __init__(self, activations: Mapping[int, int]) -> None:
+        self.nodes: dict[str, int] = {}  # of the messages that are out, by their ids
+        self._activations = dict(activations)
+        self._due: dict[int, float] = {}  # of nodes that were asked: when they are to be asked again
+        self._lost: dict[int, float] = {}  # since when nodes are not available
+
+    def is_due(self, node: int) -> bool:
+        return time.monotonic() >= self._due.get(node, 0.0)
+
+    def is_late(self, node: int) -> bool:
+        return node in self._lost and time.monotonic() > self._lost[node] + REJOIN_S
+
+    def sent(self, node: int, identifier: str) -> None:
+        self.nodes[identifier], self._due[node] = node, float("inf")
+
+    def lost(self, node: int) -> None:
+        self._lost.setdefault(node, time.monotonic())
+        self._due[node] = time.monotonic() + PAUSE_S
+
+    def notice(self, activations: Mapping[int, int]) -> None:
+        """Note that nodes have come in anew: what they were asked is forgotten."""
+        for node, count in activations.items():
+            if count > self._activations.get(node, count) and node in self._due:
+                self._due[node] = 0.0
+        self._activations = dict(activations)
+
+
+@contextlib.contextmanager
+def start_fleet(vehicles: int) -> Iterator[Deployment]:
+    """Yield a fleet of so many vehicles on this machine, in a folder of its own, which ends with the context."""
+    with tempfile.TemporaryDirectory(prefix="flcav-fleet-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        found_authority(folder)
+        with fleet_up(folder, vehicles):
+            yield Deployment(folder)
+
+
+@contextlib.contextmanager
+def fleet_up(folder: Path, vehicles: int, *options: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Yield the process of `flcav fleet up` of a folder, once the fleet is up; it ends with the context."""
+    (folder / LOGS).mkdir(exist_ok=True)
+    command = [sys.executable, "-m", "flcav", "fleet", "up", str(folder), "--vehicles", str(vehicles), *options]
+    with (folder / LOGS / "up.log").open("ab") as log:
+        ending = partial(end_with_parent, os.getpid(), signal.SIGTERM)  # however this process ends
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, preexec_fn=ending
+        )
+    try:
+        end = time.monotonic() + STARTING_S
+        while not (folder / READY).exists():
+            if process.poll() is not None or time.monotonic() > end:
+                told = (folder / LOGS / "up.log").read_text(errors="replace").strip().rpartition("\n")[2]
+                raise OSError(f"{folder}: the fleet did not come up: {told}")
+            time.sleep(POLL_S)
+        yield process
+    finally:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

@@ -1,0 +1,38 @@
+"""Whatever is killed in the middle of a round, the federation ends with the weights of one that nothing happened to."""
+
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+from fleet_clients import Walker
+
+from flcav.federation.fleet.supervisor import read_processes
+from flcav.federation.rounds import Schedule, federate
+from flcav.federation.strategies import strategy_named
+
+SCHEDULE = Schedule(3, 2, 0.1, 0.05, 7)
+NODE = "vehicle-002-supernode"
+
+
+@pytest.mark.parametrize("killed", ["superlink", "proxy", "vehicle-001-forwarder", NODE, "vehicle-003-executor"])
+def test_killed_in_mid_round(killed, weights, deployment, tmp_path):
+    clients = {f"town/cav{n}": Walker(n + 1, tmp_path / "log", lasts_s=1.5) for n in range(3)}
+    strategy = strategy_named("scaffold")  # whose clients keep arrays: a training done twice would show
+    expected = federate({n: Walker(c.samples) for n, c in clients.items()}, weights, SCHEDULE, strategy=strategy)
+    before = read_processes(deployment.folder)[killed]
+
+    def kill():
+        while len((tmp_path / "log").read_text().splitlines()) < 4:  # a client of the second round trains
+            threading.Event().wait(0.05)
+        os.kill(before, signal.SIGKILL)
+
+    def start(number, _):
+        if number == 2:
+            threading.Thread(target=kill, daemon=True).start()
+
+    ended = federate(clients, weights, SCHEDULE, strategy=strategy, runtime=deployment, before_round=start)
+    assert read_processes(deployment.folder)[killed] != before
+    for name, array in expected.weights.items():
+        np.testing.assert_array_equal(array, ended.weights[name])

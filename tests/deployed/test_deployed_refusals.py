@@ -1,0 +1,233 @@
+"""Who and what a running fleet refuses: each against the proxy, the SuperLink and the vehicles that are up."""
+
+import base64
+import ssl
+import time
+from datetime import timedelta
+
+import httpx
+import numpy as np
+import pytest
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from flwr.app import Message, MessageType, RecordDict
+from flwr.proto.control_pb2 import ListRunsRequest
+from flwr.proto.fleet_pb2 import ActivateNodeRequest, ActivateNodeResponse, PullMessagesRequest
+from flwr.proto.node_pb2 import Node
+
+from flcav.federation.fleet import bundle
+from flcav.federation.fleet.authority import found_authority, open_authority
+from flcav.federation.fleet.keys import (
+    AUTHORITY,
+    CERTIFICATE,
+    KEY,
+    load_key,
+    request_certificate,
+    take_certificate,
+)
+from flcav.federation.fleet.traffic import read_traffic
+from flcav.federation.fleet.up import VEHICLES, read_ready
+
+PROTOBUF = {"content-type": "application/protobuf", "accept": "application/protobuf"}
+
+
+@pytest.fixture(scope="module")
+def authority(deployment):
+    return open_authority(deployment.folder)
+
+
+def a_vehicle(authority, folder, name, days=1.0):
+    """Return the folder of a vehicle with a certificate of this authority."""
+    take_certificate(
+        folder, authority.register(request_certificate(folder, name), days), (authority.folder / AUTHORITY).read_bytes()
+    )
+    return folder
+
+
+def reach(deployment, folder=None, authority=None):
+    """Return a client of the proxy with a vehicle's certificate (None: without one)."""
+    context = ssl.create_default_context(cafile=str((authority or deployment.folder) / AUTHORITY))
+    if folder is not None:
+        context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
+    return httpx.Client(base_url=f"https://{read_ready(deployment.folder).proxy}", verify=context, trust_env=False)
+
+
+def signed_headers(key: ec.EllipticCurvePrivateKey, late_s: float = 0.0) -> dict[str, str]:
+    """Return Flower's headers of a node, as its SuperNode signs them where its clock is `late_s` behind."""
+    from cryptography.hazmat.primitives import hashes
+    from flwr.supercore.date import now
+
+    public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
+    stamp = (now() - timedelta(seconds=late_s)).isoformat()
+    signature = key.sign(stamp.encode(), ec.ECDSA(hashes.SHA256()))
+    encode = lambda data: base64.b64encode(data).decode()  # noqa: E731
+    return {**PROTOBUF, "flwr-public-key": encode(public), "flwr-signature": encode(signature), "flwr-timestamp": stamp}
+
+
+def activate(client, key, late_s=0.0):
+    """Return the answer to a node's first call, with Flower's signature by `key`."""
+    public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
+    asked = ActivateNodeRequest(public_key=public, heartbeat_interval=30.0)
+    return client.post(
+        "/v1/fleet/activate-node", content=asked.SerializeToString(), headers=signed_headers(key, late_s)
+    )
+
+
+def node_of(deployment, name):
+    """Return Flower's node of a vehicle."""
+    vehicles = open_authority(deployment.folder).registry.list_vehicles()
+    return Node(node_id=next(own.node for own in vehicles if own.name == name) or 0)
+
+
+def wait_enrolled(deployment, name):
+    end = time.monotonic() + 20
+    while time.monotonic() < end:
+        found = {own.name: own.node for own in open_authority(deployment.folder).registry.list_vehicles()}
+        if found.get(name) is not None:
+            return
+        time.sleep(0.1)
+    raise AssertionError(f"{name} was not enrolled")
+
+
+def test_registered_vehicle_comes_in_and_a_revoked_one_is_out_at_once(deployment, authority, tmp_path):
+    own = a_vehicle(authority, tmp_path, "in-and-out")
+    wait_enrolled(deployment, "in-and-out")
+    with reach(deployment, own) as client:
+        answer = activate(client, load_key(own / KEY))
+        assert answer.status_code == 200
+        assert ActivateNodeResponse.FromString(answer.content).node_id
+        authority.registry.revoke("in-and-out", "stolen")
+        again = activate(client, load_key(own / KEY))  # on the connection that is open
+    assert (again.status_code, again.text) == (401, "the certificate of in-and-out is revoked")
+    time.sleep(0.7)
+    assert any("in-and-out is revoked" in each for each in read_traffic(deployment.folder).refused)
+
+
+@pytest.mark.parametrize(("late_s", "told"), [(86400, "86400 s behind"), (-86400, "86400 s ahead")])
+def test_clock_that_is_off_is_named_and_comes_in_once_corrected(late_s, told, deployment):
+    own = deployment.folder / VEHICLES / "vehicle-003"
+    with reach(deployment, own) as client:
+        assert activate(client, load_key(own / KEY), late_s).status_code == 401
+        assert activate(client, load_key(own / KEY)).status_code in (200, 412)  # 412: it is in, as its own node is
+    time.sleep(0.8)
+    refused = read_traffic(deployment.folder).refused
+    assert any(each.startswith("vehicle-003: ") and each.endswith(told) for each in refused)
+
+
+def test_expired(deployment, authority, tmp_path):
+    own = a_vehicle(authority, tmp_path, "short-lived", days=3 / 86400)
+    with reach(deployment, own) as client:
+        assert activate(client, load_key(own / KEY)).status_code != 401  # but it may not be enrolled yet
+        time.sleep(3.5)
+        late = activate(client, load_key(own / KEY))  # TLS has looked at the date when the connection began
+    assert (late.status_code, late.text) == (401, "the certificate of short-lived is expired")
+    with reach(deployment, own) as client, pytest.raises(httpx.TransportError):
+        activate(client, load_key(own / KEY))
+
+
+def test_unregistered(deployment, authority, tmp_path):
+    """A certificate that the authority has signed, and that is in no registry: as after a loss of the registry."""
+    other = found_authority(tmp_path / "other")
+    request = request_certificate(tmp_path / "v", "unknown")
+    from flcav.federation.fleet.authority import Authority
+
+    forged = Authority(tmp_path / "other", authority.key, authority.certificate, other.registry)
+    take_certificate(tmp_path / "v", forged.register(request), (deployment.folder / AUTHORITY).read_bytes())
+    with reach(deployment, tmp_path / "v") as client:
+        answer = activate(client, load_key(tmp_path / "v" / KEY))
+    assert (answer.status_code, answer.text) == (401, "the certificate is not registered")
+
+
+def test_another_authority(deployment, tmp_path):
+    other = found_authority(tmp_path / "other")
+    own = a_vehicle(other, tmp_path / "v", "vehicle-001")
+    with reach(deployment, own) as client, pytest.raises(httpx.TransportError):
+        activate(client, load_key(own / KEY))
+    with reach(deployment, authority=tmp_path / "other") as client, pytest.raises(httpx.ConnectError):
+        client.post("/v1/fleet/pull-messages")  # a vehicle of another fleet does not trust this one
+
+
+def test_call_without_the_certificate(deployment):
+    """A vehicle's call is captured, and sent again at once: Flower's signature alone would let it pass for minutes."""
+    own = deployment.folder / VEHICLES / "vehicle-001"
+    headers, body = signed_headers(load_key(own / KEY)), PullMessagesRequest(node=node_of(deployment, own.name))
+    captured = {"url": "/v1/fleet/pull-messages", "headers": headers, "content": body.SerializeToString()}
+    for _ in range(2):
+        with reach(deployment, own) as client:
+            assert client.post(**captured).status_code == 200
+    with reach(deployment) as client, pytest.raises(httpx.TransportError):
+        client.post(**captured)
+
+
+def test_call_of_another_vehicle(deployment):
+    """The same captured call, on the connection of another registered vehicle."""
+    key, body = load_key(deployment.folder / VEHICLES / "vehicle-001" / KEY), PullMessagesRequest()
+    body.node.CopyFrom(node_of(deployment, "vehicle-001"))
+    with reach(deployment, deployment.folder / VEHICLES / "vehicle-002") as client:
+        answer = client.post("/v1/fleet/pull-messages", content=body.SerializeToString(), headers=signed_headers(key))
+    assert (answer.status_code, answer.text) == (401, "the node's key is not the certificate's")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/v1/control/list-runs",
+        "/v1/control/start-run",
+        "/v1/runtime/acquire-task",
+        "/v1/fleet/register-node",
+        "/v1/fleet/../control/list-runs",
+        "/v1/fleet/%2e%2e/control/list-runs",
+        "/v1/fleet/pull-messages/../../control/list-runs",
+        "//v1/control/list-runs",
+        "/health",
+        "/docs",
+    ],
+)
+def test_control_side(path, deployment):
+    own = deployment.folder / VEHICLES / "vehicle-001"
+    with reach(deployment, own) as client:
+        url = httpx.URL(str(client.base_url).rstrip("/")).copy_with(raw_path=path.encode())
+        headers = signed_headers(load_key(own / KEY))
+        answer = client.post(url, content=ListRunsRequest().SerializeToString(), headers=headers)
+    assert answer.status_code == 403
+    assert "is no call of a vehicle's" in answer.text
+
+
+def ask(deployment, app, signature):
+    """Return what a vehicle answers to a message of a run with this app."""
+    run = deployment.link.begin(app, signature)
+    run.identify()
+    node = node_of(deployment, "vehicle-001").node_id
+    sent = run.grid.push_messages([Message(RecordDict(), node, MessageType.QUERY)])
+    end = time.monotonic() + 60
+    while time.monotonic() < end:
+        if found := [*run.grid.pull_messages(sent)]:
+            run.end()
+            return found[0]
+        time.sleep(0.2)
+    raise AssertionError("no answer")
+
+
+def test_tampered_app(deployment, tmp_path):
+    """An app whose signature is of another one, one without a signature, and one that somebody else has signed."""
+    mark = tmp_path / "ran"
+    evil = bundle.build_bundle(f"open({str(mark)!r}, 'w').close()\n{bundle.CLIENT}")
+    bundle.make_publisher(tmp_path)
+    for signature in (
+        bundle.sign_bundle(deployment.folder, bundle.build_bundle()),
+        {},
+        bundle.sign_bundle(tmp_path, evil),
+    ):
+        answer = ask(deployment, evil, signature)
+        assert answer.has_error()
+        assert answer.error.code == 7  # INVALID_FAB
+    assert not mark.exists()
+
+
+def test_signed_app_runs(deployment, clients, weights):
+    """What the tests before have refused does not keep the vehicles from their publisher's app."""
+    from flcav.federation.rounds import Schedule, federate
+
+    schedule = Schedule(1, 1, 0.1, 0.1, 3)
+    expected, found = (federate(clients, weights, schedule, runtime=each).weights for each in (None, deployment))
+    np.testing.assert_array_equal(expected["w"], found["w"])

@@ -1,0 +1,125 @@
+"""`flcav fleet`: what an operator and a vehicle type, and what is refused in a sentence."""
+
+import json
+import socket
+import threading
+from pathlib import Path
+
+import httpx
+import pytest
+import uvicorn
+
+from flcav.cli.main import run as command
+from flcav.federation.fleet.authority import open_authority
+from flcav.federation.fleet.keys import request_certificate, take_certificate
+from flcav.federation.fleet.page import make_page
+from flcav.federation.fleet.traffic import Traffic
+
+
+@pytest.fixture
+def flcav(capsys):
+    def call(*arguments):
+        with pytest.raises(SystemExit) as stopped:
+            command(["fleet", *map(str, arguments)])
+        said = capsys.readouterr()
+        return stopped.value.code, said.out, said.err
+
+    return call
+
+
+@pytest.fixture
+def fleet(flcav, tmp_path):
+    assert flcav("init", tmp_path / "fleet", "--host", "192.0.2.1")[0] == 0
+    return tmp_path / "fleet"
+
+
+def register(flcav, fleet, own, name, *options, how="register"):
+    assert flcav("key", own, "--vehicle", name)[0] == 0
+    request = own / "next/vehicle.csr" if (own / "next").exists() else own / "vehicle.csr"
+    code, said, _ = flcav(how, fleet, request, "--out", own.parent / f"{name}.crt", *options)
+    assert code == 0
+    given = flcav(
+        *("install", own, own.parent / f"{name}.crt", "--authority", fleet / "ca.crt"),
+        *("--trusted", fleet / "trusted.yaml", "--server", "192.0.2.1:9443"),
+    )
+    assert given[0] == 0
+    return said
+
+
+def test_from_the_key_to_the_revocation(flcav, fleet, tmp_path):
+    said = register(flcav, fleet, tmp_path / "vehicle", "cav-1")
+    assert "cav-1 registered, until " in said
+    assert json.loads((tmp_path / "vehicle/vehicle.json").read_text())["server"] == "192.0.2.1:9443"
+    before = json.loads(flcav("list", fleet, "--json")[1])["vehicles"][0]
+    register(flcav, fleet, tmp_path / "vehicle", "cav-1", how="rotate")
+    after = json.loads(flcav("list", fleet, "--json")[1])["vehicles"][0]
+    assert (before["name"], after["name"]) == ("cav-1", "cav-1")
+    assert before["fingerprint"] != after["fingerprint"]
+    assert flcav("revoke", fleet, "cav-1", "--reason", "stolen")[1] == "cav-1: revoked\n"
+    assert flcav("list", fleet)[1].startswith("cav-1 revoked, until ")
+    trail = flcav("list", fleet, "--audit")[1].splitlines()
+    assert [line.split()[1] for line in trail] == ["found", "register", "rotate", "revoke"]
+    assert trail[-1].endswith(" stolen")
+
+
+def test_what_is_refused_in_a_sentence(flcav, fleet, tmp_path):
+    register(flcav, fleet, tmp_path / "vehicle", "cav-1")
+    (tmp_path / "other").mkdir()
+    assert flcav("init", tmp_path / "other/fleet")[0] == 0
+    for name in ("ca.crt", "ca.key"):
+        (tmp_path / "other/fleet" / name).write_bytes((fleet / name).read_bytes())
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        refused = {
+            ("init", fleet): "has an authority already",
+            ("up", fleet, "--port", port): f"127.0.0.1:{port}: cannot be listened on (Address already in use)",
+            ("up", fleet, "--vehicles", -1): "-1 is not in the range 0<=x<=64",
+            ("up", tmp_path / "other/fleet"): "registry of another authority",
+            ("up", tmp_path / "none"): "no such folder",
+            ("status", tmp_path / "none"): "has no authority",
+            ("vehicle", fleet): "is no vehicle's folder",
+            ("revoke", fleet, "cav-9"): "has no certificate in force",
+            ("key", tmp_path / "x", "--vehicle", "../x"): "an identifier has",
+            ("register", fleet, fleet / "ca.crt", "--out", tmp_path / "crt"): "is no signing request",
+            ("register", fleet, tmp_path / "vehicle/vehicle.csr", "--out", tmp_path / "crt"): "is registered already",
+        }
+        for arguments, sentence in refused.items():
+            code, _, said = flcav(*arguments)
+            assert code == 2, arguments
+            assert sentence in said
+            assert said.count("\n") == 1
+    assert not (tmp_path / "crt").exists()
+    assert not (tmp_path / "x").exists()
+
+
+def test_expired_certificate_of_a_vehicle_on_this_machine(flcav, fleet):
+    own, authority = fleet / "vehicles/vehicle-001", open_authority(fleet)
+    given = authority.register(request_certificate(own, "vehicle-001"), days=1 / 86400)
+    take_certificate(own, given, (fleet / "ca.crt").read_bytes())
+    threading.Event().wait(1.1)
+    code, _, said = flcav("up", fleet, "--vehicles", 1)
+    assert code == 2
+    assert "the certificate of 'vehicle-001' is expired; flcav fleet rotate gives another" in said
+
+
+def test_page(flcav, fleet):
+    """The page is served for this host alone, and has what the status says."""
+    traffic = Traffic()
+    traffic.count("vehicle-001", "push-object", 5, 7, (50, 70), True)
+    traffic.refuse("<script>", "a certificate is wanted")
+    traffic.save(fleet)
+    server = uvicorn.Server(uvicorn.Config(make_page(fleet), port=0, log_level="warning"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        threading.Event().wait(0.02)
+    port = server.servers[0].sockets[0].getsockname()[1]
+    with httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as client:
+        page, status = client.get("/"), client.get("/status.json")
+        assert client.get("/status.json", headers={"host": "evil.example"}).status_code == 400
+    server.should_exit = True
+    thread.join()
+    assert "default-src 'none'" in page.headers["content-security-policy"]
+    assert status.json()["refused"] == ["<script>: a certificate is wanted"]
+    assert status.json()["proxy"] is None
+    assert Path(fleet / "traffic.json").exists()
