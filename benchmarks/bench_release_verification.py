@@ -9,6 +9,7 @@ are kept in --out; the same command goes on.
 import argparse
 import json
 import shutil
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -44,8 +45,8 @@ RECORDED = {
     "test": {"town": "suburb", "seed": 9431, "scenes": 30, "spins_per_scene": 2, "cavs": 3, "weather": WEATHERS},
 }
 EVERY = {"warmup_s": 45.0, "every_s": 4.0, "vehicle_rig": "kitti_lidar"}
-STEPS, GO_ON, PEAK = 2000, 60, 5e-4  # of the driving network, of a retraining, and its peak learning rate
-BAD_STEPS = 150  # of a training on the wrong samples
+STEPS, GO_ON, PEAK = 800, 40, 5e-4  # of the driving network, of a retraining, and its peak learning rate
+BAD_STEPS = 80  # of a training on the wrong samples
 Edit = Callable[[Second, np.random.Generator], None]
 Spoil = Callable[[Sample, np.random.Generator], Sample]
 
@@ -197,8 +198,14 @@ def learn(network: Second, data: Dataset, steps: int, seed: int, spoil: Spoil | 
     samples = OBJECTS.samples(data, network.config, numbers)
     samples = samples if spoil is None else Spoilt(samples, spoil)
     peak = None if steps == STEPS else PEAK
-    train(OBJECTS, network, ConcatDataset([samples]), steps=steps, learning_rate=peak, seed=seed)  # type: ignore
+    train(OBJECTS, network, ConcatDataset([samples]), steps=steps, learning_rate=peak, seed=seed, progress=tell)  # type: ignore
     network.eval()
+
+
+def tell(done: int, total: int, note: str = "") -> None:
+    """Print the progress of a training now and then."""
+    if done % 100 == 0:
+        print(f"{done}/{total} {note}", file=sys.stderr, flush=True)
 
 
 def make(name: str, number: int, driving: Path, data: dict[str, Dataset], path: Path) -> None:

@@ -10,7 +10,7 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import carla, federate, reproduce, towns
+from flcav.cli import carla, federate, release, reproduce, towns
 from flcav.cli import (
     run as run_command,
 )
@@ -74,6 +74,7 @@ for command in (
     radio,
     rounds,
     carla,
+    release,
     reproduce,
 ):
     command.register(app)

@@ -65,7 +65,7 @@ def generate_key(path: Path) -> PrivateKey:
 
 
 def read_private_key(path: Path) -> PrivateKey:
-    """Return the private key in a PEM file; raises `InputError` for a file without one, or with one of another curve."""
+    """Return the private key in a PEM file; raises `InputError` for none, and one of another curve."""
     check_is_file(path)
     try:
         key = serialization.load_pem_private_key(path.read_bytes(), None)
@@ -97,6 +97,4 @@ def check_distinct(keys: Sequence[PublicKey], whose: str) -> None:
 
 
 def _pem(key: ec.EllipticCurvePublicKey) -> str:
-    return key.public_bytes(
-        serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo
-    ).decode()
+    return key.public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo).decode()

@@ -124,4 +124,3 @@ def hash_card(weights: Path) -> str:
 def write_report(folder: Path, page: str) -> None:
     """Write the candidate's page."""
     write_bytes(folder / REPORT, page.encode())
-

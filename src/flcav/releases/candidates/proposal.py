@@ -1,14 +1,20 @@
 """Proposal of a release: a trained network with its provenance becomes a candidate's folder."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+from torch import nn
+
 from flcav.config import InputError, check_is_file
+from flcav.dataset.store import Dataset
 from flcav.network.ledger import Ledger
-from flcav.perception.card import Card, DataEntry, write_card
+from flcav.perception.agents import choose_frames
+from flcav.perception.card import Card, DataEntry, data_entry, write_card
+from flcav.perception.task import Task
 from flcav.perception.tasks import task_named
-from flcav.perception.weights import load_network, read_card
+from flcav.perception.weights import load_network, read_card, save_network
 from flcav.releases.candidates.candidate import (
     CANDIDATE,
     CARD,
@@ -32,6 +38,7 @@ def propose(
     audience: str,
     *,
     task: str = "objects",
+    data: Sequence[Path] = (),
     recipe: Path | None = None,
     ledger: Path | None = None,
 ) -> Candidate:
@@ -45,6 +52,8 @@ def propose(
         changes: what changed, in words.
         audience: for whom, in words.
         task: name of the perception task.
+        data: datasets that it was trained on, besides those of its card; weights without a card, as a federation's, get
+            one.
         recipe: the recipe of the run that trained it.
         ledger: the ledger of that run.
 
@@ -54,37 +63,70 @@ def propose(
     if out.exists():
         raise InputError(f"{out}: exists already; a candidate is a new folder")
     learned = task_named(task)
-    load_network(learned, weights)
+    network = load_network(learned, weights)
     load_network(learned, driving)
-    card = read_card(weights)
+    entries = tuple(_enter(learned, Dataset.open(folder), network.config) for folder in data)
     if recipe is not None:
         check_is_file(recipe)
     spent = () if ledger is None else sum_ledger(Ledger.load(ledger))
-    candidate = Candidate(
-        task=task,
-        release=release,
-        changes=changes,
-        audience=audience,
-        network=card.network,
-        weights=sha256(weights),
-        driving=sha256(driving),
-        card=hash_card(weights),
-        data=tuple(trace_data(card)),
-        recipe=None if recipe is None else sha256(recipe),
-        ledger=None if ledger is None else sha256(ledger),
-        spent=spent,
-    )
     out.mkdir(parents=True)
     try:
         for source, name in ((weights, WEIGHTS), (recipe, RECIPE), (ledger, LEDGER)):
             if source is not None:
                 shutil.copyfile(source, out / name)
+        card = _complete_card(learned, network, out / WEIGHTS, entries)
         write_card(card, out / CARD)
+        candidate = Candidate(
+            task=task,
+            release=release,
+            changes=changes,
+            audience=audience,
+            network=card.network,
+            weights=sha256(out / WEIGHTS),
+            driving=sha256(driving),
+            card=hash_card(out / WEIGHTS),
+            data=tuple(trace_data(card)),
+            recipe=None if recipe is None else sha256(recipe),
+            ledger=None if ledger is None else sha256(ledger),
+            spent=spent,
+        )
         write_json(out / CANDIDATE, candidate.model_dump(mode="json"), sort=False)
     except BaseException:
         shutil.rmtree(out)
         raise
     return candidate
+
+
+def _enter(task: Task, data: Dataset, config: object) -> DataEntry:
+    return data_entry(data, choose_frames(task, config, data))
+
+
+def _complete_card(task: Task, network: nn.Module, path: Path, entries: tuple[DataEntry, ...]) -> Card:
+    """Return the card of the weights at `path`, with the datasets in `entries` too; it is written into the file.
+
+    Raises `InputError` for weights without a card where no dataset is named.
+    """
+    try:
+        card = read_card(path)
+    except InputError:
+        if not entries:
+            raise
+        known = {config: name for name, config in task.configurations.items()}
+        card = Card(
+            task=task.name,
+            network=known.get(network.config, "own"),  # pyright: ignore[reportArgumentType]
+            parameters=sum(each.numel() for each in network.parameters()),
+            seed=0,
+            samples=sum(entry.frames for entry in entries),
+            training={"trained": "by a federation", "steps": 0, "loss": 0.0, "scores": []},
+            data=(),
+            metrics={},
+        )
+    if not entries:
+        return card
+    card = card.model_copy(update={"data": (*card.data, *entries)})
+    save_network(task, network, path, card)
+    return card
 
 
 def trace_data(card: Card) -> list[DataHash]:

@@ -28,7 +28,7 @@ class Directive(Config):
 
 
 def place_in_queue(vehicle: str, task: str, release: int) -> float:
-    """Return the place of a vehicle in the queue for a release, in [0, 1), uniform and the same whenever it is asked."""
+    """Return the place of a vehicle in the queue for a release, in [0, 1): uniform, and always the same."""
     digest = hashlib.sha256(f"{task}/{release}/{vehicle}".encode()).digest()
     return int.from_bytes(digest[:8], "big") / WHOLE
 

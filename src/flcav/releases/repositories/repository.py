@@ -2,7 +2,7 @@
 
 The provider's is Uptane's image repository: it names every release. The customer's is Uptane's director repository: it
 names the release that its vehicles are to run, with a `Directive`. Both have roots of their own. Root and targets are
-signed by n of the party's m keys, snapshot and timestamp by its online key (TUF specification 1.0.34, sections 4 and 6).
+signed by n of the party's m keys, snapshot and timestamp by its online key (TUF specification 1.0.34, sections 4, 6).
 
     OUT/keys/{1..m,online}.pem    private keys, to be given to their owners
     OUT/repository/metadata/      what vehicles fetch
@@ -111,7 +111,7 @@ def read_root(out: Path) -> bytes:
 
 def read_party(out: Path) -> Party:
     """Return whose repository it is."""
-    party = _load_root(out).signed.unrecognized_fields.get(PARTY)
+    party = load_root(out).signed.unrecognized_fields.get(PARTY)
     if party not in ("provider", "customer"):
         raise InputError(f"{out}: a repository of nobody: neither the provider's nor the customer's")
     return party
@@ -125,7 +125,7 @@ def target_names(task: str, release: int) -> tuple[str, str]:
 def stage_release(
     out: Path, folder: Path, keys: Sequence[Path], directive: Directive | None = None, now: datetime | None = None
 ) -> Staged:
-    """Add a candidate to the party's next targets metadata and sign it; the provider keeps its files beside the metadata.
+    """Add a candidate to the party's next targets metadata and sign it; the provider keeps its files, too.
 
     Args:
         out: the party's folder.
@@ -135,7 +135,7 @@ def stage_release(
         now: time of the signatures; None: by this machine's clock.
 
     Raises:
-        InputError: for a key of nobody in the root or given twice, a number that does not rise, and a clock that is off.
+        InputError: for a stranger's key or one given twice, a number that does not rise, and a clock that is off.
     """
     from tuf.api.metadata import TargetFile
 
@@ -201,6 +201,52 @@ def publish(out: Path, now: datetime | None = None) -> int:
     return version
 
 
+def replace_online_key(out: Path, keys: Sequence[Path], now: datetime | None = None) -> None:
+    """Replace the online key by a new root, signed by the party's keys, and sign snapshot and timestamp anew.
+
+    What a thief of the old key signed is worth nothing from then on, high version numbers included. Raises `InputError`
+    for fewer keys than the root's threshold, keys of nobody, and one given twice.
+    """
+    at, metadata = now or datetime.now(UTC), out / "repository" / "metadata"
+    owned, party = [read_private_key(path) for path in keys], read_party(out)
+    check_distinct([key.public for key in owned], f"the keys of the {party}")
+    signed = load_root(out)
+    root: Root = signed.signed
+    lost = root.roles["timestamp"].keyids[0]
+    (out / "keys" / f"{ONLINE}.pem").unlink(missing_ok=True)
+    online = generate_key(out / "keys" / f"{ONLINE}.pem")
+    for role in ("snapshot", "timestamp"):
+        root.revoke_key(lost, role)
+        root.add_key(online.signer().public_key, role)
+    root.version, root.expires = root.version + 1, _until("root", at)
+    signed.signatures.clear()
+    for key in owned:
+        signed.sign(key.signer(), append=True)
+    if (
+        len(root.get_verification_result("root", signed.signed_bytes, signed.signatures).signed)
+        < root.roles["root"].threshold
+    ):
+        raise InputError(f"{out}: fewer signatures of the {party} than its root wants")
+    version = max(int(path.name.partition(".")[0]) for path in metadata.glob("*.targets.json"))
+    _write(signed, metadata / f"{root.version}.root.json")
+    timestamp: Metadata[Timestamp] = _load(metadata / "timestamp.json")
+    snapshot: Metadata[Snapshot] = _load(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")
+    _sign_online(metadata, snapshot, timestamp, online, at, version)
+
+
+def load_root(out: Path) -> "Metadata[Root]":
+    """Return the repository's latest root; raises `InputError` where `out` is none of a party."""
+    read_root(out)
+    metadata = out / "repository" / "metadata"
+    latest = max(int(path.name.partition(".")[0]) for path in metadata.glob("*.root.json"))
+    return _load(metadata / f"{latest}.root.json")
+
+
+def load_timestamp(out: Path) -> "Metadata[Timestamp]":
+    """Return the repository's timestamp."""
+    return _load(out / "repository" / "metadata" / "timestamp.json")
+
+
 def load_targets(out: Path) -> "Metadata[Targets]":
     """Return the repository's current targets metadata."""
     metadata = out / "repository" / "metadata"
@@ -252,7 +298,7 @@ def _stage(
     owned = [read_private_key(path) for path in keys]
     party = read_party(out)
     check_distinct([key.public for key in owned], f"the keys of the {party}")
-    known = root_keys(_load_root(out).signed)
+    known = root_keys(load_root(out).signed)
     if strangers := [path for path, key in zip(keys, owned, strict=True) if key.public not in known]:
         raise InputError(f"{strangers[0]}: is no key of the {party}, by the root of {out}")
     current = load_targets(out)
@@ -281,7 +327,7 @@ def _check_rising(out: Path, candidate: Candidate, files: Mapping[str, "TargetFi
     latest = max(list_releases(known, candidate.task), default=0)
     if candidate.release <= latest:
         raise InputError(
-            f"{out}: release {candidate.release} of {candidate.task} does not rise above {latest}, which it names already"
+            f"{out}: release {candidate.release} of {candidate.task} does not rise above {latest}, which it names"
         )
 
 
@@ -290,11 +336,13 @@ def _check_clock(out: Path, at: datetime) -> None:
     timestamp = _load(out / "repository" / "metadata" / "timestamp.json")
     made = timestamp.signed.expires - LIFETIME["timestamp"]
     if at < made - timedelta(minutes=5):
-        raise InputError(f"the clock is off: it says {at:%Y-%m-%d %H:%M} UTC, before the signatures of {made:%Y-%m-%d %H:%M}")
+        raise InputError(
+            f"the clock is off: it says {at:%Y-%m-%d %H:%M} UTC, before the signatures of {made:%Y-%m-%d %H:%M}"
+        )
 
 
 def _count(out: Path, targets: "Metadata[Targets]") -> Staged:
-    root = _load_root(out).signed
+    root = load_root(out).signed
     result = root.get_verification_result("targets", targets.signed_bytes, targets.signatures)
     return Staged(targets.signed.version, len(result.signed), root.roles["targets"].threshold)
 
@@ -321,13 +369,6 @@ def _sign_online(
     _write(timestamp, metadata / "timestamp.json")
 
 
-def _load_root(out: Path) -> "Metadata[Root]":
-    read_root(out)
-    metadata = out / "repository" / "metadata"
-    latest = max(int(path.name.partition(".")[0]) for path in metadata.glob("*.root.json"))
-    return _load(metadata / f"{latest}.root.json")
-
-
 def _load(path: Path) -> "Metadata":
     from tuf.api.exceptions import RepositoryError
     from tuf.api.metadata import Metadata
@@ -349,4 +390,3 @@ def _staged_path(out: Path) -> Path:
 
 def _until(role: str, at: datetime) -> datetime:
     return (at + LIFETIME[role]).replace(microsecond=0)
-

@@ -1,4 +1,4 @@
-"""A vehicle's check of a release: it must be named by both repositories, with the same hash (Uptane, full verification).
+"""A vehicle's check of a release: both repositories name it with the same hash (Uptane's full verification).
 
 Uptane Standard for Design and Implementation 2.1.0, section 5.4.4.2: root, timestamp, snapshot and targets of the
 director, then of the image repository, each by The Update Framework's client workflow; then the two are compared.
@@ -80,7 +80,9 @@ def trust_roots(folder: Path, image_root: bytes, director_root: bytes) -> None:
         try:
             root = Metadata[Root].from_bytes(data).signed
         except RepositoryError as error:
-            raise InputError(f"root of the {REPOSITORIES[name]}: no metadata of The Update Framework ({error})") from None
+            raise InputError(
+                f"root of the {REPOSITORIES[name]}: no metadata of The Update Framework ({error})"
+            ) from None
         if root.unrecognized_fields.get(PARTY) != REPOSITORIES[name]:
             raise InputError(f"root of the {name} repository: is not of the {REPOSITORIES[name]}")
         keys += root_keys(root)
@@ -144,7 +146,7 @@ def _refresh(folder: Path, name: str, sources: Sources, at: datetime) -> "Update
 
 
 def _check_clock(updater: "Updater", name: str, at: datetime) -> None:
-    """Raise `Refused` where metadata expire later than any that are signed now: the clock is behind, or was set back."""
+    """Raise `Refused` where metadata expire later than any signed now: the clock is behind, or was set back."""
     timestamp = updater._trusted_set.timestamp
     made = timestamp.expires - LIFETIME["timestamp"]
     if at + CLOCK_SLACK < made:

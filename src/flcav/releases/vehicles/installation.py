@@ -1,9 +1,9 @@
 """Atomic installation of a release in a vehicle: power may fail at any time, and the old network drives until then.
 
-    FOLDER/metadata/{image,director}/     what the vehicle trusts
-    FOLDER/incoming/                      files on their way
-    FOLDER/networks/HASH.safetensors      weights by their hash
-    FOLDER/current.json                   the network that drives; replaced last, by a rename
+FOLDER/metadata/{image,director}/     what the vehicle trusts
+FOLDER/incoming/                      files on their way
+FOLDER/networks/HASH.safetensors      weights by their hash
+FOLDER/current.json                   the network that drives; replaced last, by a rename
 """
 
 from dataclasses import dataclass
@@ -59,10 +59,10 @@ def update_vehicle(
     driving = read_installed(folder)
     checked = check_release(folder, vehicle, sources, task, now)
     approved = checked.approved
-    if approved is None or (driving is not None and driving.release == approved.release):
+    if approved is None or driving == Installed(task, approved.release, approved.weights):
         return driving
-    if driving is not None and approved.release < driving.release:
-        raise Refused(f"release {approved.release} of {task}: rolled back below {driving.release}, which drives")
+    if driving is not None and driving.task == task and approved.release <= driving.release:
+        raise Refused(f"release {approved.release} of {task}: does not rise above {driving.release}, which drives")
     return install(folder, checked, approved)
 
 

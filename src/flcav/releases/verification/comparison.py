@@ -177,4 +177,3 @@ def _precision(matches: Matches, times: Times) -> Values:
 
 def _scenes(pair: Pair) -> int:
     return len(np.unique(pair.scene))
-

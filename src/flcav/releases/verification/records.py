@@ -12,7 +12,7 @@ Judgement = Literal["kept", "lost", "open"]
 
 @dataclass(frozen=True)
 class Comparison:
-    """A measure of the driving network and of the candidate on the same frames, with the interval of their difference."""
+    """A measure of the driving network and of the candidate on the same frames, and their difference's interval."""
 
     by: str  # whole, class, distance, weather, scenario, cell, condition, measure
     name: str
@@ -87,6 +87,8 @@ class Verification(Record):
                     f"{guard.by:<10}{guard.name:<34}{guard.driving:.3f} -> {guard.candidate:.3f}  "
                     f"({guard.low:+.3f} to {guard.high:+.3f})  {guard.judgement}  (objects: {guard.targets})"
                 )
-        more = f"; about {self.frames_to_decide} frames would decide" if self.undecided and self.frames_to_decide else ""
+        more = (
+            f"; about {self.frames_to_decide} frames would decide" if self.undecided and self.frames_to_decide else ""
+        )
         verdict = "accepted" if self.accepted else "undecided, so refused" if self.undecided else "refused"
         return [*lines, verdict if self.accepted else f"{verdict}: {'; '.join(self.reasons)}{more}"]

@@ -109,9 +109,7 @@ def run_tests(
     return results
 
 
-def describe_domain(
-    frames: Sequence[TestFrame], truths: Sequence[FrameTruth], classes: Sequence[str]
-) -> Domain:
+def describe_domain(frames: Sequence[TestFrame], truths: Sequence[FrameTruth], classes: Sequence[str]) -> Domain:
     """Return the domain that frames cover, for a network of `classes`."""
     opened = {folder: Dataset.open(folder, checked=False) for folder in {each.data for each in frames}}
     read = [opened[each.data].frame(each.number) for each in frames]
@@ -147,7 +145,9 @@ def _split(frames: Sequence[TestFrame]) -> list[Sequence[TestFrame]]:
 
 def _join(parts: Sequence[Tested]) -> Tested:
     """Return the results of several parts of the frames as one."""
-    return Tested(*(tuple(chain.from_iterable(getattr(each, field.name) for each in parts)) for field in fields(Tested)))
+    return Tested(
+        *(tuple(chain.from_iterable(getattr(each, field.name) for each in parts)) for field in fields(Tested))
+    )
 
 
 def _nothing() -> None:
