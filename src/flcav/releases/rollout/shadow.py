@@ -89,7 +89,8 @@ def judge_shadows(reports: Sequence[ShadowReport], limit: float = LIMIT) -> Shad
     """Return whether a roll-out goes on: its canaries' mean disagreement lies below the limit, at .05.
 
     It stops where the mean lies above the limit, and waits for more vehicles where neither is told. Bounds are
-    Student's t over vehicles. Raises `InputError` for no reports, of different networks, and for a vehicle that reports twice.
+    Student's t over vehicles. Raises `InputError` for no reports, of different networks, and for a vehicle that
+    reports twice.
     """
     if not reports:
         raise InputError("no shadow run: at least two vehicles' are wanted")

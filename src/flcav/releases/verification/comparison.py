@@ -18,7 +18,7 @@ from flcav.perception.metrics import Matches, match, weighted_precision
 from flcav.perception.objects.evaluate import BreakdownPart, split_parts
 from flcav.perception.objects.truth import select_class
 from flcav.releases.verification.records import Comparison, Judgement
-from flcav.releases.verification.testing import Tested
+from flcav.releases.verification.testing import ConditionResults
 from flcav.statistics.bootstrap import REDRAWS, bootstrap_over_scenes
 from flcav.statistics.streams import stream
 
@@ -65,18 +65,20 @@ def compare(pair: Pair, redraws: int = REDRAWS) -> tuple[Comparison, float]:
     return Comparison(pair.by, pair.name, pair.targets, _scenes(pair), old, new, low, high, judgement), error
 
 
-def pair_whole(driving: Tested, candidate: Tested, by: str = "whole", name: str = "AP50") -> Pair:
+def pair_whole(driving: ConditionResults, candidate: ConditionResults, by: str = "whole", name: str = "AP50") -> Pair:
     """Return the pair of the mean AP50 over classes on all frames."""
     return _pair(by, name, _match_all(driving), _match_all(candidate), driving)
 
 
-def pair_slices(driving: Tested, candidate: Tested) -> Iterator[Pair]:
+def pair_slices(driving: ConditionResults, candidate: ConditionResults) -> Iterator[Pair]:
     """Yield the pairs by class, distance, occlusion, weather, scenario and cell (town and weather), and by measure."""
     old, new = _match_all(driving), _match_all(candidate)
     for label in old:
         yield _pair("class", label, {label: old[label]}, {label: new[label]}, driving)
     for one, other in zip(_parts(driving), _parts(candidate), strict=True):
-        yield _pair(one.by, one.name, _match_part(driving, one), _match_part(candidate, other), driving, one.frames)
+        whole = all(wanted.all() for wanted in one.wanted)  # of its frames: they are matched already
+        sides = (old, new) if whole else (_match_part(driving, one), _match_part(candidate, other))
+        yield _pair(one.by, one.name, *sides, driving, one.frames)
     finer = _match_all(driving, 0.7), _match_all(candidate, 0.7)
     yield _pair("measure", "AP70: accurate boxes", *finer, driving)
     yield _pair("measure", "AOS: right headings", old, new, driving, measure=_orientation)
@@ -84,7 +86,7 @@ def pair_slices(driving: Tested, candidate: Tested) -> Iterator[Pair]:
     yield _pair("measure", f"right from score {THRESHOLD:g} on", old, new, driving, measure=_precision)
 
 
-def _parts(tested: Tested) -> Iterator[BreakdownPart]:
+def _parts(tested: ConditionResults) -> Iterator[BreakdownPart]:
     yield from split_parts(tested.detections, tested.truths)
     weather = [truth.weather for truth in tested.truths]
     groups = {
@@ -99,12 +101,12 @@ def _parts(tested: Tested) -> Iterator[BreakdownPart]:
             yield BreakdownPart(by, name, list(tested.detections), wanted, frames)
 
 
-def _match_all(tested: Tested, overlap: float = 0.5) -> dict[str, Matches]:
+def _match_all(tested: ConditionResults, overlap: float = 0.5) -> dict[str, Matches]:
     targets, neutral = [t.targets for t in tested.truths], [t.neutral for t in tested.truths]
     return _match_classes(tested.detections, targets, neutral, overlap)
 
 
-def _match_part(tested: Tested, part: BreakdownPart) -> dict[str, Matches]:
+def _match_part(tested: ConditionResults, part: BreakdownPart) -> dict[str, Matches]:
     targets = [truth.targets[wanted] for truth, wanted in zip(tested.truths, part.wanted, strict=True)]
     others = [truth.targets[~wanted] for truth, wanted in zip(tested.truths, part.wanted, strict=True)]
     neutral = [concatenate([truth.neutral, other]) for truth, other in zip(tested.truths, others, strict=True)]
@@ -129,7 +131,7 @@ def _pair(
     name: str,
     old: dict[str, Matches],
     new: dict[str, Matches],
-    tested: Tested,
+    tested: ConditionResults,
     frames: NDArray[np.int64] | None = None,
     measure: Callable[[Matches, Times], Values] = weighted_precision,
 ) -> Pair:

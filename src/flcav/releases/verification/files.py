@@ -11,17 +11,17 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network, read_card
 from flcav.releases.candidates.candidate import CARD, WEIGHTS, Candidate, check_files
-from flcav.releases.verification.records import TestData
+from flcav.releases.verification.records import VerificationData
 from flcav.storage.files import sha256
 
 FREE = ("calibration", "augmentation", "bfloat16")  # settings in which an update may differ
 
 
-def describe_data(data: Dataset, frames: int, scenes: int) -> TestData:
+def describe_data(data: Dataset, frames: int, scenes: int) -> VerificationData:
     """Return the record of a dataset that is tested on."""
     recipe = data.manifest.recipe
     town, seed = recipe.get("town"), recipe.get("seed")
-    return TestData(
+    return VerificationData(
         name="/".join(data.folder.resolve().parts[-2:]),
         manifest=sha256(data.folder / MANIFEST),
         town=town if isinstance(town, str) else None,
@@ -31,7 +31,7 @@ def describe_data(data: Dataset, frames: int, scenes: int) -> TestData:
     )
 
 
-def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Sequence[TestData]) -> Iterator[str]:
+def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Sequence[VerificationData]) -> Iterator[str]:
     """Yield the reasons for which the candidate's files alone refuse it; the network is not run.
 
     driving: weights of the network that drives. tested: the datasets of the verification.
@@ -57,7 +57,7 @@ def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Seque
     yield from find_overlap(candidate, tested)
 
 
-def find_overlap(candidate: Candidate, tested: Sequence[TestData]) -> Iterator[str]:
+def find_overlap(candidate: Candidate, tested: Sequence[VerificationData]) -> Iterator[str]:
     """Yield the datasets of the candidate's provenance whose scenes it would be tested on.
 
     Scenes are the same where the manifests are, or town and seed, whatever the split, the sensors and the name.

@@ -42,7 +42,7 @@ class Domain:
 
 
 @dataclass(frozen=True)
-class TestData:
+class VerificationData:
     """A dataset that was tested on."""
 
     name: str
@@ -69,7 +69,7 @@ class Verification(Record):
     frames_to_decide: int | None  # None where decided, or where no number would do
     whole: Comparison | None  # None where the files alone refuse it
     guards: tuple[Comparison, ...]
-    data: tuple[TestData, ...]
+    data: tuple[VerificationData, ...]
     domain: Domain | None
 
     def lines(self) -> list[str]:

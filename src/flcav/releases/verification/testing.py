@@ -1,6 +1,6 @@
 """Tests of one network on recorded frames: its detections in every condition, and what was to be found."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
@@ -23,12 +23,13 @@ from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.records import Domain
 from flcav.sensors.frame import Frame
 
+Work = tuple[Path, Sequence["VerificationFrame"], str]  # weights, frames, condition
 AT_ONCE = 16  # frames of a piece of work
 SPARSE = 4  # every fourth frame is tested in each further condition
 
 
 @dataclass(frozen=True)
-class TestFrame:
+class VerificationFrame:
     """A frame that is tested: its number in a dataset, and what is known of its scene."""
 
     data: Path
@@ -38,15 +39,17 @@ class TestFrame:
 
 
 @dataclass(frozen=True)
-class Tested:
+class ConditionResults:
     """Results of a network in one condition, frame by frame."""
 
-    frames: tuple[TestFrame, ...]
+    frames: tuple[VerificationFrame, ...]
     detections: tuple[Boxes, ...]  # LiDAR frame
     truths: tuple[FrameTruth, ...]  # scenes are named by dataset and scene
 
 
-def choose_test_frames(folders: Sequence[Path], network: Second, most: int | None = None) -> tuple[TestFrame, ...]:
+def choose_test_frames(
+    folders: Sequence[Path], network: Second, most: int | None = None
+) -> tuple[VerificationFrame, ...]:
     """Return the frames of datasets whose sensors fit the network, at most `most` of each, evenly spread.
 
     Raises `InputError` where a dataset has no labels, none fits, or one is given twice.
@@ -64,34 +67,34 @@ def choose_test_frames(folders: Sequence[Path], network: Second, most: int | Non
         kinds = [str(each["kind"]) for each in scenarios or () if isinstance(each, Mapping) and "kind" in each]
         town = str(recipe.get("town", data.manifest.imported or "unknown"))
         scenario = ", ".join(dict.fromkeys(kinds)) or "everyday traffic"
-        chosen += [TestFrame(folder, number, town, scenario) for number in numbers[::step]]
+        chosen += [VerificationFrame(folder, number, town, scenario) for number in numbers[::step]]
     return tuple(chosen)
 
 
 def run_condition(
-    network: Second, frames: Sequence[TestFrame], condition: str, progress: Report = ignore_progress
-) -> Tested:
+    network: Second, frames: Sequence[VerificationFrame], condition: str, progress: Report = ignore_progress
+) -> ConditionResults:
     """Return the results of a network on frames in a condition, one of `CONDITIONS` or `PLAIN`."""
     opened: dict[Path, Dataset] = {}
     change = CONDITIONS.get(condition)
 
-    def read(each: TestFrame) -> Frame:
+    def read(each: VerificationFrame) -> Frame:
         data = opened.get(each.data) or opened.setdefault(each.data, Dataset.open(each.data, checked=False))
         frame = frame_reader(data, network.config.foreground)(each.number)
         return frame if change is None else change(frame)
 
     found, truths = detect_frames(network, map(read, frames), total=len(frames), progress=progress)
     named = [replace(truth, scene=f"{each.data}/{truth.scene}") for truth, each in zip(truths, frames, strict=True)]
-    return Tested(tuple(frames), tuple(found), tuple(named))
+    return ConditionResults(tuple(frames), tuple(found), tuple(named))
 
 
 def run_tests(
     networks: Sequence[Path],
-    frames: Sequence[TestFrame],
+    frames: Sequence[VerificationFrame],
     conditions: Sequence[str] = (PLAIN, *CONDITIONS),
     jobs: int = 1,
     progress: Report = ignore_progress,
-) -> list[dict[str, Tested]]:
+) -> list[dict[str, ConditionResults]]:
     """Return the results of networks (files of weights) by condition; those besides `PLAIN` on every fourth frame."""
     works = [
         (path, part, name)
@@ -99,17 +102,16 @@ def run_tests(
         for name in conditions
         for part in _split(frames if name == PLAIN else frames[::SPARSE])
     ]
-    results: list[dict[str, Tested]] = [{} for _ in networks]
+    if jobs == 1:
+        return _collect(networks, works, (_run(*work) for work in works), progress)
     with process_pool(jobs, _nothing) as pool:
         waiting = [pool.submit(_run, *work) for work in works]
-        for done, (each, (path, _, name)) in enumerate(zip(waiting, works, strict=True), start=1):
-            own = results[networks.index(path)]
-            own[name] = _join([own[name], each.result()]) if name in own else each.result()
-            progress(done, len(works), "")
-    return results
+        return _collect(networks, works, (each.result() for each in waiting), progress)
 
 
-def describe_domain(frames: Sequence[TestFrame], truths: Sequence[FrameTruth], classes: Sequence[str]) -> Domain:
+def describe_domain(
+    frames: Sequence[VerificationFrame], truths: Sequence[FrameTruth], classes: Sequence[str]
+) -> Domain:
     """Return the domain that frames cover, for a network of `classes`."""
     opened = {folder: Dataset.open(folder, checked=False) for folder in {each.data for each in frames}}
     read = [opened[each.data].frame(each.number) for each in frames]
@@ -135,18 +137,29 @@ def _span(values: Sequence[float]) -> tuple[float, float] | None:
     return (round(min(values), 3), round(max(values), 3)) if len(values) else None
 
 
-def _run(weights: Path, frames: Sequence[TestFrame], condition: str) -> Tested:
+def _run(weights: Path, frames: Sequence[VerificationFrame], condition: str) -> ConditionResults:
     return run_condition(load_network(OBJECTS, weights), frames, condition)
 
 
-def _split(frames: Sequence[TestFrame]) -> list[Sequence[TestFrame]]:
+def _collect(
+    networks: Sequence[Path], works: Sequence[Work], parts: Iterable[ConditionResults], progress: Report
+) -> list[dict[str, ConditionResults]]:
+    """Return the results of each network by condition, from those of the pieces of work."""
+    results: list[dict[str, list[ConditionResults]]] = [{} for _ in networks]
+    for done, (part, (path, _, name)) in enumerate(zip(parts, works, strict=True), start=1):
+        results[networks.index(path)].setdefault(name, []).append(part)
+        progress(done, len(works), "")
+    return [{name: _join(own) for name, own in each.items()} for each in results]
+
+
+def _split(frames: Sequence[VerificationFrame]) -> list[Sequence[VerificationFrame]]:
     return [frames[start : start + AT_ONCE] for start in range(0, len(frames), AT_ONCE)]
 
 
-def _join(parts: Sequence[Tested]) -> Tested:
+def _join(parts: Sequence[ConditionResults]) -> ConditionResults:
     """Return the results of several parts of the frames as one."""
-    return Tested(
-        *(tuple(chain.from_iterable(getattr(each, field.name) for each in parts)) for field in fields(Tested))
+    return ConditionResults(
+        *(tuple(chain.from_iterable(getattr(each, field.name) for each in parts)) for field in fields(ConditionResults))
     )
 
 

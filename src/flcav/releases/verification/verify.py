@@ -15,10 +15,10 @@ from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate
 from flcav.releases.verification.comparison import KEPT, LEAST_TARGETS, LEVEL, compare, pair_slices, pair_whole
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.files import describe_data, find_faults
-from flcav.releases.verification.records import Comparison, Domain, TestData, Verification
+from flcav.releases.verification.records import Comparison, Domain, Verification, VerificationData
 from flcav.releases.verification.testing import (
-    Tested,
-    TestFrame,
+    ConditionResults,
+    VerificationFrame,
     choose_test_frames,
     describe_domain,
     run_tests,
@@ -27,7 +27,8 @@ from flcav.statistics.power import plan_scenes
 from flcav.storage.files import sha256, write_json
 
 MARGIN = 0.03  # AP50
-Results = Mapping[str, Tested]  # by condition
+GUARD_REDRAWS = 200  # of the scenes, of each slice
+Results = Mapping[str, ConditionResults]  # by condition
 
 
 def verify(
@@ -78,7 +79,7 @@ def decide(
     candidate: Candidate,
     driving: Results | None,
     new: Results | None,
-    data: Sequence[TestData],
+    data: Sequence[VerificationData],
     domain: Domain | None,
     margin: float = MARGIN,
     faults: Sequence[str] = (),
@@ -145,10 +146,10 @@ def read_verification(folder: Path) -> Verification:
 def _guard(driving: Results, new: Results) -> list[Comparison]:
     pairs = [*pair_slices(driving[PLAIN], new[PLAIN])]
     pairs += [pair_whole(driving[name], new[name], "condition", name) for name in CONDITIONS if name in new]
-    return [compare(pair)[0] for pair in pairs if pair.targets >= LEAST_TARGETS]
+    return [compare(pair, GUARD_REDRAWS)[0] for pair in pairs if pair.targets >= LEAST_TARGETS]
 
 
-def _describe(path: Path, frames: Sequence[TestFrame]) -> TestData:
+def _describe(path: Path, frames: Sequence[VerificationFrame]) -> VerificationData:
     own = [each for each in frames if each.data == path]
     data = Dataset.open(path, checked=False)
     return describe_data(data, len(own), len({data.keys[each.number].scene for each in own}))
