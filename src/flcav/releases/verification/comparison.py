@@ -118,12 +118,11 @@ def _match_classes(
 ) -> dict[str, Matches]:
     """Return the matches of each class with targets."""
     labels = sorted({str(label) for boxes in targets for label in boxes.label})
-    return {
-        label: match(
-            *([select_class(boxes, label) for boxes in side] for side in (detections, targets, neutral)), overlap
-        )
-        for label in labels
-    }
+    found = {}
+    for label in labels:
+        own = ([select_class(boxes, label) for boxes in side] for side in (detections, targets, neutral))
+        found[label] = match(next(own), next(own), next(own), overlap)
+    return found
 
 
 def _pair(

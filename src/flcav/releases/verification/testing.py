@@ -64,7 +64,8 @@ def choose_test_frames(
         step = 1 if most is None else max(1, -(-len(numbers) // most))
         recipe = data.manifest.recipe
         scenarios = recipe.get("scenarios")
-        kinds = [str(each["kind"]) for each in scenarios or () if isinstance(each, Mapping) and "kind" in each]
+        listed = scenarios if isinstance(scenarios, Sequence) and not isinstance(scenarios, str) else ()
+        kinds = [str(each["kind"]) for each in listed if isinstance(each, Mapping) and "kind" in each]
         town = str(recipe.get("town", data.manifest.imported or "unknown"))
         scenario = ", ".join(dict.fromkeys(kinds)) or "everyday traffic"
         chosen += [VerificationFrame(folder, number, town, scenario) for number in numbers[::step]]
