@@ -171,20 +171,20 @@ def prepare(out: Path) -> dict[str, Dataset]:
     return {name: Dataset.open(out / name) for name in RECORDED}
 
 
-def keep(network: Second, path: Path, data: Dataset, seed: int, **fields: object) -> None:
+def keep(trained: Second, path: Path, data: Dataset, seed: int, **fields: object) -> None:
     """Write a network with its card."""
-    chosen = choose_frames(OBJECTS, network.config, data)
+    chosen = choose_frames(OBJECTS, trained.config, data)
     card = Card(
         task="objects",
         network="pillars",
-        parameters=sum(each.numel() for each in network.parameters()),
+        parameters=sum(each.numel() for each in trained.parameters()),
         seed=seed,
         samples=len(chosen.frames),
         training={"steps": 0, "loss": 0.0, "scores": []},
         data=(data_entry(data, chosen),),
         metrics={},
     )
-    save_network(OBJECTS, network.eval(), path, card.model_copy(update=fields))
+    save_network(OBJECTS, trained.eval(), path, card.model_copy(update=fields))
 
 
 def learn(network: Second, data: Dataset, steps: int, seed: int, spoil: Spoil | None = None, only: str | None = None):

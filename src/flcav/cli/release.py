@@ -126,6 +126,7 @@ def verify(
 
 
 @release.command()
+@only_writer_of("repository")
 def sign(
     candidate: Path = CANDIDATE,
     repository: Path = typer.Option(..., "--repository", help="Folder of the party that signs."),
@@ -169,6 +170,7 @@ def sign(
 
 
 @release.command()
+@only_writer_of("repository")
 def publish(repository: Path = typer.Argument(help="Folder of a party.")) -> None:
     """Make what a party has signed its repository's current state; without anything, renew its timestamp."""
     from flcav.releases.repositories.repository import publish as publish_staged
@@ -177,6 +179,7 @@ def publish(repository: Path = typer.Argument(help="Folder of a party.")) -> Non
 
 
 @release.command()
+@only_writer_of("folder")
 def install(
     folder: Path = typer.Argument(metavar="VEHICLE", help="Folder of the vehicle."),
     name: str = typer.Option(..., "--name", help="The vehicle's name."),
@@ -236,6 +239,7 @@ def shadow(
 
 
 @release.command()
+@only_writer_of("repository")
 def rollout(
     repository: Path = typer.Argument(help="The customer's folder."),
     key: list[Path] = KEYS,

@@ -263,8 +263,8 @@ def read_directives(targets: Mapping[str, "TargetFile"]) -> dict[str, Directive]
         custom = file.custom
         if rest.endswith(WEIGHTS) and custom is not None:
             try:
-                found[task] = Directive.model_validate(custom.get(DIRECTIVE))
-            except ValueError:
+                found[task] = Directive.model_validate(custom[DIRECTIVE])
+            except (ValueError, TypeError, KeyError):
                 raise InputError(f"{name}: its directive is malformed") from None
     return found
 

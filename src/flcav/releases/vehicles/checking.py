@@ -197,4 +197,4 @@ def refuse(what: str) -> Iterator[None]:
     try:
         yield
     except (DownloadError, RepositoryError) as error:
-        raise Refused(f"{what}: {type(error).__name__}: {error}") from None
+        raise Refused(f"{what}: {type(error).__name__}: {str(error) or 'no answer'}") from None
