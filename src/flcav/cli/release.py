@@ -1,6 +1,7 @@
 """`flcav release`: candidates, their verification, signatures of provider and customer, roll-out and roll-back."""
 
 from enum import StrEnum
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,8 @@ import typer
 
 from flcav.cli.options import check_finite
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
+from flcav.config import InputError
+from flcav.interface.extras import format_install_command
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
@@ -38,7 +41,8 @@ class PartyName(StrEnum):
 
 @release.callback()
 def _group() -> None:
-    pass
+    if missing := [name for name in ("tuf", "model_signing") if find_spec(name) is None]:
+        raise InputError(f"releases need {missing[0]}, which is in: {format_install_command('releases')}")
 
 
 def register(app: typer.Typer) -> None:
@@ -143,7 +147,6 @@ def sign(
     revoke: list[str] = REVOKE,
 ) -> None:
     """Acknowledge a verified candidate, and sign its place in the party's repository; `publish` makes it current."""
-    from flcav.config import InputError
     from flcav.releases.candidates.acknowledgement import acknowledge
     from flcav.releases.repositories.directive import MILLION, Directive
     from flcav.releases.repositories.repository import read_party, stage_release
@@ -190,7 +193,7 @@ def install(
     task: str = TASK,
 ) -> None:
     """Install in a vehicle what both repositories name with the same hash; refuse anything else."""
-    from flcav.config import InputError, check_is_file
+    from flcav.config import check_is_file
     from flcav.releases.vehicles.checking import open_sources, trust_roots
     from flcav.releases.vehicles.installation import update_vehicle
 
@@ -253,7 +256,7 @@ def rollout(
     task: str = TASK,
 ) -> None:
     """Widen a roll-out, or stop it: sign another share of the fleet that installs the release; `publish` follows."""
-    from flcav.config import InputError, read_json
+    from flcav.config import read_json
     from flcav.releases.rollout.shadow import ShadowReport, judge_shadows
     from flcav.releases.rollout.stages import change_share, next_share, read_directive
 

@@ -124,3 +124,11 @@ def test_wrong_inputs_get_one_sentence(parties: Parties, call: Call, tmp_path: P
     assert call("status", tmp_path)[0] == 2
     assert call("init", "provider", "--out", tmp_path / "two", "--keys", 1)[0] == 2
     assert not (tmp_path / "two").exists()
+
+
+def test_without_the_extra_the_command_to_install_it_is_named(call: Call, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("flcav.cli.release.find_spec", lambda name: None)
+    code, said = call("status", "nowhere")
+    assert code == 2
+    assert said.startswith("flcav: releases need tuf, which is in: ")
+    assert "pip install" in said

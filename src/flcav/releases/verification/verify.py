@@ -119,7 +119,7 @@ def decide(
         kept_share=KEPT,
         frames=frames,
         scenes=scenes,
-        frames_to_decide=wanted or None,
+        frames_to_decide=(wanted or None) if not reasons else None,
         whole=whole,
         guards=tuple(guards),
         data=tuple(data),
