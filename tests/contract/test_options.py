@@ -65,6 +65,21 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "odd sample": dict.fromkeys(("--count", "--town", "--method", "--covered", "--seed", "--openscenario"), ALWAYS),
     "odd tasks": dict.fromkeys(("--data", "--errors", "--pretrain", "--wireless", "--wireline"), ALWAYS),
     "carla serve": dict.fromkeys(("--port", "--seed", "--traffic", "--maps", "--host"), ALWAYS),
+    "release init": {"--keys": ALWAYS, "--threshold": ALWAYS},
+    "release propose": dict.fromkeys(
+        ("--driving", "--release", "--changes", "--for", "--data", "--recipe", "--ledger", "--task"), ALWAYS
+    ),
+    "release verify": dict.fromkeys(("--driving", "--data", "--margin", "--frames", "--jobs"), ALWAYS),
+    "release sign": dict.fromkeys(("--repository", "--key", "--share", "--vehicle", "--revoke"), ALWAYS),
+    "release publish": {},
+    "release install": dict.fromkeys(
+        ("--name", "--image", "--director", "--image-root", "--director-root", "--task"), ALWAYS
+    ),
+    "release shadow": dict.fromkeys(("--driving", "--data"), ALWAYS),
+    "release rollout": dict.fromkeys(("--key", "--shadows", "--share", "--revoke", "--task"), ALWAYS),
+    "release deliver": dict.fromkeys(("--data", "--pole", "--scene", "--network", "--seed"), ALWAYS),
+    "release rollback": dict.fromkeys(("--driving", "--release", "--reason"), ALWAYS),
+    "release status": dict.fromkeys(("--candidate", "--task"), ALWAYS),
     "record": {"--frames": ALWAYS, "--seed": ALWAYS, "--jobs": ALWAYS, "--engine": ALWAYS},
     "validate": {},
     "birdseye": {"--frame": ALWAYS, "--range": ALWAYS, "--tracks": ALWAYS},

@@ -10,7 +10,7 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import carla, federate, fleet, odd, reproduce, towns
+from flcav.cli import carla, federate, fleet, odd, release, reproduce, towns
 from flcav.cli import (
     run as run_command,
 )
@@ -76,6 +76,7 @@ for command in (
     odd,
     carla,
     fleet,
+    release,
     reproduce,
 ):
     command.register(app)

@@ -20,12 +20,13 @@ def bootstrap_over_scenes(
     n: int = REDRAWS,
     *,
     rng: np.random.Generator,
+    tails: tuple[float, float] = TAILS,
 ) -> tuple[float, float]:
-    """Return the ends of the 95 % percentile interval of a measure, from `n` bootstrap resamples of the scenes.
+    """Return the ends of the percentile interval of a measure, 95 %, from `n` bootstrap resamples of the scenes.
 
     `measure` takes (n, F) counts, how often each of F frames is in each resample, and returns (n,) values, NaN where it
     is undefined; such resamples are left out, and both ends are NaN where none is left. `scene_of_frame` (F,) names
-    the scene of each frame.
+    the scene of each frame; `tails` are the quantiles of the ends.
     """
     names, scene = np.unique(np.asarray(scene_of_frame), return_inverse=True)
     times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=n)
@@ -33,7 +34,7 @@ def bootstrap_over_scenes(
     known = draws[np.isfinite(draws)]
     if not len(known):
         return float("nan"), float("nan")
-    low, high = np.quantile(known, TAILS)
+    low, high = np.quantile(known, tails)
     return float(low), float(high)
 
 

@@ -62,6 +62,17 @@ def seeds_to_tell(mean: MeanOverSeeds, hypothesis: float = 0.0, level: float = L
     return plan_seeds(mean.distance(hypothesis), mean.slope * mean.sd, level, shared)
 
 
+def plan_scenes(effect: float, error: float, scenes: int, level: float = LEVEL / 2, power: float = POWER) -> int | None:
+    """Return the number of scenes that tell an `effect` above 0 in a one-sided z test at `level`, with the given power.
+
+    `error` is the standard error over `scenes`, which falls with their square root. At least `scenes`; None for an
+    effect of 0 or less, which no number of scenes tells.
+    """
+    if effect <= 0:
+        return None
+    return max(scenes, int(np.ceil(scenes * ((ndtri(1 - level) + ndtri(power)) * error / effect) ** 2)))
+
+
 @dataclass(frozen=True)
 class SampleSize:
     """Numbers of trainings and of test scenes that tell an effect together, and whether either alone can."""

@@ -11,8 +11,8 @@ def render(results: Mapping[str, Any], pictures: Mapping[str, bytes], template: 
     """Return the page about `results` as HTML, with style and pictures embedded.
 
     `pictures` are PNG files by name, as `run_page.draw` or `plan_page` names them; the page leaves out missing ones.
-    `template`: report.html.j2 about a run, plan.html.j2 about a plan. Raises `jinja2.UndefinedError` where `results`
-    lack a value that the page shows.
+    `template`: report.html.j2 about a run, plan.html.j2 about a plan, release.html.j2 about a release. Raises
+    `jinja2.UndefinedError` where `results` lack a value that the page shows.
     """
     environment = Environment(
         loader=PackageLoader("flcav", "report"),

@@ -1,0 +1,126 @@
+"""A release candidate: weights with their card, hashes of data and recipe, the ledger, and the network they replace.
+
+A candidate is a folder. `candidate.json` holds the SHA-256 of every other file that was proposed; `verification.json`
+and `report.html` come with the verification, `acknowledgements` with those who sign it.
+"""
+
+import json
+from hashlib import sha256 as sha256_of
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from flcav.config import Config, InputError, check_is_file, parse_config
+from flcav.storage.files import sha256, write_bytes
+
+CANDIDATE = "candidate.json"
+WEIGHTS = "weights.safetensors"
+CARD = "card.md"
+RECIPE = "recipe.yaml"
+LEDGER = "ledger.parquet"
+VERIFICATION = "verification.json"
+REPORT = "report.html"
+ACKNOWLEDGEMENTS = "acknowledgements"
+LARGEST = 1_000_000_000  # bytes of weights
+FORMAT = "flcav-candidate-1"
+CARD_KEY = "flcav.card"  # as in `flcav.perception.card`, which needs torch
+MOST_HEADER_BYTES = 10_000_000
+
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class DataHash(Config):
+    """Provenance of one dataset that a network was trained on, or had its best epoch chosen by."""
+
+    name: str
+    manifest: Sha256  # of its manifest, which lists the hashes of all its files
+    town: str | None = None
+    seed: int | None = None  # of its traffic; the same town and seed have the same scenes
+    split: str | None = None
+    use: Literal["training", "validation"] = "training"
+
+
+class LedgerSum(Config):
+    """Bytes on one link in one direction that the training of a candidate cost."""
+
+    stage: str
+    link: Literal["wireless", "wireline"]
+    direction: Literal["up", "down"]
+    bytes: int = Field(ge=0)
+
+
+class Candidate(Config):
+    """A release candidate, as `candidate.json` describes it."""
+
+    document: ClassVar[str | None] = None
+
+    format: Literal["flcav-candidate-1"] = FORMAT
+    task: str = Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")
+    release: int = Field(ge=1, le=10**9)  # rises with every release of a task, roll-backs included
+    changes: str = Field(max_length=4000)  # what changed
+    audience: str = Field(max_length=1000)  # for whom
+    network: str  # name of the network's configuration
+    weights: Sha256
+    driving: Sha256  # weights of the network that drives
+    card: Sha256  # of the model card in the weights' metadata, as it is written there
+    data: tuple[DataHash, ...]
+    recipe: Sha256 | None = None
+    ledger: Sha256 | None = None
+    spent: tuple[LedgerSum, ...] = ()  # sums of the ledger
+
+
+def read_candidate(folder: Path) -> Candidate:
+    """Return the description of the candidate in `folder`; raises `InputError` for a bundle of another format."""
+    path = folder / CANDIDATE
+    if not path.is_file():
+        raise InputError(f"{folder}: no release candidate, since it has no {CANDIDATE}")
+    return parse_candidate(path.read_bytes(), str(path))
+
+
+def parse_candidate(data: bytes, origin: str) -> Candidate:
+    """Return the candidate that the bytes of a `candidate.json` describe; raises `InputError` for another format."""
+    try:
+        values = json.loads(data)
+    except (ValueError, RecursionError):
+        raise InputError(f"{origin}: not JSON, so no release candidate") from None
+    found = values.get("format") if isinstance(values, dict) else None
+    if found != FORMAT:
+        raise InputError(f"{origin}: a bundle of the format {str(found)[:40]!r}, and {FORMAT!r} is wanted")
+    return parse_config(Candidate, values, origin)
+
+
+def check_files(folder: Path, candidate: Candidate) -> None:
+    """Raise `InputError` where a file of the candidate is missing or has another hash than its description says."""
+    wanted = {WEIGHTS: candidate.weights, RECIPE: candidate.recipe, LEDGER: candidate.ledger}
+    for name, digest in wanted.items():
+        path = folder / name
+        if digest is None:
+            if path.exists():
+                raise InputError(f"{path}: is not in the candidate's description")
+            continue
+        check_is_file(path)
+        if path.stat().st_size > LARGEST:
+            raise InputError(f"{path}: larger than {LARGEST} bytes")
+        if sha256(path) != digest:
+            raise InputError(f"{path}: has another SHA-256 than the candidate's description says")
+    if hash_card(folder / WEIGHTS) != candidate.card:
+        raise InputError(f"{folder}: a card of other weights: that in {WEIGHTS} is not the one described")
+
+
+def hash_card(weights: Path) -> str:
+    """Return the SHA-256 of the model card in the metadata of a safetensors file; raises `InputError` for none."""
+    try:
+        with weights.open("rb") as file:
+            size = int.from_bytes(file.read(8), "little")
+            if size > MOST_HEADER_BYTES:
+                raise ValueError("its header is too long")
+            card = json.loads(file.read(size))["__metadata__"][CARD_KEY]
+            return sha256_of(card.encode()).hexdigest()
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise InputError(f"{weights}: no safetensors file with a model card") from None
+
+
+def write_report(folder: Path, page: str) -> None:
+    """Write the candidate's page."""
+    write_bytes(folder / REPORT, page.encode())

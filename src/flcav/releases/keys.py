@@ -1,0 +1,100 @@
+"""Signing keys of a party: elliptic keys of NIST's curve P-256, in PEM files.
+
+The same key signs a candidate's folder (OpenSSF Model Signing) and a repository's metadata (The Update Framework).
+"""
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from flcav.config import InputError, check_is_file
+
+if TYPE_CHECKING:
+    from securesystemslib.signer import CryptoSigner
+
+SHORT = 16  # hexadecimal digits of a key's name
+
+
+@dataclass(frozen=True)
+class PublicKey:
+    """A public key by its encoded point, so that a key has one name whatever file it comes from."""
+
+    pem: str  # SubjectPublicKeyInfo
+
+    @property
+    def short(self) -> str:
+        """Return the key's name: the first digits of the SHA-256 of its PEM text."""
+        return hashlib.sha256(self.pem.encode()).hexdigest()[:SHORT]
+
+
+@dataclass(frozen=True)
+class PrivateKey:
+    """A private key in memory."""
+
+    key: ec.EllipticCurvePrivateKey
+
+    @property
+    def public(self) -> PublicKey:
+        """Return its public key."""
+        return PublicKey(_pem(self.key.public_key()))
+
+    def signer(self) -> "CryptoSigner":
+        """Return the signer of metadata."""
+        from securesystemslib.signer import CryptoSigner
+
+        return CryptoSigner(self.key)
+
+
+def generate_key(path: Path) -> PrivateKey:
+    """Write a new private key to `path`, which only its owner can read, and its public key beside it (.pub)."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    text = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(text)
+    path.with_suffix(".pub").write_text(_pem(key.public_key()))
+    return PrivateKey(key)
+
+
+def read_private_key(path: Path) -> PrivateKey:
+    """Return the private key in a PEM file; raises `InputError` for none, and one of another curve."""
+    check_is_file(path)
+    try:
+        key = serialization.load_pem_private_key(path.read_bytes(), None)
+    except (ValueError, TypeError):
+        raise InputError(f"{path}: holds no private key that can be read (PEM, without a password)") from None
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.curve.name != "secp256r1":
+        raise InputError(f"{path}: holds a key of another kind, and one of the curve P-256 is wanted")
+    return PrivateKey(key)
+
+
+def read_public_key(path: Path) -> PublicKey:
+    """Return the public key in a PEM file; raises `InputError` for a file without one, or with one of another curve."""
+    check_is_file(path)
+    try:
+        key = serialization.load_pem_public_key(path.read_bytes())
+    except (ValueError, TypeError):
+        raise InputError(f"{path}: holds no public key (PEM)") from None
+    if not isinstance(key, ec.EllipticCurvePublicKey) or key.curve.name != "secp256r1":
+        raise InputError(f"{path}: holds a key of another kind, and one of the curve P-256 is wanted")
+    return PublicKey(_pem(key))
+
+
+def check_distinct(keys: Sequence[PublicKey], whose: str) -> None:
+    """Raise `InputError` where a key is among `keys` twice, which would count one owner as two."""
+    names = [key.pem for key in keys]
+    for number, name in enumerate(names):
+        if name in names[:number]:
+            raise InputError(f"the key {keys[number].short} is given twice among {whose}: signatures of two are wanted")
+
+
+def _pem(key: ec.EllipticCurvePublicKey) -> str:
+    return key.public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo).decode()

@@ -1,0 +1,81 @@
+"""The state of a party's repository: what it names, who gets it, what waits for signatures, and when it expires."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+from flcav.interface.wording import plural
+from flcav.releases.candidates.acknowledgement import Acknowledgement, find_acknowledgements
+from flcav.releases.repositories.repository import (
+    Staged,
+    list_releases,
+    load_root,
+    load_targets,
+    load_timestamp,
+    read_directives,
+    read_party,
+    read_staged,
+    root_keys,
+)
+from flcav.storage.records import LEFT_OUT, Record
+
+
+@dataclass(frozen=True)
+class RepositoryStatus(Record):
+    """The state of a repository on one task."""
+
+    party: str
+    folder: str
+    releases: tuple[int, ...]
+    version: int  # of the targets metadata
+    threshold: int
+    keys: tuple[str, ...]
+    fresh_until: datetime  # of the timestamp; vehicles refuse it afterwards
+    staged: Annotated[Staged | None, LEFT_OUT] = None
+    share: Annotated[float | None, LEFT_OUT] = None  # of the fleet; None of the provider
+    revoked: tuple[str, ...] = ()
+
+    def lines(self) -> list[str]:
+        """Return the state in words."""
+        named = ", ".join(map(str, self.releases)) or "none"
+        lines = [f"{self.folder}: of the {self.party}, releases {named}, version {self.version}"]
+        if self.share is not None:
+            away = f", {plural(len(self.revoked), 'vehicle')} revoked" if self.revoked else ""
+            lines.append(f"    {self.share:.0%} of the fleet{away}")
+        if self.staged is not None:
+            lines.append(
+                f"    version {self.staged.version} has {self.staged.signatures} of "
+                f"{plural(self.staged.threshold, 'signature')}"
+            )
+        late = self.fresh_until < datetime.now(UTC)
+        lines.append(f"    {'expired' if late else 'fresh until'} {self.fresh_until:%Y-%m-%d %H:%M} UTC")
+        return lines
+
+
+def read_status(out: Path, task: str) -> RepositoryStatus:
+    """Return the state of a party's repository; raises `InputError` where `out` holds none."""
+    party, targets, root = read_party(out), load_targets(out).signed, load_root(out).signed
+    directive = read_directives(targets.targets).get(task)
+    return RepositoryStatus(
+        party=party,
+        folder=str(out),
+        releases=tuple(list_releases(targets.targets, task)),
+        version=targets.version,
+        threshold=root.roles["targets"].threshold,
+        keys=tuple(key.short for key in root_keys(root)),
+        fresh_until=load_timestamp(out).signed.expires,
+        staged=read_staged(out),
+        share=None if directive is None else directive.share,
+        revoked=() if directive is None else directive.revoked,
+    )
+
+
+def read_acknowledgements(folder: Path, repositories: list[Path]) -> list[Acknowledgement]:
+    """Return who of the repositories' parties signs the candidate in `folder` as it is now."""
+    found = []
+    for out in repositories:
+        root = load_root(out).signed
+        threshold = root.roles["targets"].threshold
+        found.append(find_acknowledgements(folder, read_party(out), root_keys(root), threshold))
+    return found

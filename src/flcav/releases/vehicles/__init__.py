@@ -1,0 +1,1 @@
+"""A vehicle's side of releases: what it fetches, what it checks, and how it installs."""

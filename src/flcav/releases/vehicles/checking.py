@@ -1,0 +1,200 @@
+"""A vehicle's check of a release: both repositories name it with the same hash (Uptane's full verification).
+
+Uptane Standard for Design and Implementation 2.1.0, section 5.4.4.2: root, timestamp, snapshot and targets of the
+director, then of the image repository, each by The Update Framework's client workflow; then the two are compared.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flcav.config import InputError
+from flcav.releases.candidates.candidate import Candidate, parse_candidate
+from flcav.releases.keys import check_distinct
+from flcav.releases.repositories.directive import Directive, is_assigned
+from flcav.releases.repositories.repository import LIFETIME, PARTY, read_directives, root_keys, target_names
+from flcav.releases.vehicles.fetching import RepositoryFetcher, locate
+
+if TYPE_CHECKING:
+    from tuf.api.metadata import Root, TargetFile
+    from tuf.ngclient import Updater
+
+REPOSITORIES = {"director": "customer", "image": "provider"}
+CLOCK_SLACK = timedelta(hours=1)
+MOST_METADATA_BYTES = 5_000_000
+
+
+class Refused(InputError):
+    """Raised where a vehicle does not load a release; the message says why."""
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The two repositories as folders or addresses, and how they are fetched."""
+
+    image: str
+    director: str
+    fetcher: RepositoryFetcher
+
+
+@dataclass(frozen=True)
+class Approved:
+    """A release that both parties name with the same hashes."""
+
+    task: str
+    release: int
+    weights: str  # SHA-256
+    bytes: int  # of the weights
+    candidate: Candidate
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What a vehicle found: the release that it is to run, if it is assigned any, and what it downloaded so far."""
+
+    approved: Approved | None
+    directive: Directive | None
+    metadata_bytes: int
+    updater: "Updater"  # of the image repository, which the weights are downloaded with
+    target: "TargetFile | None"
+
+
+def open_sources(image: str, director: str) -> Sources:
+    """Return the two repositories; raises `InputError` where one is neither a folder nor an address."""
+    return Sources(locate(image), locate(director), RepositoryFetcher())
+
+
+def trust_roots(folder: Path, image_root: bytes, director_root: bytes) -> None:
+    """Keep the two roots that a vehicle is delivered with, in its folder.
+
+    Raises `InputError` for roots of the wrong party, and where a key is among those of both parties or of one twice.
+    """
+    from tuf.api.exceptions import RepositoryError
+    from tuf.api.metadata import Metadata, Root
+
+    keys = []
+    for name, data in (("image", image_root), ("director", director_root)):
+        try:
+            root = Metadata[Root].from_bytes(data).signed
+        except RepositoryError as error:
+            raise InputError(
+                f"root of the {REPOSITORIES[name]}: no metadata of The Update Framework ({error})"
+            ) from None
+        if root.unrecognized_fields.get(PARTY) != REPOSITORIES[name]:
+            raise InputError(f"root of the {name} repository: is not of the {REPOSITORIES[name]}")
+        keys += root_keys(root)
+    check_distinct(keys, "the keys of provider and customer together")
+    for name, data in (("image", image_root), ("director", director_root)):
+        (folder / "metadata" / name).mkdir(parents=True, exist_ok=True)
+        (folder / "metadata" / name / "first.root.json").write_bytes(data)
+
+
+def check_release(
+    folder: Path, vehicle: str, sources: Sources, task: str = "objects", now: datetime | None = None
+) -> Checked:
+    """Return the release of a task that `vehicle` is to run by both repositories; nothing is installed.
+
+    folder: the vehicle's, see `trust_roots`; the metadata that it trusts are kept there. now: the vehicle's clock.
+    Raises `Refused` for anything that both parties did not sign, and where the clock is off.
+    """
+    at = now or datetime.now(UTC)
+    before = sources.fetcher.received_bytes
+    director = _refresh(folder, "director", sources, at)
+    image = _refresh(folder, "image", sources, at)
+    _check_parties(director, image)
+    directive = read_directives(director._trusted_set.targets.targets).get(task)
+    if directive is None or not is_assigned(vehicle, task, directive):
+        return Checked(None, directive, sources.fetcher.received_bytes - before, image, None)
+    names = target_names(task, directive.release)
+    weights, description = (_same(director, image, name) for name in names)
+    candidate = _read_description(image, description, names[1])
+    if (candidate.task, candidate.release) != (task, directive.release):
+        raise Refused(f"{names[1]}: describes release {candidate.release} of {candidate.task}")
+    if candidate.weights != weights.hashes["sha256"]:
+        raise Refused(f"{names[1]}: a card of other weights than {names[0]}")
+    approved = Approved(task, directive.release, candidate.weights, weights.length, candidate)
+    return Checked(approved, directive, sources.fetcher.received_bytes - before, image, weights)
+
+
+def _refresh(folder: Path, name: str, sources: Sources, at: datetime) -> "Updater":
+    """Return the updater of a repository after The Update Framework's client workflow."""
+    from tuf.ngclient import Updater, UpdaterConfig
+
+    kept = folder / "metadata" / name
+    root = kept / "first.root.json"
+    if not root.is_file():
+        raise InputError(f"{folder}: no vehicle's folder, since it has no root of the {REPOSITORIES[name]}")
+    address = getattr(sources, name)
+    config = UpdaterConfig(targets_max_length=MOST_METADATA_BYTES)
+    with refuse(f"{name} repository"):
+        updater = Updater(
+            str(kept),
+            f"{address}/metadata/",
+            str(folder / "incoming"),
+            f"{address}/targets/",
+            fetcher=sources.fetcher,
+            config=config,
+            bootstrap=root.read_bytes(),
+        )
+        updater._trusted_set.reference_time = at
+        updater.refresh()
+    _check_clock(updater, name, at)
+    return updater
+
+
+def _check_clock(updater: "Updater", name: str, at: datetime) -> None:
+    """Raise `Refused` where metadata expire later than any signed now: the clock is behind, or was set back."""
+    timestamp = updater._trusted_set.timestamp
+    made = timestamp.expires - LIFETIME["timestamp"]
+    if at + CLOCK_SLACK < made:
+        raise Refused(
+            f"the clock is off: it says {at:%Y-%m-%d %H:%M} UTC, and the {name} repository was signed at "
+            f"{made:%Y-%m-%d %H:%M}"
+        )
+
+
+def _check_parties(director: "Updater", image: "Updater") -> None:
+    """Raise `Refused` where a key that was added later is among those of both parties, or of one twice."""
+    roots: list[Root] = [director._trusted_set.root, image._trusted_set.root]
+    try:
+        check_distinct([key for root in roots for key in root_keys(root)], "the keys of provider and customer together")
+    except InputError as error:
+        raise Refused(str(error)) from None
+
+
+def _same(director: "Updater", image: "Updater", name: str) -> "TargetFile":
+    """Return the image repository's entry of a target, which the director's must equal in hashes and length."""
+    with refuse(name):
+        wanted, known = director.get_targetinfo(name), image.get_targetinfo(name)
+    if wanted is None:
+        raise Refused(f"{name}: the customer's repository does not name it: a partial bundle")
+    if known is None:
+        raise Refused(f"{name}: the provider's repository does not name it")
+    if (wanted.hashes, wanted.length) != (known.hashes, known.length) or "sha256" not in known.hashes:
+        raise Refused(f"{name}: provider and customer name it with different hashes")
+    return known
+
+
+def _read_description(image: "Updater", target: "TargetFile", name: str) -> Candidate:
+    with refuse(name):
+        path = Path(image.download_target(target))
+    try:
+        return parse_candidate(path.read_bytes(), name)
+    except InputError as error:
+        raise Refused(str(error)) from None
+    finally:
+        path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def refuse(what: str) -> Iterator[None]:
+    """Turn the errors of The Update Framework's client into `Refused` with what it was about."""
+    from tuf.api.exceptions import DownloadError, RepositoryError
+
+    try:
+        yield
+    except (DownloadError, RepositoryError) as error:
+        raise Refused(f"{what}: {type(error).__name__}: {str(error) or 'no answer'}") from None

@@ -1,0 +1,95 @@
+"""Atomic installation of a release in a vehicle: power may fail at any time, and the old network drives until then.
+
+FOLDER/metadata/{image,director}/     what the vehicle trusts
+FOLDER/incoming/                      files on their way
+FOLDER/networks/HASH.safetensors      weights by their hash
+FOLDER/current.json                   the network that drives; replaced last, by a rename
+"""
+
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from flcav.config import InputError, read_json
+from flcav.releases.candidates.candidate import hash_card
+from flcav.releases.vehicles.checking import Approved, Checked, Refused, Sources, check_release, refuse
+from flcav.storage.files import atomic_path, sha256, write_json
+from flcav.storage.records import Record, from_json
+
+CURRENT = "current.json"
+
+
+@dataclass(frozen=True)
+class Installed(Record):
+    """The network that drives a vehicle."""
+
+    task: str
+    release: int
+    weights: str  # SHA-256
+
+
+def read_installed(folder: Path) -> Installed | None:
+    """Return the network that drives; None before the first. Raises `Refused` where its file is not what was installed.
+
+    A vehicle calls it when it starts, so that weights that were changed on its disk are not loaded.
+    """
+    path = folder / CURRENT
+    if not path.is_file():
+        return None
+    installed = from_json(Installed, read_json(path), str(path))
+    weights = weights_path(folder, installed)
+    if not weights.is_file() or sha256(weights) != installed.weights:
+        raise Refused(f"{weights}: is not the network that was installed")
+    return installed
+
+
+def weights_path(folder: Path, installed: Installed) -> Path:
+    """Return the file of the weights of a network that was installed."""
+    return folder / "networks" / f"{installed.weights}.safetensors"
+
+
+def update_vehicle(
+    folder: Path, vehicle: str, sources: Sources, task: str = "objects", now: datetime | None = None
+) -> Installed | None:
+    """Install the release of a task that both parties name for `vehicle`; return the network that drives then.
+
+    Without one that is newer than the installed, that one goes on. Raises `Refused` for anything that both parties did
+    not sign, a number below the installed, and where the clock is off; the network that drives is left as it is.
+    """
+    driving = read_installed(folder)
+    checked = check_release(folder, vehicle, sources, task, now)
+    approved = checked.approved
+    if approved is None or driving == Installed(task, approved.release, approved.weights):
+        return driving
+    if driving is not None and driving.task == task and approved.release <= driving.release:
+        raise Refused(f"release {approved.release} of {task}: does not rise above {driving.release}, which drives")
+    return install(folder, checked, approved)
+
+
+def install(folder: Path, checked: Checked, approved: Approved) -> Installed:
+    """Download the weights of an approved release and make them the network that drives.
+
+    Raises `Refused` where the file is another than was approved, or its card another than its description's.
+    """
+    installed = Installed(approved.task, approved.release, approved.weights)
+    kept = weights_path(folder, installed)
+    if not kept.is_file() or sha256(kept) != approved.weights:
+        assert checked.target is not None
+        with atomic_path(kept) as temporary:
+            with refuse(f"weights of release {approved.release}"):
+                checked.updater.download_target(checked.target, str(temporary))
+            if sha256(temporary) != approved.weights:
+                raise Refused(f"weights of release {approved.release}: have another SHA-256 than was approved")
+            check_card(temporary, approved)
+    write_json(folder / CURRENT, installed.as_json())
+    return installed
+
+
+def check_card(weights: Path, approved: Approved) -> None:
+    """Raise `Refused` where the card in the weights is not the one that the parties acknowledged."""
+    try:
+        known = hash_card(weights)
+    except InputError as error:
+        raise Refused(str(error)) from None
+    if known != approved.candidate.card:
+        raise Refused(f"weights of release {approved.release}: hold a card of other weights")

@@ -1,0 +1,76 @@
+"""What a candidate's files say before any frame is tested: hashes, numbers, architecture, card, and provenance."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from pathlib import Path
+
+from flcav.config import InputError
+from flcav.dataset.layout import MANIFEST
+from flcav.dataset.store import Dataset
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.weights import load_network, read_card
+from flcav.releases.candidates.candidate import CARD, WEIGHTS, Candidate, check_files
+from flcav.releases.verification.records import VerificationData
+from flcav.storage.files import sha256
+
+FREE = ("calibration", "augmentation", "bfloat16")  # settings in which an update may differ
+
+
+def describe_data(data: Dataset, frames: int, scenes: int) -> VerificationData:
+    """Return the record of a dataset that is tested on."""
+    recipe = data.manifest.recipe
+    town, seed = recipe.get("town"), recipe.get("seed")
+    return VerificationData(
+        name="/".join(data.folder.resolve().parts[-2:]),
+        manifest=sha256(data.folder / MANIFEST),
+        town=town if isinstance(town, str) else None,
+        seed=seed if isinstance(seed, int) and data.manifest.imported is None else None,
+        frames=frames,
+        scenes=scenes,
+    )
+
+
+def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Sequence[VerificationData]) -> Iterator[str]:
+    """Yield the reasons for which the candidate's files alone refuse it; the network is not run.
+
+    driving: weights of the network that drives. tested: the datasets of the verification.
+    """
+    try:
+        check_files(folder, candidate)
+        network, now = load_network(OBJECTS, folder / WEIGHTS), load_network(OBJECTS, driving)
+        card = read_card(folder / WEIGHTS)
+    except InputError as error:
+        yield str(error)
+        return
+    if sha256(driving) != candidate.driving:
+        yield f"it is proposed to replace another network than {driving}"
+    yield from _compare_interfaces(network, now)
+    if not (folder / CARD).is_file() or (folder / CARD).read_text() != card.markdown():
+        yield f"{CARD} is not the card in the weights: a card of other weights"
+    if card.parameters != sum(each.numel() for each in network.parameters()):
+        yield "a card of other weights: it names another number of parameters"
+    if card.task != candidate.task or card.network != candidate.network:
+        yield "a card of other weights: it names another task or network"
+    if not candidate.data:
+        yield "its provenance names no training data"
+    yield from find_overlap(candidate, tested)
+
+
+def find_overlap(candidate: Candidate, tested: Sequence[VerificationData]) -> Iterator[str]:
+    """Yield the datasets of the candidate's provenance whose scenes it would be tested on.
+
+    Scenes are the same where the manifests are, or town and seed, whatever the split, the sensors and the name.
+    """
+    for known in candidate.data:
+        for test in tested:
+            same = known.seed is not None and (known.town, known.seed) == (test.town, test.seed)
+            if known.manifest == test.manifest or same:
+                yield f"{known.use} on test scenes: {known.name} has those of {test.name}"
+
+
+def _compare_interfaces(network: Second, driving: Second) -> Iterator[str]:
+    new, old = network.config, driving.config
+    names = [field.name for field in fields(new) if field.name not in FREE]
+    if odd := [name for name in names if getattr(new, name) != getattr(old, name)]:
+        yield f"another architecture than that of the network that drives: {', '.join(odd)}"

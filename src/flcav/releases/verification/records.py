@@ -1,0 +1,94 @@
+"""Records of a verification: the comparison on the whole, guards of slices, the tested domain, and the decision."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from flcav.interface.wording import plural
+from flcav.storage.records import Record
+
+Judgement = Literal["kept", "lost", "open"]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A measure of the driving network and of the candidate on the same frames, and their difference's interval."""
+
+    by: str  # whole, class, distance, weather, scenario, cell, condition, measure
+    name: str
+    targets: int
+    scenes: int
+    driving: float  # in [0, 1]
+    candidate: float
+    low: float  # ends of the 90 % interval of candidate minus driving: each is a one-sided bound at .05
+    high: float
+    judgement: Judgement  # of a guard: kept, lost (refuses), or open where the frames do not tell
+
+
+@dataclass(frozen=True)
+class Domain:
+    """The operational design domain that a candidate was tested in: the ranges of what the test frames hold."""
+
+    towns: tuple[str, ...]
+    scenarios: tuple[str, ...]
+    weathers: tuple[str, ...]
+    visibility_m: tuple[float, float] | None  # least and most
+    rain_mm_h: tuple[float, float] | None
+    sun_elevation_deg: tuple[float, float] | None
+    speed_m_s: tuple[float, float]  # of the objects
+    distance_m: tuple[float, float]  # of the targets
+    objects: Mapping[str, int]  # targets by class
+    lidars: tuple[str, ...]  # names of the rigs or sensors
+
+
+@dataclass(frozen=True)
+class VerificationData:
+    """A dataset that was tested on."""
+
+    name: str
+    manifest: str  # SHA-256
+    town: str | None
+    seed: int | None
+    frames: int
+    scenes: int
+
+
+@dataclass(frozen=True)
+class Verification(Record):
+    """The verification of a candidate beside the driving network: accepted, or refused for reasons."""
+
+    candidate: str  # SHA-256 of the weights
+    driving: str
+    accepted: bool
+    reasons: tuple[str, ...]  # of the refusal; () where accepted
+    undecided: bool  # refused because the frames do not tell
+    margin: float  # by which AP50 may be lower
+    kept_share: float  # of the driving network's measure that a slice must keep
+    frames: int
+    scenes: int
+    frames_to_decide: int | None  # None where decided, or where no number would do
+    whole: Comparison | None  # None where the files alone refuse it
+    guards: tuple[Comparison, ...]
+    data: tuple[VerificationData, ...]
+    domain: Domain | None
+
+    def lines(self) -> list[str]:
+        """Return the verification in words."""
+        lines = []
+        if self.whole is not None:
+            each = self.whole
+            lines.append(
+                f"AP50 {each.driving:.3f} -> {each.candidate:.3f}, {each.candidate - each.driving:+.3f} "
+                f"({each.low:+.3f} to {each.high:+.3f}) over {plural(self.frames, 'frame')} of "
+                f"{plural(self.scenes, 'scene')}; margin {self.margin:g}"
+            )
+            for guard in self.guards:
+                lines.append(
+                    f"{guard.by:<10}{guard.name:<34}{guard.driving:.3f} -> {guard.candidate:.3f}  "
+                    f"({guard.low:+.3f} to {guard.high:+.3f})  {guard.judgement}  (objects: {guard.targets})"
+                )
+        more = (
+            f"; about {self.frames_to_decide} frames would decide" if self.undecided and self.frames_to_decide else ""
+        )
+        verdict = "accepted" if self.accepted else "undecided, so refused" if self.undecided else "refused"
+        return [*lines, verdict if self.accepted else f"{verdict}: {'; '.join(self.reasons)}{more}"]

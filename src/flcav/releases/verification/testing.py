@@ -1,0 +1,168 @@
+"""Tests of one network on recorded frames: its detections in every condition, and what was to be found."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.geometry import Boxes
+from flcav.interface.progress import Report, ignore_progress
+from flcav.machine.processes import process_pool
+from flcav.perception.agents import choose_frames
+from flcav.perception.foreground import frame_reader
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import detect_frames
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.truth import FrameTruth
+from flcav.perception.weights import load_network
+from flcav.releases.verification.conditions import CONDITIONS, PLAIN
+from flcav.releases.verification.records import Domain
+from flcav.sensors.frame import Frame
+
+Work = tuple[Path, Sequence["VerificationFrame"], str]  # weights, frames, condition
+AT_ONCE = 16  # frames of a piece of work
+SPARSE = 4  # every fourth frame is tested in each further condition
+
+
+@dataclass(frozen=True)
+class VerificationFrame:
+    """A frame that is tested: its number in a dataset, and what is known of its scene."""
+
+    data: Path
+    number: int
+    town: str
+    scenario: str
+
+
+@dataclass(frozen=True)
+class ConditionResults:
+    """Results of a network in one condition, frame by frame."""
+
+    frames: tuple[VerificationFrame, ...]
+    detections: tuple[Boxes, ...]  # LiDAR frame
+    truths: tuple[FrameTruth, ...]  # scenes are named by dataset and scene
+
+
+def choose_test_frames(
+    folders: Sequence[Path], network: Second, most: int | None = None
+) -> tuple[VerificationFrame, ...]:
+    """Return the frames of datasets whose sensors fit the network, at most `most` of each, evenly spread.
+
+    Raises `InputError` where a dataset has no labels, none fits, or one is given twice.
+    """
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise InputError("a dataset is given twice: its frames would count twice")
+    chosen = []
+    for folder in folders:
+        data = Dataset.open(folder)
+        data.check_labelled("objects")
+        numbers = choose_frames(OBJECTS, network.config, data).frames
+        step = 1 if most is None else max(1, -(-len(numbers) // most))
+        recipe = data.manifest.recipe
+        scenarios = recipe.get("scenarios")
+        listed = scenarios if isinstance(scenarios, Sequence) and not isinstance(scenarios, str) else ()
+        kinds = [str(each["kind"]) for each in listed if isinstance(each, Mapping) and "kind" in each]
+        town = str(recipe.get("town", data.manifest.imported or "unknown"))
+        scenario = ", ".join(dict.fromkeys(kinds)) or "everyday traffic"
+        chosen += [VerificationFrame(folder, number, town, scenario) for number in numbers[::step]]
+    return tuple(chosen)
+
+
+def run_condition(
+    network: Second, frames: Sequence[VerificationFrame], condition: str, progress: Report = ignore_progress
+) -> ConditionResults:
+    """Return the results of a network on frames in a condition, one of `CONDITIONS` or `PLAIN`."""
+    opened: dict[Path, Dataset] = {}
+    change = CONDITIONS.get(condition)
+
+    def read(each: VerificationFrame) -> Frame:
+        data = opened.get(each.data) or opened.setdefault(each.data, Dataset.open(each.data, checked=False))
+        frame = frame_reader(data, network.config.foreground)(each.number)
+        return frame if change is None else change(frame)
+
+    found, truths = detect_frames(network, map(read, frames), total=len(frames), progress=progress)
+    named = [replace(truth, scene=f"{each.data}/{truth.scene}") for truth, each in zip(truths, frames, strict=True)]
+    return ConditionResults(tuple(frames), tuple(found), tuple(named))
+
+
+def run_tests(
+    networks: Sequence[Path],
+    frames: Sequence[VerificationFrame],
+    conditions: Sequence[str] = (PLAIN, *CONDITIONS),
+    jobs: int = 1,
+    progress: Report = ignore_progress,
+) -> list[dict[str, ConditionResults]]:
+    """Return the results of networks (files of weights) by condition; those besides `PLAIN` on every fourth frame."""
+    works = [
+        (path, part, name)
+        for path in networks
+        for name in conditions
+        for part in _split(frames if name == PLAIN else frames[::SPARSE])
+    ]
+    if jobs == 1:
+        return _collect(networks, works, (_run(*work) for work in works), progress)
+    with process_pool(jobs, _nothing) as pool:
+        waiting = [pool.submit(_run, *work) for work in works]
+        return _collect(networks, works, (each.result() for each in waiting), progress)
+
+
+def describe_domain(
+    frames: Sequence[VerificationFrame], truths: Sequence[FrameTruth], classes: Sequence[str]
+) -> Domain:
+    """Return the domain that frames cover, for a network of `classes`."""
+    opened = {folder: Dataset.open(folder, checked=False) for folder in {each.data for each in frames}}
+    read = [opened[each.data].frame(each.number) for each in frames]
+    weather = [frame.weather for frame in read if frame.weather is not None]
+    speeds = [np.linalg.norm(np.nan_to_num(frame.annotations.velocity), axis=1) for frame in read]
+    far = [np.hypot(truth.targets.center[:, 0], truth.targets.center[:, 1]) for truth in truths]
+    lidars = {str(name) for frame in read for name in frame.lidar}
+    return Domain(
+        towns=tuple(sorted({each.town for each in frames})),
+        scenarios=tuple(sorted({each.scenario for each in frames})),
+        weathers=tuple(sorted({truth.weather for truth in truths if truth.weather is not None})),
+        visibility_m=_span([each.visibility_m for each in weather]),
+        rain_mm_h=_span([each.rain_mm_h for each in weather]),
+        sun_elevation_deg=_span([each.sun_elevation_deg for each in weather]),
+        speed_m_s=_span(np.concatenate(speeds).tolist()) or (0.0, 0.0),
+        distance_m=_span(np.concatenate(far).tolist()) or (0.0, 0.0),
+        objects={label: int(sum((truth.targets.label == label).sum() for truth in truths)) for label in classes},
+        lidars=tuple(sorted(lidars)),
+    )
+
+
+def _span(values: Sequence[float]) -> tuple[float, float] | None:
+    return (round(min(values), 3), round(max(values), 3)) if len(values) else None
+
+
+def _run(weights: Path, frames: Sequence[VerificationFrame], condition: str) -> ConditionResults:
+    return run_condition(load_network(OBJECTS, weights), frames, condition)
+
+
+def _collect(
+    networks: Sequence[Path], works: Sequence[Work], parts: Iterable[ConditionResults], progress: Report
+) -> list[dict[str, ConditionResults]]:
+    """Return the results of each network by condition, from those of the pieces of work."""
+    results: list[dict[str, list[ConditionResults]]] = [{} for _ in networks]
+    for done, (part, (path, _, name)) in enumerate(zip(parts, works, strict=True), start=1):
+        results[networks.index(path)].setdefault(name, []).append(part)
+        progress(done, len(works), "")
+    return [{name: _join(own) for name, own in each.items()} for each in results]
+
+
+def _split(frames: Sequence[VerificationFrame]) -> list[Sequence[VerificationFrame]]:
+    return [frames[start : start + AT_ONCE] for start in range(0, len(frames), AT_ONCE)]
+
+
+def _join(parts: Sequence[ConditionResults]) -> ConditionResults:
+    """Return the results of several parts of the frames as one."""
+    return ConditionResults(
+        *(tuple(chain.from_iterable(getattr(each, field.name) for each in parts)) for field in fields(ConditionResults))
+    )
+
+
+def _nothing() -> None:
+    """Begin a worker."""

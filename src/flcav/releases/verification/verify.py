@@ -1,0 +1,155 @@
+"""Verification of a candidate: its files, non-inferiority on the whole, and guards against catastrophes."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from flcav.config import InputError, read_json
+from flcav.dataset.store import Dataset
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.weights import load_network
+from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
+from flcav.releases.verification.comparison import KEPT, LEAST_TARGETS, LEVEL, compare, pair_slices, pair_whole
+from flcav.releases.verification.conditions import CONDITIONS, PLAIN
+from flcav.releases.verification.files import describe_data, find_faults
+from flcav.releases.verification.records import Comparison, Domain, Verification, VerificationData
+from flcav.releases.verification.testing import (
+    ConditionResults,
+    VerificationFrame,
+    choose_test_frames,
+    describe_domain,
+    run_tests,
+)
+from flcav.statistics.power import plan_scenes
+from flcav.storage.files import sha256, write_json
+
+MARGIN = 0.03  # AP50
+GUARD_REDRAWS = 200  # of the scenes, of each slice
+Results = Mapping[str, ConditionResults]  # by condition
+
+
+def verify(
+    folder: Path,
+    driving: Path,
+    data: Sequence[Path],
+    *,
+    margin: float = MARGIN,
+    most: int | None = None,
+    jobs: int = 1,
+    known: Results | None = None,
+    progress: Report = ignore_progress,
+) -> Verification:
+    """Return the verification of a candidate beside the network that drives.
+
+    Args:
+        folder: the candidate.
+        driving: weights of the network that drives.
+        data: datasets of scenes that no network was trained on.
+        margin: by which AP50 may be lower on the whole.
+        most: frames of each dataset at most; None: all.
+        jobs: worker processes.
+        known: results of the driving network on the same frames, from an earlier verification.
+        progress: callback for the tests done and in total.
+
+    Raises:
+        InputError: for no candidate, another task than objects, no frames, and datasets that do not fit.
+    """
+    candidate = read_candidate(folder)
+    if candidate.task != OBJECTS.name:
+        raise InputError(f"{folder}: a network of '{candidate.task}', and those of '{OBJECTS.name}' are verified")
+    network = load_network(OBJECTS, driving)
+    frames = choose_test_frames(data, network, most)
+    if not frames:
+        raise InputError(f"no frame to verify with in {', '.join(map(str, data))}")
+    tested = [_describe(path, frames) for path in data]
+    faults = list(find_faults(folder, candidate, driving, tested))
+    if faults:
+        return decide(candidate, None, None, tested, None, margin, faults)
+    own = [] if known is not None else [driving]
+    results = run_tests([*own, folder / WEIGHTS], frames, jobs=jobs, progress=progress)
+    old, new = known if known is not None else results[0], results[-1]
+    domain = describe_domain(frames, old[PLAIN].truths, network.config.classes)
+    return decide(candidate, old, new, tested, domain, margin)
+
+
+def decide(
+    candidate: Candidate,
+    driving: Results | None,
+    new: Results | None,
+    data: Sequence[VerificationData],
+    domain: Domain | None,
+    margin: float = MARGIN,
+    faults: Sequence[str] = (),
+) -> Verification:
+    """Return the decision on a candidate by the results of both networks, or by the faults of its files alone."""
+    frames, scenes = sum(each.frames for each in data), sum(each.scenes for each in data)
+    reasons, open_reasons, wanted = list(faults), [], 0
+    whole: Comparison | None = None
+    guards: list[Comparison] = []
+    if driving is not None and new is not None:
+        whole, error = compare(pair_whole(driving[PLAIN], new[PLAIN]))
+        guards = _guard(driving, new)
+        reasons += [
+            f"{each.by} {each.name} lost: {each.driving:.3f} -> {each.candidate:.3f}"
+            for each in guards
+            if each.judgement == "lost"
+        ]
+        for label, count in domain.objects.items() if domain is not None else ():
+            if count < LEAST_TARGETS:
+                open_reasons.append(f"{plural(count, 'object')} of the class {label}, and {LEAST_TARGETS} are wanted")
+                wanted = max(wanted, -(-frames * LEAST_TARGETS // max(count, 1)))
+        change = whole.candidate - whole.driving
+        said = f"AP50 on the whole {change:+.3f} ({whole.low:+.3f} to {whole.high:+.3f}), margin {margin:g}"
+        if not whole.high >= -margin:
+            reasons.append(said)
+        elif not whole.low > -margin:
+            enough = plan_scenes(change + margin, error, scenes, LEVEL)
+            wanted = max(wanted, 0 if enough is None else int(np.ceil(enough * frames / scenes)))
+            open_reasons.append(said if enough is not None else f"{said}: no number of frames would accept this")
+    return Verification(
+        candidate=candidate.weights,
+        driving=candidate.driving,
+        accepted=not (reasons or open_reasons),
+        reasons=(*reasons, *open_reasons),
+        undecided=bool(open_reasons) and not reasons,
+        margin=margin,
+        kept_share=KEPT,
+        frames=frames,
+        scenes=scenes,
+        frames_to_decide=(wanted or None) if not reasons else None,
+        whole=whole,
+        guards=tuple(guards),
+        data=tuple(data),
+        domain=domain,
+    )
+
+
+def write_verification(folder: Path, verification: Verification) -> None:
+    """Write the verification into the candidate's folder."""
+    write_json(folder / VERIFICATION, verification.as_json(), sort=False)
+
+
+def read_verification(folder: Path) -> Verification:
+    """Return the verification in a candidate's folder; raises `InputError` for none, and one of other weights."""
+    path = folder / VERIFICATION
+    if not path.is_file():
+        raise InputError(f"{folder}: was not verified")
+    found = Verification.from_json(read_json(path), str(path))
+    if found.candidate != read_candidate(folder).weights or sha256(folder / WEIGHTS) != found.candidate:
+        raise InputError(f"{path}: is the verification of other weights")
+    return found
+
+
+def _guard(driving: Results, new: Results) -> list[Comparison]:
+    pairs = [*pair_slices(driving[PLAIN], new[PLAIN])]
+    pairs += [pair_whole(driving[name], new[name], "condition", name) for name in CONDITIONS if name in new]
+    return [compare(pair, GUARD_REDRAWS)[0] for pair in pairs if pair.targets >= LEAST_TARGETS]
+
+
+def _describe(path: Path, frames: Sequence[VerificationFrame]) -> VerificationData:
+    own = [each for each in frames if each.data == path]
+    data = Dataset.open(path, checked=False)
+    return describe_data(data, len(own), len({data.keys[each.number].scene for each in own}))

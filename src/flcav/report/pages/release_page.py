@@ -1,0 +1,104 @@
+"""The HTML page about a release: what changed, for whom, the evidence, who acknowledged it, and all hashes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+
+from flcav.releases.candidates.acknowledgement import Acknowledgement
+from flcav.releases.candidates.candidate import Candidate
+from flcav.releases.verification.conditions import WORDS
+from flcav.releases.verification.records import Comparison, Verification
+from flcav.report.pages import html
+
+GROUPS = {
+    "class": "Classes",
+    "distance": "Distance",
+    "occlusion": "Occlusion",
+    "weather": "Weather",
+    "scenario": "Scenarios",
+    "cell": "Cells of the domain",
+    "condition": "Conditions of the sensor",
+    "measure": "Other measures",
+}
+MEANINGS = {"kept": "kept", "lost": "lost", "open": "not told"}
+STATES = {"kept": "held", "lost": "did-not-hold", "open": "undecided"}  # classes of style
+
+
+def release_page(
+    candidate: Candidate,
+    verification: Verification,
+    hashes: Mapping[str, str],
+    acknowledgements: Sequence[Acknowledgement] = (),
+) -> str:
+    """Return the page as self-contained HTML.
+
+    hashes: SHA-256 of the candidate's files by name. acknowledgements: the parties' signatures so far.
+    """
+    groups = {
+        title: [_row(each) for each in verification.guards if each.by == by]
+        for by, title in GROUPS.items()
+        if any(each.by == by for each in verification.guards)
+    }
+    whole = None if verification.whole is None else _row(verification.whole)
+    values = {
+        "candidate": candidate.model_dump(mode="json"),
+        "verification": asdict(verification),
+        "verdict": "accepted" if verification.accepted else "undecided" if verification.undecided else "refused",
+        "whole": whole,
+        "scale": _scale(verification),
+        "groups": groups,
+        "domain": None if verification.domain is None else _domain(verification),
+        "hashes": hashes,
+        "acknowledgements": [asdict(each) for each in acknowledgements],
+        "complete": bool(acknowledgements) and all(len(each.keys) >= each.threshold for each in acknowledgements),
+        "spent": [{**each.model_dump(), "mb": each.bytes / 1e6} for each in candidate.spent],
+    }
+    return html.render(values, {}, "release.html.j2")
+
+
+def _row(each: Comparison) -> dict[str, object]:
+    name = WORDS.get(each.name, each.name.replace("_", " "))
+    change = each.candidate - each.driving
+    return {
+        **asdict(each),
+        "name": name,
+        "change": change,
+        "word": MEANINGS[each.judgement],
+        "state": STATES[each.judgement],
+    }
+
+
+def _scale(verification: Verification) -> dict[str, float] | None:
+    """Return the places of the interval, the mean, 0 and the margin on a bar, in percent of its width."""
+    whole = verification.whole
+    if whole is None:
+        return None
+    ends = (whole.low, whole.high, -verification.margin, verification.margin)
+    reach = 1.25 * max(abs(each) for each in ends)
+    place = {
+        "low": whole.low,
+        "mean": whole.candidate - whole.driving,
+        "high": whole.high,
+        "margin": -verification.margin,
+    }
+    return {name: round(50 + 50 * value / reach, 2) for name, value in place.items()}
+
+
+def _domain(verification: Verification) -> list[tuple[str, str]]:
+    domain = verification.domain
+    assert domain is not None
+    spans = {
+        "visibility": (domain.visibility_m, "m"),
+        "rain": (domain.rain_mm_h, "mm/h"),
+        "elevation of the sun": (domain.sun_elevation_deg, "degrees"),
+        "speed of objects": (domain.speed_m_s, "m/s"),
+        "distance of objects": (domain.distance_m, "m"),
+    }
+    rows = [
+        ("towns", ", ".join(domain.towns)),
+        ("scenarios", "; ".join(domain.scenarios).replace("_", " ")),
+        ("weather", ", ".join(domain.weathers).replace("_", " ")),
+        *((name, f"{span[0]:g} to {span[1]:g} {unit}") for name, (span, unit) in spans.items() if span is not None),
+        ("objects", ", ".join(f"{count} {label}" for label, count in domain.objects.items())),
+        ("LiDARs", ", ".join(domain.lidars)),
+    ]
+    return rows

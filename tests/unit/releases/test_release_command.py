@@ -1,0 +1,134 @@
+"""The commands of `flcav release`, from a proposal to a vehicle; wrong inputs get one sentence and exit code 2."""
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from release_parties import Parties
+
+from flcav.cli.main import run
+from flcav.releases.candidates.candidate import ACKNOWLEDGEMENTS, CANDIDATE, REPORT, WEIGHTS, read_candidate
+from flcav.releases.verification.records import Verification
+from flcav.releases.verification.verify import write_verification
+
+Call = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Call:
+    """Run `flcav release` with arguments; return its exit code and what it said."""
+
+    def called(*arguments: object) -> tuple[int, str]:
+        with pytest.raises(SystemExit) as ended:
+            run(["release", *map(str, arguments)])
+        out, err = capsys.readouterr()
+        return int(ended.value.code or 0), out + err
+
+    return called
+
+
+def accept(folder: Path, accepted: bool = True) -> None:
+    candidate = read_candidate(folder)
+    found = Verification(
+        candidate=candidate.weights,
+        driving=candidate.driving,
+        accepted=accepted,
+        reasons=() if accepted else ("class Car lost",),
+        undecided=False,
+        margin=0.03,
+        kept_share=0.8,
+        frames=0,
+        scenes=0,
+        frames_to_decide=None,
+        whole=None,
+        guards=(),
+        data=(),
+        domain=None,
+    )
+    write_verification(folder, found)
+
+
+def test_from_a_proposal_to_a_vehicle(parties: Parties, call: Call):
+    candidate, image, director = parties.candidate(2), parties.image, parties.director
+    accept(candidate)
+    assert call("sign", candidate, "--repository", image, "--key", image / "keys" / "1.pem")[1].startswith(
+        f"{image}: 1 of 2 signatures"
+    )
+    assert call("publish", image) == (2, f"flcav: {image}: 1 of 2 signatures of the provider\n")
+    assert call("sign", candidate, "--repository", image, "--key", image / "keys" / "2.pem")[0] == 0
+    keys = [each for number in (1, 2) for each in ("--key", director / "keys" / f"{number}.pem")]
+    assert call("sign", candidate, "--repository", director, *keys, "--share", 0, "--vehicle", "cav0")[0] == 0
+    for party in (image, director):
+        assert call("publish", party)[0] == 0
+    where = ("--image", image / "repository", "--director", director / "repository")
+    assert call("install", parties.vehicle, "--name", "cav0", *where) == (0, "cav0: drives release 2 of objects\n")
+    code, said = call("status", image, director, "--candidate", candidate)
+    assert code == 0
+    assert "releases 1, 2, version 3" in said
+    assert "0% of the fleet" in said
+    page = (candidate / REPORT).read_text()
+    assert "acknowledged by both parties" in page
+    assert read_candidate(candidate).weights in page
+
+
+def test_signatures_are_verified_by_the_signers_own_tool(parties: Parties, call: Call):
+    candidate, key = parties.candidate(2), parties.image / "keys" / "1.pem"
+    accept(candidate)
+    assert call("sign", candidate, "--repository", parties.image, "--key", key)[0] == 0
+    (signature,) = (candidate / ACKNOWLEDGEMENTS).glob("*.sig")
+
+    def verify() -> int:
+        command = ["-m", "model_signing", "verify", "key", candidate, "--signature", signature]
+        asked = [sys.executable, *command, "--public_key", key.with_suffix(".pub")]
+        return subprocess.run(asked, capture_output=True, check=False).returncode
+
+    assert verify() == 0
+    with (candidate / WEIGHTS).open("ab") as file:
+        file.write(b"x")
+    assert verify() != 0
+
+
+def test_wrong_inputs_get_one_sentence(parties: Parties, call: Call, tmp_path: Path):
+    candidate, image = parties.candidate(2), parties.image
+    key = ("--key", image / "keys" / "1.pem")
+    sign = ("sign", candidate, "--repository", image)
+    assert call(*sign, *key) == (2, f"flcav: {candidate}: was not verified\n")
+    accept(candidate, accepted=False)
+    assert call(*sign, *key) == (2, f"flcav: {candidate}: was refused by its verification, so nobody signs it\n")
+    accept(candidate)
+    code, said = call(*sign, *key, *key)
+    assert code == 2
+    assert "is given twice among the keys of the provider" in said
+    assert "--vehicle and --revoke are the customer's" in call(*sign, *key, "--vehicle", "cav0")[1]
+    code, said = call(*sign, "--key", image / "keys" / "1.pub")
+    assert (code, said) == (
+        2,
+        f"flcav: {image / 'keys' / '1.pub'}: holds no private key that can be read (PEM, without a password)\n",
+    )
+    (tmp_path / CANDIDATE).write_text('{"format": "other-1"}')
+    code, said = call("sign", tmp_path, "--repository", image, *key)
+    assert code == 2
+    shutil.copyfile(candidate / "verification.json", tmp_path / "verification.json")
+    code, said = call("sign", tmp_path, "--repository", image, *key)
+    assert (code, "a bundle of the format 'other-1'" in said) == (2, True)
+    where = ("--image", tmp_path / "nowhere", "--director", parties.director / "repository")
+    code, said = call("install", parties.vehicle, "--name", "cav0", *where)
+    assert (code, "neither a repository's folder" in said) == (2, True)
+    code, said = call("install", tmp_path / "new", "--name", "cav0", "--image", "http://x", "--director", "http://y")
+    assert (code, "no vehicle's folder" in said) == (2, True)
+    code, said = call("rollout", parties.director, "--key", parties.director / "keys" / "1.pem")
+    assert (code, "either --shadows or --share" in said) == (2, True)
+    assert call("status", tmp_path)[0] == 2
+    assert call("init", "provider", "--out", tmp_path / "two", "--keys", 1)[0] == 2
+    assert not (tmp_path / "two").exists()
+
+
+def test_without_the_extra_the_command_to_install_it_is_named(call: Call, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("flcav.cli.release.find_spec", lambda name: None)
+    code, said = call("status", "nowhere")
+    assert code == 2
+    assert said.startswith("flcav: releases need tuf, which is in: ")
+    assert "pip install" in said

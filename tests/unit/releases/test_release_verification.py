@@ -1,0 +1,242 @@
+"""Verification of candidates on made-up frames: what is equal passes, what is lost is refused by name."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from release_parties import Parties
+
+from flcav.config import InputError
+from flcav.geometry import Boxes
+from flcav.perception.objects.truth import FrameTruth
+from flcav.releases.candidates.candidate import CARD, WEIGHTS, DataHash, read_candidate
+from flcav.releases.verification import verify
+from flcav.releases.verification.conditions import CONDITIONS, PLAIN
+from flcav.releases.verification.files import find_faults, find_overlap
+from flcav.releases.verification.records import Verification, VerificationData
+from flcav.releases.verification.testing import ConditionResults, VerificationFrame
+from flcav.releases.verification.verify import decide, read_verification, write_verification
+from flcav.sensors.frame import Frame
+from flcav.statistics.power import plan_scenes
+
+SCENES, FRAMES = 24, 1
+SIZE = {"Car": (4.4, 1.8, 1.6), "Pedestrian": (0.8, 0.6, 1.7)}
+Change = Callable[[Boxes, FrameTruth], Boxes]
+Results = dict[str, ConditionResults]
+
+
+@pytest.fixture(autouse=True)
+def few_redraws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decide by fewer bootstrap samples than a release does."""
+    monkeypatch.setattr(verify, "GUARD_REDRAWS", 60)
+
+
+def truth_of(scene: int, rng: np.random.Generator) -> FrameTruth:
+    """Four cars and two pedestrians, ten metres apart from each other."""
+    labels = ["Car"] * 4 + ["Pedestrian"] * 2
+    center = np.stack((6 + 6 * np.arange(6) + rng.uniform(-1, 1, 6), rng.uniform(-8, 8, 6), np.full(6, -1.0)), axis=1)
+    size = np.array([SIZE[label] for label in labels])
+    boxes = Boxes(center, size, rng.uniform(-3, 3, 6), np.array(labels))
+    none = Boxes.empty()
+    return FrameTruth(f"s{scene}", boxes, none, none, np.full(6, 0.1), "fog" if scene % 3 == 0 else "clear")
+
+
+def detect(truth: FrameTruth, rng: np.random.Generator, found: float = 0.85) -> Boxes:
+    """A detector that finds a share of the targets, and invents some."""
+    kept = truth.targets[np.flatnonzero(rng.random(6) < found)]
+    invented = replace(truth.targets[[0, 4]], center=truth.targets.center[[0, 4]] + (0, 20, 0))
+    every = [kept, invented[np.flatnonzero(rng.random(2) < 0.3)]]
+    center = np.concatenate([each.center for each in every])
+    score = np.concatenate([rng.uniform(0.4, 1, len(every[0])), rng.uniform(0.1, 0.6, len(every[1]))])
+    parts = [np.concatenate([getattr(each, name) for each in every]) for name in ("size", "yaw", "label")]
+    return Boxes(center, *parts, score=score)
+
+
+def run(
+    seed: int, change: Change | None = None, found: float = 0.85, scenes: int = SCENES
+) -> dict[str, ConditionResults]:
+    """Results of a detector that draws its misses from `seed` on frames that are always the same."""
+    results = {}
+    for name in (PLAIN, *CONDITIONS):
+        world, own = np.random.default_rng(0), np.random.default_rng((seed, len(name)))
+        truths = [truth_of(scene, world) for scene in range(scenes) for _ in range(FRAMES)]
+        boxes = [detect(truth, own, found) for truth in truths]
+        if change is not None:
+            boxes = [change(one, truth) for one, truth in zip(boxes, truths, strict=True)]
+        frames = tuple(
+            VerificationFrame(Path("d"), number, "grid", "everyday traffic") for number in range(len(truths))
+        )
+        results[name] = ConditionResults(frames, tuple(boxes), tuple(truths))
+    return results
+
+
+def judge(new: Results, scenes: int = SCENES, margin: float = 0.03) -> Verification:
+    candidate = read_candidate_like()
+    data = [VerificationData("d", "a" * 64, "grid", 1, scenes * FRAMES, scenes)]
+    return decide(candidate, run(1, scenes=scenes), new, data, None, margin)
+
+
+def read_candidate_like():
+    from flcav.releases.candidates.candidate import Candidate
+
+    fields = dict.fromkeys(("weights", "driving", "card"), "b" * 64)
+    return Candidate(task="objects", release=2, changes="", audience="", network="pillars", data=(), **fields)
+
+
+def without(label: str) -> Change:
+    return lambda boxes, _: boxes[np.flatnonzero(boxes.label != label)]
+
+
+def near_only(boxes: Boxes, _: FrameTruth) -> Boxes:
+    return boxes[np.flatnonzero(boxes.center[:, 0] < 20)]
+
+
+def blind_in_fog(boxes: Boxes, truth: FrameTruth) -> Boxes:
+    return boxes[:0] if truth.weather == "fog" else boxes
+
+
+def lifted(boxes: Boxes, _: FrameTruth) -> Boxes:
+    return replace(boxes, center=boxes.center + np.array([0, 0, 0.4]))
+
+
+def turned(boxes: Boxes, _: FrameTruth) -> Boxes:
+    return replace(boxes, yaw=boxes.yaw + np.pi)
+
+
+def hushed(boxes: Boxes, _: FrameTruth) -> Boxes:
+    return replace(boxes, score=boxes.score * 0.3)
+
+
+def test_the_driving_network_itself_is_accepted():
+    found = judge(run(1))
+    assert found.accepted
+    assert found.whole is not None
+    assert found.whole.candidate == found.whole.driving
+    assert {each.by for each in found.guards} == {
+        "class",
+        "distance",
+        "occlusion",
+        "weather",
+        "cell",
+        "measure",
+        "condition",
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "lost"),
+    [
+        (without("Pedestrian"), "class Pedestrian lost"),
+        (near_only, "distance 20-40 m lost"),
+        (blind_in_fog, "weather fog lost"),
+        (lifted, "measure AP70: accurate boxes lost"),
+        (turned, "measure AOS: right headings lost"),
+        (hushed, "measure found from score 0.3 on lost"),
+    ],
+)
+def test_what_is_lost_refuses_by_name(change: Change, lost: str):
+    found = judge(run(1, change))
+    assert not found.accepted
+    assert not found.undecided
+    assert any(reason.startswith(lost) for reason in found.reasons)
+    assert found.whole is not None
+    if change in (turned, hushed):  # which average precision does not show
+        assert found.whole.candidate == pytest.approx(found.whole.driving, abs=0.02)
+
+
+def test_few_scenes_decide_nothing_and_say_how_many_would():
+    whole = judge(run(3, scenes=4), scenes=4).whole
+    assert whole is not None
+    margin = (whole.driving - whole.candidate - whole.low) / 2  # between the difference and its lower bound
+    found = judge(run(3, scenes=4), scenes=4, margin=margin)
+    assert not found.accepted
+    assert found.undecided
+    assert found.frames_to_decide is not None
+    assert found.frames_to_decide > 4 * FRAMES
+    assert "frames would decide" in found.lines()[-1]
+
+
+def test_retrainings_equal_to_the_driving_network_are_accepted_and_worse_ones_are_not():
+    margin = 0.15  # of a network whose misses are drawn anew, on so few scenes
+    assert judge(run(10), margin=margin).accepted
+    assert not judge(run(11, found=0.5), margin=margin).accepted
+
+
+def test_the_number_of_scenes_decides_by_the_rule_of_z_tests():
+    rng, error, effect = np.random.default_rng(0), 0.02, 0.02
+    scenes = plan_scenes(effect, error, 30, 0.05)
+    assert scenes is not None
+    draws = rng.normal(effect, error * np.sqrt(30 / scenes), 20_000)
+    assert (draws > 1.645 * error * np.sqrt(30 / scenes)).mean() == pytest.approx(0.8, abs=0.02)
+    assert plan_scenes(0, error, 30) is None
+
+
+def test_an_own_class_without_objects_is_undecided():
+    data = [VerificationData("d", "a" * 64, "grid", 1, 24, 24)]
+    frames = run(1)[PLAIN]
+    domain = replace(describe(frames), objects={"Car": 200, "Pedestrian": 100, "Cyclist": 2})
+    found = decide(read_candidate_like(), run(1), run(1), data, domain)
+    assert found.undecided
+    assert found.reasons == ("2 objects of the class Cyclist, and 10 are wanted",)
+    assert found.frames_to_decide == 120
+
+
+def describe(_: ConditionResults):
+    from flcav.releases.verification.records import Domain
+
+    return Domain(("grid",), ("everyday traffic",), ("clear",), None, None, None, (0, 1), (0, 1), {}, ("lidar",))
+
+
+def test_scenes_of_the_training_are_found_by_manifest_and_by_town_and_seed():
+    test = VerificationData("test/data", "c" * 64, "grid", 7, 10, 5)
+
+    def found(**fields: object) -> list[str]:
+        known = DataHash.model_validate({"name": "x", "manifest": "d" * 64, "town": "grid", "seed": 8, **fields})
+        return [*find_overlap(read_candidate_like().model_copy(update={"data": (known,)}), [test])]
+
+    assert found() == []
+    assert found(town="ring", seed=7) == []
+    assert found(manifest="c" * 64) == ["training on test scenes: x has those of test/data"]
+    assert found(seed=7, split="validation", use="validation") == [
+        "validation on test scenes: x has those of test/data"
+    ]
+
+
+def test_files_alone_refuse_a_candidate(parties: Parties):
+    folder, driving = parties.candidate(2), parties.folder / "1.safetensors"
+    assert [*find_faults(folder, read_candidate(folder), driving, [])] == []
+    (folder / CARD).write_text((parties.candidate(1) / CARD).read_text())
+    assert "a card of other weights" in next(find_faults(folder, read_candidate(folder), driving, []))
+    wrong = next(find_faults(folder, read_candidate(folder), parties.folder / "2.safetensors", []))
+    assert wrong.startswith("it is proposed to replace another network")
+    with (folder / WEIGHTS).open("r+b") as file:
+        file.seek(-4, 2)
+        file.write(b"\x00\x00\xc0\x7f")
+    (fault,) = find_faults(folder, read_candidate(folder), driving, [])
+    assert "another SHA-256" in fault
+
+
+def test_a_verification_of_other_weights_is_none(parties: Parties):
+    found = replace(judge(run(1, scenes=4), scenes=4), candidate=read_candidate(parties.candidate(1)).weights)
+    write_verification(parties.candidate(1), found)
+    assert read_verification(parties.candidate(1)) == found
+    write_verification(parties.candidate(2), found)
+    with pytest.raises(InputError, match="is the verification of other weights"):
+        read_verification(parties.candidate(2))
+
+
+def test_conditions_change_points_and_nothing_that_is_to_be_found(recorded_frame: Frame):
+    for name, condition in CONDITIONS.items():
+        changed = condition(recorded_frame)
+        assert (changed.annotations.returns == recorded_frame.annotations.returns).all()
+        (before,), (after,) = recorded_frame.lidar.values(), changed.lidar.values()
+        assert (len(before) == len(after)) == (name != "drop-out")
+        assert not np.array_equal(before, after) or name == "latency"
+        again = condition(recorded_frame)
+        assert all(
+            np.array_equal(one, two) for one, two in zip(changed.lidar.values(), again.lidar.values(), strict=True)
+        )
+    late = CONDITIONS["latency"](recorded_frame).annotations.boxes.center - recorded_frame.annotations.boxes.center
+    assert np.allclose(late, (2.0, 0.0, 0.0))
