@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from flcav.geometry import Boxes, heading_vectors, left_vectors
 from flcav.world.map.routes import Route
@@ -41,8 +42,7 @@ def find_occupied(
     points = route.at(along + marks)
     heading, left = heading_vectors(points[:, 2]), left_vectors(points[:, 2])
     reach = np.hypot(*boxes.size[:, :2].T)[:, None] / 2 + half_width_m + margin_m + SPACING_M
-    apart = np.abs(path[:, :, None] - points[None, None, :, :2]).max(axis=3).min(axis=2)
-    row, instant = np.nonzero(apart < reach)
+    row, instant = _find_near(path, points[:, :2], reach)
     if not len(row):
         return Occupied(low, high)
     shares = np.linspace(-0.5, 0.5, PARTS)
@@ -51,9 +51,8 @@ def find_occupied(
     turn = yaw[row, instant]
     corner = path[row, instant][:, None] + offset[..., :1] * heading_vectors(turn)[:, None]
     corner = corner + offset[..., 1:] * left_vectors(turn)[:, None]  # (M, 2 PARTS, 2)
-    away = corner[:, :, None] - points[None, None, :, :2]
-    nearest = (away**2).sum(axis=3).argmin(axis=2)
-    gap = np.take_along_axis(away, nearest[..., None, None], axis=2)[:, :, 0]
+    nearest = cdist(corner.reshape(-1, 2), points[:, :2]).argmin(axis=1).reshape(corner.shape[:2])
+    gap = corner - points[nearest, :2]
     ahead = (gap * heading[nearest]).sum(axis=2)
     aside = (gap * left[nearest]).sum(axis=2)
     within = (np.abs(aside) <= half_width_m + margin_m[row, instant][:, None]) & (np.abs(ahead) <= 2 * SPACING_M)
@@ -69,3 +68,15 @@ def find_occupied(
 def find_meeting(occupied: Occupied, at: Array, half_length_m: float) -> NDArray[np.bool_]:
     """Return (N, T) whether a vehicle whose middle is `at` (T,) [m] along the corridor then touches each footprint."""
     return (occupied.low <= at + half_length_m) & (occupied.high >= at - half_length_m)
+
+
+def _find_near(path: Array, points: Array, reach: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows and times of the places (N, T, 2) that are within `reach` (N, T) of the route's `points`."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    about = (path >= low - reach[..., None]) & (path <= high + reach[..., None])
+    row, instant = np.nonzero(about.all(axis=2))
+    if len(row):
+        apart = cdist(path[row, instant], points, "chebyshev").min(axis=1)
+        near = apart < reach[row, instant]
+        row, instant = row[near], instant[near]
+    return row, instant
