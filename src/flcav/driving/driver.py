@@ -24,7 +24,7 @@ GAIN_MPS2, EASE_MPS2 = 2.0, 2.5  # greatest acceleration, comfortable decelerati
 HEADWAY_S, STANDSTILL_M = 1.2, 2.0
 EMERGENCY_MPS2 = 4.0  # from this need on all brakes are used
 ASIDE_MPS2 = 2.5  # greatest lateral acceleration in curves
-LINE_M = 1.0  # from the front to a stop line
+LINE_M = 4.0  # from the front to a stop line: a head beside it stays in the picture of a camera
 SAME_WAY = 0.7  # cosine between a road user's course and the route from which it is a leader
 CURVES_M = np.arange(0.0, 45.0, 3.0)
 FARTHEST_GAP_M = 1e3
@@ -112,7 +112,7 @@ def _stop_at_light(route: Route, own: Motion, seen: Seen, half_m: float, wanted:
     """Return the acceleration for the next light: none at a yellow one that is too near to stop for."""
     for stop, link in route.stops:
         gap = stop - LINE_M - own.along - half_m
-        if gap < -LINE_M or link not in seen.closed:
+        if gap < -LINE_M + 0.5 or link not in seen.closed:
             continue
         needed = own.speed**2 / (2 * max(gap, 0.1))
         if needed > (EMERGENCY_MPS2 - 0.5 if link in seen.amber else 8.0):
