@@ -85,6 +85,7 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "placement": _told(PlacementProof, placement_tables.tables),
     "road-average": _told(RoadAverageResult, roadside_tables.average_tables),
     "road-detector": _told(RoadDetectorResult, roadside_tables.detector_tables),
+    "safety-distance": _told(SafetyDistance, safety_tables),
     "sensor-ranges": _told(SensorRanges, roadside_tables.range_tables),
     "sim-to-real": _told(SimToReal, sim_to_real_tables.tables),
     "task-objects": _of_study(objects.STUDY, objects_tables.tables),

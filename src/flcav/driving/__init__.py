@@ -1,1 +1,1 @@
-"""Closed-loop driving on perceived traffic: driver, scenarios, perception as an input, measures, and what they teach."""
+"""Closed-loop driving on perceived traffic: driver, scenarios, perception as an input, and measures."""

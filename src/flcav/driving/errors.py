@@ -10,11 +10,13 @@ tracked, and forecast by the trajectory network, as those of the networks are. A
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.driving.following import Following, Spread
+from flcav.config import read_json
+from flcav.driving.following import MOTIONS, Following, Spread, name_motion
 from flcav.driving.loop import Loop, Sensing, drive
 from flcav.driving.networks import LIGHTS_M, NetworkPerception, load_networks, load_roads
 from flcav.driving.scenarios import Scenario, Staged
@@ -23,6 +25,7 @@ from flcav.driving.truth import Truth, find_around, read_actors, read_lights
 from flcav.driving.visibility import share_seen
 from flcav.geometry import Boxes, heading_vectors, rotate, wrap_angle
 from flcav.interface.progress import Report, ignore_progress
+from flcav.machine.processes import process_pool
 from flcav.perception.objects.truth import DETECTION_CLASS
 from flcav.statistics.streams import stream
 from flcav.storage.records import Record
@@ -35,8 +38,10 @@ EDGES_M = (0.0, 15.0, 30.0, 52.0)  # distances between which errors are measured
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 FIELD_M = (51.2, 28.8)  # ahead, and to each side: the field of the network `small`
 EYE_M = 1.85
+SHIPPED = Path(__file__).parent / "shipped" / "errors.json"
 MATCH_M = 2.5
 HELD_S = 1.0
+ONE_SIGMA = 0.6827  # share of a normal distribution within one standard deviation: outliers do not widen that
 LIGHTS_S = 0.5  # between two looks at lights
 HORIZON = slice(0, len(TIMES_S), 2)
 
@@ -51,15 +56,14 @@ class ErrorModel(Record):
     lights: tuple[float, float]  # share of the lights in the picture read right, and read wrong
     weather: Mapping[str, Mapping[str, float]]  # by true class: shares of the classes that are named
     spread_factor: float
-    spread_vehicle: tuple[float, ...]
-    spread_walker: tuple[float, ...]
+    growth: Mapping[str, tuple[float, ...]]  # of `Spread`
     seen: int  # road users in sight, over all frames
     frames: int
 
     @property
     def spread(self) -> Spread:
         """Return the calibrated uncertainty of tracks."""
-        return Spread(self.spread_factor, self.spread_vehicle, self.spread_walker)
+        return Spread(self.spread_factor, self.growth)
 
 
 def find_in_field(snapshot: Snapshot, scene: Scene) -> tuple[NDArray[np.int64], Boxes, Array]:
@@ -75,22 +79,38 @@ def find_in_field(snapshot: Snapshot, scene: Scene) -> tuple[NDArray[np.int64], 
     x, y = rotate(boxes.center[:, 0] - at[0], boxes.center[:, 1] - at[1], -yaw)
     within = (x > 0) & (x < FIELD_M[0]) & (np.abs(y) < FIELD_M[1])
     rows, boxes, local = rows[within], boxes[within], np.stack((x, y), axis=1)[within]
-    seen = share_seen(scene, at + (0.0, 0.0, EYE_M), boxes, own) > 0
+    seen = share_seen(scene, at + np.array((0.0, 0.0, EYE_M)), boxes, own) > 0
     labels = np.array([DETECTION_CLASS[each] for each in boxes.label[seen].tolist()], np.str_)
     kept = boxes[seen]
     return rows[seen], Boxes(kept.center, kept.size, kept.yaw, labels), local[seen]
+
+
+def _by_class() -> defaultdict[str, Counter[str]]:
+    return defaultdict(Counter)
 
 
 @dataclass
 class Tally:
     """Counts and errors over drives."""
 
-    pairs: list[tuple[str, float, bool, float, float, float]] = field(default_factory=list)  # class, distance, found, errors
+    pairs: list[tuple[str, float, bool, float, float, float]] = field(
+        default_factory=list
+    )  # class, distance, found, errors
     false_positives: int = 0
     frames: int = 0
     lights: Counter[str] = field(default_factory=Counter)
-    weather: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    tracks: list[tuple[bool, float, Array]] = field(default_factory=list)  # walks, variance, squared errors at HORIZON
+    weather: defaultdict[str, Counter[str]] = field(default_factory=_by_class)
+    tracks: list[tuple[str, float, Array]] = field(default_factory=list)  # motion, variance, errors (H, 2) at HORIZON
+
+    def add(self, other: "Tally") -> None:
+        """Add the counts of another drive."""
+        self.pairs += other.pairs
+        self.tracks += other.tracks
+        self.false_positives += other.false_positives
+        self.frames += other.frames
+        self.lights += other.lights
+        for name, counts in other.weather.items():
+            self.weather[name] += counts
 
 
 class Comparing:
@@ -99,7 +119,7 @@ class Comparing:
     def __init__(self, staged: Staged, seed: int, tally: Tally) -> None:
         self._networks, self._truth = NetworkPerception(staged, seed), Truth(staged.scenario.weather)
         self._tally, self._class = tally, staged.scenario.weather
-        self._forecasts: list[tuple[float, str, bool, float, Array]] = []
+        self._forecasts: list[tuple[float, str, str, float, Array]] = []
         self._places: dict[tuple[str, int], Array] = {}
 
     def look(self, snapshot: Snapshot) -> Seen:
@@ -136,7 +156,7 @@ class Comparing:
         rows = find_around(snapshot, 80.0)
         everyone = snapshot.trace.position[0, rows, :2]
         lonely = [np.hypot(*(everyone - each[:2]).T).min(initial=np.inf) > 3.0 for each in found.center[free]]
-        self._tally.false_positives += sum(lonely)
+        self._tally.false_positives += int(sum(lonely))
         self._tally.frames += 1
 
     def _remember(self, snapshot: Snapshot) -> None:
@@ -150,31 +170,52 @@ class Comparing:
             for i in range(len(followed.boxes)):
                 away = np.hypot(*(trace.position[0, rows, :2] - followed.boxes.center[i, :2]).T)
                 if len(away) and away.min() < MATCH_M and followed.boxes.variance is not None:
-                    walks, variance = followed.boxes.label[i] == "Pedestrian", followed.boxes.variance[i, :2].mean()
+                    variance = float(followed.boxes.variance[i, :2].mean())
+                    motion = name_motion(str(followed.boxes.label[i]), followed.velocity[i])
                     name = str(trace.actor[rows[int(away.argmin())]])
-                    self._forecasts.append((snapshot.time_s, name, bool(walks), float(variance), followed.path[i, HORIZON]))
+                    self._forecasts.append((snapshot.time_s, name, motion, variance, followed.path[i, HORIZON]))
         last = TIMES_S[HORIZON][-1]
         over = [each for each in self._forecasts if each[0] + last <= snapshot.time_s + 1e-6]
         self._forecasts = self._forecasts[len(over) :]
-        for time_s, name, walks, variance, path in over:
+        for time_s, name, motion, variance, path in over:
             ticks = [round(10 * (time_s + float(t))) for t in TIMES_S[HORIZON]]
             places = [self._places.get((name, each)) for each in ticks]
             if all(each is not None for each in places):
-                off = ((path - np.array(places)) ** 2).mean(axis=1)
-                self._tally.tracks.append((walks, variance, off))
+                self._tally.tracks.append((motion, variance, path - np.array(places)))
 
 
 def measure_errors(
-    scenarios: Sequence[Scenario], seeds: Sequence[int], lasts_s: float = 12.0, progress: Report = ignore_progress
+    scenarios: Sequence[Scenario],
+    seeds: Sequence[int],
+    lasts_s: float = 12.0,
+    processes: int = 1,
+    progress: Report = ignore_progress,
 ) -> ErrorModel:
     """Return the error model of the package's networks over drives of these scenarios and seeds."""
-    tally, done = Tally(), 0
-    for scenario in scenarios:
-        for seed in seeds:
-            drive(scenario, seed, lambda staged, own: Comparing(staged, own, tally), Loop(lasts_s=lasts_s))
-            done += 1
-            progress(done, len(scenarios) * len(seeds), "")
-    return summarise(tally)
+    jobs = [(scenario, seed, lasts_s) for scenario in scenarios for seed in seeds]
+    whole = Tally()
+    with process_pool(processes, begin_worker) as pool:
+        for done, own in enumerate(pool.map(tally_drive, *zip(*jobs)), start=1):
+            whole.add(own)
+            progress(done, len(jobs), "")
+    return summarise(whole)
+
+
+def load_errors(path: Path | None = None) -> ErrorModel:
+    """Return the error model in a JSON file, by default that of the package; raises `InputError` for another file."""
+    path = path or SHIPPED
+    return ErrorModel.from_json(read_json(path), str(path))
+
+
+def begin_worker() -> None:
+    """Begin a worker process, which needs nothing."""
+
+
+def tally_drive(scenario: Scenario, seed: int, lasts_s: float) -> Tally:
+    """Return what the networks get wrong in one drive."""
+    tally = Tally()
+    drive(scenario, seed, lambda staged, own: Comparing(staged, own, tally), Loop(lasts_s=lasts_s))
+    return tally
 
 
 def summarise(tally: Tally) -> ErrorModel:
@@ -192,29 +233,29 @@ def summarise(tally: Tally) -> ErrorModel:
         sd[name] = (x, y, yaw)
     total = max(tally.lights.total(), 1)
     counted = tally.weather.items()
-    variance = np.array([each[1] for each in tally.tracks])
-    off = np.array([each[2] for each in tally.tracks]).reshape(-1, len(TIMES_S[HORIZON]))
-    walks = np.array([each[0] for each in tally.tracks], np.bool_)
-    factor = float(off[:, 0].mean() / variance.mean()) if len(off) else 1.0
+    off = [each[2][0] / np.sqrt(each[1]) for each in tally.tracks]
+    factor = float(np.quantile(np.abs(off), ONE_SIGMA)) ** 2 if off else 1.0
     return ErrorModel(
         detected=detected,
         sd=sd,
-        false_positives=tally.false_positives / max(tally.frames, 1),
+        false_positives=float(tally.false_positives) / max(tally.frames, 1),
         lights=(tally.lights["right"] / total, tally.lights["wrong"] / total),
         weather={name: {each: n / own.total() for each, n in own.items()} for name, own in counted},
         spread_factor=factor,
-        spread_vehicle=_growth(off[~walks], variance[~walks], factor),
-        spread_walker=_growth(off[walks], variance[walks], factor),
+        growth={motion: _growth(tally, motion, factor) for motion in MOTIONS},
         seen=len(tally.pairs),
         frames=tally.frames,
     )
 
 
-def _growth(off: Array, variance: Array, factor: float) -> tuple[float, ...]:
+def _growth(tally: Tally, motion: str, factor: float) -> tuple[float, ...]:
     """Return the standard deviation at `TIMES_S` that forecasts have beyond that of their tracks."""
-    if not len(off):
+    own = [each for each in tally.tracks if each[0] == motion]
+    if not own:
         return (0.0,) * len(TIMES_S)
-    excess = np.sqrt(np.maximum(off.mean(axis=0) - factor * variance.mean(), 0.0))
+    off = np.abs(np.array([each[2] for each in own])).transpose(1, 0, 2).reshape(len(TIMES_S[HORIZON]), -1)
+    variance = factor * float(np.median([each[1] for each in own]))
+    excess = np.sqrt(np.maximum(np.quantile(off, ONE_SIGMA, axis=1) ** 2 - variance, 0.0))
     return tuple(np.interp(TIMES_S, TIMES_S[HORIZON], excess).tolist())
 
 

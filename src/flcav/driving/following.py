@@ -4,8 +4,9 @@ Tracks come from the tracker of the package, and are kept for `KEPT_S` without a
 two seconds get the single path of the trajectory network, every half second; all others keep their velocity.
 """
 
-from collections import defaultdict, deque
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,13 @@ KEPT_S = 0.45
 EVERY_S = 0.5  # between two forecasts of a track
 SLOW_MPS = 0.5  # below it a track stands, and is not forecast
 WALKS = "Pedestrian"
+MOTIONS = ("stands", "drives", "walks")  # whose forecasts are differently good
 CATEGORY = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
+
+
+def name_motion(label: str, velocity: Array) -> str:
+    """Return which of `MOTIONS` a track of a detection class has."""
+    return "walks" if label == WALKS else "drives" if float(np.hypot(*velocity)) > 1.0 else "stands"
 
 
 @dataclass(frozen=True)
@@ -36,8 +43,12 @@ class Spread:
     """Calibrated uncertainty: what the variances of boxes are multiplied by, and how predicted paths come apart."""
 
     factor: float = 1.0  # of the variances of tracked positions
-    vehicle: tuple[float, ...] = (0.0,) * len(TIMES_S)  # standard deviation at `TIMES_S`, along each axis [m]
-    walker: tuple[float, ...] = (0.0,) * len(TIMES_S)
+    growth: Mapping[str, tuple[float, ...]] = field(
+        default_factory=dict
+    )  # by motion: deviation at `TIMES_S`, each axis [m]
+
+
+CERTAIN = Spread()
 
 
 @dataclass(frozen=True)
@@ -67,7 +78,7 @@ class _Known:
 class Following:
     """Follows detections through a drive; a network of None forecasts constant velocity for all."""
 
-    def __init__(self, network: TrajectoryNetwork | None, roads: RoadMap | None, spread: Spread = Spread()) -> None:
+    def __init__(self, network: TrajectoryNetwork | None, roads: RoadMap | None, spread: Spread = CERTAIN) -> None:
         self._tracker, self._known = Tracker(), dict[int, _Known]()
         self._network, self._roads, self._spread = network, roads, spread
 
@@ -90,7 +101,9 @@ class Following:
         rows = [self._known[n] for n in numbers]
         if not rows:
             none = np.zeros((0, len(TIMES_S)))
-            return Followed(Boxes.empty(), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, len(TIMES_S), 2)), none, none)
+            return Followed(
+                Boxes.empty(), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, len(TIMES_S), 2)), none, none
+            )
         boxes, velocity = concatenate([each.box for each in rows]), np.array([each.velocity for each in rows])
         path, yaw = predict_motion(boxes, velocity)
         late = time_s - np.array([each.seen_s for each in rows])
@@ -98,8 +111,8 @@ class Following:
         for row, each in enumerate(rows):
             if each.forecast is not None:
                 path[row], yaw[row] = _shift(each, time_s, float(boxes.yaw[row]))
-        walks = boxes.label == WALKS
-        growth = np.where(walks[:, None], self._spread.walker, self._spread.vehicle)
+        motions = [name_motion(str(label), v) for label, v in zip(boxes.label, velocity)]
+        growth = np.array([self._spread.growth.get(each, (0.0,) * len(TIMES_S)) for each in motions])
         now = np.zeros(len(rows)) if boxes.variance is None else boxes.variance[:, :2].mean(axis=1)
         spread = np.sqrt(self._spread.factor * now[:, None] + growth**2)
         return Followed(boxes, np.array(numbers, np.int64), velocity, path, yaw, spread)
@@ -156,7 +169,10 @@ def _shift(each: _Known, time_s: float, yaw_now: float) -> tuple[Array, Array]:
 def _record(everybody: list[_Known], time_s: float, closed: frozenset[str]) -> tuple[Trace, Tracks]:
     """Return the tracks as the trajectory task reads them: a trace of the present, and the past at its instants."""
     count, times = len(everybody), time_s + OFFSETS_S
-    position, yaw, speed = np.full((len(times), count, 2), np.nan), *(np.full((len(times), count), np.nan) for _ in "ab")
+    position, yaw, speed = (
+        np.full((len(times), count, 2), np.nan),
+        *(np.full((len(times), count), np.nan) for _ in "ab"),
+    )
     for actor, each in enumerate(everybody):
         past = np.array(each.past)
         own = np.flatnonzero((times <= time_s + 1e-6) & (times >= past[0, 0] - 0.15))

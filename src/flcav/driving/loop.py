@@ -8,7 +8,7 @@ import numpy as np
 from flcav.driving.driver import DEFAULT, Motion, Settings, decide
 from flcav.driving.measures import HARD_MPS2, NEAR_S, STANDS_MPS, Drive, Hit, judge_collision, measure_ttc, score_drive
 from flcav.driving.scenarios import DT_S, Scenario, Staged
-from flcav.driving.seen import EGO, TIMES_S, Perception
+from flcav.driving.seen import EGO, Perception
 from flcav.driving.truth import Truth, read_lights
 from flcav.geometry import heading_vectors
 from flcav.world.map.routes import Route
@@ -28,12 +28,15 @@ class Loop:
     lasts_s: float = LASTS_S
 
 
+LOOP = Loop()
+
+
 def sense_truth(staged: Staged, seed: int) -> Perception:
     """Return ground-truth perception."""
     return Truth(staged.scenario.weather)
 
 
-def drive(scenario: Scenario, seed: int, sense: Sensing = sense_truth, loop: Loop = Loop()) -> Drive:
+def drive(scenario: Scenario, seed: int, sense: Sensing = sense_truth, loop: Loop = LOOP) -> Drive:
     """Return the measures of a drive: a scenario with a seed, with what `sense` makes of it.
 
     It ends with a collision at fault, near the end of the route, or after its time. Raises `InputError` where the town
@@ -68,7 +71,11 @@ def _drive(staged: Staged, seed: int, perception: Perception, loop: Loop) -> Dri
         speeds.append(after.speed)
         kinds = dict(zip(now.trace.actor.tolist(), now.trace.category.tolist()))
         known = {hit.other for hit in hits}
-        new = [judge_collision(each, before, kinds, now.time_s) for each in now.collisions if EGO in (each.name, each.other)]
+        new = [
+            judge_collision(each, before, kinds, now.time_s)
+            for each in now.collisions
+            if EGO in (each.name, each.other)
+        ]
         hits += [hit for hit in new if hit.other not in known]
         if any(hit.at_fault for hit in hits) or along > route.length_m - ENDS_M:
             break

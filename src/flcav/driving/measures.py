@@ -15,9 +15,9 @@ from flcav.driving.corridor import find_meeting, find_occupied
 from flcav.driving.driver import Motion
 from flcav.driving.seen import EGO, TIMES_S, Seen
 from flcav.geometry import heading_vectors
+from flcav.storage.records import Record
 from flcav.world.map.routes import Route
 from flcav.world.snapshot import Collision, Snapshot
-from flcav.storage.records import Record
 
 Array = NDArray[np.float64]
 
@@ -47,12 +47,20 @@ class Drive(Record):
     time_s: float
     progress: float  # share of what the speed limit allows in the time, 0 to 1
     mean_speed: float  # [m/s]
-    least_ttc_s: float  # least time to collision; `TIMES_S`' last where it was never less
+    least_ttc_s: float  # least time to collision; the last of `TIMES_S` where none was less
     near_share: float  # share of the time with a time to collision below `NEAR_S`
     hard_brakes: int  # times that a deceleration of `HARD_MPS2` began
     red_lights: int  # stop lines passed at red
     hits: tuple[Hit, ...]
     score: float  # the driving score, 0 to 1
+
+    def line(self) -> str:
+        """Return the measures in words."""
+        hits = "".join(f", {'hits' if hit.at_fault else 'is hit by'} {hit.other}" for hit in self.hits)
+        return (
+            f"{self.scenario}, seed {self.seed}: progress {self.progress:.2f}, {self.mean_speed:.1f} m/s, least time "
+            f"to collision {self.least_ttc_s:.2f} s, {self.hard_brakes} hard brakes, score {self.score:.2f}{hits}"
+        )
 
     @property
     def faults(self) -> int:
@@ -79,9 +87,7 @@ def measure_ttc(route: Route, own: Motion, truth: Seen, size: tuple[float, float
     return float(TIMES_S[int(np.argmax(first))]) if first.any() else float(TIMES_S[-1])
 
 
-def judge_collision(
-    collision: Collision, before: Snapshot, categories: Mapping[str, str], time_s: float
-) -> Hit:
+def judge_collision(collision: Collision, before: Snapshot, categories: Mapping[str, str], time_s: float) -> Hit:
     """Return the collision of the ego vehicle as a record; `before` is the snapshot of the step before it.
 
     `categories` are those of the actors by name; what has none is an obstacle.
@@ -95,11 +101,12 @@ def judge_collision(
     rows = np.flatnonzero(trace.actor == other)
     if len(rows):
         ahead = heading_vectors(yaw)
-        length, width = trace.size[own, :2]
+        length = trace.size[own, 0]
         at = np.array(collision.point) - trace.position[0, own, :2]
-        at_rear = float(at @ ahead) < -length / 2 + 0.6 or float(trace.position[0, rows[0], :2] @ ahead) < float(
-            trace.position[0, own, :2] @ ahead
-        ) - length / 2
+        at_rear = (
+            float(at @ ahead) < -length / 2 + 0.6
+            or float(trace.position[0, rows[0], :2] @ ahead) < float(trace.position[0, own, :2] @ ahead) - length / 2
+        )
         faster = float((trace.velocity[0, rows[0], :2] - trace.velocity[0, own, :2]) @ ahead) > 0
         struck = at_rear and faster
     return Hit(time_s, other, kind, speed, not (speed < STANDS_MPS or struck))

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flcav.driving.following import Followed, Following, Spread
+from flcav.driving.following import CERTAIN, Followed, Following, Spread
+from flcav.driving.road import RoadUnits, fuse
 from flcav.driving.scenarios import Staged
 from flcav.driving.seen import EGO, WEATHER_SPEED, Seen
 from flcav.geometry import Boxes, heading_vectors, inverse, transform_points
@@ -106,13 +107,16 @@ class LightReader:
     def closed(self, time_s: float) -> tuple[frozenset[str], frozenset[str]]:
         """Return the lights that were last seen red or yellow, and the yellow ones."""
         fresh = {link: letter for link, (at, letter) in self._last.items() if time_s - at <= REMEMBERED_S}
-        return frozenset(n for n, each in fresh.items() if each != "G"), frozenset(n for n, each in fresh.items() if each == "y")
+        return frozenset(n for n, each in fresh.items() if each != "G"), frozenset(
+            n for n, each in fresh.items() if each == "y"
+        )
 
 
 class NetworkPerception:
     """What the networks make of the sensors of a drive."""
 
-    def __init__(self, staged: Staged, seed: int, spread: Spread = Spread()) -> None:
+    def __init__(self, staged: Staged, seed: int, *, spread: Spread = CERTAIN, road: RoadUnits | None = None) -> None:
+        """Take a drive, its seed, how uncertain tracks are, and the poles that send what they find, if any."""
         self.networks = load_networks()
         self.scene = Scene(staged.town, staged.world.snapshot.trace)
         self._seed, self._name = seed, staged.scenario.name
@@ -121,7 +125,8 @@ class NetworkPerception:
         self._following = Following(self.networks.trajectory, load_roads(staged.town.name), spread)
         self._step = 0
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
-        self.found = Boxes.empty()  # of the last look, world frame
+        self._road = road
+        self.own = self.found = Boxes.empty()  # of the last look, world frame: the vehicle's own, and with the road's
         self.followed: Followed | None = None
 
     def look(self, snapshot: Snapshot) -> Seen:
@@ -136,11 +141,15 @@ class NetworkPerception:
             self.heads = self.lights.read(frame, self.networks.signs, snapshot.time_s)
             self.named, self.lights_read_s = self.name_weather(frame), snapshot.time_s
         found = detect_in(self.networks.objects, [frame], score_threshold=SCORE)[0]
-        self.found = found.transform(frame.assumed_world_from_sensor(LIDAR))
+        self.own = self.found = found.transform(frame.assumed_world_from_sensor(LIDAR))
+        if self._road is not None:
+            self.found = fuse(self.own, self._road.receive(self.scene, snapshot))
         closed, amber = self.lights.closed(snapshot.time_s)
         told = self._following.step(self.found, snapshot.time_s, closed)
         self.followed = told
-        return Seen(told.boxes, told.velocity, told.path, told.yaw, told.spread, closed, amber, WEATHER_SPEED[self.named])
+        return Seen(
+            told.boxes, told.velocity, told.path, told.yaw, told.spread, closed, amber, WEATHER_SPEED[self.named]
+        )
 
     def name_weather(self, frame: Frame) -> str:
         """Return the likeliest class of weather in the frame's picture."""
@@ -152,4 +161,3 @@ class NetworkPerception:
 def sense_networks(staged: Staged, seed: int) -> NetworkPerception:
     """Return the perception by the networks of the package, for `loop.drive`."""
     return NetworkPerception(staged, seed)
-

@@ -3,13 +3,14 @@
 A scenario with a seed is one drive: the route is of the scenario, traffic and the moment of the event are of the seed.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Literal
 
 import numpy as np
 
-from flcav.config import InputError
+from flcav.config import InputError, shorten
 from flcav.driving.seen import EGO
 from flcav.geometry import heading_vectors, left_vectors
 from flcav.statistics.streams import derive_seed, stream
@@ -53,6 +54,21 @@ def list_scenarios() -> tuple[Scenario, ...]:
         for weather in ("clear", bad[(i + j) % 2]):
             found.append(Scenario(f"{town}-{event}-{weather}", town, event, weather, 25, 8))
     return tuple(found)
+
+
+def find_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
+    """Return the scenarios of these names, or all for none; raises `InputError` for an unknown one."""
+    known = {each.name: each for each in list_scenarios()}
+    if odd := [name for name in names if name not in known]:
+        raise InputError(f"scenario {shorten(odd[0])}: must be one of {', '.join(known)}")
+    return tuple(known[name] for name in names) or list_scenarios()
+
+
+def spread_scenarios(count: int) -> tuple[Scenario, ...]:
+    """Return so many scenarios, of towns, events and weathers in turn."""
+    known = list_scenarios()
+    step = 7  # coprime to their number: it goes through all
+    return tuple(known[(step * i) % len(known)] for i in range(count))
 
 
 class Staged:
@@ -132,7 +148,7 @@ class Staged:
         return x, y
 
     def _walk(self, along_m: float, speed: float) -> None:
-        """Let the walker set out when the ego vehicle, at this speed, is three seconds away, and stop on the far side."""
+        """Let the walker set out when the ego vehicle, at this speed, is near, and stop on the far side."""
         if self._phase == "waits" and 0 < self._at_m - along_m < max(3.2 * speed, 8.0):
             across = left_vectors(self.route.at(self._at_m)[2]) * WALKER_MPS
             self.world.apply(Walk("walker", (float(across[0]), float(across[1]))))
@@ -155,7 +171,9 @@ class Staged:
             self._phase = "drives"
         if self._phase == "drives" and self._at_m > self._after_m:
             self._phase, self._since_s = "brakes", snapshot.time_s
-        if self._phase == "brakes" and snapshot.time_s - self._since_s > 5.0 or self._at_m > self.route.length_m - 30.0:
+        if (
+            self._phase == "brakes" and snapshot.time_s - self._since_s > 5.0
+        ) or self._at_m > self.route.length_m - 30.0:
             self.world.apply(Remove(LEAD))
             self._phase = "gone"
             return
@@ -164,4 +182,6 @@ class Staged:
         steer = float(np.arctan(2 * 3.0 * left / (ahead**2 + left**2)) / np.radians(70.0))
         wanted = 0.0 if self._phase in ("brakes", "stands") else 0.8 * self.route.limit(self._at_m)
         pedal = -BRAKES_MPS2 / 8.0 if self._phase == "brakes" else (wanted - speed) / 2
-        self.world.apply(Drive(LEAD, Controls(max(min(pedal, 1.0), 0.0), max(min(steer, 1.0), -1.0), max(min(-pedal, 1.0), 0.0))))
+        self.world.apply(
+            Drive(LEAD, Controls(max(min(pedal, 1.0), 0.0), max(min(steer, 1.0), -1.0), max(min(-pedal, 1.0), 0.0)))
+        )

@@ -39,9 +39,7 @@ def find_around(snapshot: Snapshot, reach_m: float) -> NDArray[np.int64]:
     return np.flatnonzero(away <= reach_m)
 
 
-def read_actors(
-    snapshot: Snapshot, rows: NDArray[np.int64]
-) -> tuple[Boxes, NDArray[np.float64], NDArray[np.float64]]:
+def read_actors(snapshot: Snapshot, rows: NDArray[np.int64]) -> tuple[Boxes, NDArray[np.float64], NDArray[np.float64]]:
     """Return boxes (labels are categories), velocities (N, 2) [m/s] and yaw rates (N,) [rad/s] of some actors."""
     trace = snapshot.trace
     size = trace.size[rows]
