@@ -45,7 +45,7 @@ def drive(
     from flcav.config import InputError
     from flcav.driving.driver import Settings
     from flcav.driving.errors import measure_errors
-    from flcav.driving.importance import Job, Sensed, run_jobs
+    from flcav.driving.jobs import Job, Sensed, run_jobs
     from flcav.driving.loop import Loop
     from flcav.driving.pole_gain import measure_pole_gain
     from flcav.driving.scenarios import find_scenarios

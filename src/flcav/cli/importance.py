@@ -52,6 +52,9 @@ def importance(
         None, "--weigh", help="An allocation problem or a run recipe (YAML): --out gets it with these weights."
     ),
     out: Path | None = typer.Option(None, "--out", help="YAML file to write; needs --weigh."),
+    keep: Path | None = typer.Option(
+        None, "--keep", help="File of the drives that are done: the same command goes on after a stop."
+    ),
     jobs: int = JOBS,
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
 ) -> None:
@@ -60,7 +63,8 @@ def importance(
     Drives are paired over scenarios and seeds. Beside it: the article's own rule, the loss of the joint objective.
     """
     from flcav.config import InputError, read_yaml
-    from flcav.driving.importance import COUPLINGS, Sensed, measure_importance, read_reached
+    from flcav.driving.importance import COUPLINGS, measure_importance, read_reached
+    from flcav.driving.jobs import Sensed
     from flcav.driving.scenarios import spread_scenarios
     from flcav.interface.progress import show_progress
     from flcav.storage.files import check_writable
@@ -78,7 +82,7 @@ def importance(
     with show_progress("importance") as report:
         chosen, numbers = spread_scenarios(scenarios), range(1, seeds + 1)
         found = measure_importance(
-            chosen, numbers, sensed, read_reached(), lasts_s=lasts, processes=jobs, progress=report
+            chosen, numbers, sensed, read_reached(), lasts_s=lasts, processes=jobs, progress=report, kept=keep
         )
     if weigh is not None and out is not None:
         import yaml

@@ -335,7 +335,7 @@ def _safety_distance(out: Path, seeds: int, scale: str, jobs: int, engine: Engin
     from flcav.interface import progress
 
     with progress.show_progress(Target.safety_distance.value) as report:
-        results = compare_margins(seeds, jobs, report, SCENARIOS if scale == "paper" else 2)
+        results = compare_margins(out, seeds, jobs, report, SCENARIOS if scale == "paper" else 2)
     _write_figures(out, results.as_json(), {"trade_off.png": results.picture()}, results.sentences())
 
 

@@ -96,8 +96,18 @@ def _follow(speed: float, wanted: float, gap_m: float, ahead_mps: float) -> floa
     """Return the acceleration [m/s^2] of the Intelligent Driver Model at `gap_m` behind a leader of `ahead_mps`."""
     closing = speed * (speed - ahead_mps) / (2 * np.sqrt(GAIN_MPS2 * EASE_MPS2))
     desired = STANDSTILL_M + max(0.0, speed * HEADWAY_S + closing)
-    free = 1 - (speed / max(wanted, 0.1)) ** 4
-    return float(max(GAIN_MPS2 * (free - (desired / max(gap_m, 0.1)) ** 2), -12.0))
+    near = (desired / max(gap_m, 0.1)) ** 2
+    return float(max(_approach_speed(speed, max(wanted, 0.1)) - GAIN_MPS2 * near, -12.0))
+
+
+def _approach_speed(speed: float, wanted: float) -> float:
+    """Return the acceleration [m/s^2] on a free road: slower than comfortable braking where it is too fast.
+
+    Above the wanted speed it is that of the improved model (Treiber and Kesting, Traffic Flow Dynamics, 2013, 11.3.7).
+    """
+    if speed <= wanted:
+        return GAIN_MPS2 * (1 - (speed / wanted) ** 4)
+    return -EASE_MPS2 * (1 - (wanted / speed) ** (4 * GAIN_MPS2 / EASE_MPS2))
 
 
 def _halt(speed: float, wanted: float, gap_m: float) -> float:

@@ -8,20 +8,17 @@ perception is the mean of what its tasks reach, so that each loses its own.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
-from flcav.driving.couplings import FEEDS, TASKS, Coupling, Without
-from flcav.driving.errors import ErrorModel, begin_worker, sense_model
-from flcav.driving.loop import LOOP, Loop, Sensing, drive, sense_truth
+from flcav.driving.couplings import FEEDS, TASKS, Coupling
+from flcav.driving.jobs import Job, Sensed, run_jobs
+from flcav.driving.loop import Loop
 from flcav.driving.measures import Drive
-from flcav.driving.networks import sense_networks
-from flcav.driving.scenarios import Scenario, Staged
-from flcav.driving.seen import Perception
+from flcav.driving.scenarios import Scenario
 from flcav.interface.progress import Report, ignore_progress
-from flcav.machine.processes import process_pool
-from flcav.machine.threads import use_threads
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import find_shipped, read_card
 from flcav.statistics.bootstrap import bootstrap_over_scenes
@@ -40,33 +37,6 @@ MEASURES: Mapping[str, str] = {  # field of a drive -> words
     "hard_brakes": "hard brakes",
     "red_lights": "red lights passed",
 }
-
-
-@dataclass(frozen=True)
-class Sensed:
-    """Which perception drives: of the truth, of the networks, or with the errors of a model."""
-
-    kind: str  # "truth", "networks", "model"
-    model: ErrorModel | None = None
-
-    def make(self) -> Sensing:
-        """Return what makes it."""
-        if self.kind == "model":
-            if self.model is None:
-                raise ValueError("a modelled perception needs its model")
-            return sense_model(self.model)
-        return sense_networks if self.kind == "networks" else sense_truth
-
-
-@dataclass(frozen=True)
-class Job:
-    """One drive: a scenario, a seed, and the task that is left out, if any."""
-
-    scenario: Scenario
-    seed: int
-    task: str | None = None
-    coupling: Coupling = "bare"
-    loop: Loop = LOOP
 
 
 @dataclass(frozen=True)
@@ -111,35 +81,6 @@ def read_reached() -> dict[str, float]:
     return {name: max(read_card(find_shipped(task_named(name))).learning.scores or (0.0,)) for name in TASKS}
 
 
-def run_job(job: Job, sensed: Sensed) -> Drive:
-    """Return the measures of one drive."""
-    whole = sensed.make()
-
-    def sense(staged: Staged, seed: int) -> Perception:
-        own = whole(staged, seed)
-        return own if job.task is None else Without(own, job.task, job.coupling)
-
-    return drive(job.scenario, job.seed, sense, job.loop)
-
-
-def run_jobs(
-    jobs: Sequence[Job], sensed: Sensed, processes: int = 1, progress: Report = ignore_progress
-) -> list[Drive]:
-    """Return the measures of drives in the order of the jobs, on so many processes."""
-    found: list[Drive] = []
-    if processes == 1:
-        use_threads(1)
-        for done, job in enumerate(jobs, start=1):
-            found.append(run_job(job, sensed))
-            progress(done, len(jobs), job.scenario.name)
-        return found
-    with process_pool(processes, begin_worker) as pool:
-        for done, own in enumerate(pool.map(run_job, jobs, [sensed] * len(jobs)), start=1):
-            found.append(own)
-            progress(done, len(jobs), own.scenario)
-    return found
-
-
 def measure_importance(
     scenarios: Sequence[Scenario],
     seeds: Sequence[int],
@@ -149,21 +90,22 @@ def measure_importance(
     lasts_s: float = 20.0,
     processes: int = 1,
     progress: Report = ignore_progress,
+    kept: Path | None = None,
 ) -> Importance:
     """Return the importance of each task in both couplings.
 
-    `reached` is what each task's network reaches by its own measure, 0 to 1, for the article's rule. Raises
-    `ValueError` without scenarios or seeds.
+    `reached` is what each task's network reaches by its own measure, 0 to 1, for the article's rule; `kept` as in
+    `jobs.run_jobs`. Raises `ValueError` without scenarios or seeds.
     """
     if not scenarios or not seeds:
         raise ValueError("importance needs a scenario and a seed")
     loop = Loop(lasts_s=lasts_s)
-    pairs = [(scenario, seed) for scenario in scenarios for seed in seeds]
     arms: list[tuple[str | None, Coupling]] = [(None, "bare"), *((t, c) for c in COUPLINGS for t in TASKS)]
-    jobs = [Job(scenario, seed, task, coupling, loop) for task, coupling in arms for scenario, seed in pairs]
-    drives = run_jobs(jobs, sensed, processes, progress)
-    by_arm = {arm: drives[i * len(pairs) : (i + 1) * len(pairs)] for i, arm in enumerate(arms)}
-    names = [scenario.name for scenario, _ in pairs]
+    keys = [(seed, arm, scenario) for seed in seeds for arm in arms for scenario in scenarios]
+    jobs = [Job(scenario, seed, task, coupling, loop) for seed, (task, coupling), scenario in keys]
+    drives = run_jobs(jobs, sensed, processes, progress, kept)
+    by_arm = {arm: [own for own, (_, each, _) in zip(drives, keys) if each == arm] for arm in arms}
+    names = [scenario.name for _ in seeds for scenario in scenarios]
     whole = by_arm[None, "bare"]
     tasks = {c: weigh([compare(t, whole, by_arm[t, c], names) for t in TASKS]) for c in COUPLINGS}
     ranks = [[each.differences["score"].mean for each in tasks[c]] for c in COUPLINGS]

@@ -8,12 +8,14 @@ driving and walking road users. Every setting drives the same scenarios and seed
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from flcav.driving.driver import Settings
 from flcav.driving.errors import ErrorModel, load_errors
-from flcav.driving.importance import Job, Sensed, paired_difference, run_jobs
+from flcav.driving.importance import paired_difference
+from flcav.driving.jobs import Job, Sensed, run_jobs
 from flcav.driving.loop import Loop
 from flcav.driving.measures import Drive
 from flcav.driving.scenarios import spread_scenarios
@@ -74,15 +76,19 @@ class SafetyDistance(Record):
 
 
 def compare_margins(
-    seeds: int = SEEDS, jobs: int = 1, progress: Report = ignore_progress, scenarios: int = SCENARIOS
+    out: Path,
+    seeds: int = SEEDS,
+    jobs: int = 1,
+    progress: Report = ignore_progress,
+    scenarios: int = SCENARIOS,
 ) -> SafetyDistance:
-    """Return the trade-off over the package's scenarios and `seeds` seeds, on so many processes."""
+    """Return the trade-off over the package's scenarios and `seeds` seeds, on so many processes; drives are kept in `out`."""
     model = load_errors()
     settings = {f"fixed {size:g} m": Settings(size) for size in FIXED_M}
     settings |= {f"{size:g} sigma": Settings(0.0, size) for size in SIGMAS}
     pairs = [(scenario, seed) for scenario in spread_scenarios(scenarios) for seed in range(1, seeds + 1)]
     tasks = [Job(*pair, loop=Loop(own, LASTS_S)) for own in settings.values() for pair in pairs]
-    drives = run_jobs(tasks, Sensed("model", model), jobs, progress)
+    drives = run_jobs(tasks, Sensed("model", model), jobs, progress, out / "drives.jsonl")
     by_name = {name: drives[i * len(pairs) : (i + 1) * len(pairs)] for i, name in enumerate(settings)}
     results = tuple(summarise(name, settings[name], own) for name, own in by_name.items())
     compared = find_pair(results)
