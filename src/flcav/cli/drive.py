@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.importance import ERRORS, Perceives, read_model
-from flcav.cli.options import JOBS
+from flcav.cli.options import JOBS, check_finite, refuse_unused
 from flcav.cli.terminal import print_json
 
 
@@ -23,14 +23,19 @@ def drive(
         Perceives.truth, "--perception", help="truth: ground truth; model: the networks' errors; networks: themselves."
     ),
     errors: Path | None = ERRORS,
-    lasts: float = typer.Option(30.0, "--lasts", min=1.0, max=600.0, help="Length of a drive [s]."),
-    margin: float = typer.Option(0.4, "--margin", min=0.0, max=3.0, help="Distance kept free around road users [m]."),
+    lasts: float = typer.Option(
+        30.0, "--lasts", min=1.0, max=600.0, callback=check_finite, help="Length of a drive [s]."
+    ),
+    margin: float = typer.Option(
+        0.4, "--margin", min=0.0, max=3.0, callback=check_finite, help="Distance kept free around road users [m]."
+    ),
     sigmas: float = typer.Option(
         0.0,
         "--sigmas",
         min=0.0,
         max=10.0,
-        help="Multiple of the standard deviation of predicted places kept free, too.",
+        callback=check_finite,
+        help="Multiple of the standard deviation of predicted places that is kept free, too.",
     ),
     pole: list[int] = typer.Option(
         [], "--pole", help="Number of a pole that sends what it finds, with --perception networks; several times."
@@ -53,28 +58,33 @@ def drive(
     from flcav.storage.files import check_writable, write_json
 
     chosen, numbers = find_scenarios(scenario), range(1, seeds + 1)
-    if pole and perception != Perceives.networks:
-        raise InputError("--pole: needs --perception networks, since its LiDAR is simulated beside the vehicle's")
+    for option, given in (("--pole", bool(pole)), ("--measure", measure is not None)):
+        if given and perception != Perceives.networks:
+            raise InputError(f"{option}: needs --perception networks, since sensors are simulated")
+    if pole and measure is not None:
+        raise InputError("--measure: measures the vehicle's networks alone, without --pole")
+    if pole:
+        refuse_unused("drive --pole", "jobs")
     if pole and len({each.town for each in chosen}) > 1:
         raise InputError("--pole: needs scenarios of one town, --scenario")
     if measure is not None:
         check_writable(measure.parent)
     model = read_model(perception, errors)
+    loop = Loop(Settings(margin, sigmas), lasts)
     if measure is not None:
         with show_progress("measure") as report:
-            found = measure_errors(chosen, numbers, lasts, jobs, report)
+            found = measure_errors(chosen, numbers, loop, jobs, report)
         write_json(measure, found.as_json())
         typer.echo(f"{measure}: errors of the networks in {found.frames} frames")
         return
     if pole:
         with show_progress("drive") as report:
-            gain = measure_pole_gain(chosen, numbers, pole, lasts_s=lasts, progress=report)
+            gain = measure_pole_gain(chosen, numbers, pole, loop, report)
         if as_json:
             print_json(gain.as_json())
         else:
             typer.echo("\n".join(gain.lines()))
         return
-    loop = Loop(Settings(margin, sigmas), lasts)
     with show_progress("drive") as report:
         tasks = [Job(each, seed, loop=loop) for each in chosen for seed in numbers]
         drives = run_jobs(tasks, Sensed(perception.value, model), jobs, report)

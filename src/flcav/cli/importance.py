@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import JOBS
+from flcav.cli.options import JOBS, check_finite
 from flcav.cli.terminal import print_json
 
 if TYPE_CHECKING:
@@ -25,6 +25,13 @@ class Perceives(StrEnum):
     truth = "truth"
 
 
+class CouplingName(StrEnum):
+    """Couplings of perception and driving, see `flcav.driving.couplings`."""
+
+    bare = "bare"
+    cautious = "cautious"
+
+
 PERCEPTION = typer.Option(
     Perceives.model,
     "--perception",
@@ -33,7 +40,7 @@ PERCEPTION = typer.Option(
 ERRORS = typer.Option(
     None, "--errors", help="JSON of the errors of networks, of `flcav drive --measure`; by default the package's."
 )
-LASTS = typer.Option(12.0, "--lasts", min=1.0, max=600.0, help="Length of a drive [s].")
+LASTS = typer.Option(12.0, "--lasts", min=1.0, max=600.0, callback=check_finite, help="Length of a drive [s].")
 
 
 def register(group: typer.Typer) -> None:
@@ -47,7 +54,9 @@ def importance(
     perception: Perceives = PERCEPTION,
     errors: Path | None = ERRORS,
     lasts: float = LASTS,
-    coupling: str = typer.Option("bare", "--coupling", help="bare or cautious: whose weights --weigh writes."),
+    coupling: CouplingName | None = typer.Option(
+        None, "--coupling", help="Whose weights --weigh writes: bare, the default, or cautious."
+    ),
     weigh: Path | None = typer.Option(
         None, "--weigh", help="An allocation problem or a run recipe (YAML): --out gets it with these weights."
     ),
@@ -63,14 +72,14 @@ def importance(
     Drives are paired over scenarios and seeds. Beside it: the article's own rule, the loss of the joint objective.
     """
     from flcav.config import InputError, read_yaml
-    from flcav.driving.importance import COUPLINGS, measure_importance, read_reached
+    from flcav.driving.importance import measure_importance, read_reached
     from flcav.driving.jobs import Sensed
     from flcav.driving.scenarios import spread_scenarios
     from flcav.interface.progress import show_progress
     from flcav.storage.files import check_writable
 
-    if coupling not in COUPLINGS:
-        raise InputError(f"--coupling {coupling}: must be one of {', '.join(COUPLINGS)}")
+    if weigh is None and coupling is not None:
+        raise InputError("--coupling: says whose weights --weigh writes, and there is no --weigh")
     if (weigh is None) != (out is None):
         raise InputError("--weigh and --out: the file to read and the one to write go together")
     document = None if weigh is None else read_yaml(weigh)
@@ -89,7 +98,7 @@ def importance(
 
         from flcav.storage.files import write_bytes
 
-        weights = {each.task: max(each.weight, LEAST) for each in found.tasks[coupling]}
+        weights = {each.task: max(each.weight, LEAST) for each in found.tasks[coupling or CouplingName.bare]}
         write_bytes(out, yaml.safe_dump(set_weights(document, weights, str(weigh)), sort_keys=False).encode())
     if as_json:
         print_json(found.as_json())

@@ -187,12 +187,12 @@ class Comparing:
 def measure_errors(
     scenarios: Sequence[Scenario],
     seeds: Sequence[int],
-    lasts_s: float = 12.0,
+    loop: Loop,
     processes: int = 1,
     progress: Report = ignore_progress,
 ) -> ErrorModel:
     """Return the error model of the package's networks over drives of these scenarios and seeds."""
-    jobs = [(scenario, seed, lasts_s) for scenario in scenarios for seed in seeds]
+    jobs = [(scenario, seed, loop) for scenario in scenarios for seed in seeds]
     whole = Tally()
     with process_pool(processes, begin_worker) as pool:
         for done, own in enumerate(pool.map(tally_drive, *zip(*jobs)), start=1):
@@ -211,10 +211,10 @@ def begin_worker() -> None:
     """Begin a worker process, which needs nothing."""
 
 
-def tally_drive(scenario: Scenario, seed: int, lasts_s: float) -> Tally:
+def tally_drive(scenario: Scenario, seed: int, loop: Loop) -> Tally:
     """Return what the networks get wrong in one drive."""
     tally = Tally()
-    drive(scenario, seed, lambda staged, own: Comparing(staged, own, tally), Loop(lasts_s=lasts_s))
+    drive(scenario, seed, lambda staged, own: Comparing(staged, own, tally), loop)
     return tally
 
 

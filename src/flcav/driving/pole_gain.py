@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.driving.errors import EYE_M, FIELD_M
-from flcav.driving.loop import Loop, drive
+from flcav.driving.loop import LOOP, Loop, drive
 from flcav.driving.measures import Drive
 from flcav.driving.networks import NetworkPerception
 from flcav.driving.road import SPIN_S, RoadUnits
@@ -194,12 +194,11 @@ def measure_pole_gain(
     scenarios: Sequence[Scenario],
     seeds: Sequence[int],
     poles: Sequence[int],
-    *,
-    lasts_s: float = 15.0,
+    loop: Loop = LOOP,
     progress: Report = ignore_progress,
 ) -> PoleGain:
     """Return what poles of the scenarios' town give; raises `InputError` for a pole that it does not have."""
-    tally, without, with_poles, loop = FusionTally(), list[Drive](), list[Drive](), Loop(lasts_s=lasts_s)
+    tally, without, with_poles = FusionTally(), list[Drive](), list[Drive]()
     pairs = [(scenario, seed) for scenario in scenarios for seed in seeds]
     for done, (scenario, seed) in enumerate(pairs, start=1):
         without.append(drive(scenario, seed, NetworkPerception, loop))

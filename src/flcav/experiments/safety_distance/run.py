@@ -82,7 +82,7 @@ def compare_margins(
     progress: Report = ignore_progress,
     scenarios: int = SCENARIOS,
 ) -> SafetyDistance:
-    """Return the trade-off over the package's scenarios and `seeds` seeds, on so many processes; drives are kept in `out`."""
+    """Return the trade-off over the package's scenarios and `seeds` seeds; drives are kept in the folder `out`."""
     model = load_errors()
     settings = {f"fixed {size:g} m": Settings(size) for size in FIXED_M}
     settings |= {f"{size:g} sigma": Settings(0.0, size) for size in SIGMAS}
