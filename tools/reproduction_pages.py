@@ -41,6 +41,8 @@ from flcav.experiments.roadside.average import RoadAverageResult
 from flcav.experiments.roadside.detector import RoadDetectorResult
 from flcav.experiments.roadside.fig4 import Fig4
 from flcav.experiments.roadside.ranges import SensorRanges
+from flcav.experiments.safety_distance.run import SafetyDistance
+from flcav.experiments.safety_distance.tables import safety_tables
 from flcav.experiments.sim_to_real import tables as sim_to_real_tables
 from flcav.experiments.sim_to_real.run import SimToReal
 from flcav.experiments.studies import objects, signs, trajectory, weather

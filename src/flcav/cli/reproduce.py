@@ -89,7 +89,7 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
 SEEDS: Mapping[str, int] = {
     **dict.fromkeys((Target.corner_cases, Target.demo_arms, *EXCHANGES, *ATTACKS), 5),
     **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
-    Target.safety_distance: 2,
+    Target.safety_distance: 1,
 }
 
 
