@@ -28,7 +28,7 @@ from flcav.storage.records import Record
 
 FIXED_M = (0.0, 0.4, 0.8, 1.2, 1.8)
 SIGMAS = (0.25, 0.5, 1.0, 2.0)
-SCENARIOS, SEEDS, LASTS_S = 8, 1, 12.0
+SCENARIOS, SEEDS, LASTS_S = 6, 1, 12.0
 
 
 @dataclass(frozen=True)
