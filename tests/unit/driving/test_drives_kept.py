@@ -1,4 +1,4 @@
-"""Kept drives, who is hidden, messages of poles, and weights in problems and recipes: parts of driving without a loop."""
+"""Kept drives, who is hidden, messages of poles, weights in problems and recipes: driving without a loop."""
 
 import json
 from dataclasses import replace
@@ -18,10 +18,12 @@ from flcav.driving.pole_gain import find_hidden, summarise_hidden
 from flcav.driving.road import empty_trace, fuse, pack_tracks
 from flcav.driving.scenarios import list_scenarios
 from flcav.driving.seen import TIMES_S
-from flcav.geometry import Boxes
+from flcav.geometry import Boxes, left_vectors
 from flcav.network.messages import unpack
 from flcav.optimization.problem import Problem
 from flcav.perception.tracking.tracker import Tracker
+from flcav.world.map.roads import read_net
+from flcav.world.map.routes import draw_route
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
@@ -63,7 +65,7 @@ def test_weights_go_into_problems_and_recipes() -> None:
         "tasks": {"objects": {"network": "tiny", "weight": 0.7}, "weather": {}},
     }
     for bad in ([], {"tasks": []}, {"tasks": [{"weight": 1}]}, {"seed": 1}):
-        with pytest.raises(InputError, match="no tasks|no name"):
+        with pytest.raises(InputError, match=r"no tasks|no name"):
             set_weights(bad, weights, "bad.yaml")
 
 
@@ -130,10 +132,11 @@ def standing(places: list[tuple[float, float, float]]) -> Trace:
 
 def test_who_is_behind_a_car_is_hidden_from_the_vehicle_and_seen_from_above() -> None:
     town = load_town("grid")
-    x, y = town.roads[0].mean(axis=0)
-    wall = [(x + 8.0, y + side, np.pi / 2) for side in (-4.7, 0.0, 4.7)]
-    scene = Scene(town, standing([(x, y, 0.0), *wall, (x + 13.0, y, 0.0)]))
-    boxes, hidden = find_hidden(scene, 0, [np.array((x + 13.0, y + 3.0, 12.0))], 40.0)
+    route = draw_route(read_net(town.net), np.random.default_rng(5), 200.0)
+    own, _, behind = route.at([20.0, 28.0, 33.0]).tolist()
+    wall = [(*(route.at(28.0)[:2] + side * left_vectors(own[2])), own[2] + np.pi / 2) for side in (-4.7, 0.0, 4.7)]
+    scene = Scene(town, standing([tuple(own), *wall, tuple(behind)]))
+    boxes, hidden = find_hidden(scene, 0, [np.array((*behind[:2], 8.0))], 40.0)
     assert len(boxes) == 4
     assert not hidden[:3, 0].any()
     assert not hidden[3, 1]
