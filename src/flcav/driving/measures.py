@@ -2,7 +2,8 @@
 
 A collision is at fault unless the ego vehicle stood, or was run into from behind by something faster (the duty of
 the one behind: Shalev-Shwartz et al., "On a formal model of safe and scalable self-driving cars", 2017, rule 1). The
-driving score is that of CARLA's leaderboard: the share of the route times a penalty for every infringement.
+driving score is progress times a factor for every infringement: those of nuPlan's closed-loop score for collisions at
+fault (Caesar et al., 2021), and of CARLA's leaderboard for red lights.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +25,7 @@ Array = NDArray[np.float64]
 HARD_MPS2 = 4.0  # deceleration of a hard brake
 STANDS_MPS = 0.3
 NEAR_S = 1.5  # time to collision below which a drive comes close
-PENALTY: Mapping[str, float] = {"pedestrian": 0.5, "vehicle": 0.6, "obstacle": 0.65, "red light": 0.7}
+PENALTY: Mapping[str, float] = {"pedestrian": 0.0, "vehicle": 0.0, "obstacle": 0.5, "red light": 0.7}
 
 
 @dataclass(frozen=True)

@@ -131,8 +131,9 @@ def test_what_is_left_without_a_task(task: str) -> None:
 
 
 def test_score_and_faults() -> None:
-    hit = Hit(1.0, "ped3", "pedestrian", 5.0, True)
+    hit = Hit(1.0, "tree:3", "obstacle", 5.0, True)
     assert score_drive(0.8, [hit], 1) == pytest.approx(0.8 * 0.5 * 0.7)
+    assert score_drive(0.8, [replace(hit, kind="pedestrian")], 0) == 0.0
     assert score_drive(0.8, [replace(hit, at_fault=False)], 0) == pytest.approx(0.8)
 
 
