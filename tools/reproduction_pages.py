@@ -43,6 +43,8 @@ from flcav.experiments.roadside.average import RoadAverageResult
 from flcav.experiments.roadside.detector import RoadDetectorResult
 from flcav.experiments.roadside.fig4 import Fig4
 from flcav.experiments.roadside.ranges import SensorRanges
+from flcav.experiments.safety_distance.run import SafetyDistance
+from flcav.experiments.safety_distance.tables import safety_tables
 from flcav.experiments.sim_to_real import tables as sim_to_real_tables
 from flcav.experiments.sim_to_real.run import SimToReal
 from flcav.experiments.studies import objects, signs, trajectory, weather
@@ -88,6 +90,7 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "placement": _told(PlacementProof, placement_tables.tables),
     "road-average": _told(RoadAverageResult, roadside_tables.average_tables),
     "road-detector": _told(RoadDetectorResult, roadside_tables.detector_tables),
+    "safety-distance": _told(SafetyDistance, safety_tables),
     "sensor-ranges": _told(SensorRanges, roadside_tables.range_tables),
     "sim-to-real": _told(SimToReal, sim_to_real_tables.tables),
     "task-objects": _of_study(objects.STUDY, objects_tables.tables),

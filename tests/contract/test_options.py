@@ -126,7 +126,9 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--poles": ALWAYS,
         "--range": ALWAYS,
         "--count": ALWAYS,
-        **dict.fromkeys(("--sensors", "--budget", "--cover", "--data", "--line-of-sight", "--class-weight"), ALWAYS),
+        **dict.fromkeys(
+            ("--sensors", "--budget", "--cover", "--data", "--line-of-sight", "--class-weight", "--driving"), ALWAYS
+        ),
         "--method": ALWAYS,
         "--town": ALWAYS,
         "--map": ALWAYS,
@@ -150,6 +152,20 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         (
             *("--model-mb", "--update-mb", "--steps", "--step-s", "--rounds", "--edge-rounds-per-cloud-round"),
             *("--pole", "--scene", "--network", "--seed", "--timeline"),
+        ),
+        ALWAYS,
+    ),
+    "drive": dict.fromkeys(
+        (
+            *("--scenario", "--seeds", "--perception", "--errors", "--lasts", "--margin", "--sigmas"),
+            *("--pole", "--measure", "--jobs"),
+        ),
+        ALWAYS,
+    ),
+    "odd importance": dict.fromkeys(
+        (
+            *("--scenarios", "--seeds", "--perception", "--errors", "--lasts", "--coupling", "--weigh"),
+            *("--keep", "--jobs"),
         ),
         ALWAYS,
     ),

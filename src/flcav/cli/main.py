@@ -10,7 +10,7 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import carla, federate, fleet, odd, release, reproduce, towns
+from flcav.cli import carla, drive, federate, fleet, odd, release, reproduce, towns
 from flcav.cli import (
     run as run_command,
 )
@@ -73,6 +73,7 @@ for command in (
     history,
     radio,
     rounds,
+    drive,
     odd,
     carla,
     fleet,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from flcav.cli import importance
 from flcav.cli.options import Device, check_finite
 from flcav.cli.tables import numbers, read_table
 from flcav.cli.terminal import print_json
@@ -36,6 +37,7 @@ JSON = typer.Option(False, "--json", help="Print one JSON object instead.")
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
+    importance.register(odd)
     app.add_typer(odd, name="odd")
 
 

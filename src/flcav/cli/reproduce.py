@@ -51,6 +51,7 @@ class Target(StrEnum):
     placement = "placement"
     road_average = "road-average"
     road_detector = "road-detector"
+    safety_distance = "safety-distance"
     sensor_ranges = "sensor-ranges"
     sim_to_real = "sim-to-real"
 
@@ -87,11 +88,13 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig3a: (),
     **dict.fromkeys(RECORDED, ()),
     **dict.fromkeys(DRIVES, ("seeds",)),
+    Target.safety_distance: ("seeds", "scale", "jobs"),
     Target.sim_to_real: (*RUN, *REAL),
 }
 SEEDS: Mapping[str, int] = {
     **dict.fromkeys((Target.corner_cases, Target.demo_arms, *EXCHANGES, *DRIVES), 5),
     **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
+    Target.safety_distance: 1,
 }
 
 
@@ -333,6 +336,16 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName,
     _write_figures(out, results.as_json(), draw_proof(results), [*results.sentences(), *describe_claims(results)])
 
 
+@when_interrupted()
+def _safety_distance(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
+    from flcav.experiments.safety_distance.run import SCENARIOS, compare_margins
+    from flcav.interface import progress
+
+    with progress.show_progress(Target.safety_distance.value) as report:
+        results = compare_margins(out, seeds, jobs, report, SCENARIOS if scale == "paper" else 2)
+    _write_figures(out, results.as_json(), {"trade_off.png": results.picture()}, results.sentences())
+
+
 def _corner_cases(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
     from flcav.experiments.corner_cases.run import compare_corner_cases, draw_corner_cases
     from flcav.experiments.scales import shrink_recipe
@@ -356,6 +369,7 @@ COMPARISONS: Mapping[str, Callable[[Path, int, str, int, EngineName, Stale], Non
     Target.gap: _gap,
     Target.networks: _networks,
     Target.placement: _placement,
+    Target.safety_distance: _safety_distance,
 }
 
 

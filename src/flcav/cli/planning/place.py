@@ -58,6 +58,9 @@ def place(
     map_: Path | None = typer.Option(
         None, "--map", callback=check_png, help="PNG file of errors, poles and what they cover, in the town."
     ),
+    driving: bool = typer.Option(
+        False, "--driving", help="Count who is hidden from the dataset's vehicles, from every chosen pole, from both."
+    ),
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
     verify: bool = typer.Option(
         False, "--verify", help="Recompute coverage, cost and bound with no code of the solver; exit 1 if one is wrong."
@@ -87,9 +90,11 @@ def place(
     if map_ is not None:
         check_writable(map_.parent)
     here, traces = place_inputs.read_world(data, town)
-    for option, wanted in (("--map", map_ is not None), ("--line-of-sight", line_of_sight)):
+    for option, wanted in (("--map", map_ is not None), ("--line-of-sight", line_of_sight), ("--driving", driving)):
         if wanted and here is None:
             raise InputError(f"{option}: needs --town, or --data whose town is known")
+    if driving and not traces:
+        raise InputError("--driving: needs --data with recorded traffic")
     given = place_inputs.read_given(errors, poles, sensors, range_m, class_weight)
     if here is not None:
         check_inside(here, given.errors, given.poles, (errors, poles))
@@ -112,6 +117,12 @@ def place(
     conventional = _place_conventionally(candidates, given, limit, here, traces)
     if map_ is not None and here is not None:
         _draw(map_, here, given, result, conventional, seen, traces)
+    hidden = None
+    if driving and here is not None:
+        from flcav.driving.pole_gain import count_hidden
+
+        sites, ranges_m = given.poles[list(result.chosen)], given.ranges_m[list(result.sensors)].tolist()
+        hidden = count_hidden(here, traces, sites, ranges_m)
     cost = given.cost_of(result)
     verified = _verify(given, seen, result, least, count, budget, cover) if verify else None
     if as_json:
@@ -127,6 +138,7 @@ def place(
                 "cost_lower_bound": least,
                 "marginal_gain": result.marginal_gain,
                 "certificate": None if result.certificate is None else asdict(result.certificate),
+                **({} if hidden is None else {"hidden": hidden.as_json()}),
                 **({} if verified is None else {"verification": asdict(verified)}),
                 "baselines": {
                     **{name: _tell(given, placed) for name, placed in conventional.items()},
@@ -136,6 +148,8 @@ def place(
         )
     else:
         _show(given, np.diff(candidates.covers.indptr).tolist(), result, conventional, least)
+        for line in [] if hidden is None else hidden.lines():
+            typer.echo(line)
         told = [] if verified is None else verified.lines(counted=count is not None or not given.priced)
         typer.echo("\n".join(told), nl=verified is not None)
     if verified is not None and verified.faults:

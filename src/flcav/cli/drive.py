@@ -1,0 +1,97 @@
+"""`flcav drive`: closed-loop drives through scenarios, by what perception finds."""
+
+from pathlib import Path
+
+import typer
+
+from flcav.cli.importance import ERRORS, Perceives, read_model
+from flcav.cli.options import JOBS, check_finite, refuse_unused
+from flcav.cli.terminal import print_json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to `app`."""
+    app.command("drive")(drive)
+
+
+def drive(
+    scenario: list[str] = typer.Option(
+        [], "--scenario", help="Name of a scenario; may be given several times. By default all of the package."
+    ),
+    seeds: int = typer.Option(1, "--seeds", min=1, max=100, help="Seeds of each, from 1."),
+    perception: Perceives = typer.Option(
+        Perceives.truth, "--perception", help="truth: ground truth; model: the networks' errors; networks: themselves."
+    ),
+    errors: Path | None = ERRORS,
+    lasts: float = typer.Option(
+        30.0, "--lasts", min=1.0, max=600.0, callback=check_finite, help="Length of a drive [s]."
+    ),
+    margin: float = typer.Option(
+        0.4, "--margin", min=0.0, max=3.0, callback=check_finite, help="Distance kept free around road users [m]."
+    ),
+    sigmas: float = typer.Option(
+        0.0,
+        "--sigmas",
+        min=0.0,
+        max=10.0,
+        callback=check_finite,
+        help="Multiple of the standard deviation of predicted places that is kept free, too.",
+    ),
+    pole: list[int] = typer.Option(
+        [], "--pole", help="Number of a pole that sends what it finds, with --perception networks; several times."
+    ),
+    measure: Path | None = typer.Option(
+        None, "--measure", help="JSON file to write: the errors of the networks on these drives."
+    ),
+    jobs: int = JOBS,
+    as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
+) -> None:
+    """Drive through scenarios in closed loop, and print time to collision, hard brakes, progress and collisions."""
+    from flcav.config import InputError
+    from flcav.driving.driver import Settings
+    from flcav.driving.errors import measure_errors
+    from flcav.driving.jobs import Job, Sensed, run_jobs
+    from flcav.driving.loop import Loop
+    from flcav.driving.pole_gain import measure_pole_gain
+    from flcav.driving.scenarios import find_scenarios
+    from flcav.interface.progress import show_progress
+    from flcav.storage.files import check_writable, write_json
+
+    chosen, numbers = find_scenarios(scenario), range(1, seeds + 1)
+    for option, given in (("--pole", bool(pole)), ("--measure", measure is not None)):
+        if given and perception != Perceives.networks:
+            raise InputError(f"{option}: needs --perception networks, since sensors are simulated")
+    if pole and measure is not None:
+        raise InputError("--measure: measures the vehicle's networks alone, without --pole")
+    if pole:
+        refuse_unused("drive --pole", "jobs")
+    if pole and len({each.town for each in chosen}) > 1:
+        raise InputError("--pole: needs scenarios of one town, --scenario")
+    if measure is not None:
+        check_writable(measure.parent)
+    model = read_model(perception, errors)
+    loop = Loop(Settings(margin, sigmas), lasts)
+    if measure is not None:
+        with show_progress("measure") as report:
+            found = measure_errors(chosen, numbers, loop, jobs, report)
+        write_json(measure, found.as_json())
+        typer.echo(f"{measure}: errors of the networks in {found.frames} frames")
+        return
+    if pole:
+        with show_progress("drive") as report:
+            gain = measure_pole_gain(chosen, numbers, pole, loop, report)
+        if as_json:
+            print_json(gain.as_json())
+        else:
+            typer.echo("\n".join(gain.lines()))
+        return
+    with show_progress("drive") as report:
+        tasks = [Job(each, seed, loop=loop) for each in chosen for seed in numbers]
+        drives = run_jobs(tasks, Sensed(perception.value, model), jobs, report)
+    if as_json:
+        print_json({"drives": [own.as_json() for own in drives]})
+        return
+    for own in drives:
+        typer.echo(own.line())
+    faults, hits = sum(own.faults for own in drives), sum(len(own.hits) for own in drives)
+    typer.echo(f"{len(drives)} drives: {faults} collisions at fault, {hits - faults} others")

@@ -1,0 +1,178 @@
+"""A driver: follows a route, keeps its distance, stops at red, and brakes for what is predicted to be in its way.
+
+Longitudinal control is the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000) behind the
+nearest of several leaders: road users in the corridor, a stop line, and the place where a predicted path crosses the
+corridor at the time at which the vehicle would be there. Where only more than `EMERGENCY_MPS2` avoids that, it brakes
+with all it has. Steering is pure pursuit (Coulter, CMU-RI-TR-92-01, 1992).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.driving.corridor import Occupied, find_meeting, find_occupied
+from flcav.driving.seen import TIMES_S, Seen
+from flcav.geometry import heading_vectors, rotate
+from flcav.world.commands import Controls
+from flcav.world.dynamics.blueprints import Blueprint
+from flcav.world.map.routes import Route
+
+Array = NDArray[np.float64]
+
+GAIN_MPS2, EASE_MPS2 = 2.0, 2.5  # greatest acceleration, comfortable deceleration
+HEADWAY_S, STANDSTILL_M = 1.2, 2.0
+EMERGENCY_MPS2 = 4.0  # from this need on all brakes are used
+ASIDE_MPS2 = 2.5  # greatest lateral acceleration in curves
+LINE_M = 4.0  # from the front to a stop line: a head beside it stays in the picture of a camera
+SAME_WAY = 0.7  # cosine between a road user's course and the route from which it is a leader
+CURVES_M = np.arange(0.0, 45.0, 3.0)
+FARTHEST_GAP_M = 1e3
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a driver keeps free around road users: a fixed distance, and a multiple of its perception's uncertainty."""
+
+    margin_m: float = 0.4
+    sigmas: float = 0.0  # multiple of the standard deviation of predicted positions
+    most_m: float = 3.0  # the margin is never more
+
+
+DEFAULT = Settings()
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where the vehicle is and how fast, as its own navigation knows it."""
+
+    x: float  # of the box's middle [m]
+    y: float
+    yaw: float  # [rad]
+    speed: float  # [m/s]
+    along: float  # the route [m]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a driver does, and why."""
+
+    controls: Controls
+    acceleration: float  # that it wants [m/s^2]
+    emergency: bool
+
+
+def decide(route: Route, own: Motion, seen: Seen, vehicle: Blueprint, settings: Settings = DEFAULT) -> Decision:
+    """Return the controls for the next tenth of a second."""
+    wanted = find_speed(route, own, seen.speed_share)
+    half = vehicle.size[0] / 2
+    free = _follow(own.speed, wanted, FARTHEST_GAP_M, wanted)
+    needs = [free, _stop_at_light(route, own, seen, half, wanted)]
+    margin = np.minimum(settings.margin_m + settings.sigmas * seen.spread, settings.most_m)
+    occupied = find_occupied(route, own.along, seen.boxes, seen.path, seen.yaw, vehicle.size[1] / 2, margin)
+    needs += _avoid(route, own, seen, occupied, half, wanted)
+    acceleration = min(needs)
+    emergency = acceleration < -EMERGENCY_MPS2
+    if emergency:
+        acceleration = -vehicle.brake_mps2
+    pedal = acceleration / (GAIN_MPS2 * 2 if acceleration > 0 else vehicle.brake_mps2)
+    if own.speed < 0.3 and acceleration <= 0.1:
+        pedal = -1.0  # stand still
+    steer = _steer(route, own, vehicle)
+    throttle, brake = float(np.clip(pedal, 0, 1)), float(np.clip(-pedal, 0, 1))
+    return Decision(Controls(throttle=throttle, steer=steer, brake=brake), acceleration, emergency)
+
+
+def find_speed(route: Route, own: Motion, share: float) -> float:
+    """Return the speed [m/s] that limits, curves ahead and the weather allow."""
+    ahead = own.along + CURVES_M
+    turn = np.abs(np.diff(np.unwrap(route.at(np.append(ahead - 1.5, ahead[-1] + 1.5))[:, 2])))
+    curve = np.sqrt(ASIDE_MPS2 / np.maximum(turn / np.diff(CURVES_M)[0], 1e-3))
+    limits = np.minimum(curve, [route.limit(float(each)) * share for each in ahead])
+    return float(np.sqrt(limits**2 + 2 * EASE_MPS2 * 0.8 * CURVES_M).min())
+
+
+def _follow(speed: float, wanted: float, gap_m: float, ahead_mps: float) -> float:
+    """Return the acceleration [m/s^2] of the Intelligent Driver Model at `gap_m` behind a leader of `ahead_mps`."""
+    closing = speed * (speed - ahead_mps) / (2 * np.sqrt(GAIN_MPS2 * EASE_MPS2))
+    desired = STANDSTILL_M + max(0.0, speed * HEADWAY_S + closing)
+    near = (desired / max(gap_m, 0.1)) ** 2
+    return float(max(_approach_speed(speed, max(wanted, 0.1)) - GAIN_MPS2 * near, -12.0))
+
+
+def _approach_speed(speed: float, wanted: float) -> float:
+    """Return the acceleration [m/s^2] on a free road: slower than comfortable braking where it is too fast.
+
+    Above the wanted speed it is that of the improved model (Treiber and Kesting, Traffic Flow Dynamics, 2013, 11.3.7).
+    """
+    if speed <= wanted:
+        return GAIN_MPS2 * (1 - (speed / wanted) ** 4)
+    return -EASE_MPS2 * (1 - (wanted / speed) ** (4 * GAIN_MPS2 / EASE_MPS2))
+
+
+def _halt(speed: float, wanted: float, gap_m: float) -> float:
+    """Return the acceleration [m/s^2] with which to halt `gap_m` further on: none before it has to be comfortable."""
+    needed = speed**2 / (2 * max(gap_m, 0.1))
+    if needed > EASE_MPS2:
+        return -1.1 * needed
+    return _follow(speed, wanted, gap_m + STANDSTILL_M, 0.0)
+
+
+def _stop_at_light(route: Route, own: Motion, seen: Seen, half_m: float, wanted: float) -> float:
+    """Return the acceleration for the next light: none at a yellow one that is too near to stop for."""
+    for stop, link in route.stops:
+        gap = stop - LINE_M - own.along - half_m
+        if gap < -LINE_M + 0.5 or link not in seen.closed:
+            continue
+        needed = own.speed**2 / (2 * max(gap, 0.1))
+        if needed > (EMERGENCY_MPS2 - 0.5 if link in seen.amber else 8.0):
+            continue
+        return _halt(own.speed, wanted, gap)
+    return np.inf
+
+
+def _avoid(route: Route, own: Motion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[float]:
+    """Return the acceleration for each road user that is, or is going to be, in the way."""
+    present = np.isfinite(occupied.low).any(axis=1)
+    if not present.any():
+        return []
+    go = _cover(own.speed, wanted, GAIN_MPS2)
+    keep = own.speed * TIMES_S
+    meets = find_meeting(occupied, go, half_m) | find_meeting(occupied, keep, half_m)
+    needs = []
+    for row in np.flatnonzero(present):
+        low = occupied.low[row]
+        nearest = float(np.min(low))
+        place = own.along + (float(low[0]) if np.isfinite(low[0]) else nearest)
+        along_mps = float(seen.velocity[row] @ heading_vectors(route.at(place)[2]))
+        same_way = along_mps > SAME_WAY * float(np.hypot(*seen.velocity[row])) and along_mps > 0.5
+        if np.isfinite(low[0]) and occupied.high[row, 0] > 0:  # now in the corridor, and not behind
+            if occupied.low[row, 0] > -half_m:
+                needs.append(_follow(own.speed, wanted, float(low[0]) - half_m, max(along_mps, 0.0)))
+            continue
+        if not meets[row].any():
+            continue
+        first = int(np.argmax(meets[row]))
+        if same_way:
+            gap = float(low[first]) - along_mps * float(TIMES_S[first]) - half_m
+            needs.append(_follow(own.speed, wanted, max(gap, 1.0), along_mps))
+            continue
+        gap = float(np.min(low[np.isfinite(low)])) - half_m
+        if gap > 0:  # otherwise it is in the way already, and leaves it
+            needs.append(_halt(own.speed, wanted, gap - 1.0))
+    return needs
+
+
+def _cover(speed: float, wanted: float, gain: float) -> Array:
+    """Return the distances (T,) [m] driven by `TIMES_S` when accelerating to the wanted speed."""
+    rise = max((wanted - speed) / gain, 0.0)
+    early = np.minimum(TIMES_S, rise)
+    return speed * early + gain * early**2 / 2 + max(wanted, speed) * (TIMES_S - early)
+
+
+def _steer(route: Route, own: Motion, vehicle: Blueprint) -> float:
+    """Return the share of the greatest steering angle (pure pursuit)."""
+    aim_x, aim_y, _ = route.at(own.along + 3.5 + 0.35 * own.speed)
+    ahead, left = rotate(aim_x - own.x, aim_y - own.y, -own.yaw)
+    angle = np.arctan(2 * vehicle.wheelbase_m * left / (ahead**2 + left**2))
+    return float(np.clip(angle / vehicle.steer_limit_rad, -1, 1))

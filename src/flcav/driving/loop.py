@@ -1,0 +1,122 @@
+"""The closed loop: ten times a second the driver is told what is seen, and the world goes on by what it does."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from flcav.driving.driver import DEFAULT, Motion, Settings, decide
+from flcav.driving.measures import HARD_MPS2, NEAR_S, STANDS_MPS, Drive, Hit, judge_collision, measure_ttc, score_drive
+from flcav.driving.scenarios import DT_S, Scenario, Staged
+from flcav.driving.seen import EGO, Perception
+from flcav.driving.truth import Truth, read_lights
+from flcav.geometry import heading_vectors
+from flcav.world.map.routes import Route
+from flcav.world.snapshot import Snapshot
+
+LASTS_S = 30.0
+ENDS_M = 15.0  # before the end of the route a drive ends
+
+Sensing = Callable[[Staged, int], Perception]  # makes the perception of a drive, by its scenario and seed
+
+
+@dataclass(frozen=True)
+class Loop:
+    """How the closed loop is run."""
+
+    driver: Settings = DEFAULT
+    lasts_s: float = LASTS_S
+
+
+LOOP = Loop()
+
+
+def sense_truth(staged: Staged, seed: int) -> Perception:
+    """Return ground-truth perception."""
+    return Truth(staged.scenario.weather)
+
+
+def drive(scenario: Scenario, seed: int, sense: Sensing = sense_truth, loop: Loop = LOOP) -> Drive:
+    """Return the measures of a drive: a scenario with a seed, with what `sense` makes of it.
+
+    It ends with a collision at fault, near the end of the route, or after its time. Raises `InputError` where the town
+    has no room for the ego vehicle, and what the perception raises.
+    """
+    staged = Staged(scenario, seed)
+    try:
+        return _drive(staged, seed, sense(staged, seed), loop)
+    finally:
+        staged.world.close()
+
+
+def _drive(staged: Staged, seed: int, perception: Perception, loop: Loop) -> Drive:
+    world, route, truth = staged.world, staged.route, Truth(staged.scenario.weather)
+    body = world.bodies.find(EGO).blueprint
+    size = (body.size[0], body.size[1])
+    now, along = world.snapshot, staged.start_m
+    hits: list[Hit] = []
+    ttc, speeds, hard, braking, reds = [], [], 0, False, 0
+    for _ in range(round(loop.lasts_s / DT_S)):
+        own = find_motion(now, route, along)
+        staged.act(own.along, own.speed)
+        now = world.snapshot
+        controls = decide(route, own, perception.look(now), body, loop.driver).controls
+        ttc.append(measure_ttc(route, own, truth.look(now), size))
+        before, now = now, world.step({EGO: controls})
+        after = find_motion(now, route, own.along)
+        slowing = (own.speed - after.speed) / DT_S > HARD_MPS2
+        hard, braking = hard + (slowing and not braking), slowing
+        reds += _pass_red(route, own, after, size[0], now)
+        along = after.along
+        speeds.append(after.speed)
+        kinds = dict(zip(now.trace.actor.tolist(), now.trace.category.tolist()))
+        known = {hit.other for hit in hits}
+        new = [
+            judge_collision(each, before, kinds, now.time_s)
+            for each in now.collisions
+            if EGO in (each.name, each.other)
+        ]
+        hits += [hit for hit in new if hit.other not in known]
+        if any(hit.at_fault for hit in hits) or along > route.length_m - ENDS_M:
+            break
+    allowed = _allowed(route, staged.start_m, loop.lasts_s if along <= route.length_m - ENDS_M else now.time_s)
+    progress = min((along - staged.start_m) / allowed, 1.0)
+    least, near = np.array(ttc), np.array(ttc) < NEAR_S
+    return Drive(
+        scenario=staged.scenario.name,
+        seed=seed,
+        time_s=now.time_s,
+        progress=progress,
+        mean_speed=float(np.mean(speeds)),
+        least_ttc_s=float(least.min()),
+        near_share=float(near.mean()),
+        hard_brakes=hard,
+        red_lights=reds,
+        hits=tuple(hits),
+        score=score_drive(progress, hits, reds),
+    )
+
+
+def find_motion(snapshot: Snapshot, route: Route, near: float) -> Motion:
+    """Return the motion of the ego vehicle, which was `near` [m] along the route a moment ago."""
+    trace, row = snapshot.trace, snapshot.row(EGO)
+    x, y = trace.position[0, row, :2].tolist()
+    yaw = float(trace.yaw[0, row])
+    along, _ = route.project(x, y, near)
+    return Motion(x, y, yaw, float(trace.velocity[0, row, :2] @ heading_vectors(yaw)), along)
+
+
+def _pass_red(route: Route, own: Motion, after: Motion, length_m: float, snapshot: Snapshot) -> int:
+    """Return how many stop lines the front has passed at red between two steps."""
+    closed, amber = read_lights(snapshot)
+    front, next_front = own.along + length_m / 2, after.along + length_m / 2
+    passed = [link for stop, link in route.stops if front <= stop < next_front and after.speed > STANDS_MPS]
+    return sum(link in closed - amber for link in passed)
+
+
+def _allowed(route: Route, start_m: float, time_s: float) -> float:
+    """Return the distance [m] that the speed limit allows from a place on in a time, at most to the route's end."""
+    at = start_m
+    for _ in range(round(time_s / DT_S)):
+        at += route.limit(at) * DT_S
+    return max(min(at, route.length_m) - start_m, 1.0)

@@ -1,0 +1,113 @@
+"""Measures of a drive: time to collision, hard brakes, progress, collisions, and the driving score.
+
+A collision is at fault unless the ego vehicle stood, or was run into from behind by something faster (the duty of
+the one behind: Shalev-Shwartz et al., "On a formal model of safe and scalable self-driving cars", 2017, rule 1). The
+driving score is progress times a factor for every infringement: those of nuPlan's closed-loop score for collisions at
+fault (Caesar et al., 2021), and of CARLA's leaderboard for red lights.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.driving.corridor import find_meeting, find_occupied
+from flcav.driving.driver import Motion
+from flcav.driving.seen import EGO, TIMES_S, Seen
+from flcav.geometry import heading_vectors
+from flcav.storage.records import Record
+from flcav.world.map.routes import Route
+from flcav.world.snapshot import Collision, Snapshot
+
+Array = NDArray[np.float64]
+
+HARD_MPS2 = 4.0  # deceleration of a hard brake
+STANDS_MPS = 0.3
+NEAR_S = 1.5  # time to collision below which a drive comes close
+PENALTY: Mapping[str, float] = {"pedestrian": 0.0, "vehicle": 0.0, "obstacle": 0.5, "red light": 0.7}
+
+
+@dataclass(frozen=True)
+class Hit(Record):
+    """A collision of the ego vehicle: with what, when, and whether by its own fault."""
+
+    time_s: float
+    other: str
+    kind: str  # a key of `PENALTY`
+    speed: float  # of the ego vehicle before [m/s]
+    at_fault: bool
+
+
+@dataclass(frozen=True)
+class Drive(Record):
+    """The measures of one drive."""
+
+    scenario: str
+    seed: int
+    time_s: float
+    progress: float  # share of what the speed limit allows in the time, 0 to 1
+    mean_speed: float  # [m/s]
+    least_ttc_s: float  # least time to collision; the last of `TIMES_S` where none was less
+    near_share: float  # share of the time with a time to collision below `NEAR_S`
+    hard_brakes: int  # times that a deceleration of `HARD_MPS2` began
+    red_lights: int  # stop lines passed at red
+    hits: tuple[Hit, ...]
+    score: float  # the driving score, 0 to 1
+
+    def line(self) -> str:
+        """Return the measures in words."""
+        hits = "".join(f", {'hits' if hit.at_fault else 'is hit by'} {hit.other}" for hit in self.hits)
+        return (
+            f"{self.scenario}, seed {self.seed}: progress {self.progress:.2f}, {self.mean_speed:.1f} m/s, least time "
+            f"to collision {self.least_ttc_s:.2f} s, {self.hard_brakes} hard brakes, score {self.score:.2f}{hits}"
+        )
+
+    @property
+    def faults(self) -> int:
+        """Return the number of collisions at fault."""
+        return sum(hit.at_fault for hit in self.hits)
+
+
+def score_drive(progress: float, hits: Sequence[Hit], red_lights: int) -> float:
+    """Return the driving score: progress times the penalties of collisions at fault and of red lights."""
+    penalty = float(np.prod([PENALTY[hit.kind] for hit in hits if hit.at_fault]))
+    return progress * penalty * PENALTY["red light"] ** red_lights
+
+
+def measure_ttc(route: Route, own: Motion, truth: Seen, size: tuple[float, float]) -> float:
+    """Return the time to collision [s] when all go on as they do, by true states; the horizon where there is none.
+
+    The ego vehicle, `size` its length and width [m], keeps its speed along the route.
+    """
+    if own.speed < STANDS_MPS:
+        return float(TIMES_S[-1])
+    margin = np.zeros(truth.yaw.shape)
+    occupied = find_occupied(route, own.along, truth.boxes, truth.path, truth.yaw, size[1] / 2, margin)
+    first = find_meeting(occupied, own.speed * TIMES_S, size[0] / 2).any(axis=0)
+    return float(TIMES_S[int(np.argmax(first))]) if first.any() else float(TIMES_S[-1])
+
+
+def judge_collision(collision: Collision, before: Snapshot, categories: Mapping[str, str], time_s: float) -> Hit:
+    """Return the collision of the ego vehicle as a record; `before` is the snapshot of the step before it.
+
+    `categories` are those of the actors by name; what has none is an obstacle.
+    """
+    other = collision.other if collision.name == EGO else collision.name
+    trace, own = before.trace, before.row(EGO)
+    yaw, speed = float(trace.yaw[0, own]), float(np.hypot(*trace.velocity[0, own, :2]))
+    category = categories.get(other)
+    kind = "obstacle" if category in (None, "prop") else "pedestrian" if category == "pedestrian" else "vehicle"
+    struck = False
+    rows = np.flatnonzero(trace.actor == other)
+    if len(rows):
+        ahead = heading_vectors(yaw)
+        length = trace.size[own, 0]
+        at = np.array(collision.point) - trace.position[0, own, :2]
+        at_rear = (
+            float(at @ ahead) < -length / 2 + 0.6
+            or float(trace.position[0, rows[0], :2] @ ahead) < float(trace.position[0, own, :2] @ ahead) - length / 2
+        )
+        faster = float((trace.velocity[0, rows[0], :2] - trace.velocity[0, own, :2]) @ ahead) > 0
+        struck = at_rear and faster
+    return Hit(time_s, other, kind, speed, not (speed < STANDS_MPS or struck))

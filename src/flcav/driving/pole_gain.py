@@ -1,0 +1,213 @@
+"""The gain of poles while driving: who is hidden from the vehicle, from every pole, from both; AP fused; collisions.
+
+The article argues for road sensors with what a vehicle cannot see (Wang et al., IEEE Network 37(3), 2023). Counted
+are cars and vans in the field of the vehicle's detector, and hidden is who no ray reaches: `visibility.share_seen`.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.driving.errors import EYE_M, FIELD_M
+from flcav.driving.loop import LOOP, Loop, drive
+from flcav.driving.measures import Drive
+from flcav.driving.networks import NetworkPerception
+from flcav.driving.road import SPIN_S, RoadUnits
+from flcav.driving.scenarios import Scenario, Staged
+from flcav.driving.seen import EGO, Seen
+from flcav.driving.visibility import share_seen
+from flcav.geometry import Boxes, rotate
+from flcav.interface.progress import Report, ignore_progress
+from flcav.perception.metrics.average_precision import average_precision
+from flcav.perception.metrics.matching import match
+from flcav.perception.objects.truth import CARS
+from flcav.statistics.estimates import Estimate, score_interval
+from flcav.storage.records import Record
+from flcav.world.map.town import Town
+from flcav.world.scene import Scene
+from flcav.world.snapshot import Snapshot
+from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
+
+RANGE_M = 40.0  # of a pole's sensor
+OVERLAP = 0.3  # bird's-eye IoU of a found car: what braking needs, when boxes are half a second old
+INSTANTS = 40
+
+
+@dataclass(frozen=True)
+class Hidden(Record):
+    """Shares of the cars around vehicles that are hidden, with Wilson's interval; 0 cars give no shares."""
+
+    cars: int
+    vehicle: Estimate | None  # from the vehicle
+    poles: Estimate | None  # from every pole, or out of its range
+    both: Estimate | None
+
+    def lines(self) -> list[str]:
+        """Return the shares in words."""
+        if self.vehicle is None or self.poles is None or self.both is None:
+            return ["nobody drives near the vehicles"]
+        return [
+            f"of {self.cars} cars around vehicles hidden from the vehicle {self.vehicle.describe()}, "
+            f"from every pole {self.poles.describe()}, from both {self.both.describe()}"
+        ]
+
+
+def find_hidden(scene: Scene, own: int, sites: Sequence[Array], range_m: float) -> tuple[Boxes, Array]:
+    """Return the cars in the field of the vehicle in row `own`, and (N, 2) whether hidden from it, from every site."""
+    trace, i = scene.trace, scene.index
+    rows = np.flatnonzero(trace.present[i] & np.isin(trace.category, CARS))
+    rows = rows[rows != own]
+    at, yaw = trace.position[i, own], float(trace.yaw[i, own])
+    x, y = rotate(trace.position[i, rows, 0] - at[0], trace.position[i, rows, 1] - at[1], -yaw)
+    rows = rows[(x > 0) & (x < FIELD_M[0]) & (np.abs(y) < FIELD_M[1])]
+    size = trace.size[rows]
+    boxes = Boxes(trace.position[i, rows] + size * (0.0, 0.0, 0.5), size, trace.yaw[i, rows], np.full(len(rows), "Car"))
+    hidden = np.ones((len(rows), 2), np.bool_)
+    hidden[:, 0] = share_seen(scene, at + np.array((0.0, 0.0, EYE_M)), boxes, own) == 0
+    for site in sites:
+        near = np.linalg.norm(boxes.center - site, axis=1) <= range_m
+        hidden[near, 1] &= share_seen(scene, site, boxes[near]) == 0
+    return boxes, hidden
+
+
+def summarise_hidden(flags: Sequence[NDArray[np.bool_]]) -> Hidden:
+    """Return the shares of the flags (N, 2) of all instants."""
+    joined = np.concatenate([np.zeros((0, 2), np.bool_), *flags])
+    n = len(joined)
+    if not n:
+        return Hidden(0, None, None, None)
+    vehicle, poles, both = joined[:, 0].mean(), joined[:, 1].mean(), joined.all(axis=1).mean()
+    return Hidden(n, *(score_interval(float(share), n) for share in (vehicle, poles, both)))
+
+
+def count_hidden(town: Town, traces: Sequence[Trace], sites: Array, ranges_m: Sequence[float]) -> Hidden:
+    """Return who is hidden from connected vehicles ("cav0", ...) of recorded traffic, and from sites (P, 3) [m].
+
+    Looked at are about `INSTANTS` instants. Without connected vehicles every car that drives is one.
+    """
+    flags = []
+    for scene in _instants(town, traces):
+        trace, i = scene.trace, scene.index
+        names = np.char.startswith(trace.actor, "cav") & trace.present[i]
+        if not names.any():
+            driving = np.linalg.norm(trace.velocity[i, :, :2], axis=1) > 1.0
+            names = trace.present[i] & np.isin(trace.category, CARS) & driving
+        for own in np.flatnonzero(names).tolist():
+            flags.append(_hidden_of(scene, own, sites, ranges_m))
+    return summarise_hidden(flags)
+
+
+def _hidden_of(scene: Scene, own: int, sites: Array, ranges_m: Sequence[float]) -> NDArray[np.bool_]:
+    """Return the flags of the cars around one vehicle, of sites that have a range each."""
+    _, hidden = find_hidden(scene, own, [], 0.0)
+    for site, range_m in zip(sites, ranges_m, strict=True):
+        hidden[:, 1] &= find_hidden(scene, own, [site], range_m)[1][:, 1]
+    return hidden
+
+
+def _instants(town: Town, traces: Sequence[Trace]) -> Iterator[Scene]:
+    for trace in traces:
+        scene = Scene(town, trace)
+        for index in np.unique(np.linspace(0, len(trace.time_s) - 1, max(INSTANTS // len(traces), 1)).astype(int)):
+            scene.move_to(int(index))
+            yield scene
+
+
+@dataclass
+class FusionTally:
+    """What vehicle and poles find of the cars around, look by look."""
+
+    own: list[Boxes] = field(default_factory=list)
+    fused: list[Boxes] = field(default_factory=list)
+    targets: list[Boxes] = field(default_factory=list)
+    hidden: list[NDArray[np.bool_]] = field(default_factory=list)
+    latency_s: list[float] = field(default_factory=list)
+
+
+class Cooperative:
+    """Perception by the networks of the vehicle and of poles; what both find is tallied beside the truth."""
+
+    def __init__(self, staged: Staged, seed: int, poles: Sequence[int], tally: FusionTally) -> None:
+        self._units = RoadUnits(staged.town, poles, seed)
+        self._networks = NetworkPerception(staged, seed, road=self._units)
+        self._tally, self._looked_s = tally, -SPIN_S
+
+    def look(self, snapshot: Snapshot) -> Seen:
+        """Return what is found at this instant."""
+        told = self._networks.look(snapshot)
+        if snapshot.time_s - self._looked_s >= SPIN_S - 1e-6:
+            self._looked_s = snapshot.time_s
+            own = snapshot.row(EGO)
+            sites = list(self._units.sites.values())
+            targets, hidden = find_hidden(self._networks.scene, own, sites, RANGE_M)
+            place = (*snapshot.trace.position[0, own, :2].tolist(), float(snapshot.trace.yaw[0, own]))
+            self._tally.own.append(keep_in_field(self._networks.own, place))
+            self._tally.fused.append(keep_in_field(self._networks.found, place))
+            self._tally.targets.append(targets)
+            self._tally.hidden.append(hidden)
+            self._tally.latency_s += self._units.latency_s
+            self._units.latency_s.clear()
+        return told
+
+
+def keep_in_field(boxes: Boxes, place: tuple[float, float, float]) -> Boxes:
+    """Return the cars, world frame, in the field of the detector of a vehicle at x, y [m] and yaw [rad]."""
+    x, y = rotate(boxes.center[:, 0] - place[0], boxes.center[:, 1] - place[1], -place[2])
+    return boxes[(boxes.label == "Car") & (x > 0) & (x < FIELD_M[0]) & (np.abs(y) < FIELD_M[1])]
+
+
+@dataclass(frozen=True)
+class PoleGain(Record):
+    """What poles give while driving, over the same drives with and without them."""
+
+    poles: tuple[int, ...]
+    hidden: Hidden
+    ap_vehicle: float | None  # of all cars in the field, hidden ones too; None where there are none
+    ap_fused: float | None
+    latency_s: float | None  # mean age of a message on arrival; None where none arrived
+    without: tuple[Drive, ...]
+    with_poles: tuple[Drive, ...]
+
+    def lines(self) -> list[str]:
+        """Return the gain in words."""
+        lines = self.hidden.lines()
+        if self.ap_vehicle is not None and self.ap_fused is not None:
+            lines.append(f"AP of the vehicle alone {self.ap_vehicle:.3f}, with the poles {self.ap_fused:.3f}")
+        late = "no message arrived" if self.latency_s is None else f"messages are {self.latency_s:.3f} s old on arrival"
+        for name, drives in (("without poles", self.without), ("with poles", self.with_poles)):
+            ttc, near = (
+                float(np.mean([getattr(own, each) for own in drives])) for each in ("least_ttc_s", "near_share")
+            )
+            faults, score = sum(own.faults for own in drives), float(np.mean([own.score for own in drives]))
+            lines.append(
+                f"{name}: least time to collision {ttc:.2f} s, below 1.5 s for {near:.1%} of the time, "
+                f"{faults} collisions at fault, driving score {score:.2f}"
+            )
+        return [*lines, late]
+
+
+def measure_pole_gain(
+    scenarios: Sequence[Scenario],
+    seeds: Sequence[int],
+    poles: Sequence[int],
+    loop: Loop = LOOP,
+    progress: Report = ignore_progress,
+) -> PoleGain:
+    """Return what poles of the scenarios' town give; raises `InputError` for a pole that it does not have."""
+    tally, without, with_poles = FusionTally(), list[Drive](), list[Drive]()
+    pairs = [(scenario, seed) for scenario in scenarios for seed in seeds]
+    for done, (scenario, seed) in enumerate(pairs, start=1):
+        without.append(drive(scenario, seed, NetworkPerception, loop))
+        with_poles.append(drive(scenario, seed, lambda staged, own: Cooperative(staged, own, poles, tally), loop))
+        progress(done, len(pairs), scenario.name)
+    none = [Boxes.empty()] * len(tally.targets)
+    ap = [average_precision(match(each, tally.targets, none, OVERLAP, "bev")) for each in (tally.own, tally.fused)]
+    vehicle, fused = (None if np.isnan(each) else float(each) for each in ap)
+    late = float(np.mean(tally.latency_s)) if tally.latency_s else None
+    return PoleGain(
+        tuple(poles), summarise_hidden(tally.hidden), vehicle, fused, late, tuple(without), tuple(with_poles)
+    )

@@ -1,0 +1,148 @@
+"""What a pole gives while driving: roadside detections that reach the ego vehicle with the road's latency.
+
+A pole spins its LiDAR every `SPIN_S`; the road detector of the package finds cars in the returns before the pole's
+static background, which a sweep of the town without actors shows. The message is as old on arrival as the detector
+takes and as its bytes need at the rate of the V2X link (3GPP TR 37.885: `network.radio`); out of coverage there is
+none. The vehicle moves the boxes on at the velocity that the pole has tracked, and drops those that it sees itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.driving.seen import EGO
+from flcav.fusion.detector import THRESHOLD, load_road_network
+from flcav.geometry import Boxes, concatenate
+from flcav.network.messages import from_names, pack
+from flcav.network.radio.budget import Radio
+from flcav.network.radio.links import link_vehicles, unit_positions
+from flcav.perception.objects.predict import detect
+from flcav.perception.tracking.tracker import Tracked, Tracker
+from flcav.sensors.lidar.background import Background, learn_background
+from flcav.sensors.observe import observe
+from flcav.sensors.rig import lidar_pole
+from flcav.world.map.town import Town
+from flcav.world.scene import Scene
+from flcav.world.snapshot import Snapshot
+from flcav.world.trace import Trace
+
+Array = NDArray[np.float64]
+
+SPIN_S = 0.5  # between two messages of a pole
+DETECTS_S = 0.1  # from the end of a spin to the boxes
+STALE_S = 0.9  # older messages are not used
+SAME_M = 2.5  # a box so near to one of the vehicle's own is the same road user
+EMPTY_SWEEPS = 4  # of the town without actors, since returns are lost at random
+LIDAR = "lidar"
+
+
+@dataclass(frozen=True)
+class RoadMessage:
+    """What a pole sends: its tracks at one spin, and when they arrive."""
+
+    seen_s: float
+    arrives_s: float
+    tracked: Tracked
+    megabytes: float
+
+
+class RoadUnits:
+    """The poles of a drive that send what they find."""
+
+    def __init__(self, town: Town, poles: Sequence[int], seed: int, *, radio: Radio | None = None) -> None:
+        """Take the numbers of the town's poles; raises `InputError` for one that the town does not have."""
+        self.sites = unit_positions(town, poles)
+        self._town, self._seed, self._radio = town, seed, radio or Radio()
+        self._background = {name: learn_pole_background(town, name, seed) for name in self.sites}
+        self._tracker = {name: Tracker() for name in self.sites}
+        self._last: dict[str, list[RoadMessage]] = {name: [] for name in self.sites}
+        self._spun_s = -SPIN_S
+        self.latency_s: list[float] = []  # of the messages so far
+
+    def receive(self, scene: Scene, snapshot: Snapshot) -> Boxes:
+        """Return the boxes (world frame) that have arrived, moved on to this instant; `scene` is at it."""
+        if snapshot.time_s - self._spun_s >= SPIN_S - 1e-6:
+            self._spun_s = snapshot.time_s
+            self._spin(scene, snapshot)
+        parts = []
+        for messages in self._last.values():
+            here = [m for m in messages if m.arrives_s <= snapshot.time_s and snapshot.time_s - m.seen_s <= STALE_S]
+            if here:
+                newest = max(here, key=lambda m: m.seen_s)
+                boxes = newest.tracked.boxes
+                move = newest.tracked.velocity * (snapshot.time_s - newest.seen_s)
+                centre = boxes.center + np.pad(move, ((0, 0), (0, 1)))
+                parts.append(Boxes(centre, boxes.size, boxes.yaw, boxes.label, boxes.score, boxes.variance))
+        return concatenate(parts) if parts else Boxes.empty()
+
+    def _spin(self, scene: Scene, snapshot: Snapshot) -> None:
+        """Let every pole look, and send what it finds."""
+        links = link_vehicles(self._town, snapshot.trace, [EGO], self.sites, self._radio, self._seed)
+        for number, (name, messages) in enumerate(self._last.items()):
+            boxes = self._detect(scene, snapshot, name)
+            tracked = self._tracker[name].step(boxes, snapshot.time_s)
+            rate = float(links.rate_bps[0, 0, number])
+            if rate <= 0:
+                continue
+            size = len(pack_tracks(tracked))
+            latency = DETECTS_S + 8 * size / rate
+            self.latency_s.append(latency)
+            messages.append(RoadMessage(snapshot.time_s, snapshot.time_s + latency, tracked, size / 1e6))
+            del messages[:-4]
+
+    def _detect(self, scene: Scene, snapshot: Snapshot, name: str) -> Boxes:
+        frame = observe(scene, lidar_pole(), name, 0, scene_name="road", seed=self._seed, number=snapshot.step)
+        points = frame.lidar[LIDAR]
+        points = points[self._background[name].in_front(points)]
+        found = detect(load_road_network(), points, score_threshold=THRESHOLD)
+        return found.transform(frame.world_from_sensor(LIDAR))
+
+
+def pack_tracks(tracked: Tracked) -> bytes:
+    """Return the message of a pole's tracks to vehicles: boxes, variances, classes, scores and velocities."""
+    boxes = tracked.boxes
+    arrays = {"boxes": boxes.array(), "category": from_names(boxes.label.tolist()), "velocity": tracked.velocity}
+    return pack({**arrays, "score": np.asarray(boxes.score), "variance": np.asarray(boxes.variance)})
+
+
+def learn_pole_background(town: Town, pole: str, seed: int) -> Background:
+    """Return the static background of a pole's LiDAR: what it sees of the town without actors."""
+    scene = Scene(town, empty_trace(town))
+    sweeps = [
+        observe(scene, lidar_pole(), pole, 0, scene_name="empty", seed=seed, number=number).lidar[LIDAR]
+        for number in range(EMPTY_SWEEPS)
+    ]
+    return learn_background(sweeps)
+
+
+def empty_trace(town: Town) -> Trace:
+    """Return the trace of one instant without actors."""
+    none, words = np.zeros((1, 0)), np.array([], np.str_)
+    return Trace(
+        town=town.name,
+        time_s=np.zeros(1),
+        actor=words,
+        category=words,
+        shape=np.zeros(0, np.int64),
+        size=np.zeros((0, 3)),
+        present=np.zeros((1, 0), np.bool_),
+        position=np.zeros((1, 0, 3)),
+        yaw=none,
+        velocity=np.zeros((1, 0, 3)),
+        acceleration=np.zeros((1, 0, 3)),
+        yaw_rate=none,
+        light=words,
+        light_state=np.zeros((1, 0), np.str_),
+    )
+
+
+def fuse(own: Boxes, road: Boxes) -> Boxes:
+    """Return the vehicle's own boxes, and those of the road that are none of them."""
+    if not len(road):
+        return own
+    if len(own):
+        away = np.linalg.norm(road.center[:, None, :2] - own.center[None, :, :2], axis=2).min(axis=1)
+        road = road[away > SAME_M]
+    return concatenate([own, road])

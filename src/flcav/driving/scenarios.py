@@ -1,0 +1,187 @@
+"""Scenarios of closed-loop drives: a route in a town, its traffic and weather, and an event that asks for brakes.
+
+A scenario with a seed is one drive: the route is of the scenario, traffic and the moment of the event are of the seed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Literal
+
+import numpy as np
+
+from flcav.config import InputError, shorten
+from flcav.driving.seen import EGO
+from flcav.geometry import heading_vectors, left_vectors
+from flcav.statistics.streams import derive_seed, stream
+from flcav.world.commands import Controls, Drive, Remove, Spawn, Walk
+from flcav.world.live import LiveWorld, Settings
+from flcav.world.map.roads import read_net
+from flcav.world.map.routes import Route, draw_route
+from flcav.world.map.town import TOWNS, Town, load_town
+
+Event = Literal["none", "walker", "stalled", "braking"]
+
+CAR = ("car", 3)
+ROUTE_M = 500.0
+SHORTEST_M = 250.0
+TRIES = 200
+DT_S = 0.1
+WALKER_MPS = 1.6
+STALLED_S = 14.0  # so long a broken-down car stands
+BRAKES_MPS2 = 6.0  # of the car ahead
+LEAD = "lead"
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What is driven through, but for the seed."""
+
+    name: str
+    town: str
+    event: Event
+    weather: str  # a class of the weather task
+    traffic: int  # vehicles of SUMO
+    pedestrians: int
+
+
+def list_scenarios() -> tuple[Scenario, ...]:
+    """Return the scenarios of the package: every town with each event in clear weather, and in rain or fog in turn."""
+    bad = ("fog", "heavy_rain")
+    events: tuple[Event, ...] = ("none", "walker", "stalled", "braking")
+    found = []
+    for (i, town), (j, event) in product(enumerate(TOWNS), enumerate(events)):
+        for weather in ("clear", bad[(i + j) % 2]):
+            found.append(Scenario(f"{town}-{event}-{weather}", town, event, weather, 25, 8))
+    return tuple(found)
+
+
+def find_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
+    """Return the scenarios of these names, or all for none; raises `InputError` for an unknown one."""
+    known = {each.name: each for each in list_scenarios()}
+    if odd := [name for name in names if name not in known]:
+        raise InputError(f"scenario {shorten(odd[0])}: must be one of {', '.join(known)}")
+    return tuple(known[name] for name in names) or list_scenarios()
+
+
+def spread_scenarios(count: int) -> tuple[Scenario, ...]:
+    """Return so many scenarios, of towns, events and weathers in turn."""
+    known = list_scenarios()
+    step = 7  # coprime to their number: it goes through all
+    return tuple(known[(step * i) % len(known)] for i in range(count))
+
+
+class Staged:
+    """A scenario under way: the world with the ego vehicle at the start of its route, and the event's actors."""
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        """Start the world; raises `InputError` where no room is found for the ego vehicle."""
+        self.scenario = scenario
+        self.town: Town = load_town(scenario.town)
+        self.world = LiveWorld(
+            self.town,
+            Settings(
+                seed=derive_seed(seed, "traffic", scenario.name),
+                traffic=scenario.traffic,
+                pedestrians=scenario.pedestrians,
+                dt_s=DT_S,
+                remembers=False,
+            ),
+        )
+        try:
+            self.route, self.start_m = self._set_out(stream(seed, "route", scenario.name))
+            self._random = stream(seed, "event", scenario.name)
+            self._at_m = self.start_m + float(self._random.uniform(45.0, 75.0))
+            self._phase, self._since_s = "waits", 0.0
+            self._prepare()
+        except BaseException:
+            self.world.close()
+            raise
+
+    def act(self, along_m: float, speed: float) -> None:
+        """Let the event go on, when the ego vehicle is `along_m` its route [m] and drives at `speed` [m/s]."""
+        match self.scenario.event:
+            case "walker":
+                self._walk(along_m, speed)
+            case "stalled":
+                if self._phase == "stands" and self.world.snapshot.time_s > STALLED_S:
+                    self.world.apply(Remove(LEAD))
+                    self._phase = "gone"
+            case "braking":
+                self._lead()
+            case "none":
+                pass
+
+    def _set_out(self, random: np.random.Generator) -> tuple[Route, float]:
+        net = read_net(self.town.net)
+        for _ in range(TRIES):
+            route, along = draw_route(net, random, ROUTE_M), float(random.uniform(8.0, 15.0))
+            x, y, yaw = route.at(along).tolist()
+            car = Spawn(EGO, *CAR, x, y, yaw)
+            if route.length_m > SHORTEST_M and not self.world.find_obstruction(car):
+                self.world.apply(car)
+                return route, along
+        raise InputError(f"{self.town.name}: no room was found for the car in {TRIES} places")
+
+    def _prepare(self) -> None:
+        event = self.scenario.event
+        if event == "walker":
+            x, y = self._beside(self._at_m, -4.0)
+            self._phase = "waits" if self._spawn(Spawn("walker", "pedestrian", 2, x, y)) else "gone"
+        elif event in ("stalled", "braking"):
+            at = self._at_m if event == "stalled" else self.start_m + 18.0
+            x, y, yaw = self.route.at(at).tolist()
+            self._phase = "stands" if self._spawn(Spawn(LEAD, *CAR, x, y, yaw)) else "gone"
+            self._at_m = at
+            self._after_m = at + float(self._random.uniform(60.0, 110.0))
+
+    def _spawn(self, command: Spawn) -> bool:
+        """Put an actor where there is room; return whether there was."""
+        if self.world.find_obstruction(command):
+            return False
+        self.world.apply(command)
+        return True
+
+    def _beside(self, along_m: float, left_m: float) -> tuple[float, float]:
+        place = self.route.at(along_m)
+        x, y = (place[:2] + left_m * left_vectors(place[2])).tolist()
+        return x, y
+
+    def _walk(self, along_m: float, speed: float) -> None:
+        """Let the walker set out when the ego vehicle, at this speed, is near, and stop on the far side."""
+        if self._phase == "waits" and 0 < self._at_m - along_m < max(3.2 * speed, 8.0):
+            across = left_vectors(self.route.at(self._at_m)[2]) * WALKER_MPS
+            self.world.apply(Walk("walker", (float(across[0]), float(across[1]))))
+            self._phase, self._since_s = "walks", self.world.snapshot.time_s
+        elif self._phase == "walks" and self.world.snapshot.time_s - self._since_s > 8.0 / WALKER_MPS:
+            self.world.apply(Walk("walker", (0.0, 0.0)))
+            self._phase = "gone"
+
+    def _lead(self) -> None:
+        """Let the car ahead drive along the route, brake hard, wait, and go on."""
+        if self._phase == "gone":
+            return
+        snapshot = self.world.snapshot
+        row = snapshot.row(LEAD)
+        x, y, _ = snapshot.trace.position[0, row].tolist()
+        yaw = float(snapshot.trace.yaw[0, row])
+        self._at_m, _ = self.route.project(x, y, self._at_m)
+        speed = float(np.hypot(*snapshot.trace.velocity[0, row, :2]))
+        if self._phase == "stands" and snapshot.time_s > 1.0:
+            self._phase = "drives"
+        if self._phase == "drives" and self._at_m > self._after_m:
+            self._phase, self._since_s = "brakes", snapshot.time_s
+        if (
+            self._phase == "brakes" and snapshot.time_s - self._since_s > 5.0
+        ) or self._at_m > self.route.length_m - 30.0:
+            self.world.apply(Remove(LEAD))
+            self._phase = "gone"
+            return
+        aim = self.route.at(self._at_m + 4.0 + 0.4 * speed)
+        ahead, left = (aim[:2] - (x, y)) @ np.stack((heading_vectors(yaw), left_vectors(yaw)), axis=1)
+        steer = float(np.arctan(2 * 3.0 * left / (ahead**2 + left**2)) / np.radians(70.0))
+        wanted = 0.0 if self._phase in ("brakes", "stands") else 0.8 * self.route.limit(self._at_m)
+        pedal = -BRAKES_MPS2 / 8.0 if self._phase == "brakes" else (wanted - speed) / 2
+        self.world.apply(
+            Drive(LEAD, Controls(max(min(pedal, 1.0), 0.0), max(min(steer, 1.0), -1.0), max(min(-pedal, 1.0), 0.0)))
+        )

@@ -1,0 +1,1 @@
+"""Uncertainty of perception as safety distance."""

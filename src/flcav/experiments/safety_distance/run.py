@@ -1,0 +1,130 @@
+"""Safety distance: a margin by the calibrated uncertainty of perception, against a fixed one, in closed loop.
+
+The article names it as future work. A driver keeps a distance free around what it sees and expects: fixed, or a
+multiple of the standard deviation of predicted positions, which grows with the time ahead and is another for standing,
+driving and walking road users. Every setting drives the same scenarios and seeds with the same errors of perception
+(`driving.errors`), so that settings are paired.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flcav.driving.driver import Settings
+from flcav.driving.errors import ErrorModel, load_errors
+from flcav.driving.importance import paired_difference
+from flcav.driving.jobs import Job, Sensed, run_jobs
+from flcav.driving.loop import Loop
+from flcav.driving.measures import Drive
+from flcav.driving.scenarios import spread_scenarios
+from flcav.interface.progress import Report, ignore_progress
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.report import style
+from flcav.report.charts.safety import draw_trade_off
+from flcav.statistics.estimates import Estimate
+from flcav.storage.records import Record
+
+FIXED_M = (0.0, 0.4, 0.8, 1.2, 1.8)
+SIGMAS = (0.25, 0.5, 1.0, 2.0)
+SCENARIOS, SEEDS, LASTS_S = 6, 1, 12.0
+
+
+@dataclass(frozen=True)
+class MarginResult:
+    """Measures of one setting of the margin, over all drives."""
+
+    name: str
+    uncertain: bool  # whether the margin is by uncertainty
+    size: float  # of the fixed margin [m], or the multiple of the standard deviation
+    faults: int  # collisions at fault
+    near_share: float  # of the time with less than 1.5 s to collision
+    hard_brakes: float  # a drive
+    mean_speed: float  # [m/s]
+    score: float
+
+
+@dataclass(frozen=True)
+class SafetyDistance(Record):
+    """The trade-off of fixed and uncertain margins; differences are of the pair nearest in mean speed."""
+
+    drives: int  # of each setting
+    settings: tuple[MarginResult, ...]
+    compared: tuple[str, str]  # the fixed margin, and the one by uncertainty
+    differences: Mapping[str, Estimate]  # the second less the first, by field of a drive
+    errors: ErrorModel
+    provenance: Provenance
+
+    def sentences(self) -> list[str]:
+        """Return the trade-off in words."""
+        lines = [
+            f"{each.name}: {each.faults} collisions at fault in {self.drives} drives, {each.hard_brakes:.2f} hard "
+            f"brakes a drive, {each.near_share:.1%} of the time below 1.5 s to collision, {each.mean_speed:.2f} m/s"
+            for each in self.settings
+        ]
+        told = ", ".join(f"{name} {gap.describe(sign=True)}" for name, gap in self.differences.items())
+        return [*lines, f"{self.compared[1]} less {self.compared[0]}: {told}"]
+
+    def picture(self) -> bytes:
+        """Return the trade-off curve as a PNG."""
+        lines = {
+            name: [(e.mean_speed, e.near_share, e.hard_brakes, e.faults) for e in self.settings if e.uncertain == kind]
+            for name, kind in (("fixed", False), ("by uncertainty", True))
+        }
+        return style.png(draw_trade_off(lines))
+
+
+def compare_margins(
+    out: Path,
+    seeds: int = SEEDS,
+    jobs: int = 1,
+    progress: Report = ignore_progress,
+    scenarios: int = SCENARIOS,
+) -> SafetyDistance:
+    """Return the trade-off over the package's scenarios and `seeds` seeds; drives are kept in the folder `out`."""
+    model = load_errors()
+    settings = {f"fixed {size:g} m": Settings(size) for size in FIXED_M}
+    settings |= {f"{size:g} sigma": Settings(0.0, size) for size in SIGMAS}
+    pairs = [(scenario, seed) for scenario in spread_scenarios(scenarios) for seed in range(1, seeds + 1)]
+    tasks = [Job(*pair, loop=Loop(own, LASTS_S)) for own in settings.values() for pair in pairs]
+    drives = run_jobs(tasks, Sensed("model", model), jobs, progress, out / "drives.jsonl")
+    by_name = {name: drives[i * len(pairs) : (i + 1) * len(pairs)] for i, name in enumerate(settings)}
+    results = tuple(summarise(name, settings[name], own) for name, own in by_name.items())
+    compared = find_pair(results)
+    names = [scenario.name for scenario, _ in pairs]
+    first, second = (by_name[name] for name in compared)
+    fields = ("near_share", "hard_brakes", "mean_speed", "faults", "score")
+    return SafetyDistance(
+        drives=len(pairs),
+        settings=results,
+        compared=compared,
+        differences={name: paired_difference(first, second, names, name) for name in fields},
+        errors=model,
+        provenance=provenance(),
+    )
+
+
+def summarise(name: str, settings: Settings, drives: Sequence[Drive]) -> MarginResult:
+    """Return the measures of one setting."""
+
+    def mean(field: str) -> float:
+        return float(np.mean([getattr(own, field) for own in drives]))
+
+    return MarginResult(
+        name=name,
+        uncertain=settings.sigmas > 0,
+        size=settings.sigmas or settings.margin_m,
+        faults=sum(own.faults for own in drives),
+        near_share=mean("near_share"),
+        hard_brakes=mean("hard_brakes"),
+        mean_speed=mean("mean_speed"),
+        score=mean("score"),
+    )
+
+
+def find_pair(results: Sequence[MarginResult]) -> tuple[str, str]:
+    """Return the names of the fixed margin and the one by uncertainty that are nearest in mean speed."""
+    pairs = [(a, b) for a in results for b in results if b.uncertain and not a.uncertain]
+    first, second = min(pairs, key=lambda pair: abs(pair[0].mean_speed - pair[1].mean_speed))
+    return first.name, second.name

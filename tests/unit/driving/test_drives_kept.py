@@ -1,0 +1,158 @@
+"""Kept drives, who is hidden, messages of poles, weights in problems and recipes: driving without a loop."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flcav.cli.importance import set_weights
+from flcav.config import InputError
+from flcav.driving import jobs as driven
+from flcav.driving.errors import CLASSES, Tally, load_errors, summarise
+from flcav.driving.following import CERTAIN, Following
+from flcav.driving.jobs import Job, Sensed, read_kept, run_jobs
+from flcav.driving.measures import Drive
+from flcav.driving.pole_gain import find_hidden, summarise_hidden
+from flcav.driving.road import empty_trace, fuse, pack_tracks
+from flcav.driving.scenarios import list_scenarios
+from flcav.driving.seen import TIMES_S
+from flcav.geometry import Boxes, left_vectors
+from flcav.network.messages import unpack
+from flcav.optimization.problem import Problem
+from flcav.perception.tracking.tracker import Tracker
+from flcav.world.map.roads import read_net
+from flcav.world.map.routes import draw_route
+from flcav.world.map.town import load_town
+from flcav.world.scene import Scene
+from flcav.world.trace import Trace
+
+DRIVE = Drive("s", 1, 10.0, 0.5, 5.0, 4.0, 0.0, 0, 0, (), 0.5)
+
+
+def cars(*places: tuple[float, float]) -> Boxes:
+    rows = [(x, y, 0.8, 4.5, 1.8, 1.6, 0.0) for x, y in places]
+    return Boxes.from_array(np.array(rows).reshape(-1, 7), "Car", np.full(len(rows), 0.9))
+
+
+def test_kept_drives_are_not_driven_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = (Job(list_scenarios()[0], seed) for seed in (1, 2))
+    sensed, kept = Sensed("truth"), tmp_path / "drives.jsonl"
+    lines = [
+        json.dumps({"key": job.key(sensed), "drive": replace(DRIVE, seed=job.seed).as_json()})
+        for job in (first, second)
+    ]
+    kept.write_text(lines[0] + "\n" + lines[1][:40], encoding="utf-8")  # the last line was cut off
+    assert list(read_kept(kept)) == [first.key(sensed)]
+    monkeypatch.setattr(driven, "process_pool", lambda *_: pytest.fail("nothing is to be driven"))
+    assert run_jobs([first, first], sensed, kept=kept) == [DRIVE, DRIVE]
+    with pytest.raises(pytest.fail.Exception):
+        run_jobs([first, second], sensed, kept=kept)
+    assert first.key(sensed) != first.key(Sensed("networks")) != replace(first, task="signs").key(sensed)
+
+
+def test_weights_go_into_problems_and_recipes() -> None:
+    weights = {"objects": 0.7, "signs": 0.3}
+    problem = {"budgets_mb": {}, "tasks": [{"name": "objects", "weight": 1}, {"name": "lanes", "weight": 2}]}
+    assert set_weights(problem, weights, "p") == {
+        "budgets_mb": {},
+        "tasks": [{"name": "objects", "weight": 0.7}, {"name": "lanes", "weight": 2}],
+    }
+    recipe = {"seed": 1, "tasks": {"objects": {"network": "tiny"}, "weather": None}}
+    assert set_weights(recipe, weights, "r") == {
+        "seed": 1,
+        "tasks": {"objects": {"network": "tiny", "weight": 0.7}, "weather": {}},
+    }
+    for bad in ([], {"tasks": []}, {"tasks": [{"weight": 1}]}, {"seed": 1}):
+        with pytest.raises(InputError, match=r"no tasks|no name"):
+            set_weights(bad, weights, "bad.yaml")
+
+
+def test_the_weights_are_those_that_allocate_takes() -> None:
+    from flcav.config import parse_config, read_yaml
+
+    path = Path(__file__).parents[3] / "recipes" / "allocation" / "three_tasks.yaml"
+    weighed = set_weights(read_yaml(path), {"objects": 0.9, "signs": 0.001, "weather": 0.099}, str(path))
+    assert [task.weight for task in parse_config(Problem, weighed, "weighed").tasks] == [0.099, 0.001, 0.9]
+
+
+def test_the_packaged_error_model() -> None:
+    model = load_errors()
+    assert set(model.detected) == set(CLASSES)
+    assert model.detected["Car"][0] > model.detected["Car"][-1]
+    assert len(model.spread.growth["drives"]) == len(TIMES_S)
+    assert np.allclose([sum(row.values()) for row in model.weather.values()], 1)
+
+
+def test_the_error_model_is_calibrated() -> None:
+    """Errors drawn with known deviations give these back, whatever the variances that the tracker claims."""
+    random, tally = np.random.default_rng(1), Tally()
+    horizon = len(TIMES_S[::2])
+    true = 0.5 * np.sqrt(1 + np.arange(horizon))
+    tally.tracks = [("drives", 0.0625, random.normal(size=(horizon, 2)) * true[:, None]) for _ in range(4000)]
+    tally.pairs = [("Car", 10.0, i % 4 > 0, *random.normal(size=3).tolist()) for i in range(4000)]
+    model = summarise(tally)
+    assert model.spread_factor == pytest.approx(4.0, rel=0.1)
+    whole = np.sqrt(np.array(model.growth["drives"])[::2] ** 2 + model.spread_factor * 0.0625)
+    assert whole == pytest.approx(true, rel=0.08)
+    assert model.detected["Car"][0] == pytest.approx(0.75, abs=0.01)
+    assert model.sd["Car"] == pytest.approx((1.0, 1.0, 1.0), rel=0.05)
+
+
+def test_tracks_are_followed_kept_and_forget() -> None:
+    following = Following(None, None, CERTAIN)
+    for tick in range(20):
+        told = following.step(cars((10.0 + 0.5 * tick, 3.0)), tick / 10, frozenset())
+    assert told.velocity[0] == pytest.approx((5.0, 0.0), abs=0.3)
+    assert told.path[0, 4] == pytest.approx((19.5 + 5.0, 3.0), abs=0.5)
+    late = following.step(cars(), 2.3, frozenset())
+    assert late.path[0, 0] == pytest.approx((21.5, 3.0), abs=0.5)  # moved on without a detection
+    assert not len(following.step(cars(), 2.6, frozenset()).boxes)
+
+
+def standing(places: list[tuple[float, float, float]]) -> Trace:
+    """Return the trace of one instant with cars at x, y, yaw in the town `grid`."""
+    n = len(places)
+    array = np.array(places)
+    return replace(
+        empty_trace(load_town("grid")),
+        actor=np.array([f"car{i}" for i in range(n)]),
+        category=np.full(n, "car"),
+        shape=np.full(n, 3),
+        size=np.tile((4.7, 1.84, 1.45), (n, 1)),
+        present=np.ones((1, n), np.bool_),
+        position=np.c_[array[:, :2], np.zeros(n)][None],
+        yaw=array[None, :, 2],
+        velocity=np.zeros((1, n, 3)),
+        acceleration=np.zeros((1, n, 3)),
+        yaw_rate=np.zeros((1, n)),
+    )
+
+
+def test_who_is_behind_a_car_is_hidden_from_the_vehicle_and_seen_from_above() -> None:
+    town = load_town("grid")
+    route = draw_route(read_net(town.net), np.random.default_rng(5), 200.0)
+    own, _, behind = route.at([20.0, 28.0, 33.0]).tolist()
+    wall = [(*(route.at(28.0)[:2] + side * left_vectors(own[2])), own[2] + np.pi / 2) for side in (-4.7, 0.0, 4.7)]
+    scene = Scene(town, standing([tuple(own), *wall, tuple(behind)]))
+    boxes, hidden = find_hidden(scene, 0, [np.array((*behind[:2], 8.0))], 40.0)
+    assert len(boxes) == 4
+    assert not hidden[:3, 0].any()
+    assert not hidden[3, 1]
+    _, alone = find_hidden(scene, 0, [], 40.0)
+    assert alone[:, 1].all()
+    shares = summarise_hidden([hidden, hidden])
+    assert shares.cars == 8
+    assert shares.both is not None
+    assert shares.vehicle is not None
+    assert shares.both.mean <= shares.vehicle.mean
+    assert summarise_hidden([]).vehicle is None
+
+
+def test_boxes_of_the_road_join_those_of_the_vehicle_once() -> None:
+    both = fuse(cars((10.0, 0.0)), cars((11.0, 0.5), (30.0, 0.0)))
+    assert both.center[:, 0].tolist() == [10.0, 30.0]
+    assert len(fuse(cars(), cars((1.0, 1.0)))) == 1
+    tracked = Tracker().step(cars((1.0, 1.0)), 0.0)
+    assert unpack(pack_tracks(tracked))["boxes"].shape == (1, 7)
