@@ -130,8 +130,10 @@ def update_fleet(out: Path, sources: Sources, vehicles: int, kills: int, signed:
     print(f"{vehicles} vehicles, {(time.perf_counter() - began) / vehicles * 1000:.0f} ms each: {dict(counts)}")
 
 
-def start_and_wait(out: Path, first: Path, sources: Sources, name: str, kill_after_s: float | None) -> tuple[Path, int]:
-    """Return the folder of a vehicle that updated, or was killed, and how its process ended."""
+def start_and_wait(
+    out: Path, first: Path, sources: Sources, name: str, kill_after_s: float | None
+) -> tuple[Path, int, float]:
+    """Return the folder of a vehicle that updated, or was killed, how its process ended, and after what time [s]."""
     folder = out / "fleet" / name
     shutil.copytree(first, folder, symlinks=True)
     began, process = time.perf_counter(), start_update(folder, name, sources)

@@ -159,7 +159,7 @@ class Spoilt(Sequence):
     def __len__(self) -> int:
         return len(self.samples)
 
-    def __getitem__(self, index: int) -> Sample:
+    def __getitem__(self, index: int) -> Sample:  # pyright: ignore[reportIncompatibleMethodOverride] # no slices
         return self.spoil(self.samples[index], np.random.default_rng(index))
 
 

@@ -22,8 +22,8 @@ def buffered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunRecipe,
     pytest.importorskip("cyclonedds")
     asked: dict[str, Any] = load_run_recipe(RECIPE).model_dump()
     few = {"scenes": 1, "spins": 4, "cavs": 3}
-    asked["splits"] = dict.fromkeys(("pool", "validation", "registry", "edge"), few)
-    asked["splits"]["test"] = {"scenes": 2, "spins": 1, "cavs": 1}
+    splits = dict.fromkeys(("pool", "validation", "registry", "edge"), few)
+    asked["splits"] = {**splits, "test": {"scenes": 2, "spins": 1, "cavs": 1}}
     asked["training"] = Training(steps=2, local_steps=1)
     asked["tasks"]["weather"]["plan"] = {"samples": 4, "edge_rounds": 2, "cloud_rounds": 2}
     how = asked["federation"]

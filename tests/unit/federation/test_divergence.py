@@ -57,7 +57,7 @@ def test_a_cloud_round_records_how_far_regions_were_apart(tmp_path: Path, monkey
     def run(folder: Path) -> Any:
         folder.mkdir(exist_ok=True)
         where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), folder, ignore_progress)
-        federate_cloud(CloudFederation(learning, network, starts, 1, *where), 2, Rules())
+        federate_cloud(CloudFederation(learning, network, starts, dict.fromkeys(starts, 1), *where), 2, Rules())
         return Checkpoint.read(folder, LAST).records[CLOUD]
 
     first, second = run(tmp_path / "whole")

@@ -58,7 +58,9 @@ def test_the_cloud_s_replay_is_one_more_in_its_averages_and_sends_nothing(tmp_pa
     for folder, cloud in (("without", None), ("with", replay)):
         book = Ledger(LinkMegabytes(1.0, 1.0))
         where: Any = (Strategies(FEDAVG, FEDAVG), book, tmp_path / folder, ignore_progress)
-        federation = CloudFederation(learning, network, regions, 1, *where, replay=cloud, replay_share=0.3)
+        federation = CloudFederation(
+            learning, network, regions, dict.fromkeys(regions, 1), *where, replay=cloud, replay_share=0.3
+        )
         federate_cloud(federation, 1, Rules())
         ends[folder] = to_arrays(load_stage_network(learning.task, tmp_path / folder))
         assert {entry.client for entry in book.entries} == {"a", "b", "a/cav0", "b/cav0"}
@@ -198,7 +200,7 @@ def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:
         clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
         starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
     where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
-    federation = CloudFederation(learning, network, starts, 1, *where)
+    federation = CloudFederation(learning, network, starts, dict.fromkeys(starts, 1), *where)
     federate_cloud(federation, 2, Rules(personal=("bias",)))
     found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
     assert np.array_equal(found["a"]["weight"], found["b"]["weight"])
@@ -218,7 +220,7 @@ def test_regional_models_are_beside_that_of_all(tmp_path: Path) -> None:
         starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
     where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
     rules = Rules.model_validate({"personal": {"pull": 0.5}})
-    federate_cloud(CloudFederation(learning, network, starts, 1, *where), 2, rules)
+    federate_cloud(CloudFederation(learning, network, starts, dict.fromkeys(starts, 1), *where), 2, rules)
     found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
     for name in ("weight", "bias"):
         assert found["a"][name] != found["b"][name]
@@ -250,7 +252,7 @@ def test_the_note_of_a_round_names_who_failed_in_it(tmp_path: Path) -> None:
     notes.clear()
     start = {"a": RegionStart(clients, to_arrays(network), earlier=0)}
     where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / "cloud", report)
-    federate_cloud(CloudFederation(learning, network, start, 2, *where), 2, Rules())
+    federate_cloud(CloudFederation(learning, network, start, dict.fromkeys(start, 2), *where), 2, Rules())
     assert notes == ["failed or lost: " + ", ".join(f"{name} in 2" for name in names)] * 2
 
 
@@ -273,7 +275,12 @@ def test_both_stages_in_two_processes_end_with_the_bytes_of_one_also_where_label
         federate_edge(replace(edge, relabel=renew if renewed else None), Rules(), processes=processes)
         starts = {name: RegionStart(own, to_arrays(network), earlier=3) for name, own in regions.items()}
         where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), folders[1], ignore_progress)
-        federate_cloud(CloudFederation(learning, network, starts, 2, *where), 2, Rules(), processes=processes)
+        federate_cloud(
+            CloudFederation(learning, network, starts, dict.fromkeys(starts, 2), *where),
+            2,
+            Rules(),
+            processes=processes,
+        )
         return tuple((folder / WEIGHTS).read_bytes() for folder in folders)
 
     assert end(2) == end(1)
@@ -301,7 +308,9 @@ def test_cloud_rounds_begin_the_learning_rate_anew_where_that_is_asked_for_and_s
     starts = {"a": RegionStart(clients, to_arrays(network), earlier=2)}
     for rate, expected in ((None, [0.1, 0.1]), (0.4, [0.4, 0.1])):
         how = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / str(rate), ignore_progress)
-        federate_cloud(CloudFederation(learning, network, starts, 1, *how, rate=rate), 2, Rules())
+        federate_cloud(
+            CloudFederation(learning, network, starts, dict.fromkeys(starts, 1), *how, rate=rate), 2, Rules()
+        )
         assert rates == pytest.approx(expected)
         rates.clear()
 
@@ -344,7 +353,11 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
     def cloud(edge_rounds: int) -> int:
         book, folder = Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / f"cloud{edge_rounds}"
         how = (Strategies(FEDAVG, FEDAVG), book, folder, report)
-        return len(federate_cloud(CloudFederation(learning, network, starts, edge_rounds, *how), 9, rules))
+        return len(
+            federate_cloud(
+                CloudFederation(learning, network, starts, dict.fromkeys(starts, edge_rounds), *how), 9, rules
+            )
+        )
 
     assert (cloud(1), cloud(2), cloud(3)) == (4, 2, 1)
     fifth = account_epsilon(rules.privacy, rules.selection, [*clients["a"]], 5)

@@ -76,7 +76,13 @@ def cloud(folder: Path, rules: Rules, dies_at: int = 0, wireless_mb: float = 1.0
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
     network = learning.build_network()
     regions = {name: RegionStart(vehicles(learning, name, dies_at), to_arrays(network), earlier=0) for name in "ab"}
-    how = (2, Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(wireless_mb, 1.0)), folder, ignore_progress)
+    how = (
+        dict.fromkeys(regions, 2),
+        Strategies(FEDAVG, FEDAVG),
+        Ledger(LinkMegabytes(wireless_mb, 1.0)),
+        folder,
+        ignore_progress,
+    )
     federate_cloud(CloudFederation(learning, network, regions, *how), 2, rules)
 
 

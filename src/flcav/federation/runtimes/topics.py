@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 from flwr.app import Error, Message, RecordDict
 from flwr.clientapp import ClientApp
@@ -43,6 +43,7 @@ class RosTopics:
     in one domain need namespaces of their own. Raises `InputError` for what is no ROS name.
     """
 
+    deployed: ClassVar[Literal[False]] = False
     namespace: str = "/flcav"
     domain: int | None = None  # None: the environment's ROS_DOMAIN_ID, or 0
     bag: Path | None = None  # new folder of a ROS 2 bag with every message; None: none is written
