@@ -52,7 +52,7 @@ def register(app: typer.Typer) -> None:
 
 @release.command()
 def init(
-    party: PartyName = typer.Argument(metavar="PARTY", help="Whose repository: the provider's or the customer's."),
+    party: PartyName = typer.Argument(metavar="PARTY", help="Whose repository: provider or customer."),
     out: Path = typer.Option(..., "--out", help="New folder of repository and keys."),
     keys: int = typer.Option(3, "--keys", min=1, max=16, help="Keys that are generated, one for each who signs."),
     threshold: int = typer.Option(2, "--threshold", min=1, max=16, help="Signatures that a release needs."),

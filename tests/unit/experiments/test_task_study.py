@@ -64,7 +64,7 @@ RECORDED = {
     "weather": "e5217e3fd7183127",
     "signs": "af6031549073e2c9",
     "objects": "91e0a73860e306cc",
-    "objects-streets": "8066dfcd7602c022",  # of the second training that the page announces
+    "objects-streets": "7621a783ce5d6a7b",  # of the third training of the page
     "trajectory": "3b5f95cc2d111a7a",
     "trajectory-cameras": "9889f4d36a9b6fc9",
 }

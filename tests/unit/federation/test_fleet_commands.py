@@ -108,7 +108,7 @@ def test_page(flcav, fleet):
     traffic.count("vehicle-001", "push-object", 5, 7, (50, 70), True)
     traffic.refuse("<script>", "a certificate is wanted")
     traffic.save(fleet)
-    server = uvicorn.Server(uvicorn.Config(make_page(fleet), port=0, log_level="warning"))
+    server = uvicorn.Server(uvicorn.Config(make_page(fleet), port=0, log_level="warning", log_config=None))
     thread = threading.Thread(target=server.run)
     thread.start()
     while not server.started:

@@ -66,6 +66,7 @@ def serve_https(
         loop="asyncio",
         lifespan="on",
         log_level="warning",
+        log_config=None,
         access_log=False,
         ssl_certfile=certificate,
         ssl_keyfile=key,

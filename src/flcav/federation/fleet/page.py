@@ -87,4 +87,4 @@ def serve_page(folder: Path, port: int, report: Callable[[str], None]) -> None:
     read_status(folder)
     port = check_port("127.0.0.1", port)
     report(f"http://127.0.0.1:{port}/ follows {folder}")
-    uvicorn.run(make_page(folder), host="127.0.0.1", port=port, log_level="warning")
+    uvicorn.run(make_page(folder), host="127.0.0.1", port=port, log_level="warning", log_config=None)

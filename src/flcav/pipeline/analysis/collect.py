@@ -25,6 +25,7 @@ from flcav.pipeline.results.run import ArmResult, LinkUse, Run, Spent
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import Pretrained, StageResult, Watched
 from flcav.pipeline.rigs import compare_rigs
+from flcav.pipeline.steps.centralised import COUNTED_MB
 from flcav.pipeline.steps.graph import Graph
 from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings, count_private_rounds
 
@@ -83,9 +84,8 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
     if CLOUD in arm.stages:
         books = [Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks]  # they include the others
     budgets = graph.recipe.budgets_mb
-    book = Ledger(
-        LinkMegabytes(budgets.wireless, budgets.wireline), (entry for each in books for entry in each.entries)
-    )
+    wireline = budgets.wireline if arm.uploads is None else COUNTED_MB  # as when they were sent
+    book = Ledger(LinkMegabytes(budgets.wireless, wireline), (entry for each in books for entry in each.entries))
     book.save(work.parent / "ledgers" / f"{arm.name}.parquet")
     stages = tuple(StageResult.load(work / step) for step in trained)
     return ArmResult(
