@@ -7,12 +7,16 @@ unexport PYTHONDONTWRITEBYTECODE # each of many processes would compile all modu
 STAMP := .venv/.installed
 BIN := .venv/bin
 
-.PHONY: demo test test-carla test-deployed test-peers test-ray lint docs check bench bench-peers format clean
+.PHONY: demo test test-runs test-carla test-deployed test-peers test-ray lint docs check bench bench-peers format clean
 demo: $(STAMP)
 	$(BIN)/flcav demo --out out/demo
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
+
+# Whole pipelines at toy scale: runs of all recipes and examples, stopped and killed ones, the installed wheel, studies.
+test-runs: $(STAMP)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 # Exports read by other software, in environments of their own below out/peers: docs/formats.md.
 test-peers: $(STAMP)
@@ -48,8 +52,7 @@ docs:
 	$(BIN)/python -m sphinx -b html -c docs -d out/doctrees --fail-on-warning --keep-going --quiet . out/docs
 	$(BIN)/python tools/check_site.py out/docs
 
-check: lint docs
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
+check: lint docs test
 
 bench: $(STAMP)
 	for b in benchmarks/bench_*.py; do $(BIN)/python $$b || exit 1; done
