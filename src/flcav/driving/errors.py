@@ -150,7 +150,8 @@ class Comparing:
                 continue
             best = int(np.argmin(np.where(same, away, np.inf)))
             free[best] = False
-            x, y = rotate(*(found.center[best, :2] - boxes.center[row, :2]).tolist(), -yaw)
+            apart_x, apart_y = (found.center[best, :2] - boxes.center[row, :2]).tolist()
+            x, y = rotate(apart_x, apart_y, -yaw)
             turn = float(wrap_angle(2 * (found.yaw[best] - boxes.yaw[row]))) / 2  # either way round
             self._tally.pairs.append((label, distance, True, float(x), float(y), turn))
         rows = find_around(snapshot, 80.0)

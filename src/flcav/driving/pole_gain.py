@@ -56,7 +56,7 @@ class Hidden(Record):
         ]
 
 
-def find_hidden(scene: Scene, own: int, sites: Sequence[Array], range_m: float) -> tuple[Boxes, Array]:
+def find_hidden(scene: Scene, own: int, sites: Sequence[Array], range_m: float) -> tuple[Boxes, NDArray[np.bool_]]:
     """Return the cars in the field of the vehicle in row `own`, and (N, 2) whether hidden from it, from every site."""
     trace, i = scene.trace, scene.index
     rows = np.flatnonzero(trace.present[i] & np.isin(trace.category, CARS))

@@ -102,8 +102,7 @@ def test_the_error_model_is_calibrated() -> None:
 
 def test_tracks_are_followed_kept_and_forget() -> None:
     following = Following(None, None, CERTAIN)
-    for tick in range(20):
-        told = following.step(cars((10.0 + 0.5 * tick, 3.0)), tick / 10, frozenset())
+    *_, told = [following.step(cars((10.0 + 0.5 * tick, 3.0)), tick / 10, frozenset()) for tick in range(20)]
     assert told.velocity[0] == pytest.approx((5.0, 0.0), abs=0.3)
     assert told.path[0, 4] == pytest.approx((19.5 + 5.0, 3.0), abs=0.5)
     late = following.step(cars(), 2.3, frozenset())
