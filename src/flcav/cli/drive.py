@@ -7,6 +7,7 @@ import typer
 from flcav.cli.importance import ERRORS, Perceives, read_model
 from flcav.cli.options import JOBS, check_finite, refuse_unused
 from flcav.cli.terminal import print_json
+from flcav.interface.wording import plural
 
 
 def register(app: typer.Typer) -> None:
@@ -75,7 +76,7 @@ def drive(
         with show_progress("measure") as report:
             found = measure_errors(chosen, numbers, loop, jobs, report)
         write_json(measure, found.as_json())
-        typer.echo(f"{measure}: errors of the networks in {found.frames} frames")
+        typer.echo(f"{measure}: errors of the networks in {plural(found.frames, 'frame')}")
         return
     if pole:
         with show_progress("drive") as report:

@@ -173,7 +173,7 @@ def inside(
         told = None if agreement is None else agreement.as_json()
         print_json({"domain": found.name, **truth.as_json(), "frames_per_s": rate, "perceived": told})
         return
-    typer.echo(f"{found.name}: {truth.sentence}, by ground truth ({rate:,.0f} frames/s)")
+    typer.echo(f"{found.name}: {truth.sentence}, by ground truth ({rate:,.0f} a second)")
     for module, count in truth.failed.items():
         typer.echo(f"    {module} puts {plural(count, 'frame')} outside")
     if seen is not None and agreement is not None:
