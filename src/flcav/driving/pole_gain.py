@@ -4,7 +4,7 @@ The article argues for road sensors with what a vehicle cannot see (Wang et al.,
 are cars and vans in the field of the vehicle's detector, and hidden is who no ray reaches: `visibility.share_seen`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,6 +25,7 @@ from flcav.perception.metrics.matching import match
 from flcav.perception.objects.truth import CARS
 from flcav.statistics.estimates import Estimate, score_interval
 from flcav.storage.records import Record
+from flcav.world.line_of_sight import look_at_instants
 from flcav.world.map.town import Town
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
@@ -90,7 +91,7 @@ def count_hidden(town: Town, traces: Sequence[Trace], sites: Array, ranges_m: Se
     Looked at are about `INSTANTS` instants. Without connected vehicles every car that drives is one.
     """
     flags = []
-    for scene in _instants(town, traces):
+    for scene in look_at_instants(town, traces, INSTANTS):
         trace, i = scene.trace, scene.index
         names = np.char.startswith(trace.actor, "cav") & trace.present[i]
         if not names.any():
@@ -107,14 +108,6 @@ def _hidden_of(scene: Scene, own: int, sites: Array, ranges_m: Sequence[float]) 
     for site, range_m in zip(sites, ranges_m, strict=True):
         hidden[:, 1] &= find_hidden(scene, own, [site], range_m)[1][:, 1]
     return hidden
-
-
-def _instants(town: Town, traces: Sequence[Trace]) -> Iterator[Scene]:
-    for trace in traces:
-        scene = Scene(town, trace)
-        for index in np.unique(np.linspace(0, len(trace.time_s) - 1, max(INSTANTS // len(traces), 1)).astype(int)):
-            scene.move_to(int(index))
-            yield scene
 
 
 @dataclass

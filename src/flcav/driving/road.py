@@ -26,7 +26,7 @@ from flcav.sensors.rig import lidar_pole
 from flcav.world.map.town import Town
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
-from flcav.world.trace import Trace
+from flcav.world.trace import empty_trace
 
 Array = NDArray[np.float64]
 
@@ -109,33 +109,12 @@ def pack_tracks(tracked: Tracked) -> bytes:
 
 def learn_pole_background(town: Town, pole: str, seed: int) -> Background:
     """Return the static background of a pole's LiDAR: what it sees of the town without actors."""
-    scene = Scene(town, empty_trace(town))
+    scene = Scene(town, empty_trace(town.name))
     sweeps = [
         observe(scene, lidar_pole(), pole, 0, scene_name="empty", seed=seed, number=number).lidar[LIDAR]
         for number in range(EMPTY_SWEEPS)
     ]
     return learn_background(sweeps)
-
-
-def empty_trace(town: Town) -> Trace:
-    """Return the trace of one instant without actors."""
-    none, words = np.zeros((1, 0)), np.array([], np.str_)
-    return Trace(
-        town=town.name,
-        time_s=np.zeros(1),
-        actor=words,
-        category=words,
-        shape=np.zeros(0, np.int64),
-        size=np.zeros((0, 3)),
-        present=np.zeros((1, 0), np.bool_),
-        position=np.zeros((1, 0, 3)),
-        yaw=none,
-        velocity=np.zeros((1, 0, 3)),
-        acceleration=np.zeros((1, 0, 3)),
-        yaw_rate=none,
-        light=words,
-        light_state=np.zeros((1, 0), np.str_),
-    )
 
 
 def fuse(own: Boxes, road: Boxes) -> Boxes:

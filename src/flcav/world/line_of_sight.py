@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flcav.world.map.town import Town
 from flcav.world.scene import Scene
-from flcav.world.trace import Trace
+from flcav.world.trace import Trace, empty_trace
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ def find_visible(
     origins, directions, lengths = _rays(sites[pairs[0]], places[pairs[1]])
     far = np.maximum(lengths - START_M - END_M, 0.0).astype(np.float32)
     seen, instants = np.zeros(len(far), np.int64), 0
-    for scene in _instants(town, traces or [_no_traffic(town)]):
+    for scene in look_at_instants(town, traces or [empty_trace(town.name)]):
         seen += ~scene.find_occluded(origins, directions, far)
         instants += 1
     return 2 * seen >= instants
@@ -71,7 +71,7 @@ def count_visible_actors(town: Town, traces: Sequence[Trace], sites: Array, rang
     An actor is seen where the ray to the centre of its box is free up to half of its length before it.
     """
     total, instants = np.zeros((len(sites), len(ranges_m))), 0
-    for scene in _instants(town, traces):
+    for scene in look_at_instants(town, traces):
         size = scene.trace.size
         here = np.flatnonzero(scene.trace.present[scene.index])
         centre = scene.poses()[here, :3] + np.array([0.0, 0.0, 0.5]) * size[here, 2:]
@@ -95,33 +95,11 @@ def _rays(starts: Array, ends: Array) -> tuple[NDArray[np.float32], NDArray[np.f
     return (starts + START_M * directions).astype(np.float32), directions.astype(np.float32), lengths
 
 
-def _instants(town: Town, traces: Sequence[Trace]) -> Iterator[Scene]:
-    """Yield the scenes of about INSTANTS instants, evenly spread over each trace; each is the same object moved on."""
-    each = max(INSTANTS // max(len(traces), 1), 1)
+def look_at_instants(town: Town, traces: Sequence[Trace], count: int = INSTANTS) -> Iterator[Scene]:
+    """Yield the scenes of about `count` instants, evenly spread over each trace; each is the same object moved on."""
+    each = max(count // max(len(traces), 1), 1)
     for trace in traces:
         scene = Scene(town, trace)
         for index in np.unique(np.linspace(0, len(trace.time_s) - 1, each).round().astype(np.int64)).tolist():
             scene.move_to(index)
             yield scene
-
-
-def _no_traffic(town: Town) -> Trace:
-    """Return the trace of one instant without actors."""
-    none, instant = np.zeros((1, 0)), np.zeros((1, 0, 3))
-    words = np.array([], np.str_)
-    return Trace(
-        town=town.name,
-        time_s=np.zeros(1),
-        actor=words,
-        category=words,
-        shape=np.zeros(0, np.int64),
-        size=np.zeros((0, 3)),
-        present=np.zeros((1, 0), np.bool_),
-        position=instant,
-        yaw=none,
-        velocity=instant,
-        acceleration=instant,
-        yaw_rate=none,
-        light=words,
-        light_state=np.zeros((1, 0), np.str_),
-    )

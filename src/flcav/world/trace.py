@@ -187,3 +187,25 @@ class Trace:
             raise ValueError("a bow is not of an actor, or not within 0 and 1 m")
         if (self.size <= 0).any() or (np.diff(self.time_s) <= 0).any():
             raise ValueError("a size is not above 0, or time does not go on")
+
+
+def empty_trace(town: str) -> Trace:
+    """Return the trace of one instant of a town, by its name, without actors."""
+    none, instant = np.zeros((1, 0)), np.zeros((1, 0, 3))
+    words = np.array([], np.str_)
+    return Trace(
+        town=town,
+        time_s=np.zeros(1),
+        actor=words,
+        category=words,
+        shape=np.zeros(0, np.int64),
+        size=np.zeros((0, 3)),
+        present=np.zeros((1, 0), np.bool_),
+        position=instant,
+        yaw=none,
+        velocity=instant,
+        acceleration=instant,
+        yaw_rate=none,
+        light=words,
+        light_state=np.zeros((1, 0), np.str_),
+    )

@@ -15,7 +15,7 @@ from flcav.driving.following import CERTAIN, Following
 from flcav.driving.jobs import Job, Sensed, read_kept, run_jobs
 from flcav.driving.measures import Drive
 from flcav.driving.pole_gain import find_hidden, summarise_hidden
-from flcav.driving.road import empty_trace, fuse, pack_tracks
+from flcav.driving.road import fuse, pack_tracks
 from flcav.driving.scenarios import list_scenarios
 from flcav.driving.seen import TIMES_S
 from flcav.geometry import Boxes, left_vectors
@@ -26,7 +26,7 @@ from flcav.world.map.roads import read_net
 from flcav.world.map.routes import draw_route
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
-from flcav.world.trace import Trace
+from flcav.world.trace import Trace, empty_trace
 
 DRIVE = Drive("s", 1, 10.0, 0.5, 5.0, 4.0, 0.0, 0, 0, (), 0.5)
 
@@ -115,7 +115,7 @@ def standing(places: list[tuple[float, float, float]]) -> Trace:
     n = len(places)
     array = np.array(places)
     return replace(
-        empty_trace(load_town("grid")),
+        empty_trace("grid"),
         actor=np.array([f"car{i}" for i in range(n)]),
         category=np.full(n, "car"),
         shape=np.full(n, 3),
