@@ -184,7 +184,7 @@ def test_a_lost_server_is_named_and_the_recording_goes_on(tmp_path: Path) -> Non
     port = free_port()
     server = start_server(port)
     fields = {**FIELDS, "source": "carla", "port": port, "traffic_port": free_port(), "vehicles": 4, "timeout_s": 3}
-    fields |= {"poles": [], "scenes": 2, "spins_per_scene": 3}
+    fields |= {"poles": [], "scenes": 2, "spins_per_scene": 20}
 
     def kill(frames: int) -> Callable[[int, int, str], None]:
         def progress(done: int, total: int, rate: str) -> None:
@@ -196,14 +196,14 @@ def test_a_lost_server_is_named_and_the_recording_goes_on(tmp_path: Path) -> Non
 
     recipe = CarlaRecipe.model_validate(fields)
     with pytest.raises(OSError, match=f"CARLA at 127.0.0.1:{port} .* and the same command goes on"):
-        record(recipe, tmp_path / "out", progress=kill(4))
+        record(recipe, tmp_path / "out", progress=kill(21))
     assert (tmp_path / "out" / ".recording" / "grid-3-000" / "00000").is_dir()  # the first scene
     assert not (tmp_path / "out" / "manifest.json").exists()
     server = start_server(port)
     try:
         again: list[int] = []
         assert record(recipe, tmp_path / "out", progress=lambda done, total, rate: again.append(done))
-        assert min(again) >= 3  # only the second scene was missing
+        assert min(again) >= 20  # only the second scene was missing
         assert validate(tmp_path / "out") == []
     finally:
         server.terminate()
