@@ -18,7 +18,7 @@ LEAST = 1e-3  # a weight is above 0
 
 
 class Perceives(StrEnum):
-    """Which perception drives."""
+    """Source of perception in a closed-loop drive."""
 
     model = "model"
     networks = "networks"

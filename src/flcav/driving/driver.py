@@ -32,7 +32,7 @@ FARTHEST_GAP_M = 1e3
 
 @dataclass(frozen=True)
 class Settings:
-    """What a driver keeps free around road users: a fixed distance, and a multiple of its perception's uncertainty."""
+    """Safety margins of a driver: a fixed distance, and a multiple of its perception's uncertainty."""
 
     margin_m: float = 0.4
     sigmas: float = 0.0  # multiple of the standard deviation of predicted positions
@@ -44,7 +44,7 @@ DEFAULT = Settings()
 
 @dataclass(frozen=True)
 class Motion:
-    """Where the vehicle is and how fast, as its own navigation knows it."""
+    """Pose and speed of the ego vehicle, by its own navigation."""
 
     x: float  # of the box's middle [m]
     y: float
@@ -55,7 +55,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Decision:
-    """What a driver does, and why."""
+    """Controls of a driver, with the acceleration that they are for."""
 
     controls: Controls
     acceleration: float  # that it wants [m/s^2]

@@ -48,7 +48,7 @@ HORIZON = slice(0, len(TIMES_S), 2)
 
 @dataclass(frozen=True)
 class ErrorModel(Record):
-    """What the networks get wrong, as measured."""
+    """Error model of the perception networks, as measured."""
 
     detected: Mapping[str, tuple[float, ...]]  # by class: share of those in sight, between `EDGES_M`
     sd: Mapping[str, tuple[float, float, float]]  # by class: of x, y [m] along the ego vehicle's axes, and yaw [rad]

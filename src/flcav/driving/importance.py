@@ -41,7 +41,7 @@ MEASURES: Mapping[str, str] = {  # field of a drive -> words
 
 @dataclass(frozen=True)
 class TaskImportance(Record):
-    """What driving loses without a task; differences are without the task less with all of them."""
+    """Loss of driving without a perception task; differences are without the task less with all of them."""
 
     task: str
     feeds: str

@@ -1,7 +1,7 @@
 """A live world as a source of frames: the drives of a planner, seen by its vehicles' sensors."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from flcav.config import InputError, Json
@@ -99,7 +99,7 @@ class LiveSource:
         Raises `InputError` where a vehicle is not there, `RuntimeError` where SUMO fails.
         """
         seed = derive_seed(self.settings.seed, "live", self.scenes().index(scene))
-        started = Settings(**{**vars(self.settings), "seed": seed, "remembers": False})
+        started = replace(self.settings, seed=seed, remembers=False)
         seen: list[Snapshot] = []
         with LiveWorld(self.town, started) as world:
             self.driver.begin(world)
