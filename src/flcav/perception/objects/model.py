@@ -198,7 +198,7 @@ def tiny_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -
 
 
 def pillars_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -> SecondConfig:
-    """Return the configuration of the demo, of pillars: the range of `tiny_config`, 0.16 M parameters, a third of its time.
+    """Return the demo's configuration, of pillars: the range of `tiny_config`, 0.16 M parameters, a third of its time.
 
     Raises `InputError` for unknown classes.
     """
