@@ -30,18 +30,18 @@ def record(simulation: Simulation, steps: Sequence[int], out: Path) -> None:
     letters: list[list[str]] = []
     for step in steps:
         while now < step:
-            simulation.step()
+            simulation.advance()
             now += 1
         seen.append(simulation.states())
         letters.append([lights.getRedYellowGreenState(junction) for junction in junctions])
     if director:
         for states, step in zip(seen, steps):  # only now, since a script may place a prop at earlier steps
             states |= {name: (kind, *state) for name, kind, state in director.props(step)}
-    kinds = {name: kind for states in seen for name, (kind, *_) in states.items()}
+    kinds = {name: each[0] for states in seen for name, each in states.items()}
     column = {name: i for i, name in enumerate(kinds)}
     state = np.full((len(steps), len(kinds), 4), np.nan)
     for row, states in zip(state, seen):
-        row[[column[name] for name in states]] = np.array([at for _, *at in states.values()]).reshape(-1, 4)
+        row[[column[name] for name in states]] = np.array([each[1:] for each in states.values()]).reshape(-1, 4)
     recorded = Recorded(
         id=np.array(list(kinds), dtype=np.str_),
         type=np.array(list(kinds.values()), dtype=np.str_),

@@ -1,7 +1,7 @@
 """Stepped traffic: a SUMO run that is the same for recordings and for live worlds, and reacts to what is driven there.
 
 A step of `STEP_S` obeys a `Request`: the vehicles under control are placed, SUMO's brake for what is in their way, and
-then all move. A recording makes its steps with nobody under control.
+then all move. Nobody is under control in a recording.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,9 +46,6 @@ class Request(NamedTuple):
     halted: Sequence[str] = ()  # vehicles that a collision has stopped
 
 
-FREE = Request()  # nobody is under control
-
-
 class Simulation:
     """A SUMO run, step by step."""
 
@@ -80,9 +77,9 @@ class Simulation:
         if self._drives:
             sumo.route.add("own", [job.edge])
         for _ in range(job.steps):
-            self._advance()
+            self.advance()
 
-    def step(self, request: Request = FREE) -> None:
+    def step(self, request: Request) -> None:
         """Make a step that obeys the request."""
         for light, state in request.lights.items():
             self.sumo.trafficlight.setRedYellowGreenState(light, state)
@@ -92,7 +89,7 @@ class Simulation:
                 self.sumo.vehicle.setSpeed(name, 0.0)
                 self._halted[name] = HALT_STEPS
         self._brakes.apply(request.dangers, self._own | self._halted.keys())
-        self._advance()
+        self.advance()
 
     def states(self) -> States:
         """Return the states of SUMO's own vehicles and pedestrians, as scenarios have them seen."""
@@ -106,8 +103,8 @@ class Simulation:
             out[name] = (_type_of(self.sumo.person, name), *state)
         return out
 
-    def _advance(self) -> None:
-        """Let all move; vehicles that have arrived are followed by the next one, or set out again."""
+    def advance(self) -> None:
+        """Make a step with nobody under control; vehicles that have arrived are followed, or set out again."""
         sumo = self.sumo
         sumo.simulationStep()
         for name in sumo.simulation.getArrivedIDList():
