@@ -25,6 +25,7 @@ from flcav.pipeline.training.groups import (
     Picked,
     choose_members,
     count_labels,
+    find_gradient,
     find_in_range,
     find_lead,
     has_levelled,
@@ -38,7 +39,7 @@ PLACES = {name: np.array([x, 0.0, 0.0]) for name, x in {"a": 0.0, "b": 250.0, "c
 
 @pytest.mark.parametrize(("count", "held"), [(8, [2, 6]), (4, [2]), (2, [1]), (1, []), (12, [2, 6, 10])])
 def test_frames_are_held_back_evenly_and_none_is_in_both(count: int, held: list[int]) -> None:
-    train, found = hold_back([None] * count, 0.25)
+    train, found = hold_back(count, 0.25)
     assert found == held
     assert sorted([*train, *found]) == [*range(count)]
 
@@ -83,7 +84,8 @@ def test_members_are_those_that_asked_and_the_best_of_the_others() -> None:
     assert chosen.members == ("a", "c", "b")
     assert chosen.stayed == {"e": "not in the town", "d": NOT_NEEDED}
     assert choose_members(Requests(most=2), ["a"], quality, {}).members == ("a", "c")
-    assert choose_members(Requests(most=1), ["a", "d"], quality, {}).members == ("a", "d")
+    assert choose_members(Requests(most=1), ["a", "d"], quality, {}).members == ("a",)  # no more than that
+    assert choose_members(Requests(most=2), ["a", "d"], quality, {}).members == ("a", "d")  # those that asked first
 
 
 def test_an_offer_is_a_message_of_some_hundred_bytes() -> None:
@@ -129,7 +131,7 @@ def test_labels_are_counted_by_class_and_sketches_keep_angles() -> None:
             def train(self, weights: Any, **how: Any) -> LocalUpdate:
                 return LocalUpdate(weights, 1, 0.0, {"w": gradients[row]})
 
-        return sketch_gradient(Client(), {}, 7)  # type: ignore[arg-type]
+        return sketch_gradient(find_gradient(Client(), {}, 7), 7)  # type: ignore[arg-type]
 
     cosine = lambda one, other: one @ other / np.linalg.norm(one) / np.linalg.norm(other)  # noqa: E731
     found = [sketch(row) for row in range(3)]

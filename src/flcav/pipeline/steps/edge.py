@@ -231,7 +231,8 @@ def edge_step(
     before, labelled = len(book.entries), label_samples(work, settings, inputs, book, EDGE)
     called = None
     if stage == EDGE and settings.federation.requests is not None:
-        called = call_group(work, settings, inputs, settings.federation.requests, labelled.samples, book)
+        most = plan.tasks[settings.learning.task].called
+        called = call_group(work, settings, inputs, settings.federation.requests, labelled.samples, book, most)
         labelled = replace(labelled, samples=called.samples)
     if stage == MORE_EDGE and isinstance(labelled.samples, RoadAverageLabels):
         _label_once(work, settings, plan, labelled.samples)

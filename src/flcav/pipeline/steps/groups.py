@@ -32,6 +32,7 @@ from flcav.pipeline.training.groups import (
     Picked,
     choose_members,
     count_labels,
+    find_gradient,
     find_in_range,
     find_lead,
     hold_back,
@@ -71,8 +72,9 @@ def call_group(
     how: Requests,
     samples: Mapping[str, Sequence[Any]],
     book: Ledger,
+    most: int | None = None,
 ) -> Called:
-    """Return the group that a region's vehicles form; requests and offers enter `book`.
+    """Return the group that a region's vehicles form, `most` of them by the plan; requests and offers enter `book`.
 
     Who asks is there when the vehicle that errs most is first there. Raises `InputError` where pretraining has no loss,
     and `BudgetExceeded`.
@@ -84,7 +86,7 @@ def call_group(
         raise InputError("requests: vehicles ask by the loss at the end of pretraining, and there is no pretraining")
     limit = how.excess * validated[-1].loss
     clients = [name for name in sorted(samples) if len(samples[name])]
-    parts = {name: hold_back(samples[name], how.held_back) for name in clients}
+    parts = {name: hold_back(len(samples[name]), how.held_back) for name in clients}
     held = {name: Picked(samples[name], own) for name, (_, own) in parts.items()}
     vehicles: dict[str, Checked] = {}
     for name, own in held.items():
@@ -113,12 +115,14 @@ def call_group(
     for name in linked:
         own = Picked(samples[name], parts[name][0])
         client = TaskClient(task, frozen.config, own, batch=learning.batch)
-        sketch = sketch_gradient(client, weights, derive_seed(learning.seed, "offer"))
+        seed = derive_seed(learning.seed, "offer")
+        sketch = sketch_gradient(find_gradient(client, weights, seed), seed)
         offers[name] = Offer(len(own), count_labels(own), sketch)
         send(book, offers[name].message(), client=name, **where)
     if not offers:
         return Called(Group(limit, vehicles, lead, stayed=stayed), {}, watch)
-    chosen = choose_members(how, [name for name in present if name in linked], weigh_offers(offers), stayed)
+    asking = [name for name in present if name in linked]
+    chosen = choose_members(how, asking, weigh_offers(offers), stayed, most)
     watch.held = {name: held[name] for name in chosen.members}
     watch.note(weights)
     sent = sum(entry.bytes for entry in book.entries[before:] if entry.direction == "up")
