@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from flcav.federation.leads import Term
 from flcav.interface.wording import plural
 from flcav.storage.records import Record
 
@@ -31,6 +32,7 @@ class Group(Record):
     most_rounds: int = 0  # of the plan
     losses: tuple[float, ...] = ()  # on the members' held-back frames, mean: before the first round, and after each
     dissolved: str = ""  # why
+    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group; none: an edge server led
 
     @property
     def asked(self) -> tuple[str, ...]:
@@ -48,8 +50,16 @@ class Group(Record):
             f"{plural(self.most_rounds, 'round')}",
             f"{self.request_bytes} bytes of requests and offers",
         ]
+        told += [_describe_end(term) for term in self.terms[:-1]]
         for name in self.asked:
             own = self.vehicles[name]
             told.append(f"{name} {own.before:.3f} to {own.after:.3f}" if own.after is not None else name)
         told += [f"{name} stayed ({why})" for name, why in self.stayed.items()]
         return "; ".join([*told, *([self.dissolved] if self.dissolved else [])])
+
+
+def _describe_end(term: Term) -> str:
+    """Return in words how the term of a lead ended."""
+    if term.received is None:
+        return f"{term.lead} was gone before round {term.left}"
+    return f"{term.lead} left in round {term.left} with {plural(term.received, 'update')}, and the round began again"

@@ -10,6 +10,7 @@ from typing import Any
 from safetensors.numpy import load_file
 
 from flcav.federation.buffered_rounds import Buffers, afford_buffers
+from flcav.federation.leads import Term, federate_led, follow_leads
 from flcav.federation.privacy import count_affordable
 from flcav.federation.rounds import BeforeRound, Schedule, federate
 from flcav.federation.rules import Rules
@@ -88,6 +89,7 @@ class EdgeFederation:
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
     relabel: BeforeRound | None = None  # changes the clients' labels before each round
     watch: GroupWatch | None = None  # over a group, which dissolves when its loss has levelled off
+    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group; none: an edge server leads
 
     @property
     def start_share(self) -> float:
@@ -164,7 +166,8 @@ def federate_edge(
         if own.watch is not None and own.watch.over:
             raise Levelled
         if done < own.afford(rules, own.schedule.rounds, buffers):
-            federate(
+            run = partial(federate_led, terms=own.terms) if own.terms else federate
+            run(
                 clients,
                 start,
                 own.schedule,
@@ -245,6 +248,9 @@ def edge_step(
     federation = _open_federation(work, settings, labelled, rounds, book)
     federation = federation if called is None else replace(federation, watch=called.watch)
     driven = _drive(work, settings, federation, own)
+    if called is not None and called.group.lead in called.samples:  # ad hoc
+        terms = follow_leads([*called.samples], called.group.lead, driven.records, inputs.region)
+        federation, called = replace(federation, terms=terms), replace(called, terms=terms)
     where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
     where["fleet"] = Path(fleet) if fleet else None
     losses = federate_edge(federation, driven.rules, driven.outages, buffers=driven.buffers, **where)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
+from flcav.federation.leads import Term
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.network.ledger import Ledger
 from flcav.network.messages import pack, send
@@ -53,6 +54,7 @@ class Called:
     group: Group
     samples: Mapping[str, Sequence[Any]]  # that its members train on, by client
     watch: GroupWatch
+    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group
 
     def dissolve(self, folder: Path, most_rounds: int) -> Group:
         """Return the group after its rounds, with what the network in `folder` does on what members held back."""
@@ -62,7 +64,9 @@ class Called:
         vehicles = {name: replace(each, after=reached.get(name)) for name, each in self.group.vehicles.items()}
         over = "the loss has levelled off" if self.watch.over else "the plan's rounds are over"
         losses = tuple(self.watch.losses)
-        return replace(self.group, vehicles=vehicles, losses=losses, most_rounds=most_rounds, dissolved=over)
+        led = tuple(term for term in self.terms if term.first < len(losses) or term.first == 1)
+        about: Any = {"losses": losses, "most_rounds": most_rounds, "dissolved": over, "terms": led}
+        return replace(self.group, vehicles=vehicles, **about)
 
 
 def call_group(
