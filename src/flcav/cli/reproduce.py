@@ -40,6 +40,7 @@ class Target(StrEnum):
     federation_exchange = "federation-exchange"
     federation_exchange_objects = "federation-exchange-objects"
     federation_faults = "federation-faults"
+    federation_groups = "federation-groups"
     federation_leakage = "federation-leakage"
     fig1b = "fig1b"
     fig3a = "fig3a"
@@ -70,6 +71,7 @@ EXCHANGES: Mapping[str, str] = {  # recipe of each
 DRIVES = (  # one recording, several seeds
     Target.federation_asynchrony,
     Target.federation_faults,
+    Target.federation_groups,
     Target.federation_leakage,
 )
 
@@ -216,6 +218,8 @@ def _repeat_drives(target: Target, out: Path, seeds: int) -> None:
             from flcav.experiments.asynchrony.run import compare_asynchrony as repeat
         elif target == Target.federation_faults:
             from flcav.experiments.attacks.faults import repeat_faults as repeat
+        elif target == Target.federation_groups:
+            from flcav.experiments.groups.run import compare_groups as repeat
         else:
             from flcav.experiments.attacks.leakage import repeat_leakage as repeat
         results, pictures = repeat(out, seeds, report)

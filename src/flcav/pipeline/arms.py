@@ -290,6 +290,13 @@ def _check_requests(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> 
         raise InputError("privacy: requests and offers tell of a vehicle's data, and no noise covers them")
     if _plans_joiners(recipe, setting):
         raise InputError("requests: nobody joins rounds by a plan; leave out horizon_s")
+    if how.requests is not None and how.requests.roadside:
+        for task, kind in setting.labels.items():
+            if not LABEL_SOURCES[kind].trained or LABEL_SOURCES[kind].averaged:
+                raise InputError(
+                    f"requests.roadside: units label by their trained detector, and the labels of '{task}' are "
+                    f"'{kind}'; choose 'road' or 'road+tracks'"
+                )
     if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
         raise InputError("requests: vehicles check the network by labels of their own, not by those of 'road-average'")
 

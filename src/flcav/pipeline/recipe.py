@@ -146,6 +146,7 @@ class Requests(Config):
     )  # share of a further vehicle's data that those called before it have, in such a plan
     least_quality: float = Field(default=0.5, ge=0, le=1)  # of a member's data, relative to the best that are offered
     link_s: float = Field(default=10.0, gt=0)  # longest time of an update alone on the air, where there is a network
+    roadside: bool = False  # whether units on poles in range join, with what they see and their own detector's labels
     patience: int = Field(default=2, ge=1, le=1000)  # rounds by which the loss on held-back frames has to fall
     least_gain: float = Field(default=0.01, ge=0, lt=1)  # share of the loss that these have to gain
 

@@ -1,5 +1,6 @@
 """Groups on request: who is called, who leads, what an offer costs, and when a group dissolves."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 from safetensors.numpy import load
 
 from flcav.config import InputError
+from flcav.federation.leads import Term
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.perception.weather.samples import Sample
@@ -147,9 +149,21 @@ def test_the_record_says_who_asked_why_who_came_and_what_it_mended() -> None:
     )
     assert group.describe() == (
         "grid/a asked, with a loss above 0.900 on frames held back; pole3 led 2 vehicles for 2 of 6 rounds; 1234 bytes "
-        "of requests and offers; grid/a 1.400 to 0.600; grid/c stayed (no link to spare); the loss has levelled off"
+        "of requests and offers; mended: 1 of 1; grid/a 1.400 to 0.600; grid/c stayed (no link to spare); the loss has "
+        "levelled off"
     )
     assert Group.from_json(group.as_json(), "here") == group
+    lasting = replace(group, vehicles={**vehicles, "grid/a": Checked(3, 1.4, 1.0, asks=True)}, scores=(0.5, 0.25))
+    assert lasting.mended == ()
+    assert "mended: 0 of 1" in lasting.describe()
+    assert "on validation frames 0.500 to 0.250, which nobody acts on" in lasting.describe()
+    terms = (Term("grid/a", 1, 2, 1), Term("grid/b", 2, 3), Term("grid/c", 3))
+    adhoc = replace(group, lead="grid/a", terms=terms, roadside=("grid/pole3",))
+    assert "grid/a led 2 vehicles and 1 roadside unit (pole3) for 2" in adhoc.describe()
+    assert "grid/a left in round 2 with 1 update, and the round began again; grid/b was gone before round 3" in (
+        adhoc.describe()
+    )
+    assert Group.from_json(adhoc.as_json(), "here") == adhoc
     calm = Group(0.9, {"grid/b": vehicles["grid/b"]}, "")
     assert calm.describe() == "nobody asked: the largest loss on held-back frames is 0.200, and 0.900 the limit"
 

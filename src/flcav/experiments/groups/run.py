@@ -111,15 +111,15 @@ class Followed:
 
 
 def compare_groups(
-    out: Path, seeds: Sequence[int], progress: Report = ignore_progress
+    out: Path, seeds: int, progress: Report = ignore_progress, *, first: int = 1
 ) -> tuple[GroupsResult, dict[str, bytes]]:
     """Record the drives into `out`, and federate by each setting, seed and rival; return numbers and a picture."""
     drives = record_drives(out, progress)
     right: dict[tuple[str, str, str], list[NDArray[np.float64]]] = {}
     found: dict[str, dict[str, dict[str, Trajectory]]] = {setting: {} for setting in SETTINGS}
     meet: dict[str, tuple[str, ...]] = {}
-    total, done = len(seeds) * len(SETTINGS), 0
-    for seed in seeds:
+    total, done = seeds * len(SETTINGS), 0
+    for seed in range(first, first + seeds):
         for setting in SETTINGS:
             fleet = open_fleet(drives, seed, alike=setting == ALIKE, held_back=REQUESTS.held_back)
             if setting == UNLIKE:
