@@ -1,15 +1,20 @@
 """Ad hoc groups: who takes over when a lead leaves, and that the round goes on to the same weights."""
 
 from collections import Counter
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
+from regression import START as REGRESSION
+from regression import ledger
+from regression import vehicles as regressions
 
 from flcav.federation.leads import Term, federate_led, follow_leads
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account, Outage
+from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import strategy_named
 from flcav.federation.trainable import LocalUpdate, Weights
@@ -145,3 +150,15 @@ def timing(number: int, *clients: tuple[str, float, str]) -> RoundTiming:
 )
 def test_who_leads_by_the_clock(rounds: list[RoundTiming], terms: list[Term]) -> None:
     assert [*follow_leads(["r/a", "r/b", "r/c"], "r/a", rounds, "r")] == terms
+
+
+def test_a_round_begins_again_where_clients_train_in_processes() -> None:
+    vehicles, terms = regressions("grid", 4), [Term("grid/cav0", 1, 2, 1), Term("grid/cav1", 2)]
+    found = []
+    for count in (1, 2):
+        own = Account(ledger(), "edge", "regression", "wireless")
+        how: Any = {"on_round": lambda *_: None}
+        with ClientProcesses(vehicles, 2) if count == 2 else nullcontext() as where:
+            weights = federate_led(vehicles, REGRESSION, SCHEDULE, own, terms, runtime=where, **how).weights
+        found.append((weights["w"].tobytes(), Counter(own.ledger.entries)))
+    assert found[0] == found[1]
