@@ -96,6 +96,7 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
 SEEDS: Mapping[str, int] = {
     **dict.fromkeys((Target.corner_cases, Target.demo_arms, *EXCHANGES, *DRIVES), 5),
     **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
+    Target.federation_groups: 10,
     Target.safety_distance: 1,
 }
 
@@ -121,8 +122,8 @@ def reproduce(
         None,
         "--seeds",
         min=1,
-        help="Number of seeds, from 1: 8 of federation-exchange and placement, 5 of corner-cases, demo-arms and the "
-        "other federation-*, 3 of the others if not given.",
+        help="Number of seeds, from 1: 10 of federation-groups, 8 of federation-exchange and placement, 5 of "
+        "corner-cases, demo-arms and the other federation-*, 3 of the others if not given.",
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."

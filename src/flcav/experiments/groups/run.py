@@ -42,13 +42,15 @@ from flcav.statistics.verdicts import judge_means
 from flcav.storage.records import Record
 
 ROUNDS, STEPS, LEARNING_RATE = 20, 5, 0.05
-REQUESTS = Requests(excess=4.0, most=4)
+REQUESTS = Requests(excess=50.0, most=4)
+TARGET = 0.95  # accuracy
 ROSTER, GROUP, DRAWN = "fixed roster, all ten", "group on request", "four drawn for each round"
 RIVALS = (ROSTER, GROUP, DRAWN)
 UNLIKE, ALIKE = "three meet two new weathers", "all meet two new weathers"
 SETTINGS = (UNLIKE, ALIKE)
 MEGABYTES, WHOLE = "the group's megabytes", "the whole plan"
-MEASURES = (MEGABYTES, WHOLE)
+MEASURES = (MEGABYTES, WHOLE)  # of accuracy
+UNTIL = f"megabytes until accuracy {TARGET}"
 UP: Any = {"stage": EDGE, "task": WEATHER.name, "link": "wireless", "direction": "up"}
 
 
@@ -62,6 +64,7 @@ class Trajectory:
     asked: tuple[str, ...] = ()  # of a group
     at: Mapping[str, float] | None = None  # accuracy by `MEASURES`
     gain_per_mb: Mapping[str, float] | None = None  # of accuracy since pretraining, by `MEASURES`
+    until_mb: float | None = None  # uplink until `TARGET`, at most that of the roster's whole plan
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,8 @@ class GroupsResult(Record):
     trajectories: Mapping[str, Mapping[str, Mapping[str, Trajectory]]]  # by setting, seed and rival
     accuracy: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by setting, measure and rival
     gains: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # per megabyte
-    differences: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # of accuracy
+    until_mb: Mapping[str, Mapping[str, MeanOverSeeds]]  # by setting and rival
+    differences: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # of accuracy; megabytes saved until `TARGET`
     provenance: Provenance
 
     @property
@@ -149,7 +153,7 @@ def call(fleet: Fleet, seed: int) -> Followed:
     """Return the rounds of the group that those vehicles call whose loss on held-back pictures is above the limit."""
     book, limit = Ledger(LinkMegabytes(1e6, 0.0)), REQUESTS.excess * fleet.loss
     losses = {name: float(measure_losses(fleet.start, own).mean()) for name, own in fleet.held.items()}
-    asked = [name for name, loss in losses.items() if loss > limit]
+    asked = sorted((name for name, loss in losses.items() if loss > limit), key=lambda name: -losses[name])
     if not asked:
         return Followed((fleet.start,), (0,), ())
     for name in asked:
@@ -199,7 +203,7 @@ def score(
     """Return the trajectories by rival, and which test pictures (N,) are right, by measure and rival."""
     found: dict[str, Trajectory] = {}
     marks: dict[tuple[str, str], NDArray[np.float64]] = {}
-    group_bytes = followed[GROUP].up_bytes[-1]
+    group_bytes, most_mb = followed[GROUP].up_bytes[-1], followed[ROSTER].up_bytes[-1] / BYTES_PER_MB
     for name, own in followed.items():
         right = [find_right(weights, drives.test).astype(float) for weights in own.weights]
         mb = [each / BYTES_PER_MB for each in own.up_bytes]
@@ -207,7 +211,9 @@ def score(
         at = {measure: float(right[end].mean()) for measure, end in ends.items()}
         gain = {m: (at[m] - float(right[0].mean())) / mb[end] if end else 0.0 for m, end in ends.items()}
         accuracy = tuple(round(float(each.mean()), 5) for each in right)
-        found[name] = Trajectory(tuple(np.round(mb, 4).tolist()), accuracy, own.members, own.asked, at, gain)
+        until = next((sent for sent, each in zip(mb, accuracy, strict=True) if each >= TARGET), most_mb)
+        reached = (at, gain, round(min(until, most_mb), 4))
+        found[name] = Trajectory(tuple(np.round(mb, 4).tolist()), accuracy, own.members, own.asked, *reached)
         marks |= {(measure, name): right[end] for measure, end in ends.items()}
     return found, marks
 
@@ -232,6 +238,12 @@ def summarise(
         pairs = zip(right[setting, measure, rival], right[setting, measure, ROSTER], strict=True)
         return mean([one - other for one, other in pairs], share=False)
 
+    def until(setting: str, rival: str) -> list[float]:
+        return [seed[rival].until_mb or 0.0 for seed in found[setting].values()]
+
+    def saved(setting: str, rival: str) -> MeanOverSeeds:
+        return mean_over_seeds([a - b for a, b in zip(until(setting, ROSTER), until(setting, rival), strict=True)])
+
     others = [rival for rival in RIVALS if rival != ROSTER]
     return GroupsResult(
         pictures=len(drives.test.scenes),
@@ -240,6 +252,11 @@ def summarise(
         trajectories=found,
         accuracy={s: {m: {n: mean(right[s, m, n], True) for n in RIVALS} for m in MEASURES} for s in SETTINGS},
         gains={s: {m: {n: gain(s, m, n) for n in RIVALS} for m in MEASURES} for s in SETTINGS},
-        differences={s: {m: {n: difference(s, m, n) for n in others} for m in MEASURES} for s in SETTINGS},
+        until_mb={s: {n: mean_over_seeds(until(s, n)) for n in RIVALS} for s in SETTINGS},
+        differences={
+            s: {m: {n: difference(s, m, n) for n in others} for m in MEASURES}
+            | {UNTIL: {n: saved(s, n) for n in others}}
+            for s in SETTINGS
+        },
         provenance=provenance(),
     )

@@ -2,7 +2,17 @@
 
 import numpy as np
 
-from flcav.experiments.groups.run import MEASURES, MEGABYTES, RIVALS, ROSTER, SETTINGS, WHOLE, GroupsResult
+from flcav.experiments.groups.run import (
+    MEASURES,
+    MEGABYTES,
+    RIVALS,
+    ROSTER,
+    SETTINGS,
+    TARGET,
+    UNTIL,
+    WHOLE,
+    GroupsResult,
+)
 from flcav.statistics.verdicts import judge_means
 from flcav.storage.markdown import format_table
 
@@ -18,8 +28,9 @@ def groups_tables(results: GroupsResult) -> dict[str, str]:
             gain = results.gains[setting][WHOLE][rival].describe()
             rounds = np.mean([len(each.up_mb) - 1 for each in own])
             sent = np.mean([each.up_mb[-1] for each in own])
-            accuracy.append([setting, rival, means[0], means[1], f"{rounds:.1f}", f"{sent:.2f}", gain])
-            for measure in MEASURES if rival != ROSTER else ():
+            until = results.until_mb[setting][rival].describe()
+            accuracy.append([setting, rival, *means, f"{rounds:.1f}", f"{sent:.2f}", gain, until])
+            for measure in (*MEASURES, UNTIL) if rival != ROSTER else ():
                 one, verdict = (
                     results.differences[setting][measure][rival],
                     judged[f"{setting}, {measure}: {rival}"],
@@ -38,11 +49,20 @@ def groups_tables(results: GroupsResult) -> dict[str, str]:
         "accuracy after the whole plan",
         "rounds until its end",
         "MB up by then",
-        "gain in accuracy per MB",
+        "gain in accuracy per MB of it",
+        f"MB up until accuracy {TARGET}",
     )
     of_groups = ("vehicles", "seed", "met the new weathers", "asked", "came", "rounds", "requests and offers, kB")
     more = "if undecided: seeds that detect a difference of the observed size"
-    told = ("vehicles", "at", "rounds", "accuracy - fixed roster's", "p, corrected", "claim that it is positive", more)
+    told = (
+        "vehicles",
+        "at",
+        "rounds",
+        "accuracy - fixed roster's, or megabytes saved",
+        "p, corrected",
+        "claim that it is positive",
+        more,
+    )
     return {
         "accuracy": format_table(heads, accuracy),
         "groups": format_table(of_groups, groups),

@@ -143,7 +143,7 @@ def call_group(
         send(book, offers[name].message(), client=name, **where)
     if not offers:
         return Called(Group(limit, vehicles, lead, stayed=stayed), {}, watch)
-    asking = [name for name in present if name in linked]
+    asking = sorted((name for name in present if name in linked), key=lambda name: -vehicles[name].before)
     chosen = choose_members(how, asking, weigh_offers(offers), stayed, most)
     watch.held = {name: held[name] for name in chosen.members}
     watch.note(weights)

@@ -162,15 +162,16 @@ def choose_members(
     stayed: Mapping[str, str],
     most: int | None = None,
 ) -> Chosen:
-    """Return the group: who asked, and of the others those whose data are good enough; of both the best first.
+    """Return the group: who asked, and of the others those whose data are good enough, the best first.
 
-    quality: of all who made an offer; stayed: why others made none; most: members by the plan, None: those of `how`.
+    asked: those that made an offer, who errs most first; quality: of all who made one; stayed: why others made none;
+    most: members by the plan, None: those of `how`.
     """
-    ranked = sorted(quality, key=lambda name: (name not in asked, -quality[name], name))
-    least = how.least_quality * max(quality.values())
-    came = [name for name in ranked if name in asked or quality[name] >= least][: most or how.most]
-    unneeded = {name: NOT_NEEDED for name in ranked if name not in came}
-    return Chosen(tuple(came), quality, {**stayed, **unneeded})
+    others = sorted((name for name in quality if name not in asked), key=lambda name: (-quality[name], name))
+    good = [name for name in others if quality[name] >= how.least_quality * max(quality.values())]
+    came = (*asked, *good)[: most or how.most]
+    unneeded = {name: NOT_NEEDED for name in (*asked, *others) if name not in came}
+    return Chosen(came, quality, {**stayed, **unneeded})
 
 
 def has_levelled(losses: Sequence[float], how: Requests) -> bool:
