@@ -6,19 +6,19 @@ again: it asks for the received updates once more, and the weights are those of 
 a strategy keeps at the server between rounds, such as moments, is lost with the lead.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
-from flcav.federation.rounds import OnRound, Schedule, federate
+from flcav.federation.rounds import OnRound
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.state import FederationState
-from flcav.federation.trainable import LocalUpdate, Trainable, Weights
+from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.clock.records import RoundTiming
 from flcav.network.clock.rounds import LEFT_TOWN, NO_COVERAGE
 from flcav.network.ledger import Ledger, LedgerEntry
 from flcav.storage.records import Record
 
+RunRounds = Callable[[Weights, Account, int, OnRound], LocalUpdate]  # `federate` after so many rounds, with the rest
 LEAVES = (LEFT_TOWN, NO_COVERAGE)  # why a vehicle is lost that cannot lead any longer
 
 
@@ -88,28 +88,25 @@ def _keeps(term: Term, key: tuple[int, str], outage: Outage) -> bool:
 
 
 def federate_led(
-    clients: Mapping[str, Trainable],
+    run: RunRounds,
     weights: Weights,
-    schedule: Schedule,
     account: Account,
     terms: Sequence[Term],
-    *,
-    state: FederationState | None = None,
-    done: int = 0,
     on_round: OnRound,
-    **how: Any,
+    *,
+    state: FederationState,
+    done: int = 0,
 ) -> LocalUpdate:
-    """Run the rounds of a group whose leads have these `terms`; the arguments are otherwise those of `federate`.
+    """Run the rounds of a group whose leads have these `terms`, by `run`, whose rounds keep `state`.
 
     A round whose lead leaves begins again under the next one, without whoever left: the messages of both attempts are
     in the ledger. Raises as `federate`.
     """
-    state = state or FederationState()
-    reached, kept = (done, weights), (state.to_arrays(), [*state.records])
+    reached = done, weights
 
     def keep(number: int, combined: Weights, loss: float | None) -> None:
-        nonlocal reached, kept
-        reached, kept = (number, combined), (state.to_arrays(), [*state.records])
+        nonlocal reached
+        reached = number, combined
         on_round(number, combined, loss)
 
     outages = dict(account.outages)
@@ -119,11 +116,10 @@ def federate_led(
         there = {key: each for key, each in outages.items() if not _keeps(term, key, each)}
         own = replace(account, outages=there, within=frozenset({term.lead}), ledger=_LeadBook(account.ledger, term))
         try:
-            return federate(clients, reached[1], schedule, own, state=state, done=reached[0], on_round=keep, **how)
+            return run(reached[1], own, reached[0], keep)
         except LeadLeft:
             assert term.left is not None
-            state.restore(*kept)
-            state.server = {}
+            state.server = {}  # clients keep theirs: it changes when a round is over
             lost = outages.get((term.left, term.lead))
             outages[term.left, term.lead] = Outage(LEFT_TOWN if lost is None else lost.reason)
     return LocalUpdate(reached[1], 0, 0.0)

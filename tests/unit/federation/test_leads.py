@@ -12,7 +12,7 @@ from regression import ledger
 from regression import vehicles as regressions
 
 from flcav.federation.leads import Term, federate_led, follow_leads
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.rounds import OnRound, Schedule, federate
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
@@ -46,10 +46,21 @@ def account(outages: dict[tuple[int, str], Outage] | None = None, **more: Any) -
     return Account(Ledger(LinkMegabytes(1.0, 0.0)), "edge", "t", "wireless", outages or {}, **more)
 
 
+def lead(clients: Any, weights: Weights, own: Account, terms: list[Term], on_round: OnRound, **about: Any) -> Weights:
+    """Federate under the leads of these terms."""
+    state, done = about.pop("state", None) or FederationState(), about.pop("done", 0)
+    schedule = about.pop("schedule", SCHEDULE)
+
+    def run(weights: Weights, account: Account, done: int, on_round: OnRound) -> LocalUpdate:
+        return federate(clients, weights, schedule, account, state=state, done=done, on_round=on_round, **about)
+
+    return federate_led(run, weights, own, terms, on_round, state=state, done=done).weights
+
+
 def led(terms: list[Term], outages: dict[tuple[int, str], Outage], **how: Any) -> tuple[Weights, Account, dict]:
     own, vehicles, reached = account(outages), clients(), dict[int, Weights]()
     keep = lambda number, weights, _loss: reached.__setitem__(number, weights)  # noqa: E731
-    weights = federate_led(vehicles, START, SCHEDULE, own, terms, on_round=keep, **how).weights
+    weights = lead(vehicles, START, own, terms, keep, **how)
     assert [*reached] == [*range(how.get("done", 0) + 1, 5)]
     np.testing.assert_array_equal(weights["w"], reached[4]["w"])
     return weights, own, vehicles
@@ -104,11 +115,11 @@ def test_a_stopped_group_goes_on_in_the_term_of_its_round() -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        federate_led(clients(), START, SCHEDULE, account(LEAVES), terms, state=states, on_round=stop)
+        lead(clients(), START, account(LEAVES), terms, stop, state=states)
     rest = account(LEAVES)
     keep = lambda number, weights, loss: None  # noqa: E731
-    after = federate_led(clients(), reached[2], SCHEDULE, rest, terms, state=states, done=2, on_round=keep)
-    np.testing.assert_array_equal(after.weights["w"], whole["w"])
+    after = lead(clients(), reached[2], rest, terms, keep, state=states, done=2)
+    np.testing.assert_array_equal(after["w"], whole["w"])
     assert [e for e in own.ledger if e.round > 2] == [*rest.ledger]
     assert [each.round for each in states.records] == [1, 2, 3, 4]
 
@@ -157,8 +168,7 @@ def test_a_round_begins_again_where_clients_train_in_processes() -> None:
     found = []
     for count in (1, 2):
         own = Account(ledger(), "edge", "regression", "wireless")
-        how: Any = {"on_round": lambda *_: None}
         with ClientProcesses(vehicles, 2) if count == 2 else nullcontext() as where:
-            weights = federate_led(vehicles, REGRESSION, SCHEDULE, own, terms, runtime=where, **how).weights
+            weights = lead(vehicles, REGRESSION, own, terms, lambda *_: None, runtime=where)
         found.append((weights["w"].tobytes(), Counter(own.ledger.entries)))
     assert found[0] == found[1]

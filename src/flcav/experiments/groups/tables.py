@@ -37,7 +37,7 @@ def groups_tables(results: GroupsResult) -> dict[str, str]:
                 )
                 row = [setting, measure, rival, one.describe(sign=True), verdict.p_cell, verdict.verdict]
                 differences.append([*row, verdict.takes_cell])
-        for seed, rivals in seeds.items():
+        for seed, rivals in sorted(seeds.items(), key=lambda each: int(each[0])):
             group = rivals[RIVALS[1]]
             told = (", ".join(group.asked), ", ".join(group.members))
             met = ", ".join(results.meet[seed]) if setting == SETTINGS[0] else "all"

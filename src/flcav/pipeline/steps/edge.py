@@ -12,7 +12,7 @@ from safetensors.numpy import load_file
 from flcav.federation.buffered_rounds import Buffers, afford_buffers
 from flcav.federation.leads import Term, federate_led, follow_leads
 from flcav.federation.privacy import count_affordable
-from flcav.federation.rounds import BeforeRound, Schedule, federate
+from flcav.federation.rounds import BeforeRound, OnRound, Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.link import Runtime, open_runtime
 from flcav.federation.runtimes.metered import Account, Outage
@@ -21,7 +21,7 @@ from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.trainable import Trainable, Weights
+from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
 from flcav.perception.client import TaskClient
@@ -167,23 +167,31 @@ def federate_edge(
         if own.watch is not None and own.watch.over:
             raise Levelled
         if done < own.afford(rules, own.schedule.rounds, buffers):
-            run = partial(federate_led, terms=own.terms) if own.terms else federate
-            run(
-                clients,
-                start,
-                own.schedule,
-                Account(own.book, EDGE, learning.task.name, "wireless", outages, own.roadside),
-                strategy=own.strategy,
-                rules=rules,
-                state=state,
-                done=done,
-                earlier=own.earlier,
-                before_round=partial(own.prepare, clients, where),
-                on_round=partial(_keep_round, own.watch, checkpoints),
-                runtime=where,
-                distiller=own.shared,
-                buffers=buffers,
-            )
+            account = Account(own.book, EDGE, learning.task.name, "wireless", outages, own.roadside)
+            keep = partial(_keep_round, own.watch, checkpoints)
+
+            def run(weights: Weights, account: Account, done: int, on_round: OnRound) -> LocalUpdate:
+                return federate(
+                    clients,
+                    weights,
+                    own.schedule,
+                    account,
+                    strategy=own.strategy,
+                    rules=rules,
+                    state=state,
+                    done=done,
+                    earlier=own.earlier,
+                    before_round=partial(own.prepare, clients, where),
+                    on_round=on_round,
+                    runtime=where,
+                    distiller=own.shared,
+                    buffers=buffers,
+                )
+
+            if own.terms:
+                federate_led(run, start, account, own.terms, keep, state=state, done=done)
+            else:
+                run(start, account, done, keep)
     return checkpoints.finish(own.network, learning.training.average_rounds, own.start_share)
 
 
