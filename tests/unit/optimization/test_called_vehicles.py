@@ -36,12 +36,14 @@ def error_of(task: dict[str, Any], called: int, x: int, y: int, z: int, k: int) 
     brought, whole = ([sum(worth[: min(n, size)]) for size in sizes] for n in (called, max(sizes)))
     if curve["model"] == "federated":
         held = [own * a / b for own, a, b in zip(curve["group_samples"], brought, whole, strict=True)]
-        one, drift = sum(held) / len(held), curve["drift"]
-        known = one * (1 - 1 / (y + k * z + 1)) + curve["gamma"] * (sum(held) - one) * z / (z + 1)
+        one, all_ = (sum(each) / len(each) for each in (held, curve["group_samples"]))
+        drift = curve["drift"]
+        known = one * (1 - 1 / (y + k * z + 1)) + (curve["gamma"] + (k > 0) * (1 - one / all_)) * all_ * z / (z + 1)
         extra = drift * z / (z + 1) if drift > 0 else -drift / (z + 1)
     else:
         share = sum(brought) / sum(whole)
-        known, extra = curve["group_samples"] * share * (1 - 1 / (y + k * z + 1)), 0.0
+        by_cloud = (k > 0) * (1 - share) * z / (z + 1)  # stage III has all vehicles
+        known, extra = curve["group_samples"] * (share * (1 - 1 / (y + k * z + 1)) + by_cloud), 0.0
     power = curve["a"] * (curve["alpha"] * x + curve["beta"] * known) ** -curve["b"]
     return float(curve["floor"] + power + extra)
 
@@ -182,6 +184,7 @@ def test_baselines_call_the_most_and_are_no_better(name: str) -> None:
     found, plan = baseline(parsed(values), name), allocate(parsed(values))
     assert found.objective >= plan.objective * (1 - 1e-9)
     assert [own.called for own in found.tasks] == [own["called"][1] for own in values["tasks"]]
+    assert found.used_mb.wireless_mb <= values["budgets_mb"]["wireless"]
 
 
 @pytest.mark.parametrize(

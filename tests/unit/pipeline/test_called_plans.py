@@ -2,19 +2,23 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from flcav.config import parse_config
 from flcav.network.ledger import LinkMegabytes
 from flcav.network.plan import MessageSizes, StagePlan, price
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.curves.history import History
+from flcav.optimization.problem import Problem
 from flcav.optimization.verification.allocation import verify_allocation
 from flcav.pipeline.arms import Names, resolve_settings
 from flcav.pipeline.plan.allocation import PlanRequest, PlanSettings, make_plan
 from flcav.pipeline.plan.replanning import remake_plan
 from flcav.pipeline.recipe import PlanLimits, Requests, RunRecipe
+from flcav.pipeline.tables import parse_history, read_history
 from flcav.pipeline.training.groups import choose_members
 
 SIZES = MessageSizes(sample_mb=0.4, model_mb=1.4)
@@ -46,6 +50,7 @@ def test_a_run_s_plan_decides_how_many_vehicles_are_called_and_pays_for_them() -
     assert own.predicted is not None
     assert all_of_them.tasks["objects"].predicted is not None
     assert own.predicted["cloud"] > all_of_them.tasks["objects"].predicted["cloud"]
+    assert parse_config(Problem, json.loads(problem.model_dump_json()), "problem.json") == problem
     told = json.loads(json.dumps(allocate(problem), default=vars))
     told = {**told, **{each: {k.removesuffix("_mb"): v for k, v in told[each].items()} for each in ("used_mb",)}}
     assert not verify_allocation(problem.model_dump_json(), json.dumps(told)).faults
@@ -58,7 +63,7 @@ def test_a_fixed_roster_has_all_vehicles() -> None:
 
 
 def test_unspent_bytes_of_a_group_that_dissolved_buy_cloud_rounds() -> None:
-    frame = replace(FRAME, limits=PlanLimits(edge_rounds=(6, 12), cloud_rounds=(0, 20)))
+    frame = replace(FRAME, limits=PlanLimits(edge_rounds=(4, 12), cloud_rounds=(0, 20)), called=(4, 4))
     plan, problem = make_plan((REQUEST,), frame, "joint")
     assert problem is not None
     own = plan.tasks["objects"]
@@ -97,3 +102,13 @@ def test_an_arm_with_groups_has_a_plan_of_its_own_and_a_group_no_more_members() 
     quality = {"a": 0.4, "b": 0.9, "c": 1.0}
     assert choose_members(Requests(), ["a"], quality, {}, 2).members == ("a", "c")
     assert choose_members(Requests(most=3), ["a"], quality, {}, 1).members == ("a",)
+
+
+@pytest.mark.parametrize(("overlap", "called"), [(0.0, 3), (0.3, 2), (0.6, 1)])
+def test_by_the_package_s_history_fewer_are_called_the_more_their_data_overlap(overlap: float, called: int) -> None:
+    """As docs/groups.md has it."""
+    tracks = parse_history("objects", read_history("objects", "tracks", Path()), "objects")
+    about = (LinkMegabytes(40, 40), 0.02, PlanLimits(), (4, 3), 1, (320, 240))
+    frame = PlanSettings(*about, called=(1, 4), overlap=overlap)
+    asked = PlanRequest("objects", 1.0, MessageSizes(0.52, 0.83), 320, tracks, None)
+    assert make_plan((asked,), frame, "joint")[0].tasks["objects"].called == called

@@ -149,7 +149,7 @@ def _busy_s(problem: Problem, plans: Sequence[TaskAllocation]) -> float | None:
 def _call(problem: Problem, branch: Problem) -> Problem:
     """Return the problem with as many vehicles called as in one of its branches."""
     tasks = tuple(
-        task if own.called is None else call_vehicles(task, *own.called)
+        task if own.called is None else call_vehicles(task, *own.called, problem.edge_rounds_per_cloud_round)
         for task, own in zip(problem.tasks, branch.tasks, strict=True)
     )
     return problem.model_copy(update={"tasks": tasks})

@@ -67,7 +67,7 @@ def condition_problem(problem: Problem, progress: PlanState) -> Problem:
         if name not in names:
             raise InputError(f"progress.tasks names {name!r}, which is none of {', '.join(names)}")
     called = problem.model_copy(
-        update={"tasks": tuple(_call(task, progress.tasks.get(task.name)) for task in problem.tasks)}
+        update={"tasks": tuple(_call(problem, task, progress.tasks.get(task.name)) for task in problem.tasks)}
     )
     tasks = tuple(
         _continued(called, task, progress.tasks[task.name]) if task.name in progress.tasks else task
@@ -76,13 +76,13 @@ def condition_problem(problem: Problem, progress: PlanState) -> Problem:
     return problem.model_copy(update={"tasks": tasks, "budgets_mb": _left(called, progress)})
 
 
-def _call(task: AllocationTask, spent: TaskState | None) -> AllocationTask:
+def _call(problem: Problem, task: AllocationTask, spent: TaskState | None) -> AllocationTask:
     """Return the task with the vehicles that were called to the edge rounds done."""
     if spent is None or spent.called is None:
         return task
     if task.called is None or not task.called[0] <= spent.called <= task.called[1]:
         raise InputError(f"progress.tasks.{task.name}.called = {spent.called}: the problem does not call so many")
-    return call_vehicles(task, spent.called, spent.called)
+    return call_vehicles(task, spent.called, spent.called, problem.edge_rounds_per_cloud_round)
 
 
 def _continued(problem: Problem, task: AllocationTask, spent: TaskState) -> AllocationTask:

@@ -13,7 +13,7 @@ from math import prod
 from typing import TypeVar
 
 from flcav.config import InputError
-from flcav.optimization.curves.curves import Additive, Curve, Effective, Federated, SharedCurve
+from flcav.optimization.curves.curves import Additive, Curve, Effective, Federated, SharedCurve, split_regions
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible
 
@@ -40,36 +40,45 @@ def solve_branches(problem: Problem, solve: Callable[[Problem], T]) -> list[T]:
     return found
 
 
-def call_vehicles(task: AllocationTask, least: int, most: int) -> AllocationTask:
-    """Return the task with `least` to `most` vehicles called to stage II, and curves by what `most` bring.
+def call_vehicles(task: AllocationTask, least: int, most: int, k: int) -> AllocationTask:
+    """Return the task with `least` to `most` vehicles called to stage II, and curves by what `most` bring to it.
 
-    Of what the vehicles of an edge server hold they bring the share of their `worth`. The data of vehicles that are not
-    called do not count in stage III either, so that the gain of cloud rounds is rather underestimated.
+    Of what the vehicles of an edge server hold they bring the share of their `worth`. Stage III has all vehicles, so
+    that the rest is learned in cloud rounds: z of them bring the share 1 - 1 / (z + 1) of it, which for `k` > 1 edge
+    rounds in each is less than it would be; for k = 0 nobody trains in them.
     """
     before = task.weigh_groups(max(task.edge_groups) if task.called is None else task.called[1])
     after = task.weigh_groups(most)
-    held, whole = [own / all_ for own, all_ in zip(after, before, strict=True)], sum(after) / sum(before)
+    shares = [one / all_ for one, all_ in zip(after, before, strict=True)]
+    whole = sum(after) / sum(before)
 
     def share(curve: Curve | None) -> Curve | None:
-        if isinstance(curve, Effective):
-            return curve.model_copy(update={"group_samples": whole * curve.group_samples})
+        if isinstance(curve, Effective) and whole < 1:
+            held = whole * curve.group_samples
+            others = 0.0 if k == 0 else (1 - whole) / whole
+            values = {name: getattr(curve, name) for name in ("floor", "a", "b", "alpha", "beta")}
+            return Federated(model="federated", **values, group_samples=(held, held), gamma=others)
         if isinstance(curve, Federated):
-            shares = held if len(held) == len(curve.group_samples) else [whole] * len(curve.group_samples)
-            brought = tuple(part * own for part, own in zip(shares, curve.group_samples, strict=True))
-            return curve.model_copy(update={"group_samples": brought})
+            parts = shares if len(shares) == len(curve.group_samples) else [whole] * len(curve.group_samples)
+            brought = tuple(part * own for part, own in zip(parts, curve.group_samples, strict=True))
+            (own, others), (new_own, new_others) = split_regions(curve.group_samples), split_regions(brought)
+            rest = curve.gamma * others + (own - new_own) * (k > 0)
+            return curve.model_copy(
+                update={"group_samples": brought, "gamma": rest / new_others if new_others else curve.gamma}
+            )
         return curve
 
     update = {"called": (least, most), "curve": share(task.curve), "upper": share(task.upper)}
     return task.model_copy(update=update)
 
 
-def list_calls(task: AllocationTask) -> Iterator[AllocationTask]:
+def list_calls(task: AllocationTask, k: int) -> Iterator[AllocationTask]:
     """Yield the task with each number of vehicles that a plan may call, the fewest first; or itself."""
     if task.called is None:
         yield task
         return
     for number in range(task.called[0], task.called[1] + 1):
-        yield call_vehicles(task, number, number)
+        yield call_vehicles(task, number, number, k)
 
 
 def _list_branches(problem: Problem) -> list[Problem]:
@@ -78,7 +87,8 @@ def _list_branches(problem: Problem) -> list[Problem]:
         raise InputError(
             f"called: {choices} combinations of vehicles, and {MOST_CALLS} at most can be planned; narrow the ranges"
         )
-    options = [[each for called in list_calls(task) for each in _branch(called)] for task in problem.tasks]
+    k = problem.edge_rounds_per_cloud_round
+    options = [[each for called in list_calls(task, k) for each in _branch(called)] for task in problem.tasks]
     branching = sum(len(_branch(task)) > 1 for task in problem.tasks)
     if branching > MOST_BRANCHING:
         raise InputError(

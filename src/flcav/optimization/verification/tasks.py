@@ -62,15 +62,18 @@ def read_tasks(problem: Data, k: int) -> tuple[list[VerifiedTask], Array]:
         rounds = [[cars * (sent + labels), 0, train_s], [k * cars * sent, servers * model, k * train_s]]
         costs = np.array([[sample, sample, 0], *rounds, [cars * labels, 0, 0]], dtype=object)
         own = VerifiedTask(curves, limits, costs[:3], costs[3])
-        tasks.append(own._replace(calls=_list_calls(task, own, sent + labels)) if task.get("called") else own)
+        tasks.append(own._replace(calls=_list_calls(task, own, sent + labels, k)) if task.get("called") else own)
     budgets += [horizon_s] * (horizon_s is not None and any(task.unit[1, 2] for task in tasks))
     kept = slice(len(budgets))
     tasks = [_keep(task, kept) for task in tasks]
     return tasks, np.array([exact(budget) * SLACK for budget in budgets])
 
 
-def _list_calls(task: Data, own: VerifiedTask, sent: Fraction) -> dict[int, VerifiedTask]:
-    """Return the task by the number of vehicles called: they pay the edge rounds, and bring their share of the data."""
+def _list_calls(task: Data, own: VerifiedTask, sent: Fraction, k: int) -> dict[int, VerifiedTask]:
+    """Return the task by the number of vehicles called: they pay the edge rounds, and bring their share of the data.
+
+    The rest of it comes with cloud rounds, if anybody trains in them.
+    """
     (least, most), found = task["called"], {}
     worth = task.get("worth") or [1.0] * max(task["edge_groups"])
     before = [fsum(worth[: min(most, size)]) for size in task["edge_groups"]]
@@ -83,12 +86,9 @@ def _list_calls(task: Data, own: VerifiedTask, sent: Fraction) -> dict[int, Veri
         unit[1, 0] = cars * sent
         for weight, curve in own.curves:
             held = curve["group_samples"]
-            if isinstance(held, list):
-                by = shares if len(shares) == len(held) else [whole] * len(held)
-                held = [share * each for share, each in zip(by, held)]
-            else:
-                held = whole * held
-            curves.append((weight, {**curve, "group_samples": held}))
+            by = [whole] if not isinstance(held, list) else shares if len(shares) == len(held) else [whole] * len(held)
+            left = [(1 - share) * each for share, each in zip(by, np.atleast_1d(held))]
+            curves.append((weight, {**curve, "left": fsum(left) / len(left), "trained": k > 0}))
         found[number] = own._replace(curves=curves, unit=unit)
     return found
 
@@ -127,9 +127,10 @@ def error(curve: Data, counts: Sequence[Any], k: int) -> Any:
 
 def held_samples(curve: Data, y: Any, z: Any, k: int) -> Any:
     """Return the effective samples that rounds bring."""
-    groups, t = np.atleast_1d(curve["group_samples"]), y + k * z
+    groups, t, left = np.atleast_1d(curve["group_samples"]), y + k * z, curve.get("left", 0.0)
     own = fsum(groups) / len(groups)
-    return curve["beta"] * (own * t / (t + 1) + curve.get("gamma", 0.0) * own * (len(groups) - 1) * z / (z + 1))
+    later = curve.get("gamma", 0.0) * own * (len(groups) - 1) + left * curve.get("trained", False)
+    return curve["beta"] * ((own - left) * t / (t + 1) + later * z / (z + 1))
 
 
 def drift_part(curve: Data, z: Any) -> Any:

@@ -98,16 +98,18 @@ def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarr
         "horizon_s": frame.horizon_s,
         "tasks": [_task(task, frame) for task in tasks],
     }
-    return parse_config(Problem, values, "the run's allocation problem")
+    problem = parse_config(Problem, values, "the run's allocation problem")
+    if frame.called is None:
+        return problem
+    least, most = (min(each, max(frame.edge_groups)) for each in frame.called)
+    narrowed = (call_vehicles(task, least, most, frame.edge_rounds_per_cloud_round) for task in problem.tasks)
+    return problem.model_copy(update={"tasks": tuple(narrowed)})
 
 
 def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
     assert task.history is not None
-    k, called = frame.edge_rounds_per_cloud_round, None
-    brought = _count_brought(frame)
-    found = fit(task.history, model=_choose_model(task.history, frame), group_samples=brought, k=k)
-    if frame.called is not None:
-        called = [min(each, max(frame.edge_groups)) for each in frame.called]
+    k, all_ = frame.edge_rounds_per_cloud_round, max(frame.edge_groups)
+    found = fit(task.history, model=_choose_model(task.history, frame), group_samples=frame.group_samples, k=k)
     least, most = frame.limits.samples
     most = task.pool if most is None else min(most, task.pool)
     measured = task.history.resources.max(axis=0)
@@ -123,8 +125,8 @@ def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
         "exchange_mb": task.sizes.exchange_mb,
         "labels_mb": task.sizes.labels_mb,
         "edge_groups": list(frame.edge_groups),
-        "called": called,
-        "worth": None if called is None else _weigh(frame, max(frame.edge_groups)),
+        "called": None if frame.called is None else [1, all_],
+        "worth": None if frame.called is None else [(1 - frame.overlap) ** number for number in range(all_)],
         "limits": {
             "samples": [min(least, most), most],
             "edge_rounds": edge,
@@ -147,19 +149,6 @@ def _choose_model(history: History, frame: PlanSettings) -> Literal["best", "eff
     return "federated" if several else "effective"
 
 
-def _count_brought(frame: PlanSettings) -> tuple[float, ...]:
-    """Return the samples of each edge server's vehicles, or of the most that may be called."""
-    if frame.called is None:
-        return frame.group_samples
-    sizes, most = zip(frame.edge_groups, frame.group_samples, strict=True), frame.called[1]
-    return tuple(held * sum(_weigh(frame, min(most, size))) / sum(_weigh(frame, size)) for size, held in sizes)
-
-
-def _weigh(frame: PlanSettings, vehicles: int) -> tuple[float, ...]:
-    """Return the worth of the data of so many vehicles, in the order in which they are called."""
-    return tuple((1 - frame.overlap) ** number for number in range(vehicles))
-
-
 def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan:
     if fixed.samples > task.pool:
         raise InputError(f"tasks.{task.name}.plan: {plural(fixed.samples, 'sample')}; the pools hold {task.pool}")
@@ -171,8 +160,8 @@ def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan
 def make_task_plan(sizes: MessageSizes, own: TaskAllocation, problem: Problem, shares: Shares) -> TaskPlan:
     """Return the plan of a task by its allocation in `problem`: scores predicted after each stage, rounds to join."""
     task = next(each for each in problem.tasks if each.name == own.name)
-    curve = task.curve if own.called is None else call_vehicles(task, own.called, own.called).curve
     k, counts = problem.edge_rounds_per_cloud_round, (own.samples, own.edge_rounds, own.cloud_rounds)
+    curve = task.curve if own.called is None else call_vehicles(task, own.called, own.called, k).curve
     spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}
     predicted = {stage: max(1 - float(curve.error(*each, k)), 0.0) for stage, each in spent.items()}
     joins = {each.vehicle: each.rounds for each in shares[own.name]} if own.name in shares else None
