@@ -20,6 +20,7 @@ from flcav.pipeline.arms import check_federations, resolve_settings
 from flcav.pipeline.recipe import Requests, RunRecipe
 from flcav.pipeline.results.groups import Checked, Group
 from flcav.pipeline.training.groups import (
+    FULL,
     NOT_NEEDED,
     SKETCH,
     GroupWatch,
@@ -85,7 +86,8 @@ def test_members_are_those_that_asked_and_the_best_of_the_others() -> None:
     chosen = choose_members(Requests(), ["a"], quality, {"e": "not in the town"})
     assert chosen.members == ("a", "c", "b")
     assert chosen.stayed == {"e": "not in the town", "d": NOT_NEEDED}
-    assert choose_members(Requests(most=2), ["a"], quality, {}).members == ("a", "c")
+    few = choose_members(Requests(most=2), ["a"], quality, {})
+    assert (few.members, few.stayed) == (("a", "c"), {"d": NOT_NEEDED, "b": FULL})
     assert choose_members(Requests(most=1), ["a", "d"], quality, {}).members == ("a",)  # no more than that
     assert choose_members(Requests(most=2), ["a", "d"], quality, {}).members == ("a", "d")  # those that asked first
 

@@ -288,9 +288,11 @@ def edge_step(
 
 
 def _open_book(work: Work, settings: EdgeSettings, plan: Plan) -> Ledger:
-    """Return the ledger of the region, with what it sent before."""
+    """Return the ledger of the region, with what it sent before; its share is by the vehicles that a plan calls."""
     inputs, share = settings.inputs, share_plan_budget(plan, settings.budgets_mb, settings.learning.task)
-    book = open_region_book(work, share, inputs.pretrain, settings.vehicles, inputs.region)
+    called = plan.tasks[settings.learning.task].called
+    vehicles = {name: count if called is None else min(called, count) for name, count in settings.vehicles.items()}
+    book = open_region_book(work, share, inputs.pretrain, vehicles, inputs.region)
     before = inputs.edge or inputs.errors  # the ledger of stage II includes that of the errors
     return book if before is None else Ledger(book.budget, read_entries(work, before))
 

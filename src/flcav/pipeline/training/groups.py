@@ -31,6 +31,7 @@ SERVER_RANGE = "out of V2X range of whoever asked"
 ABSENT = "not in the town"
 NO_LINK = "no link to spare"
 NOT_NEEDED = "its data add less"
+FULL = "the group is full"
 
 
 @dataclass(frozen=True)
@@ -170,8 +171,8 @@ def choose_members(
     others = sorted((name for name in quality if name not in asked), key=lambda name: (-quality[name], name))
     good = [name for name in others if quality[name] >= how.least_quality * max(quality.values())]
     came = (*asked, *good)[: most or how.most]
-    unneeded = {name: NOT_NEEDED for name in (*asked, *others) if name not in came}
-    return Chosen(came, quality, {**stayed, **unneeded})
+    left = {name: NOT_NEEDED for name in others if name not in good} | dict.fromkeys((*asked, *good)[len(came) :], FULL)
+    return Chosen(came, quality, {**stayed, **left})
 
 
 def has_levelled(losses: Sequence[float], how: Requests) -> bool:
