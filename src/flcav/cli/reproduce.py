@@ -40,6 +40,7 @@ class Target(StrEnum):
     federation_exchange = "federation-exchange"
     federation_exchange_objects = "federation-exchange-objects"
     federation_faults = "federation-faults"
+    federation_groups = "federation-groups"
     federation_leakage = "federation-leakage"
     fig1b = "fig1b"
     fig3a = "fig3a"
@@ -70,6 +71,7 @@ EXCHANGES: Mapping[str, str] = {  # recipe of each
 DRIVES = (  # one recording, several seeds
     Target.federation_asynchrony,
     Target.federation_faults,
+    Target.federation_groups,
     Target.federation_leakage,
 )
 
@@ -94,6 +96,7 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
 SEEDS: Mapping[str, int] = {
     **dict.fromkeys((Target.corner_cases, Target.demo_arms, *EXCHANGES, *DRIVES), 5),
     **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
+    Target.federation_groups: 10,
     Target.safety_distance: 1,
 }
 
@@ -119,8 +122,8 @@ def reproduce(
         None,
         "--seeds",
         min=1,
-        help="Number of seeds, from 1: 8 of federation-exchange and placement, 5 of corner-cases, demo-arms and the "
-        "other federation-*, 3 of the others if not given.",
+        help="Number of seeds, from 1: 10 of federation-groups, 8 of federation-exchange and placement, 5 of "
+        "corner-cases, demo-arms and the other federation-*, 3 of the others if not given.",
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
@@ -216,6 +219,8 @@ def _repeat_drives(target: Target, out: Path, seeds: int) -> None:
             from flcav.experiments.asynchrony.run import compare_asynchrony as repeat
         elif target == Target.federation_faults:
             from flcav.experiments.attacks.faults import repeat_faults as repeat
+        elif target == Target.federation_groups:
+            from flcav.experiments.groups.run import compare_groups as repeat
         else:
             from flcav.experiments.attacks.leakage import repeat_leakage as repeat
         results, pictures = repeat(out, seeds, report)
