@@ -38,6 +38,7 @@ from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.steps.groups import call_group
+from flcav.pipeline.steps.memory import Memory, remember
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.regions import (
     LabelledSamples,
@@ -202,11 +203,13 @@ class EdgeSettings(FederationSettings):
     validation: Mapping[str, str] = {}  # recordings of the frames that each round is scored on, by region
     scored: bool = False  # whether the labels are compared with ground truth
     last: bool = False  # whether the arm ends with it
+    memory: Memory | None = None  # that its vehicles replay, of conditions that they were in before
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Return the names of the steps whose results it takes."""
-        return (*self.inputs.needs, *self.validation.values())
+        remembered = () if self.memory is None else self.memory.needs
+        return (*self.inputs.needs, *self.validation.values(), *remembered)
 
     @property
     def stage(self) -> str:
@@ -233,6 +236,9 @@ def edge_step(
     if stage == EDGE and settings.federation.requests is not None:
         called = call_group(work, settings, inputs, settings.federation.requests, labelled.samples, book)
         labelled = replace(labelled, samples=called.samples)
+    if settings.memory is not None:
+        replayed = remember(work, settings, settings.memory, inputs.region, labelled.samples)
+        labelled = replace(labelled, samples=replayed)
     if stage == MORE_EDGE and isinstance(labelled.samples, RoadAverageLabels):
         _label_once(work, settings, plan, labelled.samples)
     noise = _find_noise(work, settings, plan)
