@@ -1,4 +1,4 @@
-"""A run of lifelong learning at toy size: records agree with its files, and it goes on after a stop to the same bytes."""
+"""A run of lifelong learning at toy size: records agree with files, and it goes on after a stop to the same."""
 
 import json
 import shutil

@@ -153,8 +153,8 @@ def _federate(
 ) -> EdgeSettings:
     """Return the settings of a condition's rounds: those of stage II, with groups on request."""
     about = outline.federation(main, task, EDGE)
-    federation = main.edge_federation.model_copy(update={"requests": asked})
-    return EdgeSettings(**(about | {"federation": federation}), inputs=inputs, last=True, memory=memory)
+    about["federation"] = main.edge_federation.model_copy(update={"requests": asked})
+    return EdgeSettings(**about, inputs=inputs, last=True, memory=memory)
 
 
 def _track(outline: Outline, main: Setting, task: str, inputs: RegionInputs) -> Step:
