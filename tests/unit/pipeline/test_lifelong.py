@@ -7,6 +7,7 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
+from flcav.pipeline import forecast
 from flcav.pipeline.analysis.lifelong import find_mended
 from flcav.pipeline.arms import check_federations
 from flcav.pipeline.recipe import RunRecipe
@@ -146,3 +147,14 @@ def test_memories_are_labelled_without_a_budget() -> None:
     assert Ledger(NO_LIMIT, [entry]).left_mb("wireless") > 0
     with pytest.raises(InputError):
         Ledger(LinkMegabytes(1.0, 1.0), [entry])
+
+
+def test_a_forecast_counts_the_rounds_and_scores_of_both_arms() -> None:
+    """By hand: three conditions of two vehicles, two rounds of one step; toy sizes of tests and validations."""
+    asked = recipe()
+    assert asked.lifelong is not None
+    graph, splits = Graph(asked, Path()), asked.sized_splits
+    tests, validations = (each.scenes * each.spins * each.cavs for each in (splits.test, splits.validation))
+    measured = forecast._Measured(sample_mb=1.0, exchange_mb=None, pool=4, frame_s=9.0, step_s=100.0, test_s=1.0)
+    found = forecast._count_lifelong_s(graph, asked.lifelong, "objects", 2, measured)
+    assert found == 2 * (100.0 * 2 * 3 * 2 + 9 * tests + (1 + 2 + 3) * 3 * validations)
