@@ -204,7 +204,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
     selection, privacy = how.selection, how.privacy
     if isinstance(edge, FedBuff) and setting.central is None:
         _check_buffers(recipe, setting)
-    if how.requests is not None and setting.central is None:
+    lifelong = recipe.lifelong is not None and setting.name == MAIN
+    if (how.requests is not None or lifelong) and setting.central is None:
         _check_requests(recipe, setting, edge)
     if how.network is not None and selection.rule == "importance":
         raise InputError("federation.network: importance selection draws the clients after they have trained")

@@ -17,6 +17,7 @@ from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.problem import Budgets
+from flcav.pipeline.lifelong import Lifelong
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
 from flcav.statistics.streams import stream
@@ -388,6 +389,7 @@ class RunRecipe(Config):
     )  # errors of vehicles' poses and clocks, in labels of tracks and road sensors; or "estimated"
     recording: Recording = Recording()  # changes to how all regions are recorded
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
+    lifelong: Lifelong | None = None  # conditions that come one after another; None: no lifelong learning
     primary_claims: tuple[str, ...] = Field(
         default=(), max_length=3
     )  # what the run is made to decide: edge, cloud, elsewhere, or arms by name; they are corrected apart from others
@@ -431,6 +433,8 @@ class RunRecipe(Config):
         )
         if replays and not all(task.pretrains for task in self.tasks.values()):
             raise ValueError("federation.replay: the cloud trains on samples of stage I, and a plan has none")
+        if self.lifelong is not None:
+            self._check_lifelong(self.lifelong)
         if MAIN in self.arms:
             raise ValueError(f"arms: '{MAIN}' is the run itself; choose another name")
         for name, arm in self.arms.items():
@@ -443,6 +447,26 @@ class RunRecipe(Config):
                 f"placement.tasks: '{sorted(unknown)[0]}' is none of the run's tasks: {', '.join(self.tasks)}"
             )
         return self
+
+    def _check_lifelong(self, own: Lifelong) -> None:
+        federating = self.with_role("federate")
+        if odd := [each for each in own.conditions if each not in federating]:
+            raise ValueError(f"lifelong.conditions: '{odd[0]}' is none of {', '.join(federating)}")
+        if not all(task.pretrains for task in self.tasks.values()):
+            raise ValueError("lifelong: vehicles ask by the loss at the end of pretraining, and a plan has none")
+        try:
+            parse_config(Requests, self._name_requests(own), "lifelong.requests")
+        except InputError as error:
+            raise ValueError(str(error)) from None
+
+    def _name_requests(self, own: Lifelong) -> dict[str, Any]:
+        return (self.federation.requests or Requests()).model_dump() | dict(own.requests)
+
+    def lifelong_requests(self) -> Requests:
+        """Return the groups on request of lifelong learning; raises ValueError of a recipe without it."""
+        if self.lifelong is None:
+            raise ValueError("lifelong: the recipe has none")
+        return Requests.model_validate(self._name_requests(self.lifelong))
 
     def _check_arm(self, name: str, arm: Arm) -> None:
         if arm.central == PRETRAIN and not all(task.pretrains for task in self.tasks.values()):

@@ -39,6 +39,7 @@ from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.steps.groups import call_group
+from flcav.pipeline.steps.memory import Memory, remember
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.regions import (
     LabelledSamples,
@@ -215,11 +216,13 @@ class EdgeSettings(FederationSettings):
     shown: str = ""  # recording of the region's validation frames, on which a group's score is told; "": it is not
     scored: bool = False  # whether the labels are compared with ground truth
     last: bool = False  # whether the arm ends with it
+    memory: Memory | None = None  # that its vehicles replay, of conditions that they were in before
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Return the names of the steps whose results it takes."""
-        return (*self.inputs.needs, *self.validation.values(), *((self.shown,) if self.shown else ()))
+        remembered = () if self.memory is None else self.memory.needs
+        return (*self.inputs.needs, *self.validation.values(), *((self.shown,) if self.shown else ()), *remembered)
 
     @property
     def stage(self) -> str:
@@ -249,6 +252,9 @@ def edge_step(
             work, settings, inputs, settings.federation.requests, labelled.samples, book, most, labelled.poles
         )
         labelled = replace(labelled, samples=called.samples)
+    if settings.memory is not None:
+        replayed = remember(work, settings, settings.memory, inputs.region, labelled.samples)
+        labelled = replace(labelled, samples=replayed)
     if stage == MORE_EDGE and isinstance(labelled.samples, RoadAverageLabels):
         _label_once(work, settings, plan, labelled.samples)
     noise = _find_noise(work, settings, plan)
