@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from line_task import LineTask, Slope
 
-from flcav.federation.leads import Term
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Outage
 from flcav.federation.strategies import FEDAVG
@@ -18,7 +17,7 @@ from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.recipe import Requests, Training
-from flcav.pipeline.results.groups import Group
+from flcav.pipeline.results.groups import Group, Term
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.steps import groups
 from flcav.pipeline.steps.edge import EdgeFederation, federate_edge

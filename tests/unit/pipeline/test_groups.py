@@ -11,14 +11,13 @@ from pydantic import ValidationError
 from safetensors.numpy import load
 
 from flcav.config import InputError
-from flcav.federation.leads import Term
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.arms import check_federations, resolve_settings
 from flcav.pipeline.recipe import Requests, RunRecipe
-from flcav.pipeline.results.groups import Checked, Group
+from flcav.pipeline.results.groups import Checked, Group, Term
 from flcav.pipeline.training.groups import (
     FULL,
     NOT_NEEDED,

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from flcav.federation.leads import Term
 from flcav.interface.wording import plural
 from flcav.storage.records import Record
 
@@ -16,6 +15,16 @@ class Checked(Record):
     before: float  # loss of the network that drives
     after: float | None = None  # of the group's network; None: it is in no group
     asks: bool = False  # whether `before` is above the limit, so that it sends a request
+
+
+@dataclass(frozen=True)
+class Term(Record):
+    """The term of a lead."""
+
+    lead: str  # client
+    first: int  # round, from 1
+    left: int | None = None  # round in which it is gone; None: it leads to the end
+    received: int | None = None  # updates that it had received in that round; None: it was gone before it began
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from typing import Any
 from safetensors.numpy import load_file
 
 from flcav.federation.buffered_rounds import Buffers, afford_buffers
-from flcav.federation.leads import Term, federate_led, follow_leads
 from flcav.federation.privacy import count_affordable
 from flcav.federation.rounds import BeforeRound, OnRound, Schedule, federate
 from flcav.federation.rules import Rules
@@ -36,6 +35,7 @@ from flcav.pipeline.plan.updates import follow_plan
 from flcav.pipeline.radio.buffered import drive_buffers
 from flcav.pipeline.radio.driving import DrivenRounds
 from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
+from flcav.pipeline.results.groups import Term
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.steps.groups import call_group
@@ -60,6 +60,7 @@ from flcav.pipeline.steps.settings import (
 )
 from flcav.pipeline.training.checkpoints import FederationCheckpoints, load_round_network, round_path
 from flcav.pipeline.training.groups import GroupWatch, Levelled
+from flcav.pipeline.training.leads import federate_led, follow_leads
 from flcav.pipeline.training.learning import (
     Learning,
     describe_federation,

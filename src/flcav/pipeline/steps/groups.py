@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.federation.leads import Term
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.network.ledger import Ledger
 from flcav.network.messages import pack, send
@@ -23,7 +22,7 @@ from flcav.pipeline.labels.roadside import label_roadside
 from flcav.pipeline.poles import find_sites
 from flcav.pipeline.radio.driving import link_scenes
 from flcav.pipeline.recipe import EDGE, Requests
-from flcav.pipeline.results.groups import Checked, Group
+from flcav.pipeline.results.groups import Checked, Group, Term
 from flcav.pipeline.results.plans import Placed
 from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.steps.settings import FederationSettings, RegionInputs

@@ -7,7 +7,7 @@ a strategy keeps at the server between rounds, such as moments, is lost with the
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from flcav.federation.rounds import OnRound
 from flcav.federation.runtimes.metered import Account, Outage
@@ -16,20 +16,10 @@ from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.clock.records import RoundTiming
 from flcav.network.clock.rounds import LEFT_TOWN, NO_COVERAGE
 from flcav.network.ledger import Ledger, LedgerEntry
-from flcav.storage.records import Record
+from flcav.pipeline.results.groups import Term
 
 RunRounds = Callable[[Weights, Account, int, OnRound], LocalUpdate]  # `federate` after so many rounds, with the rest
 LEAVES = (LEFT_TOWN, NO_COVERAGE)  # why a vehicle is lost that cannot lead any longer
-
-
-@dataclass(frozen=True)
-class Term(Record):
-    """The term of a lead."""
-
-    lead: str  # client
-    first: int  # round, from 1
-    left: int | None = None  # round in which it is gone; None: it leads to the end
-    received: int | None = None  # updates that it had received in that round; None: it was gone before it began
 
 
 class LeadLeft(Exception):

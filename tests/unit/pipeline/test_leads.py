@@ -7,11 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from regression import START as REGRESSION
-from regression import ledger
-from regression import vehicles as regressions
 
-from flcav.federation.leads import Term, federate_led, follow_leads
 from flcav.federation.rounds import OnRound, Schedule, federate
 from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.runtimes.processes import ClientProcesses
@@ -20,6 +16,8 @@ from flcav.federation.strategies import strategy_named
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.clock.records import ClientTiming, RoundTiming
 from flcav.network.ledger import Ledger, LinkMegabytes
+from flcav.pipeline.results.groups import Term
+from flcav.pipeline.training.leads import federate_led, follow_leads
 
 SCHEDULE = Schedule(rounds=4, steps=2, learning_rate=0.1, final_learning_rate=0.05, seed=3)
 START = {"w": np.arange(6, dtype=np.float64)}
@@ -164,11 +162,10 @@ def test_who_leads_by_the_clock(rounds: list[RoundTiming], terms: list[Term]) ->
 
 
 def test_a_round_begins_again_where_clients_train_in_processes() -> None:
-    vehicles, terms = regressions("grid", 4), [Term("grid/cav0", 1, 2, 1), Term("grid/cav1", 2)]
-    found = []
+    terms, found = [Term("r/a", 1, 2, 1), Term("r/b", 2)], []
     for count in (1, 2):
-        own = Account(ledger(), "edge", "regression", "wireless")
+        own, vehicles = account(), clients()
         with ClientProcesses(vehicles, 2) if count == 2 else nullcontext() as where:
-            weights = lead(vehicles, REGRESSION, own, terms, lambda *_: None, runtime=where)
+            weights = lead(vehicles, START, own, terms, lambda *_: None, runtime=where)
         found.append((weights["w"].tobytes(), Counter(own.ledger.entries)))
     assert found[0] == found[1]
