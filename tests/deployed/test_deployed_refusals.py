@@ -1,8 +1,11 @@
 """Who and what a running fleet refuses: each against the proxy, the SuperLink and the vehicles that are up."""
 
 import base64
+import os
+import signal
 import ssl
 import time
+from dataclasses import replace
 from datetime import timedelta
 
 import httpx
@@ -15,7 +18,8 @@ from flwr.proto.control_pb2 import ListRunsRequest
 from flwr.proto.fleet_pb2 import ActivateNodeRequest, ActivateNodeResponse, PullMessagesRequest
 from flwr.proto.node_pb2 import Node
 
-from flcav.federation.fleet import bundle
+from flcav.config import InputError
+from flcav.federation.fleet import bundle, requests
 from flcav.federation.fleet.authority import found_authority, open_authority
 from flcav.federation.fleet.keys import (
     AUTHORITY,
@@ -25,6 +29,8 @@ from flcav.federation.fleet.keys import (
     request_certificate,
     take_certificate,
 )
+from flcav.federation.fleet.status import read_status
+from flcav.federation.fleet.supervisor import read_processes
 from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.fleet.up import VEHICLES, read_ready
 
@@ -123,6 +129,40 @@ def test_expired(deployment, authority, tmp_path):
     assert (late.status_code, late.text) == (401, "the certificate of short-lived is expired")
     with reach(deployment, own) as client, pytest.raises(httpx.TransportError):
         activate(client, load_key(own / KEY))
+
+
+def test_fl_request_sent_twice(deployment):
+    """Also to a proxy that was killed and started anew, and by another vehicle that has captured it."""
+    one, another = (deployment.folder / VEHICLES / name for name in ("vehicle-001", "vehicle-002"))
+    asked = requests.make_request("weather", 2.5, 12, (10.0, -3.0))
+    requests.send_request(one, asked)
+    with pytest.raises(InputError, match="a request with this nonce came before"):
+        requests.send_request(one, asked)
+    before = read_processes(deployment.folder)["proxy"]
+    os.kill(before, signal.SIGKILL)
+    end = time.monotonic() + 60
+    while True:
+        try:
+            with pytest.raises(InputError, match="a request with this nonce came before"):
+                requests.send_request(another, asked)
+            break
+        except OSError:  # the proxy is starting
+            assert time.monotonic() < end
+            time.sleep(0.2)
+    assert read_processes(deployment.folder)["proxy"] != before
+    assert [(each.vehicle, each.request) for each in read_status(deployment.folder).requests] == [(one.name, asked)]
+
+
+def test_fl_request_that_is_old_or_none(deployment):
+    own = deployment.folder / VEHICLES / "vehicle-001"
+    asked = requests.make_request("weather", 2.5, 12, (10.0, -3.0))
+    with pytest.raises(InputError, match="the request is 400 s old"):
+        requests.send_request(own, replace(asked, time=asked.time - 400))
+    with reach(deployment, own) as client:
+        for content in (b"{}", bytes(10**6)):
+            assert client.post(requests.PATH, content=content).status_code == 400
+    with reach(deployment) as client, pytest.raises(httpx.TransportError):
+        client.post(requests.PATH, content=asked.as_bytes())
 
 
 def test_unregistered(deployment, authority, tmp_path):

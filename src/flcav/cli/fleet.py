@@ -166,7 +166,7 @@ def status(
     as_json: bool = JSON,
 ) -> None:
     """Tell who is in, the rounds of the federation, bytes against budgets, failures and refusals."""
-    from flcav.federation.fleet.status import read_status
+    from flcav.federation.fleet.status import LEAST_ROOM, read_status
 
     if page is not None:
         from flcav.federation.fleet.page import serve_page
@@ -186,8 +186,29 @@ def status(
         )
     if found.federation is not None:
         typer.echo(found.federation.describe())
+    for asked in found.requests:
+        typer.echo(asked.describe())
     for each in found.refused:
         typer.echo(f"refused: {each}")
+    if found.free < LEAST_ROOM:
+        typer.echo(f"{folder}: no room on its disk, {found.free} bytes are free")
+
+
+@fleet.command()
+def request(
+    folder: Path = typer.Argument(help="Folder of the vehicle, on the vehicle."),
+    task: str = typer.Option(..., "--task", help="Name of the task."),
+    loss: float = typer.Option(
+        ..., "--loss", callback=check_finite, help="Of the network that drives, on frames held back from training."
+    ),
+    frames: int = typer.Option(..., "--frames", min=1, help="Number of these frames."),
+    at: tuple[float, float] = typer.Option(..., "--at", help="Position of the vehicle: X Y [m]."),
+) -> None:
+    """On a vehicle: ask the fleet for federated learning; a request is taken once."""
+    from flcav.federation.fleet.requests import make_request, send_request
+
+    send_request(folder, made := make_request(task, loss, frames, at))
+    typer.echo(f"{folder}: the request {made.nonce} is taken")
 
 
 @fleet.command()
