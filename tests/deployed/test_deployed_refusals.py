@@ -19,8 +19,9 @@ from flwr.proto.fleet_pb2 import ActivateNodeRequest, ActivateNodeResponse, Pull
 from flwr.proto.node_pb2 import Node
 
 from flcav.config import InputError
-from flcav.federation.fleet import bundle, requests
+from flcav.federation.fleet import bundle
 from flcav.federation.fleet.authority import found_authority, open_authority
+from flcav.federation.fleet.forwarder import send_request
 from flcav.federation.fleet.keys import (
     AUTHORITY,
     CERTIFICATE,
@@ -33,6 +34,7 @@ from flcav.federation.fleet.status import read_status
 from flcav.federation.fleet.supervisor import read_processes
 from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.fleet.up import VEHICLES, read_ready
+from flcav.federation.messages.fl_request import PATH, make_request
 
 PROTOBUF = {"content-type": "application/protobuf", "accept": "application/protobuf"}
 
@@ -133,18 +135,19 @@ def test_expired(deployment, authority, tmp_path):
 
 def test_fl_request_sent_twice(deployment):
     """Also to a proxy that was killed and started anew, and by another vehicle that has captured it."""
+    server = read_ready(deployment.folder).proxy
     one, another = (deployment.folder / VEHICLES / name for name in ("vehicle-001", "vehicle-002"))
-    asked = requests.make_request("weather", 2.5, 12, (10.0, -3.0))
-    requests.send_request(one, asked)
+    asked = make_request("weather", 2.5, 12, (10.0, -3.0))
+    send_request(one, server, asked)
     with pytest.raises(InputError, match="a request with this nonce came before"):
-        requests.send_request(one, asked)
+        send_request(one, server, asked)
     before = read_processes(deployment.folder)["proxy"]
     os.kill(before, signal.SIGKILL)
     end = time.monotonic() + 60
     while True:
         try:
             with pytest.raises(InputError, match="a request with this nonce came before"):
-                requests.send_request(another, asked)
+                send_request(another, server, asked)
             break
         except OSError:  # the proxy is starting
             assert time.monotonic() < end
@@ -155,14 +158,14 @@ def test_fl_request_sent_twice(deployment):
 
 def test_fl_request_that_is_old_or_none(deployment):
     own = deployment.folder / VEHICLES / "vehicle-001"
-    asked = requests.make_request("weather", 2.5, 12, (10.0, -3.0))
+    asked = make_request("weather", 2.5, 12, (10.0, -3.0))
     with pytest.raises(InputError, match="the request is 400 s old"):
-        requests.send_request(own, replace(asked, time=asked.time - 400))
+        send_request(own, read_ready(deployment.folder).proxy, replace(asked, time=asked.time - 400))
     with reach(deployment, own) as client:
         for content in (b"{}", bytes(10**6)):
-            assert client.post(requests.PATH, content=content).status_code == 400
+            assert client.post(PATH, content=content).status_code == 400
     with reach(deployment) as client, pytest.raises(httpx.TransportError):
-        client.post(requests.PATH, content=asked.as_bytes())
+        client.post(PATH, content=asked.as_bytes())
 
 
 def test_unregistered(deployment, authority, tmp_path):

@@ -177,7 +177,7 @@ def status(
     if as_json:
         print_json(found.as_json())
         return
-    typer.echo("not up" if found.proxy is None else f"up at {found.proxy}, {plural(len(found.processes), 'process')}")
+    typer.echo("not up" if found.proxy is None else f"up at {found.proxy}, processes: {len(found.processes)}")
     for own in found.vehicles:
         there = "online" if own.online else "offline"
         typer.echo(
@@ -205,9 +205,12 @@ def request(
     at: tuple[float, float] = typer.Option(..., "--at", help="Position of the vehicle: X Y [m]."),
 ) -> None:
     """On a vehicle: ask the fleet for federated learning; a request is taken once."""
-    from flcav.federation.fleet.requests import make_request, send_request
+    from flcav.federation.fleet.forwarder import send_request
+    from flcav.federation.fleet.vehicle import load_settings
+    from flcav.federation.messages.fl_request import make_request
 
-    send_request(folder, made := make_request(task, loss, frames, at))
+    made = make_request(task, loss, frames, at)
+    send_request(folder, load_settings(folder).server, made)
     typer.echo(f"{folder}: the request {made.nonce} is taken")
 
 

@@ -8,7 +8,7 @@ import pytest
 from flcav.config import InputError
 from flcav.federation.fleet.authority import found_authority, open_registry
 from flcav.federation.fleet.registry import KEPT_S, MOST, WINDOW_S
-from flcav.federation.fleet.requests import LARGEST, OLDEST_S, check_age, make_request, parse_request
+from flcav.federation.messages.fl_request import LARGEST, OLDEST_S, check_age, make_request, parse_request
 
 REQUEST = make_request("weather", 2.5, 12, (10.0, -3.0))
 

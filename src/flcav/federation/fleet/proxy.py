@@ -26,9 +26,9 @@ from flcav.federation.fleet.keys import AUTHORITY, public_der
 from flcav.federation.fleet.mutual_tls import CERTIFICATE, CONNECTION, Connection, serve_https
 from flcav.federation.fleet.registry import Registry, Vehicle
 from flcav.federation.fleet.relay import TIMEOUT, answer, keep_alive, read_body, relay
-from flcav.federation.fleet.requests import LARGEST, check_age, parse_request
-from flcav.federation.fleet.requests import PATH as REQUEST_PATH
 from flcav.federation.fleet.traffic import Traffic, read_traffic
+from flcav.federation.messages.fl_request import LARGEST, check_age, parse_request
+from flcav.federation.messages.fl_request import PATH as REQUEST_PATH
 
 FLEET = "/v1/fleet/"
 CALLS = frozenset(

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from flcav.config import InputError
 from flcav.federation.fleet.authority import open_registry
-from flcav.federation.fleet.requests import FLRequest, parse_request
 from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
 from flcav.federation.fleet.supervisor import read_processes
 from flcav.federation.fleet.traffic import Crossed, read_traffic
 from flcav.federation.fleet.up import read_ready
+from flcav.federation.messages.fl_request import FLRequest, parse_request
 from flcav.interface.wording import plural
 from flcav.storage.files import write_bytes
 from flcav.storage.records import Record

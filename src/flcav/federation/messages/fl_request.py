@@ -1,8 +1,8 @@
 """FL request: the message by which a vehicle that errs asks its edge server for federated learning.
 
-It goes to the fleet's proxy with the vehicle's certificate, which says whose it is, and is taken once: its nonce stays
-in the registry for longer than a request may be old, so that a request sent again is refused, also by a proxy that was
-started anew. Wang et al., IEEE Network 37(3), 2023.
+It goes to the proxy of a fleet with the vehicle's certificate, which says whose it is, and is taken once: its nonce
+stays in the registry for longer than a request may be old, so that a request sent again is refused, also by a proxy
+that was started anew. Wang et al., IEEE Network 37(3), 2023.
 """
 
 import json
@@ -10,13 +10,8 @@ import os
 import re
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
-
-import httpx
 
 from flcav.config import InputError
-from flcav.federation.fleet.forwarder import vehicle_tls
-from flcav.federation.fleet.vehicle import load_settings
 
 PATH = "/v1/flcav/request"  # at the proxy
 LARGEST = 2048  # bytes of a request
@@ -74,23 +69,6 @@ def _find_wrong(own: FLRequest) -> str | None:
     if isinstance(own.frames, bool) or not isinstance(own.frames, int) or not 0 < own.frames < 10**9:
         return "a number of frames, 1 or more, is wanted"
     return None
-
-
-def send_request(folder: Path, request: FLRequest) -> None:
-    """Send a request of a vehicle; raises `InputError` where it is refused, `OSError` where nobody is there."""
-    server = load_settings(folder).server
-    try:
-        answer = httpx.post(
-            f"https://{server}{PATH}",
-            content=request.as_bytes(),
-            verify=vehicle_tls(folder),
-            trust_env=False,
-            timeout=30.0,
-        )
-    except httpx.HTTPError as error:
-        raise OSError(f"{server}: the fleet cannot be reached: {error}") from None
-    if answer.status_code != httpx.codes.OK:
-        raise InputError(f"{server}: the request is refused: {answer.text[:200]}")
 
 
 def check_age(request: FLRequest, now: float) -> str | None:
