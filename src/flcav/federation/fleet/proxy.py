@@ -86,8 +86,7 @@ class FleetProxy:
         if done.status == httpx.codes.UNAUTHORIZED:
             self._traffic.refuse(vehicle.name, describe_clock(dict(scope["headers"]).get(SIGNED_AT, b"")))
         connection: Connection = state[CONNECTION]
-        answered = done.status == httpx.codes.OK
-        self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), answered)
+        self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), done.status)
         self._changed = True
 
     async def _take_request(self, vehicle: str, receive: Receive, send: Send) -> None:

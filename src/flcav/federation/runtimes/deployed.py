@@ -192,9 +192,9 @@ class DeployedGrid(WrappedGrid):
         while True:
             try:
                 return self._begin()
-            except SuperLinkLost:
+            except SuperLinkLost as error:
                 if time.monotonic() > end:
-                    raise
+                    raise OSError(f"{self._deployment.folder}: the SuperLink begins no run: {error}") from None
                 time.sleep(PAUSE_S)
 
     def follow(self, record: RoundRecord) -> None:
@@ -238,7 +238,7 @@ class DeployedGrid(WrappedGrid):
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
         """Yield the replies in the order of the messages; raises `BudgetExceeded` where one was kept for its size."""
         asked = {message.metadata.dst_node_id: message for message in messages}
-        exchange = _Exchange(self._count_activations())
+        exchange = _Exchange(self._count_losses())
         answers: dict[int, Message] = {}
         end = time.monotonic() + (timeout or float("inf"))
         for node, message in asked.items():
@@ -250,11 +250,11 @@ class DeployedGrid(WrappedGrid):
                     self._pull(exchange, asked, answers)
                 except SuperLinkLost:
                     self._renew()
-                    exchange = _Exchange(self._count_activations())
+                    exchange = _Exchange(self._count_losses())
                 if node not in answers:
                     if time.monotonic() > end:
                         return
-                    exchange.notice(self._count_activations())
+                    exchange.notice(self._count_losses())
                     time.sleep(POLL_S)
             reply = answers.pop(node)
             answers[node] = message  # answered; only its place is looked at
@@ -291,9 +291,11 @@ class DeployedGrid(WrappedGrid):
             else:
                 answers[node] = reply
 
-    def _count_activations(self) -> dict[int, int]:
-        vehicles = read_traffic(self._deployment.folder).vehicles
-        return {node: vehicles[name].activations for node, name in self._vehicles.items() if name in vehicles}
+    def _count_losses(self) -> dict[int, int]:
+        """Return how often each node may have lost what it was asked: it came in anew, or the SuperLink failed it."""
+        found = read_traffic(self._deployment.folder).vehicles
+        there = {node: found[name] for node, name in self._vehicles.items() if name in found}
+        return {node: own.activations + own.lost for node, own in there.items()}
 
 
 def _excuse(reply: Message) -> str | None:
@@ -310,9 +312,9 @@ def _excuse(reply: Message) -> str | None:
 class _Exchange:
     """Who was asked in a run, by which message, and who is to be asked again when."""
 
-    def __init__(self, activations: Mapping[int, int]) -> None:
+    def __init__(self, losses: Mapping[int, int]) -> None:
         self.nodes: dict[str, int] = {}  # of the messages that are out, by their ids
-        self._activations = dict(activations)
+        self._losses = dict(losses)
         self._due: dict[int, float] = {}  # of nodes that were asked: when they are to be asked again
         self._lost: dict[int, float] = {}  # since when nodes are not available
 
@@ -329,12 +331,12 @@ class _Exchange:
         self._lost.setdefault(node, time.monotonic())
         self._due[node] = time.monotonic() + PAUSE_S
 
-    def notice(self, activations: Mapping[int, int]) -> None:
-        """Note that nodes have come in anew: what they were asked is forgotten."""
-        for node, count in activations.items():
-            if count > self._activations.get(node, count) and node in self._due:
-                self._due[node] = 0.0
-        self._activations = dict(activations)
+    def notice(self, losses: Mapping[int, int]) -> None:
+        """Note that nodes have lost something: they are asked again, and give the same answer."""
+        for node, count in losses.items():
+            if count > self._losses.get(node, count) and node in self._due:
+                self._due[node] = time.monotonic() + PAUSE_S
+        self._losses = dict(losses)
 
 
 @contextlib.contextmanager
