@@ -36,12 +36,16 @@ CHOICES: dict[str, dict[str, str]] = {
     },
     "fit": {model: f"none --model {model}" for model in ("additive", "effective", "federated")},
     "federate": {name: f"none --out out --runtime {name}" for name in ("embedded", "ray", "flower")},
+    "run": {name: f"none --out out --runtime {name}" for name in ("embedded", "ray", "flower")},
     "reproduce": {target: f"{target} --out out" for target in TARGETS},
 }
 RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads", "--device"), ALWAYS)
 # command -> option -> what of CHOICES takes it; `--out` and `--json` are always taken
 TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
-    "run": dict.fromkeys(("--dry", "--jobs", "--seeds", "--engine", "--stale"), ALWAYS),
+    "run": {
+        **dict.fromkeys(("--dry", "--jobs", "--seeds", "--engine", "--runtime", "--stale"), ALWAYS),
+        "--fleet": ("flower",),
+    },
     "demo": dict.fromkeys(("--seed", "--recipe", "--seeds", "--jobs", "--engine", "--stale"), ALWAYS),
     "compare": dict.fromkeys(("--data", "--task", "--agents"), ALWAYS),
     "federate": {**dict.fromkeys(("--arm", "--jobs", "--runtime", "--stale"), ALWAYS), "--fleet": ("flower",)},
@@ -55,6 +59,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "fleet status": {"--page": ALWAYS},
     "fleet up": dict.fromkeys(("--vehicles", "--host", "--port"), ALWAYS),
     "fleet vehicle": {},
+    "fleet request": dict.fromkeys(("--task", "--loss", "--frames", "--at"), ALWAYS),
     "towns list": {},
     "towns show": {"--poles": ALWAYS},
     "towns import": {},

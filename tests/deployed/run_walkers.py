@@ -11,12 +11,12 @@ from flcav.federation.runtimes.deployed import Deployment
 from flcav.federation.strategies import strategy_named
 
 
-def walk(runtime, count, rounds, log=None, lasts_s=0.0):
+def walk(runtime, count, rounds, log=None, lasts_s=0.0, **more):
     """Return the weights of a federation of `count` walkers by SCAFFOLD, whose clients keep arrays."""
     clients = {f"town/cav{number}": Walker(number + 1, log, lasts_s) for number in range(count)}
     weights = {"w": np.arange(500, dtype=np.float32)}
     schedule = Schedule(rounds, 2, 0.1, 0.05, 11)
-    return federate(clients, weights, schedule, strategy=strategy_named("scaffold"), runtime=runtime).weights
+    return federate(clients, weights, schedule, strategy=strategy_named("scaffold"), runtime=runtime, **more).weights
 
 
 if __name__ == "__main__":

@@ -2,12 +2,14 @@
 
 import os
 import signal
+import sqlite3
 import threading
 
 import numpy as np
 import pytest
 from fleet_clients import Walker
 
+from flcav.federation.fleet.superlink import DATABASE
 from flcav.federation.fleet.supervisor import read_processes
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.strategies import strategy_named
@@ -36,3 +38,25 @@ def test_killed_in_mid_round(killed, weights, deployment, tmp_path):
     assert read_processes(deployment.folder)[killed] != before
     for name, array in expected.weights.items():
         np.testing.assert_array_equal(array, ended.weights[name])
+
+
+def test_superlink_that_cannot_write(weights, deployment, tmp_path):
+    """Its database is locked for some seconds, so that it fails calls, and messages are lost on their way."""
+    clients = {f"town/cav{n}": Walker(n + 1, tmp_path / "log", lasts_s=1.0) for n in range(3)}
+    expected = federate({n: Walker(c.samples) for n, c in clients.items()}, weights, SCHEDULE)
+    held = threading.Event()
+
+    def hold():
+        while not (tmp_path / "log").exists() or len((tmp_path / "log").read_text().splitlines()) < 4:
+            threading.Event().wait(0.05)
+        connection = sqlite3.connect(deployment.folder / DATABASE, timeout=30.0, isolation_level=None)
+        connection.execute("BEGIN IMMEDIATE")
+        held.set()
+        threading.Event().wait(12.0)  # longer than SQLite's writers wait
+        connection.execute("ROLLBACK")
+        connection.close()
+
+    threading.Thread(target=hold, daemon=True).start()
+    ended = federate(clients, weights, SCHEDULE, runtime=deployment)
+    assert held.is_set()
+    np.testing.assert_array_equal(expected.weights["w"], ended.weights["w"])

@@ -1,8 +1,11 @@
 """Who and what a running fleet refuses: each against the proxy, the SuperLink and the vehicles that are up."""
 
 import base64
+import os
+import signal
 import ssl
 import time
+from dataclasses import replace
 from datetime import timedelta
 
 import httpx
@@ -15,8 +18,10 @@ from flwr.proto.control_pb2 import ListRunsRequest
 from flwr.proto.fleet_pb2 import ActivateNodeRequest, ActivateNodeResponse, PullMessagesRequest
 from flwr.proto.node_pb2 import Node
 
+from flcav.config import InputError
 from flcav.federation.fleet import bundle
 from flcav.federation.fleet.authority import found_authority, open_authority
+from flcav.federation.fleet.forwarder import send_request
 from flcav.federation.fleet.keys import (
     AUTHORITY,
     CERTIFICATE,
@@ -25,8 +30,11 @@ from flcav.federation.fleet.keys import (
     request_certificate,
     take_certificate,
 )
+from flcav.federation.fleet.status import read_status
+from flcav.federation.fleet.supervisor import read_processes
 from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.fleet.up import VEHICLES, read_ready
+from flcav.federation.messages.fl_request import PATH, make_request
 
 PROTOBUF = {"content-type": "application/protobuf", "accept": "application/protobuf"}
 
@@ -89,6 +97,14 @@ def wait_enrolled(deployment, name):
     raise AssertionError(f"{name} was not enrolled")
 
 
+def wait_refused(deployment, who, why):
+    """Wait until the proxy has told of a refusal."""
+    end = time.monotonic() + 20
+    while not any(each.startswith(who) and each.endswith(why) for each in read_traffic(deployment.folder).refused):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
 def test_registered_vehicle_comes_in_and_a_revoked_one_is_out_at_once(deployment, authority, tmp_path):
     own = a_vehicle(authority, tmp_path, "in-and-out")
     wait_enrolled(deployment, "in-and-out")
@@ -99,8 +115,7 @@ def test_registered_vehicle_comes_in_and_a_revoked_one_is_out_at_once(deployment
         authority.registry.revoke("in-and-out", "stolen")
         again = activate(client, load_key(own / KEY))  # on the connection that is open
     assert (again.status_code, again.text) == (401, "the certificate of in-and-out is revoked")
-    time.sleep(0.7)
-    assert any("in-and-out is revoked" in each for each in read_traffic(deployment.folder).refused)
+    wait_refused(deployment, "", "in-and-out is revoked")
 
 
 @pytest.mark.parametrize(("late_s", "told"), [(86400, "86400 s behind"), (-86400, "86400 s ahead")])
@@ -109,9 +124,7 @@ def test_clock_that_is_off_is_named_and_comes_in_once_corrected(late_s, told, de
     with reach(deployment, own) as client:
         assert activate(client, load_key(own / KEY), late_s).status_code == 401
         assert activate(client, load_key(own / KEY)).status_code in (200, 412)  # 412: it is in, as its own node is
-    time.sleep(0.8)
-    refused = read_traffic(deployment.folder).refused
-    assert any(each.startswith("vehicle-003: ") and each.endswith(told) for each in refused)
+    wait_refused(deployment, "vehicle-003: ", told)
 
 
 def test_expired(deployment, authority, tmp_path):
@@ -123,6 +136,41 @@ def test_expired(deployment, authority, tmp_path):
     assert (late.status_code, late.text) == (401, "the certificate of short-lived is expired")
     with reach(deployment, own) as client, pytest.raises(httpx.TransportError):
         activate(client, load_key(own / KEY))
+
+
+def test_fl_request_sent_twice(deployment):
+    """Also to a proxy that was killed and started anew, and by another vehicle that has captured it."""
+    server = read_ready(deployment.folder).proxy
+    one, another = (deployment.folder / VEHICLES / name for name in ("vehicle-001", "vehicle-002"))
+    asked = make_request("weather", 2.5, 12, (10.0, -3.0))
+    send_request(one, server, asked)
+    with pytest.raises(InputError, match="a request with this nonce came before"):
+        send_request(one, server, asked)
+    before = read_processes(deployment.folder)["proxy"]
+    os.kill(before, signal.SIGKILL)
+    end = time.monotonic() + 60
+    while True:
+        try:
+            with pytest.raises(InputError, match="a request with this nonce came before"):
+                send_request(another, server, asked)
+            break
+        except OSError:  # the proxy is starting
+            assert time.monotonic() < end
+            time.sleep(0.2)
+    assert read_processes(deployment.folder)["proxy"] != before
+    assert [(each.vehicle, each.request) for each in read_status(deployment.folder).requests] == [(one.name, asked)]
+
+
+def test_fl_request_that_is_old_or_none(deployment):
+    own = deployment.folder / VEHICLES / "vehicle-001"
+    asked = make_request("weather", 2.5, 12, (10.0, -3.0))
+    with pytest.raises(InputError, match="the request is 400 s old"):
+        send_request(own, read_ready(deployment.folder).proxy, replace(asked, time=asked.time - 400))
+    with reach(deployment, own) as client:
+        for content in (b"{}", bytes(10**6)):
+            assert client.post(PATH, content=content).status_code == 400
+    with reach(deployment) as client, pytest.raises(httpx.TransportError):
+        client.post(PATH, content=asked.as_bytes())
 
 
 def test_unregistered(deployment, authority, tmp_path):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import STALE, Runtime, Stale, refuse_unused
+from flcav.cli.options import FLEET, STALE, Runtime, Stale, refuse_unused
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
@@ -34,9 +34,7 @@ def federate(
         "--runtime",
         help="Processes here, Flower's simulation on Ray, or a deployed Flower federation.",
     ),
-    fleet: Path | None = typer.Option(
-        None, "--fleet", help="flower: folder of a fleet that is up; by default one is brought up here, for as long."
-    ),
+    fleet: Path | None = FLEET,
     stale: Stale = STALE,
     as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead of sentences."),
 ) -> None:

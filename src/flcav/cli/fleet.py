@@ -166,7 +166,7 @@ def status(
     as_json: bool = JSON,
 ) -> None:
     """Tell who is in, the rounds of the federation, bytes against budgets, failures and refusals."""
-    from flcav.federation.fleet.status import read_status
+    from flcav.federation.fleet.status import LEAST_ROOM, read_status
 
     if page is not None:
         from flcav.federation.fleet.page import serve_page
@@ -177,7 +177,7 @@ def status(
     if as_json:
         print_json(found.as_json())
         return
-    typer.echo("not up" if found.proxy is None else f"up at {found.proxy}, {plural(len(found.processes), 'process')}")
+    typer.echo("not up" if found.proxy is None else f"up at {found.proxy}, processes: {len(found.processes)}")
     for own in found.vehicles:
         there = "online" if own.online else "offline"
         typer.echo(
@@ -186,8 +186,32 @@ def status(
         )
     if found.federation is not None:
         typer.echo(found.federation.describe())
+    for asked in found.requests:
+        typer.echo(asked.describe())
     for each in found.refused:
         typer.echo(f"refused: {each}")
+    if found.free < LEAST_ROOM:
+        typer.echo(f"{folder}: no room on its disk, {found.free} bytes are free")
+
+
+@fleet.command()
+def request(
+    folder: Path = typer.Argument(help="Folder of the vehicle, on the vehicle."),
+    task: str = typer.Option(..., "--task", help="Name of the task."),
+    loss: float = typer.Option(
+        ..., "--loss", callback=check_finite, help="Of the network that drives, on frames held back from training."
+    ),
+    frames: int = typer.Option(..., "--frames", min=1, help="Number of these frames."),
+    at: tuple[float, float] = typer.Option(..., "--at", help="Position of the vehicle: X Y [m]."),
+) -> None:
+    """On a vehicle: ask the fleet for federated learning; a request is taken once."""
+    from flcav.federation.fleet.forwarder import send_request
+    from flcav.federation.fleet.vehicle import load_settings
+    from flcav.federation.messages.fl_request import make_request
+
+    made = make_request(task, loss, frames, at)
+    send_request(folder, load_settings(folder).server, made)
+    typer.echo(f"{folder}: the request {made.nonce} is taken")
 
 
 @fleet.command()

@@ -80,6 +80,12 @@ def join_choices(choices: Iterable[str]) -> str:
 
 OWN = "or one of your own as module:NAME"
 ANY_TASK = f"{join_choices(TASKS)}, {OWN}"
+FLEET = typer.Option(
+    None,
+    "--fleet",
+    help="flower: folder of a fleet that is up, or of one for each region, FOLDER/REGION; by default one is brought up "
+    "here, for as long.",
+)
 ENGINE = typer.Option(EngineName.processes, "--engine", help="Backend: processes on this machine, or a Ray cluster.")
 STALE = typer.Option(
     Stale.refuse,

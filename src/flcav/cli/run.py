@@ -1,12 +1,13 @@
 """`flcav run`, `flcav demo`, `flcav compare`: run a recipe through the three stages, and compare two runs."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from flcav.cli.options import AGENTS, ENGINE, JOBS, STALE, EngineName, Stale
+from flcav.cli.options import AGENTS, ENGINE, FLEET, JOBS, STALE, EngineName, Runtime, Stale, refuse_unused
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.config import InputError
 from flcav.interface.wording import plural
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from flcav.pipeline.results.run import Run, Summary
 
 
+RUNTIME = typer.Option(
+    Runtime.embedded, "--runtime", help="Where vehicles train: embedded: processes here; flower: a deployed fleet."
+)
 SEEDS = typer.Option(1, "--seeds", min=1, help="Number of seeds, from the recipe's on; above 1, a folder each.")
 DRY = typer.Option(False, "--dry", help="Say what the run would take, and do nothing of it.")
 AS_JSON = typer.Option(False, "--json", help="Print one JSON object instead of sentences.")
@@ -37,16 +41,21 @@ def run(
     jobs: int = JOBS,
     seeds: int = SEEDS,
     engine: EngineName = ENGINE,
+    runtime: Runtime = RUNTIME,
+    fleet: Path | None = FLEET,
     stale: Stale = STALE,
     as_json: bool = AS_JSON,
 ) -> None:
     """Run a recipe through the three stages; write report.html, results.json and history.csv."""
+    if runtime is not Runtime.flower:
+        refuse_unused(f"--runtime {runtime.value}", "fleet")
     if dry:
         _forecast(recipe, as_json)
     elif out is None:
         raise InputError("--out is missing: the folder of the run; --dry says what it would take")
     else:
-        _run(recipe, None, out, jobs, seeds, engine, stale, as_json, "run")
+        how = {"jobs": jobs, "stale": stale.value, "engine": engine.value, "runtime": runtime.value, "fleet": fleet}
+        _run(recipe, None, out, seeds, as_json, "run", how)
 
 
 def _forecast(path: Path, as_json: bool) -> None:
@@ -80,20 +89,19 @@ def demo(
     stale: Stale = STALE,
 ) -> None:
     """Run recipes/runs/demo.yaml: pretraining, roadside sensors, edge FL and cloud FL on three towns."""
-    _run(recipe, seed, out, jobs, seeds, engine, stale, False, "demo")
+    _run(recipe, seed, out, seeds, False, "demo", {"jobs": jobs, "stale": stale.value, "engine": engine.value})
 
 
 def _run(
     path: Path,
     seed: int | None,
     out: Path,
-    jobs: int,
     seeds: int,
-    engine: EngineName,
-    stale: Stale,
     as_json: bool,
     title: str,
+    how: Mapping[str, Any],
 ) -> None:
+    """Run a recipe; `how`: arguments of `flcav.run`."""
     use_threads(1)
     from flcav.cli.steps import live_steps
     from flcav.experiments.seed_tables import draw_seeds
@@ -109,7 +117,7 @@ def _run(
     asked = load_run_recipe(found)
     if seed is not None:
         asked = asked.model_copy(update={"seed": seed})
-    how = {"beside": found.parent, "jobs": jobs, "stale": stale.value, "engine": engine.value}
+    how = {**how, "beside": found.parent}
     with live_steps(title) as notify:
         if seeds == 1:
             results = {out: run_one(asked, out, notify=notify, **how)}

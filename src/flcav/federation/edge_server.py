@@ -12,8 +12,8 @@ from flcav.federation.buffered_rounds import Buffers
 from flcav.federation.privacy import count_affordable
 from flcav.federation.rounds import EVERYBODY, Schedule, federate
 from flcav.federation.rules import RegionalModels, Rules
+from flcav.federation.runtimes.link import Runtime
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.trainable import Distiller, LocalUpdate, Trainable, Weights
@@ -34,7 +34,7 @@ class EdgeServer:
     rules: Rules = EVERYBODY  # of the region's rounds
     state: FederationState = field(default_factory=FederationState)  # of the region's rounds
     earlier: int = 0  # rounds of stage II, which a privacy budget counts
-    runtime: ClientProcesses | None = None  # where the vehicles train; None: in this process
+    runtime: Runtime | None = None  # where the vehicles train; None: in this process
     distiller: Distiller | None = None  # where vehicles send outputs
     buffers: Buffers | None = None  # of `FedBuff`, the region's rounds by a clock
     begun: Weights = field(default_factory=dict)  # that its last cloud round began with

@@ -18,7 +18,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
-from scipy.optimize import root_scalar
 
 from flcav.config import Config, InputError
 from flcav.federation.noise import Normals, secret_noise
@@ -213,6 +212,8 @@ def find_noise(privacy: Privacy, selection: Selection, clients: int, rounds: int
 @functools.lru_cache(maxsize=256)
 def _find_least_noise(privacy: str, selection: str, clients: int, rounds: int) -> float:
     """Return the noise of `find_noise`; settings are JSON, by which they are looked up."""
+    from scipy.optimize import root_scalar  # the processes of a fleet start without it
+
     asked, drawn = Privacy.model_validate_json(privacy), Selection.model_validate_json(selection)
 
     def exceeds(exponent: float) -> float:

@@ -13,9 +13,9 @@ from typing import Annotated
 from flcav.config import InputError
 from flcav.interface.progress import DAMAGED
 from flcav.pipeline.arms import check_federations
+from flcav.pipeline.deployment import check_labels
 from flcav.pipeline.engine import Notify, Stale, Step, print_steps, run_steps
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
 from flcav.pipeline.results.saved import WEIGHTS, Saved
@@ -80,10 +80,7 @@ def federate_regions(
     if graph.settings[arm].central:
         raise InputError(f"--arm {arm}: it trains centrally, without a federation")
     check_federations(recipe, graph.settings.values())
-    if runtime != "embedded" and any(LABEL_SOURCES[kind].averaged for kind in graph.settings[arm].labels.values()):
-        raise InputError(
-            f"labels 'road-average' are renewed between rounds, and clients elsewhere get them once; not on '{runtime}'"
-        )
+    check_labels(graph, [arm], runtime)
     tell_rigs([graph], notify)
     asked = list_federations(graph, arm)
     means = {"processes": jobs, "runtime": runtime, "timed": 1, "fleet": "" if fleet is None else str(fleet)}

@@ -9,6 +9,7 @@ from flcav.pipeline.analysis.collect import collect_results
 from flcav.pipeline.analysis.histories import make_history_points
 from flcav.pipeline.analysis.summary import summarise
 from flcav.pipeline.arms import check_federations
+from flcav.pipeline.deployment import deploy
 from flcav.pipeline.engine import Notify, Stale, print_steps, run_side_by_side, run_steps, stopwatch
 from flcav.pipeline.recipe import RunRecipe, load_run_recipe
 from flcav.pipeline.results.run import Run, Summary
@@ -31,6 +32,8 @@ def run(
     notify: Notify = print_steps,
     stale: Stale = "refuse",
     engine: str = "processes",
+    runtime: str = "embedded",
+    fleet: Path | None = None,
 ) -> Run:
     """Run or finish a recipe, or that in a YAML file, in the folder `out`; write its results there, and return them.
 
@@ -44,6 +47,8 @@ def run(
         notify: called with a step's name, its progress and a note.
         stale: what becomes of finished steps of other code or arguments: refuse, redo or keep (see `run_steps`).
         engine: processes of this machine, or ray: actors of a cluster.
+        runtime: where vehicles train: embedded, or flower: vehicles of a deployed fleet; the results are the same.
+        fleet: folder of the fleet that is up; None: one is brought up on this machine for each federation.
 
     Raises `InputError` where a part of the recipe cannot be used, and where `out` holds another run or, if `stale`
     refuses that, one of other code.
@@ -76,7 +81,8 @@ def run(
             clock()
         notify(step, done, total, note)
 
-    run_steps(graph.steps, out / WORK, jobs=jobs, notify=timed, stale=stale, engine=engine)
+    steps = deploy(graph, runtime, fleet, engine)
+    run_steps(steps, out / WORK, jobs=jobs, notify=timed, stale=stale, engine=engine)
     return _save_results(graph, out, out / HISTORY, clock(), f"seed{recipe.seed}")
 
 
@@ -90,6 +96,8 @@ def run_seeds(
     notify: Notify = print_steps,
     stale: Stale = "refuse",
     engine: str = "processes",
+    runtime: str = "embedded",
+    fleet: Path | None = None,
 ) -> tuple[tuple[Run, ...], Summary]:
     """Run or finish a recipe with `seeds` consecutive seeds, its own first; return all runs and their summary.
 
@@ -104,11 +112,14 @@ def run_seeds(
         notify: called with a step's name, its progress and a note.
         stale: what becomes of finished steps of other code or arguments: refuse, redo or keep (see `run_steps`).
         engine: processes of this machine, or ray: actors of a cluster.
+        runtime: where vehicles train: embedded, or flower: vehicles of a deployed fleet; the results are the same.
+        fleet: folder of the fleet that is up; None: one is brought up on this machine for each federation.
     """
     recipes = {
         f"seed{seed}": recipe.model_copy(update={"seed": seed}) for seed in range(recipe.seed, recipe.seed + seeds)
     }
-    runs = run_several(recipes, out, beside=beside, jobs=jobs, notify=notify, stale=stale, engine=engine)
+    where = {"engine": engine, "runtime": runtime, "fleet": fleet}
+    runs = run_several(recipes, out, beside=beside, jobs=jobs, notify=notify, stale=stale, **where)
     summary = summarise(runs, [Path(out) / name / WORK for name in recipes])
     summary.save(out)
     return runs, summary
@@ -123,6 +134,8 @@ def run_several(
     notify: Notify = print_steps,
     stale: Stale = "refuse",
     engine: str = "processes",
+    runtime: str = "embedded",
+    fleet: Path | None = None,
 ) -> tuple[Run, ...]:
     """Run or finish several recipes side by side, each in the folder of its name in `out`; return their results.
 
@@ -133,7 +146,7 @@ def run_several(
     for graph in graphs.values():
         check_federations(graph.recipe, graph.settings.values())
     tell_rigs(graphs.values(), notify)
-    steps = {folder / WORK: graph.steps for folder, graph in graphs.items()}
+    steps = {folder / WORK: deploy(graph, runtime, fleet, engine) for folder, graph in graphs.items()}
     names = {folder / WORK: folder.name for folder in graphs}
     run_side_by_side(steps, jobs=jobs, notify=notify, stale=stale, engine=engine, names=names)
     return tuple(_save_results(graph, folder, out / HISTORY, 0.0, folder.name) for folder, graph in graphs.items())

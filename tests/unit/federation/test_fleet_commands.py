@@ -105,7 +105,7 @@ def test_expired_certificate_of_a_vehicle_on_this_machine(flcav, fleet):
 def test_page(flcav, fleet):
     """The page is served for this host alone, and has what the status says."""
     traffic = Traffic()
-    traffic.count("vehicle-001", "push-object", 5, 7, (50, 70), True)
+    traffic.count("vehicle-001", "push-object", 5, 7, (50, 70), 200)
     traffic.refuse("<script>", "a certificate is wanted")
     traffic.save(fleet)
     server = uvicorn.Server(uvicorn.Config(make_page(fleet), port=0, log_level="warning", log_config=None))

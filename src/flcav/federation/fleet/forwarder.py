@@ -1,6 +1,7 @@
 """A vehicle's forwarder: Flower's SuperNode, which knows no client certificates, reaches the fleet's proxy through it.
 
-It listens on the vehicle's loopback alone, and passes calls on with the vehicle's certificate.
+It listens on the vehicle's loopback alone, and passes calls on with the vehicle's certificate. FL requests go to the
+proxy directly.
 """
 
 import ssl
@@ -9,9 +10,11 @@ from pathlib import Path
 import httpx
 from starlette.types import Receive, Scope, Send
 
+from flcav.config import InputError
 from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, KEY, LOOPBACK, LOOPBACK_KEY
 from flcav.federation.fleet.mutual_tls import serve_https
 from flcav.federation.fleet.relay import TIMEOUT, keep_alive, relay
+from flcav.federation.messages.fl_request import PATH, FLRequest
 
 
 class Forwarder:
@@ -43,3 +46,22 @@ def run_forwarder(folder: Path, port: int, server: str) -> None:
         base_url=f"https://{server}", verify=vehicle_tls(folder), timeout=TIMEOUT, trust_env=False
     )
     serve_https(Forwarder(client), "127.0.0.1", port, folder / LOOPBACK, folder / LOOPBACK_KEY).run()
+
+
+def send_request(folder: Path, server: str, request: FLRequest) -> None:
+    """Send a request of the vehicle in `folder` to the proxy at `server` (host:port).
+
+    Raises `InputError` where it is refused, `OSError` where nobody is there.
+    """
+    try:
+        answer = httpx.post(
+            f"https://{server}{PATH}",
+            content=request.as_bytes(),
+            verify=vehicle_tls(folder),
+            trust_env=False,
+            timeout=30.0,
+        )
+    except httpx.HTTPError as error:
+        raise OSError(f"{server}: the fleet cannot be reached: {error}") from None
+    if answer.status_code != httpx.codes.OK:
+        raise InputError(f"{server}: the request is refused: {answer.text[:200]}")

@@ -28,6 +28,7 @@ th { border-bottom: 1px solid; } td.n { text-align: right; font-variant-numeric:
 <h1>Fleet</h1><p id="state">…</p>
 <h2>Federation</h2><p id="federation"></p><table id="rounds"></table>
 <h2>Vehicles</h2><table id="vehicles"></table>
+<h2>FL requests</h2><ul id="asked"></ul>
 <h2>Refused</h2><ul id="refused"></ul>
 <script>
 const at = id => document.getElementById(id);
@@ -41,6 +42,9 @@ const fill = (table, heads, rows) => {
     const r = document.createElement("tr"); r.append(...cells); return r;
   }));
 };
+const list = (where, lines) => where.replaceChildren(...lines.map(line => {
+  const i = document.createElement("li"); i.textContent = line; return i;
+}));
 const number = value => value === null ? "" : value.toPrecision(4);
 async function follow() {
   try {
@@ -54,9 +58,8 @@ async function follow() {
       s.vehicles.map(v => [cell(v.name), cell(v.state, v.state == "registered" ? "" : "bad"),
         cell(v.online ? "online" : "offline", v.online ? "" : "off"), cell(v.socket_up, "n"), cell(v.socket_down, "n"),
         cell(v.content_up, "n"), cell(v.content_down, "n")]));
-    at("refused").replaceChildren(...s.refused.map(r => {
-      const i = document.createElement("li"); i.textContent = r; return i;
-    }));
+    list(at("asked"), s.asked);
+    list(at("refused"), s.refused);
   } catch (error) { at("state").textContent = `no answer: ${error}`; }
   setTimeout(follow, 1000);
 }
@@ -75,7 +78,8 @@ def make_page(folder: Path) -> Starlette:
     async def status(_: Request) -> Response:
         found = await asyncio.to_thread(read_status, folder)
         told = "" if found.federation is None else found.federation.describe()
-        return Response(json.dumps({**found.as_json(), "told": told}), media_type="application/json")
+        asked = [each.describe() for each in found.requests]
+        return Response(json.dumps({**found.as_json(), "told": told, "asked": asked}), media_type="application/json")
 
     routes = [Route("/", page), Route("/status.json", status)]
     local = Middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost"])  # no page elsewhere reads it

@@ -2,16 +2,19 @@
 
 A call passes where its path is one of a node's under `/v1/fleet/`, its TLS connection has the certificate of a vehicle
 that is in the registry, neither revoked nor replaced nor expired at that moment, and Flower's node key is that
-vehicle's. The control side of the SuperLink listens on the operator's host alone.
+vehicle's. FL requests, which need the certificate alone, are for the proxy itself. The control side of the SuperLink
+listens on the operator's host alone.
 """
 
 import asyncio
 import base64
 import binascii
 import hashlib
+import sqlite3
 import time
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import httpx
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -22,8 +25,10 @@ from flcav.federation.fleet.authority import SERVER, SERVER_KEY, open_registry
 from flcav.federation.fleet.keys import AUTHORITY, public_der
 from flcav.federation.fleet.mutual_tls import CERTIFICATE, CONNECTION, Connection, serve_https
 from flcav.federation.fleet.registry import Registry, Vehicle
-from flcav.federation.fleet.relay import TIMEOUT, answer, keep_alive, relay
+from flcav.federation.fleet.relay import TIMEOUT, answer, keep_alive, read_body, relay
 from flcav.federation.fleet.traffic import Traffic, read_traffic
+from flcav.federation.messages.fl_request import LARGEST, check_age, parse_request
+from flcav.federation.messages.fl_request import PATH as REQUEST_PATH
 
 FLEET = "/v1/fleet/"
 CALLS = frozenset(
@@ -67,6 +72,9 @@ class FleetProxy:
         if isinstance(vehicle, str):
             await self._refuse(send, 401, state[CERTIFICATE], vehicle)
             return
+        if path == REQUEST_PATH and scope["method"] == "POST":
+            await self._take_request(vehicle.name, receive, send)
+            return
         call = path.removeprefix(FLEET)
         if scope["method"] != "POST" or path != FLEET + call or call not in CALLS:
             await self._refuse(send, 403, vehicle.name, f"{scope['method']} {path[:100]} is no call of a vehicle's")
@@ -78,9 +86,36 @@ class FleetProxy:
         if done.status == httpx.codes.UNAUTHORIZED:
             self._traffic.refuse(vehicle.name, describe_clock(dict(scope["headers"]).get(SIGNED_AT, b"")))
         connection: Connection = state[CONNECTION]
-        answered = done.status == httpx.codes.OK
-        self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), answered)
+        self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), done.status)
         self._changed = True
+
+    async def _take_request(self, vehicle: str, receive: Receive, send: Send) -> None:
+        """Keep a vehicle's FL request, or refuse it: 400 for another message, 409 for one that came before."""
+        try:
+            request = parse_request(content := await read_body(receive, LARGEST))
+        except ValueError as error:
+            await self._refuse(send, 400, vehicle, str(error))
+            return
+        now = time.time()
+        if (odd := check_age(request, now)) is not None:
+            await self._refuse(send, 400, vehicle, odd)
+            return
+        try:
+            why = await asyncio.to_thread(self._keep_request, vehicle, request.nonce, content, now)
+        except sqlite3.Error as error:
+            await self._refuse(send, 503, vehicle, f"the registry cannot be written: {error}")
+            return
+        if why is not None:
+            await self._refuse(send, 409, vehicle, why)
+            return
+        await answer(send, 200, "the request is taken")
+
+    def _keep_request(self, *about: Any) -> str | None:
+        registry = open_registry(self._folder)
+        try:
+            return registry.take_request(*about)
+        finally:
+            registry.close()
 
     async def _refuse(self, send: Send, status: int, who: str | bytes | None, why: str) -> None:
         told = who if isinstance(who, str) else "nobody" if who is None else hashlib.sha256(who).hexdigest()[:16]
@@ -93,7 +128,11 @@ class FleetProxy:
             await asyncio.sleep(SAVE_S)
             if self._changed:
                 self._changed = False
-                await asyncio.to_thread(Traffic(dict(self._traffic.vehicles), self._traffic.refused).save, self._folder)
+                try:
+                    now = Traffic(dict(self._traffic.vehicles), self._traffic.refused)
+                    await asyncio.to_thread(now.save, self._folder)
+                except OSError:  # no room: what was counted is written later
+                    self._changed = True
 
 
 def find_caller(registry: Registry, certificate: bytes | None, now: float | None = None) -> Vehicle | str:

@@ -39,6 +39,17 @@ CREATE TABLE audit (
 CREATE TRIGGER audit_stays BEFORE UPDATE ON audit BEGIN SELECT RAISE(ABORT, 'an audit trail is not changed'); END;
 CREATE TRIGGER audit_is_kept BEFORE DELETE ON audit BEGIN SELECT RAISE(ABORT, 'an audit trail is not changed'); END;
 """
+REQUESTS = """
+CREATE TABLE IF NOT EXISTS requests (
+    nonce TEXT PRIMARY KEY,
+    vehicle TEXT NOT NULL,
+    time REAL NOT NULL,  -- when it came, seconds since 1970
+    content BLOB NOT NULL  -- the request as it was sent
+);
+CREATE INDEX IF NOT EXISTS requests_by_time ON requests (time);
+"""  # one who opens a registry of an earlier version makes the table
+KEPT_S = 86400.0  # that an FL request stays
+WINDOW_S, MOST = 300.0, 60  # requests of one vehicle within such a time
 BUSY_S = 10.0  # that another process may hold the registry
 
 
@@ -84,7 +95,7 @@ class Registry:
         """Return a new, empty registry of the authority with this fingerprint."""
         made = cls(path)
         made._connection.execute("PRAGMA journal_mode=WAL")
-        made._connection.executescript(f"BEGIN; {SCHEMA} COMMIT;")
+        made._connection.executescript(f"BEGIN; {SCHEMA} {REQUESTS} COMMIT;")
         with made._change() as cursor:
             cursor.execute("INSERT INTO authority VALUES (?)", (authority,))
             made._note(cursor, "found", "", authority, "")
@@ -102,6 +113,9 @@ class Registry:
             raise InputError(f"{path}: is no registry of a fleet") from None
         if row != (authority,):
             raise InputError(f"{path}: is the registry of another authority than {path.parent / 'ca.crt'}")
+        known = found._connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'requests_by_time'").fetchone()
+        if known is None:
+            found._connection.executescript(f"BEGIN; {REQUESTS} COMMIT;")
         return found
 
     def close(self) -> None:
@@ -167,6 +181,24 @@ class Registry:
     def list_enrolled(self) -> list[Vehicle]:
         """Return every certificate whose key has a node at the SuperLink, in force or not."""
         return [*self._select("WHERE node IS NOT NULL")]
+
+    def take_request(self, vehicle: str, nonce: str, content: bytes, now: float) -> str | None:
+        """Keep a vehicle's FL request for a day; return in words why it is refused: it came before, or too many did."""
+        with self._change() as cursor:
+            cursor.execute("DELETE FROM requests WHERE time < ?", (now - KEPT_S,))
+            if cursor.execute("SELECT 1 FROM requests WHERE nonce = ?", (nonce,)).fetchone():
+                return "a request with this nonce came before"
+            since = vehicle, now - WINDOW_S
+            (count,) = cursor.execute("SELECT count(*) FROM requests WHERE vehicle = ? AND time > ?", since).fetchone()
+            if count >= MOST:
+                return f"{MOST} requests within {WINDOW_S:.0f} s are enough"
+            cursor.execute("INSERT INTO requests VALUES (?, ?, ?, ?)", (nonce, vehicle, now, content))
+        return None
+
+    def list_requests(self, most: int) -> list[tuple[str, float, bytes]]:
+        """Return vehicle, time of arrival and content of the last requests, the latest last."""
+        asked = "SELECT vehicle, time, content FROM requests ORDER BY time DESC LIMIT ?"
+        return [*self._connection.execute(asked, (most,))][::-1]
 
     def count_changes(self) -> int:
         """Return how many changes the registry has seen."""

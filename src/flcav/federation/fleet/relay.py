@@ -28,6 +28,20 @@ async def answer(send: Send, status: int, text: str) -> None:
     await send({"type": "http.response.body", "body": body})
 
 
+async def read_body(receive: Receive, most: int) -> bytes:
+    """Return the body of a request; raises ValueError where it is longer than `most` bytes, or breaks off."""
+    body, more = b"", True
+    while more:
+        event = await receive()
+        if event["type"] == "http.disconnect":
+            raise ValueError("the client has left")
+        body += event.get("body", b"")
+        if len(body) > most:
+            raise ValueError(f"the message has more than {most} bytes")
+        more = event.get("more_body", False)
+    return body
+
+
 async def relay(client: httpx.AsyncClient, scope: Scope, receive: Receive, send: Send) -> Relayed:
     """Pass a request on by `client`, whose base address is the other server's; return the sizes.
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,10 +14,13 @@ from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
 from flcav.federation.fleet.supervisor import read_processes
 from flcav.federation.fleet.traffic import Crossed, read_traffic
 from flcav.federation.fleet.up import read_ready
+from flcav.federation.messages.fl_request import FLRequest, parse_request
 from flcav.interface.wording import plural
 from flcav.storage.files import write_bytes
 from flcav.storage.records import Record
 
+SHOWN = 20  # of requests and refusals, the latest
+LEAST_ROOM = 1_000_000  # bytes on the fleet's disk below which is said so
 PROGRESS = "federation.json"  # in the fleet's folder, written by the server of a federation
 
 
@@ -42,6 +46,7 @@ class Followed(Record):
     used_mb: float  # of the uplink, by the ledger
     left_mb: float
     rounds: tuple[FollowedRound, ...] = ()
+    waits: Mapping[str, str] = field(default_factory=dict)  # by client why it is waited for
 
     def save(self, folder: Path) -> None:
         """Write it to the fleet's folder."""
@@ -56,7 +61,7 @@ class Followed(Record):
         told += f", {plural(failed, 'failure')}" if failed else ""
         if self.rounds and self.rounds[-1].epsilon is not None:
             told += f", epsilon {self.rounds[-1].epsilon:.3g}"
-        return told
+        return "; ".join([told, *(f"waits for {client}: {why}" for client, why in self.waits.items())])
 
 
 @dataclass(frozen=True)
@@ -74,13 +79,29 @@ class VehicleStatus(Record):
 
 
 @dataclass(frozen=True)
+class Asked(Record):
+    """An FL request that was taken."""
+
+    vehicle: str
+    request: FLRequest
+
+    def describe(self) -> str:
+        """Return it in a sentence."""
+        own = self.request
+        seen = f"loss {own.loss:.3g} on {plural(own.frames, 'frame')} held back, at ({own.x:.0f}, {own.y:.0f}) m"
+        return f"{self.vehicle} asks for federated learning of {own.task}: {seen}"
+
+
+@dataclass(frozen=True)
 class FleetStatus(Record):
     """A fleet."""
 
     proxy: str | None  # host:port; None: it is not up
     processes: Mapping[str, int]  # ids by name, of those that run on this machine
     vehicles: tuple[VehicleStatus, ...]
+    requests: tuple[Asked, ...]  # for federated learning; the latest last
     refused: tuple[str, ...]  # who, and why; the latest last
+    free: int  # room on the disk of the fleet's folder [bytes]
     federation: Followed | None
     time: float  # [s since 1970]
 
@@ -90,6 +111,7 @@ def read_status(folder: Path) -> FleetStatus:
     registry = open_registry(folder)
     try:
         registered = registry.list_vehicles()
+        asked = registry.list_requests(SHOWN)
     finally:
         registry.close()
     traffic, online = read_traffic(folder), set[int]()
@@ -110,5 +132,7 @@ def read_status(folder: Path) -> FleetStatus:
     except FileNotFoundError:
         federation = None
     proxy = None if ready is None else ready.proxy
-    refused = tuple(traffic.refused[-20:])
-    return FleetStatus(proxy, read_processes(folder), tuple(vehicles), refused, federation, time.time())
+    requests = tuple(Asked(vehicle, parse_request(content)) for vehicle, _, content in asked)
+    refused, free = tuple(traffic.refused[-SHOWN:]), shutil.disk_usage(folder).free
+    told = tuple(vehicles), requests, refused, free, federation, time.time()
+    return FleetStatus(proxy, read_processes(folder), *told)

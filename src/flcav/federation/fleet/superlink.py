@@ -110,7 +110,7 @@ class SuperLink:
             SuperExecAuthHttpInterceptor(master_secret=(self.folder / SECRET).read_bytes(), protected_methods=ACQUIRE),
         ]
         with (
-            _locked(self.folder / f"{SECRET}.lock"),  # so that the task which is pending is this run's
+            locked(self.folder / f"{SECRET}.lock"),  # so that the task which is pending is this run's
             self._control() as control,
             RuntimeHttpClient.from_server_address(self.address, False, certificate, interceptors) as runtime,
         ):
@@ -165,7 +165,8 @@ class Run:
 
 
 @contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock of a file; waits while another holds it."""
     with path.open("a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

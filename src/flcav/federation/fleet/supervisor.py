@@ -58,16 +58,17 @@ def supervise(
 
     before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
     all_, waiting = {name: _Supervised(do) for name, do in processes.items()}, dict(later)
+    changed = False
     try:
         while not ended:
-            changed = _reap(all_)
+            changed |= _reap(all_)
             for name, own in all_.items():
                 if not own.pid and time.monotonic() >= own.started + own.pause_s:
                     own.pid, own.started, own.starts = _fork(folder, name, own.do), time.monotonic(), own.starts + 1
                     changed = True
             if changed:
                 told = {name: {"pid": own.pid, "starts": own.starts} for name, own in all_.items()}
-                write_bytes(folder / PROCESSES, json.dumps(told).encode())
+                changed = not _write(folder / PROCESSES, json.dumps(told).encode())
             if is_up() and waiting:
                 all_ |= {name: _Supervised(do) for name, do in waiting.items()}
                 waiting = {}
@@ -85,6 +86,15 @@ def read_processes(folder: Path) -> dict[str, int]:
         return {name: own["pid"] for name, own in json.loads((folder / PROCESSES).read_bytes()).items() if own["pid"]}
     except FileNotFoundError:
         return {}
+
+
+def _write(path: Path, data: bytes) -> bool:
+    """Write a file that others follow the fleet by; return whether there was room for it."""
+    try:
+        write_bytes(path, data)
+    except OSError:
+        return False
+    return True
 
 
 def _reap(all_: Mapping[str, _Supervised]) -> bool:
@@ -144,6 +154,7 @@ def _fork(folder: Path, name: str, do: Callable[[], None]) -> int:
 
         traceback.print_exc()
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        with contextlib.suppress(BaseException):  # where there is no room for the log, this process still ends here
+            sys.stdout.flush()
+            sys.stderr.flush()
         os._exit(code & 255)

@@ -2,12 +2,14 @@
 
 import json
 from dataclasses import asdict, dataclass, field
+from http import HTTPStatus
 from pathlib import Path
 
 from flcav.storage.files import write_bytes
 
 TRAFFIC = "traffic.json"
 CONTENT = ("push-object", "pull-object")  # calls that carry what an app sends; all others are Flower's own
+LOOKS = ("pull-messages", "send-node-heartbeat")  # calls that lose nothing where they fail: the next one does for both
 MOST_REFUSALS = 200  # that are kept
 
 
@@ -23,6 +25,7 @@ class Crossed:
     other_down: int = 0
     calls: int = 0
     activations: int = 0  # of its SuperNode: how often it has come in
+    lost: int = 0  # calls that the SuperLink failed, with which a message may be lost
 
 
 @dataclass
@@ -32,16 +35,17 @@ class Traffic:
     vehicles: dict[str, Crossed] = field(default_factory=dict)
     refused: list[str] = field(default_factory=list)
 
-    def count(self, vehicle: str, call: str, up: int, down: int, socket: tuple[int, int], answered: bool) -> None:
+    def count(self, vehicle: str, call: str, up: int, down: int, socket: tuple[int, int], status: int) -> None:
         """Count one call with the sizes of its bodies, and the bytes that crossed the socket since the last one.
 
-        answered: whether the SuperLink answered without an error.
+        status: of the SuperLink's answer.
         """
         own = self.vehicles.setdefault(vehicle, Crossed())
         own.calls += 1
         own.socket_up += socket[0]
         own.socket_down += socket[1]
-        own.activations += answered and call == "activate-node"
+        own.activations += status == HTTPStatus.OK and call == "activate-node"
+        own.lost += status >= HTTPStatus.INTERNAL_SERVER_ERROR and call not in LOOKS
         if call in CONTENT:
             own.content_up += up
             own.content_down += down

@@ -5,6 +5,7 @@ import fcntl
 import json
 import os
 import socket
+import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -195,7 +196,7 @@ class _Enrolment:
             if registry.count_changes() != self._seen:
                 link.enrol(registry)
                 self._seen = registry.count_changes()
-        except SuperLinkLost as error:  # not there yet, or not now
+        except (*SuperLinkLost, sqlite3.Error) as error:  # not there yet, or not now; or its disk is full
             self.wrong = str(error)
         finally:
             registry.close()

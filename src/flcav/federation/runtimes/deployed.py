@@ -6,7 +6,9 @@ vehicles keep their last answer, the weights are those of a federation that noth
 """
 
 import contextlib
+import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -23,9 +25,10 @@ from flwr.serverapp import Grid
 
 from flcav.config import InputError
 from flcav.federation.fleet.authority import found_authority, open_registry
+from flcav.federation.fleet.keys import AUTHORITY
 from flcav.federation.fleet.registry import Vehicle
 from flcav.federation.fleet.status import Followed, FollowedRound
-from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
+from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost, locked
 from flcav.federation.fleet.supervisor import LOGS, end_with_parent
 from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.fleet.up import READY, VEHICLES, read_ready
@@ -41,10 +44,14 @@ from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable
 from flcav.network.ledger import BudgetExceeded
 
+SERVING = "serving.lock"  # in a fleet's folder: held by the federation that it serves
 STARTING_S = 120.0  # for a fleet to be up, its vehicles to be in, and a SuperLink to come back
 STARTING_VEHICLE_S = 15.0  # more for each vehicle, which may all be on a busy machine
 REJOIN_S = 180.0  # that a vehicle is waited for which the network lost
-POLL_S, PAUSE_S = 0.1, 1.0  # between looks for answers; before a vehicle that was not there is asked again
+POLL_S, PAUSE_S = 0.2, 1.0  # between looks for answers; before a vehicle that was not there is asked again
+LOOK_S = 0.4  # between looks who is in: each is a connection of its own, of some 0.1 s of CPU time
+RAISED = 2  # Flower's error code of an app that raised an exception, whose words are the reason
+FULL = re.compile(rf"\[Errno (?:{errno.ENOSPC}|{errno.EDQUOT}|{errno.EFBIG})\] ([A-Z][A-Za-z ]*)")
 TRANSPORT = (3, 4, 5, 8)  # Flower's error codes of messages and nodes that are not available, and of a crashed app
 
 
@@ -63,9 +70,9 @@ class Deployment:
 
     deployed: Literal[True] = True
 
-    def __init__(self, folder: Path) -> None:
-        """Find the fleet of `folder`; raises `InputError` where it is not up."""
-        self.folder = folder
+    def __init__(self, folder: Path, first: int = 0) -> None:
+        """Find the fleet of `folder`; `first` vehicles are another region's. Raises `InputError` where it is not up."""
+        self.folder, self.first = folder, first
         self.link = SuperLink(folder, read_ready(folder).superlink)
 
     @contextlib.contextmanager
@@ -73,6 +80,8 @@ class Deployment:
         self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
     ) -> Iterator["DeployedGrid"]:
         """Yield the grid of vehicles that `clients` are assigned to, in the order of the vehicles' identifiers.
+
+        A fleet serves one federation at a time: another one waits until this one has ended.
 
         states: what clients have kept from earlier rounds. account: by which vehicles are granted bytes. Raises
         `InputError` where there are fewer vehicles than clients, or they cannot import these, `OSError` where they do
@@ -82,6 +91,13 @@ class Deployment:
             if type(client).__module__ == "__main__":
                 kind = type(client).__name__
                 raise InputError(f"{name}: vehicles cannot import {kind} from a script; put it in a module")
+        with locked(self.folder / SERVING), keep_identity(), self._open(clients, agreed, states, account) as grid:
+            yield grid
+
+    @contextlib.contextmanager
+    def _open(
+        self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
+    ) -> Iterator["DeployedGrid"]:
         vehicles = self._wait([*clients])
         federation = os.urandom(8).hex()
         for (name, client), vehicle in zip(clients.items(), vehicles, strict=True):
@@ -91,14 +107,13 @@ class Deployment:
                 own.save(self.folder / VEHICLES / vehicle.name)
         names = {vehicle.node or 0: name for vehicle, name in zip(vehicles, clients, strict=True)}
         of_nodes = {vehicle.node or 0: vehicle.name for vehicle in vehicles}
-        with keep_identity():
-            grid = DeployedGrid(self, names, of_nodes, account)
-            try:
-                yield grid
-            except BaseException:
-                grid.end(failed=True)
-                raise
-            grid.end()
+        grid = DeployedGrid(self, names, of_nodes, account)
+        try:
+            yield grid
+        except BaseException:
+            grid.end(failed=True)
+            raise
+        grid.end()
 
     def _wait(self, clients: list[str]) -> list[Vehicle]:
         """Return as many vehicles as `clients`, once they are in."""
@@ -106,10 +121,11 @@ class Deployment:
         end = time.monotonic() + seconds
         while True:
             registry = open_registry(self.folder)
-            able = [own for own in registry.list_vehicles() if own.describe_state() == "registered"]
+            able = [own for own in registry.list_vehicles() if own.describe_state() == "registered"][self.first :]
             registry.close()
             if len(able) < len(clients):
-                raise InputError(f"{self.folder}: {len(able)} vehicles, and the federation has {len(clients)} clients")
+                told = f"{len(able)} vehicles" + (f" beside {self.first} of other regions" if self.first else "")
+                raise InputError(f"{self.folder}: {told}, and the federation has {len(clients)} clients")
             with contextlib.suppress(*SuperLinkLost):
                 online = self.link.list_online()
                 found = [own for own in able if own.node in online]
@@ -117,7 +133,38 @@ class Deployment:
                     return found[: len(clients)]
             if time.monotonic() > end:
                 raise OSError(f"{self.folder}: fewer than {len(clients)} vehicles are in after {seconds:g} s")
-            time.sleep(POLL_S)
+            time.sleep(LOOK_S)
+
+
+class RegionalDeployment:
+    """Where each region's clients are deployed: in a fleet of their own, or side by side in one."""
+
+    deployed: Literal[True] = True
+
+    def __init__(self, folder: Path, clients: Mapping[str, int]) -> None:
+        """Find the fleet of each region: in `folder`/REGION where an authority is there, else in `folder` itself.
+
+        clients: number of each region; in one fleet the vehicles of one region come after another's. Raises
+        `InputError` where a fleet is not up.
+        """
+        first, self._fleets = 0, dict[str, Deployment]()
+        for region, count in clients.items():
+            if (folder / region / AUTHORITY).exists():
+                self._fleets[region] = Deployment(folder / region)
+            else:
+                self._fleets[region] = Deployment(folder, first)
+                first += count
+
+    def open(
+        self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
+    ) -> contextlib.AbstractContextManager["DeployedGrid"]:
+        """Return the grid of a region's `clients`, which are named REGION/VEHICLE, see `Deployment.open`."""
+        return self._fleets[region_of(next(iter(clients)))].open(clients, agreed, states, account)
+
+
+def region_of(client: str) -> str:
+    """Return the region of a client that is named REGION/VEHICLE."""
+    return client.partition("/")[0]
 
 
 class DeployedGrid(WrappedGrid):
@@ -129,6 +176,7 @@ class DeployedGrid(WrappedGrid):
         """Reach nodes with the clients' `names`, which are `vehicles` of the registry."""
         self._deployment, self.names, self._vehicles, self._account = deployment, names, vehicles, account
         self._rounds: tuple[FollowedRound, ...] = ()
+        self._waits: dict[str, str] = {}  # by client why it is waited for
         self._begin()
 
     def _begin(self) -> None:
@@ -144,18 +192,31 @@ class DeployedGrid(WrappedGrid):
         while True:
             try:
                 return self._begin()
-            except SuperLinkLost:
+            except SuperLinkLost as error:
                 if time.monotonic() > end:
-                    raise
+                    raise OSError(f"{self._deployment.folder}: the SuperLink begins no run: {error}") from None
                 time.sleep(PAUSE_S)
 
     def follow(self, record: RoundRecord) -> None:
         """Write a round that has ended to the fleet's folder, where `flcav fleet status` reads it."""
         about = time.time(), len(record.clients), record.failed, record.loss, record.epsilon
-        self._rounds = (*self._rounds, FollowedRound(record.round, *about))
+        self._rounds, self._waits = (*self._rounds, FollowedRound(record.round, *about)), {}
+        self._tell()
+
+    def _tell(self) -> None:
         account, link = self._account, self._account.link
         used, left = account.ledger.used_mb(link), account.ledger.left_mb(link)
-        Followed(account.stage, account.task, link, used, left, self._rounds).save(self._deployment.folder)
+        told = Followed(account.stage, account.task, link, used, left, self._rounds, dict(self._waits))
+        with contextlib.suppress(OSError):  # the federation goes on where the disk of its display is full
+            told.save(self._deployment.folder)
+
+    def _wait_for(self, exchange: "_Exchange", node: int, reason: str) -> None:
+        """Ask a node again later, and tell why."""
+        exchange.lost(node)
+        name = self.names[node]
+        if self._waits.get(name) != reason:
+            self._waits[name] = reason
+            self._tell()
 
     def end(self, failed: bool = False) -> None:
         """End the run."""
@@ -177,7 +238,7 @@ class DeployedGrid(WrappedGrid):
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
         """Yield the replies in the order of the messages; raises `BudgetExceeded` where one was kept for its size."""
         asked = {message.metadata.dst_node_id: message for message in messages}
-        exchange = _Exchange(self._count_activations())
+        exchange = _Exchange(self._count_losses())
         answers: dict[int, Message] = {}
         end = time.monotonic() + (timeout or float("inf"))
         for node, message in asked.items():
@@ -189,11 +250,11 @@ class DeployedGrid(WrappedGrid):
                     self._pull(exchange, asked, answers)
                 except SuperLinkLost:
                     self._renew()
-                    exchange = _Exchange(self._count_activations())
+                    exchange = _Exchange(self._count_losses())
                 if node not in answers:
                     if time.monotonic() > end:
                         return
-                    exchange.notice(self._count_activations())
+                    exchange.notice(self._count_losses())
                     time.sleep(POLL_S)
             reply = answers.pop(node)
             answers[node] = message  # answered; only its place is looked at
@@ -222,24 +283,38 @@ class DeployedGrid(WrappedGrid):
             node = exchange.nodes.pop(reply.metadata.reply_to_message_id, None)
             if node is None or node in answers:
                 continue
-            if reply.has_error() and reply.error.code in TRANSPORT and not exchange.is_late(node):
-                exchange.lost(node)
-            elif reply.has_error() and reply.error.code in TRANSPORT:
-                answers[node] = Message(Error(LOST_BY_NETWORK, str(reply.error.reason)), reply_to=asked[node])
+            reason = _excuse(reply)
+            if reason is not None and not exchange.is_late(node):
+                self._wait_for(exchange, node, reason)
+            elif reason is not None:
+                answers[node] = Message(Error(LOST_BY_NETWORK, reason), reply_to=asked[node])
             else:
                 answers[node] = reply
 
-    def _count_activations(self) -> dict[int, int]:
-        vehicles = read_traffic(self._deployment.folder).vehicles
-        return {node: vehicles[name].activations for node, name in self._vehicles.items() if name in vehicles}
+    def _count_losses(self) -> dict[int, int]:
+        """Return how often each node may have lost what it was asked: it came in anew, or the SuperLink failed it."""
+        found = read_traffic(self._deployment.folder).vehicles
+        there = {node: found[name] for node, name in self._vehicles.items() if name in found}
+        return {node: own.activations + own.lost for node, own in there.items()}
+
+
+def _excuse(reply: Message) -> str | None:
+    """Return why a vehicle could not answer, where that may pass: it was not there, or its disk is full."""
+    if not reply.has_error():
+        return None
+    if reply.error.code in TRANSPORT:
+        return str(reply.error.reason)
+    if reply.error.code == RAISED and (full := FULL.search(str(reply.error.reason))):
+        return f"no room on the vehicle's disk: {full[1]}"
+    return None
 
 
 class _Exchange:
     """Who was asked in a run, by which message, and who is to be asked again when."""
 
-    def __init__(self, activations: Mapping[int, int]) -> None:
+    def __init__(self, losses: Mapping[int, int]) -> None:
         self.nodes: dict[str, int] = {}  # of the messages that are out, by their ids
-        self._activations = dict(activations)
+        self._losses = dict(losses)
         self._due: dict[int, float] = {}  # of nodes that were asked: when they are to be asked again
         self._lost: dict[int, float] = {}  # since when nodes are not available
 
@@ -256,12 +331,12 @@ class _Exchange:
         self._lost.setdefault(node, time.monotonic())
         self._due[node] = time.monotonic() + PAUSE_S
 
-    def notice(self, activations: Mapping[int, int]) -> None:
-        """Note that nodes have come in anew: what they were asked is forgotten."""
-        for node, count in activations.items():
-            if count > self._activations.get(node, count) and node in self._due:
-                self._due[node] = 0.0
-        self._activations = dict(activations)
+    def notice(self, losses: Mapping[int, int]) -> None:
+        """Note that nodes have lost something: they are asked again, and give the same answer."""
+        for node, count in losses.items():
+            if count > self._losses.get(node, count) and node in self._due:
+                self._due[node] = time.monotonic() + PAUSE_S
+        self._losses = dict(losses)
 
 
 @contextlib.contextmanager

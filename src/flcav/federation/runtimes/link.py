@@ -4,6 +4,7 @@ What crosses a link is lost where the network loses it, held to the budget where
 """
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -27,13 +28,13 @@ from flcav.federation.trainable import Trainable
 from flcav.interface.wording import suggest
 
 if TYPE_CHECKING:
-    from flcav.federation.runtimes.deployed import Deployment
+    from flcav.federation.runtimes.deployed import Deployment, RegionalDeployment
     from flcav.federation.runtimes.simulation import RaySimulation
     from flcav.federation.runtimes.topics import RosTopics
 
 RUNTIMES = "embedded", "ray", "flower"
 # where clients train, and how messages reach them
-Runtime = Union[ClientProcesses, "RaySimulation", "Deployment", "RosTopics"]
+Runtime = Union[ClientProcesses, "RaySimulation", "Deployment", "RegionalDeployment", "RosTopics"]
 
 
 @dataclass(frozen=True)
@@ -103,13 +104,18 @@ def open_processes(clients: Mapping[str, Trainable], count: int) -> Iterator[Cli
 
 @contextlib.contextmanager
 def open_runtime(
-    name: str, clients: Mapping[str, Trainable], count: int, fleet: Path | None = None
+    name: str,
+    clients: Mapping[str, Trainable],
+    count: int,
+    fleet: Path | None = None,
+    vehicles: Mapping[str, int] = {},
 ) -> Iterator[Runtime | None]:
-    """Yield what `federate` takes as its `runtime`.
+    """Yield what `federate` takes as its `runtime` for clients of one region, or for those of each of several.
 
     embedded: messages within this process, and clients in `count` processes where these are several. ray: Flower's
-    simulation with `count` actors. flower: vehicles of the `fleet` that is up in this folder, or one that is brought
-    up on this machine for as long. Raises `InputError` for another name.
+    simulation with `count` actors. flower: vehicles of the `fleet` that is up in this folder, where each region of
+    `vehicles` has so many (see `RegionalDeployment`), or of one that is brought up on this machine for as long. Raises
+    `InputError` for another name.
     """
     match name:
         case "embedded":
@@ -120,12 +126,12 @@ def open_runtime(
 
             yield RaySimulation(count)
         case "flower":
-            from flcav.federation.runtimes.deployed import Deployment, start_fleet
+            from flcav.federation.runtimes.deployed import RegionalDeployment, region_of, start_fleet
 
             if fleet is not None:
-                yield Deployment(fleet)
+                yield RegionalDeployment(fleet, vehicles)
             else:
                 with start_fleet(len(clients)) as deployment:
-                    yield deployment
+                    yield RegionalDeployment(deployment.folder, Counter(map(region_of, clients)))
         case _:
             raise InputError(f"runtime '{name}': choose one of {', '.join(RUNTIMES)}{suggest(name, RUNTIMES)}")

@@ -52,7 +52,9 @@ class Assignment:
     state: dict[str, Weights] = field(default_factory=dict)  # what it has kept from earlier rounds
 
     def save(self, folder: Path) -> None:
-        """Write it to a vehicle's folder."""
+        """Write it to a vehicle's folder, without what is left there of earlier federations."""
+        for path in folder.glob(f"*.{STATE}"):
+            path.unlink(missing_ok=True)
         write_private(folder / ASSIGNMENT, pickle.dumps(self))
 
 

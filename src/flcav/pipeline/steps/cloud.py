@@ -13,9 +13,8 @@ from flcav.federation.edge_server import EdgeServer, afford_cloud_rounds, edge_s
 from flcav.federation.rounds import federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.runtimes.link import open_processes
+from flcav.federation.runtimes.link import Runtime, open_runtime
 from flcav.federation.runtimes.metered import Account, Outage
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.runtimes.ros_names import join_names
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
@@ -153,12 +152,12 @@ class CloudFederation:
         account: Account,
         done: int,
         states: Mapping[str, FederationState],
-        runtime: ClientProcesses | None,
+        runtime: Runtime | None,
         buffers: Mapping[str, Buffers] = {},
     ) -> dict[str, EdgeServer]:
         """Return the edge servers by region, after `done` cloud rounds; `states` are their own.
 
-        The vehicles of one after another train, in the processes of `runtime`.
+        The vehicles of one after another train, where `runtime` says.
         """
         return {
             region: EdgeServer(
@@ -187,13 +186,16 @@ def federate_cloud(
     *,
     buffers: Mapping[str, Buffers] = {},
     processes: int = 1,
+    runtime: str = "embedded",
+    fleet: Path | None = None,
+    vehicles: Mapping[str, int] = {},
 ) -> tuple[float | None, ...]:
     """Run stage III; write weights and ledger, return each round's loss.
 
     Edge rounds are run by `rules`, and lose the vehicles that `outages` names; the cloud's rounds need all edge
     servers. Where rules make arrays personal, the weights have the mean of the regions' own, and each region's model is
     beside them, as are regional models. A privacy budget may end it before `rounds`. The vehicles of one region after
-    another train, in so many `processes`.
+    another train, in so many `processes` of a `runtime` of `RUNTIMES`: `fleet` and `vehicles` as in `open_runtime`.
     """
     own, learning, task = federation, federation.learning, federation.learning.task
     state, states = FederationState(), {region: FederationState() for region in federation.regions}
@@ -216,8 +218,8 @@ def federate_cloud(
     schedule = learning.schedule(rounds, learning.training.local_steps, CLOUD, "", earlier=earlier, restart=own.rate)
     wireless = Account(own.book, CLOUD, task.name, "wireless", outages)
     everybody = {name: client for region in own.regions for name, client in own.vehicles(region).items()}
-    with checkpoints.refusals(), open_processes(everybody, processes) as runtime:
-        servers = own.open_servers(rules, wireless, done, states, runtime, buffers)
+    with checkpoints.refusals(), open_runtime(runtime, everybody, processes, fleet, vehicles) as where:
+        servers = own.open_servers(rules, wireless, done, states, where, buffers)
         federate(
             {**servers, **own.open_replay()},
             start,
@@ -308,10 +310,12 @@ class _Servers:
         return sum(len(start.clients) for start in self.starts.values())
 
 
-def cloud_step(work: Work, settings: CloudSettings, processes: int = 1) -> None:
+def cloud_step(
+    work: Work, settings: CloudSettings, processes: int = 1, runtime: str = "embedded", fleet: str = ""
+) -> None:
     """Run stage III of a task: the edge servers of all regions federate with the cloud, vehicles with edge servers.
 
-    Vehicles train in so many `processes`.
+    Vehicles train in so many `processes` of a `runtime`, or in the `fleet` of this folder.
     """
     first, task, learning = settings.first, settings.learning.task, settings.learning.resolve()
     noise = StageResult.load(work.inputs[next(iter(settings.edges.values()))]).noise
@@ -325,9 +329,9 @@ def cloud_step(work: Work, settings: CloudSettings, processes: int = 1) -> None:
     servers = _open_servers(work, settings, learning, start.config, rounds, book)
     federation = _open_federation(work, settings, learning, start, servers, book)
     driven = _drive(work, settings, federation, plan.tasks[task])
-    losses = federate_cloud(
-        federation, rounds, driven.rules, driven.outages, buffers=driven.buffers, processes=processes
-    )
+    where: Any = {"processes": processes, "runtime": runtime, "vehicles": settings.vehicles}
+    where["fleet"] = Path(fleet) if fleet else None
+    losses = federate_cloud(federation, rounds, driven.rules, driven.outages, buffers=driven.buffers, **where)
     StageResult(
         stage=CLOUD,
         task=task,

@@ -131,13 +131,14 @@ def federate_edge(
     runtime: str = "embedded",
     timed: bool = False,
     fleet: Path | None = None,
+    vehicles: Mapping[str, int] = {},
 ) -> tuple[float | None, ...]:
     """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
 
     A privacy budget may end it before the schedule's end, and of asynchronous rounds, `buffers`, each budget. Vehicles
     train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights; where that is `timed`, their times
     are kept, see `read_times`, unless nobody is to know who was drawn. The vehicles that `outages` name by round are
-    lost in it.
+    lost in it. `fleet` and `vehicles` are those of `open_runtime`.
     """
     own, learning, state = federation, federation.learning, FederationState()
     checkpoints = FederationCheckpoints(
@@ -163,7 +164,7 @@ def federate_edge(
             own.watch.note(load_file(round_path(own.folder, number)))
     with (
         checkpoints.refusals(),
-        open_runtime(runtime, clients, processes, fleet) as where,
+        open_runtime(runtime, clients, processes, fleet, vehicles) as where,
         contextlib.suppress(Levelled),
     ):
         if own.watch is not None and own.watch.over:
@@ -271,7 +272,7 @@ def edge_step(
     if called is not None and called.group.lead in called.vehicles:  # ad hoc
         terms = follow_leads(called.vehicles, called.group.lead, driven.records, inputs.region)
         federation, called = replace(federation, terms=terms), replace(called, terms=terms)
-    where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
+    where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed), "vehicles": settings.vehicles}
     where["fleet"] = Path(fleet) if fleet else None
     losses = federate_edge(federation, driven.rules, driven.outages, buffers=driven.buffers, **where)
     clients, labels = federation.clients, None

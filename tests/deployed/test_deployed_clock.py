@@ -1,0 +1,57 @@
+"""A node whose clock is a day off is refused by Flower, is named, and comes in once the clock is corrected."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from flcav.federation.fleet.authority import open_authority
+from flcav.federation.fleet.bundle import TRUSTED
+from flcav.federation.fleet.install import install_vehicle
+from flcav.federation.fleet.keys import AUTHORITY, request_certificate
+from flcav.federation.fleet.status import read_status
+from flcav.federation.fleet.up import read_ready
+
+HERE, LIMIT_S = Path(__file__).parent, 180.0
+NAME = "without-clock"  # after all others: no federation of other tests has it
+
+
+def wait(done):
+    end = time.monotonic() + LIMIT_S
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.2)
+
+
+@pytest.mark.parametrize(("ahead_s", "told"), [(86400, "ahead"), (-86400, "behind")])
+def test_clock_of_a_node_a_day_off(ahead_s, told, deployment, tmp_path):
+    fleet, own, clock = deployment.folder, tmp_path / "vehicle", tmp_path / "clock"
+    authority, name = open_authority(fleet), f"{NAME}-{told}"
+    (tmp_path / "vehicle.crt").write_bytes(authority.register(request_certificate(own, name)))
+    proxy = read_ready(fleet).proxy
+    install_vehicle(own, tmp_path / "vehicle.crt", fleet / AUTHORITY, fleet / TRUSTED, proxy)
+    clock.write_text(str(ahead_s))
+
+    def is_named():
+        of_clock = [each for each in read_status(fleet).refused if each.startswith(f"{name}: ") and "clock" in each]
+        return any(each.endswith(f"s {told}") for each in of_clock)
+
+    def is_online():
+        return next(each for each in read_status(fleet).vehicles if each.name == name).online
+
+    process = subprocess.Popen(
+        [sys.executable, str(HERE / "run_late_vehicle.py"), str(own), str(clock)], start_new_session=True
+    )
+    try:
+        wait(is_named)
+        assert not is_online()
+        clock.write_text("0")
+        wait(is_online)
+    finally:
+        authority.registry.revoke(name)
+        os.kill(process.pid, signal.SIGTERM)
+        process.wait(30)
