@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import check_finite
+from flcav.cli.options import check_finite, parse_axes
 from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
 from flcav.config import InputError
 from flcav.interface.extras import format_install_command
@@ -104,6 +104,12 @@ def verify(
         0.03, "--margin", min=1e-4, max=0.5, callback=check_finite, help="By which AP50 may be lower on the whole."
     ),
     frames: int | None = typer.Option(None, "--frames", min=1, help="Most frames of each dataset; by default all."),
+    odd: str = typer.Option(
+        "urban", "--odd", help="Operational design domain, by name or as an OpenODD file: how much of it is tested."
+    ),
+    by: str = typer.Option(
+        "junction,visibility", "--by", metavar="X,Y", help="Two attributes of the domain, whose cells are slices."
+    ),
     jobs: int = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each."),
     as_json: bool = AS_JSON,
 ) -> None:
@@ -118,7 +124,17 @@ def verify(
 
     use_threads(1)
     with show_progress("verify") as report:
-        found = verify_candidate(candidate, driving, data, margin=margin, most=frames, jobs=jobs, progress=report)
+        found = verify_candidate(
+            candidate,
+            driving,
+            data,
+            margin=margin,
+            most=frames,
+            odd=odd,
+            by=parse_axes(by),
+            jobs=jobs,
+            progress=report,
+        )
     write_verification(candidate, found)
     _draw_page(candidate, [])
     if as_json:

@@ -10,12 +10,15 @@ from release_parties import Parties
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
+from flcav.perception.metrics import average_precision, match
+from flcav.perception.objects.evaluate import split_parts
 from flcav.perception.objects.truth import FrameTruth
 from flcav.releases.candidates.candidate import CARD, WEIGHTS, DataHash, read_candidate
 from flcav.releases.verification import verify
+from flcav.releases.verification.comparison import pair_slices
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.files import find_faults, find_overlap
-from flcav.releases.verification.records import Verification, VerificationData
+from flcav.releases.verification.records import OddCoverage, Verification, VerificationData, VerifiedDomain
 from flcav.releases.verification.testing import ConditionResults, VerificationFrame
 from flcav.releases.verification.verify import decide, read_verification, write_verification
 from flcav.sensors.frame import Frame
@@ -66,7 +69,8 @@ def run(
         if change is not None:
             boxes = [change(one, truth) for one, truth in zip(boxes, truths, strict=True)]
         frames = tuple(
-            VerificationFrame(Path("d"), number, "grid", "everyday traffic") for number in range(len(truths))
+            VerificationFrame(Path("d"), number, "grid", "everyday traffic", ("none", "crossroad")[number % 2])
+            for number in range(len(truths))
         )
         results[name] = ConditionResults(frames, tuple(boxes), tuple(truths))
     return results
@@ -146,6 +150,33 @@ def test_what_is_lost_refuses_by_name(change: Change, lost: str):
         assert found.whole.candidate == pytest.approx(found.whole.driving, abs=0.02)
 
 
+def test_slices_are_matched_as_the_evaluation_of_objects_matches_them():
+    tested, other = run(1, found=0.7)[PLAIN], run(1)[PLAIN]
+    known = {
+        (part.by, part.name): part
+        for part in split_parts(tested.detections, tested.truths)
+        if part.by in ("distance", "occlusion")
+    }
+    pairs = {(pair.by, pair.name): pair for pair in pair_slices(other, tested)}
+    once = np.ones((1, len(tested.truths)), np.int64)
+    for key, part in known.items():
+        each = []
+        for label in ("Car", "Pedestrian"):
+            wanted = [
+                truth.targets[inside & (truth.targets.label == label)]
+                for truth, inside in zip(tested.truths, part.wanted, strict=True)
+            ]
+            others = [
+                truth.targets[~inside & (truth.targets.label == label)]
+                for truth, inside in zip(tested.truths, part.wanted, strict=True)
+            ]
+            found = [boxes[boxes.label == label] for boxes in part.detections]
+            if sum(map(len, wanted)):
+                each.append(average_precision(match(found, wanted, others, 0.5)))
+        if each:
+            assert pairs[key].candidate(once)[0] == pytest.approx(np.mean(each), abs=1e-12), key
+
+
 def test_few_scenes_decide_nothing_and_say_how_many_would():
     whole = judge(run(3, scenes=4), scenes=4).whole
     assert whole is not None
@@ -184,9 +215,9 @@ def test_an_own_class_without_objects_is_undecided():
 
 
 def describe(_: ConditionResults):
-    from flcav.releases.verification.records import Domain
-
-    return Domain(("grid",), ("everyday traffic",), ("clear",), None, None, None, (0, 1), (0, 1), {}, ("lidar",))
+    odd = OddCoverage("urban", None, ("junction", "visibility"), {"inside": 24}, 0.5, {})
+    own = (("grid",), ("everyday traffic",), ("clear",), None, None, None, (0, 1), (0, 1), {}, ("lidar",))
+    return VerifiedDomain(*own, odd)
 
 
 def test_scenes_of_the_training_are_found_by_manifest_and_by_town_and_seed():

@@ -1,6 +1,7 @@
 """Verification of a candidate: its files, non-inferiority on the whole, and guards against catastrophes."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,20 +10,16 @@ from flcav.config import InputError, read_json
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
+from flcav.odd.domain import read_domain
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
 from flcav.releases.verification.comparison import KEPT, LEAST_TARGETS, LEVEL, compare, pair_slices, pair_whole
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
+from flcav.releases.verification.domain import BY, ODD, describe_domain, find_cells
 from flcav.releases.verification.files import describe_data, find_faults
-from flcav.releases.verification.records import Comparison, Domain, Verification, VerificationData
-from flcav.releases.verification.testing import (
-    ConditionResults,
-    VerificationFrame,
-    choose_test_frames,
-    describe_domain,
-    run_tests,
-)
+from flcav.releases.verification.records import Comparison, Verification, VerificationData, VerifiedDomain
+from flcav.releases.verification.testing import ConditionResults, VerificationFrame, choose_test_frames, run_tests
 from flcav.statistics.power import plan_scenes
 from flcav.storage.files import sha256, write_json
 
@@ -38,6 +35,8 @@ def verify(
     *,
     margin: float = MARGIN,
     most: int | None = None,
+    odd: str | Path = ODD,
+    by: Sequence[str] = BY,
     jobs: int = 1,
     known: Results | None = None,
     progress: Report = ignore_progress,
@@ -50,6 +49,8 @@ def verify(
         data: datasets of scenes that no network was trained on.
         margin: by which AP50 may be lower on the whole.
         most: frames of each dataset at most; None: all.
+        odd: operational design domain, by name or as an OpenODD file, whose coverage is told.
+        by: two attributes of it: a cell is a bucket of each, and a slice.
         jobs: worker processes.
         known: results of the driving network on the same frames, from an earlier verification.
         progress: callback for the tests done and in total.
@@ -60,10 +61,12 @@ def verify(
     candidate = read_candidate(folder)
     if candidate.task != OBJECTS.name:
         raise InputError(f"{folder}: a network of '{candidate.task}', and those of '{OBJECTS.name}' are verified")
-    network = load_network(OBJECTS, driving)
+    network, allowed = load_network(OBJECTS, driving), read_domain(odd)
     frames = choose_test_frames(data, network, most)
     if not frames:
         raise InputError(f"no frame to verify with in {', '.join(map(str, data))}")
+    cells, coverage = find_cells(frames, allowed, by)
+    frames = tuple(replace(frame, cell=cell) for frame, cell in zip(frames, cells, strict=True))
     tested = [_describe(path, frames) for path in data]
     faults = list(find_faults(folder, candidate, driving, tested))
     if faults:
@@ -71,7 +74,9 @@ def verify(
     own = [] if known is not None else [driving]
     results = run_tests([*own, folder / WEIGHTS], frames, jobs=jobs, progress=progress)
     old, new = known if known is not None else results[0], results[-1]
-    domain = describe_domain(frames, old[PLAIN].truths, network.config.classes)
+    if not any(len(truth.targets) for truth in new[PLAIN].truths):
+        raise InputError(f"no object to be found in {', '.join(map(str, data))}")
+    domain = describe_domain(frames, new[PLAIN].truths, network.config.classes, coverage)
     return decide(candidate, old, new, tested, domain, margin)
 
 
@@ -80,7 +85,7 @@ def decide(
     driving: Results | None,
     new: Results | None,
     data: Sequence[VerificationData],
-    domain: Domain | None,
+    domain: VerifiedDomain | None,
     margin: float = MARGIN,
     faults: Sequence[str] = (),
 ) -> Verification:
@@ -91,12 +96,14 @@ def decide(
     guards: list[Comparison] = []
     if driving is not None and new is not None:
         whole, error = compare(pair_whole(driving[PLAIN], new[PLAIN]))
-        guards = _guard(driving, new)
-        reasons += [
-            f"{each.by} {each.name} lost: {each.driving:.3f} -> {each.candidate:.3f}"
-            for each in guards
-            if each.judgement == "lost"
-        ]
+        for guard, spread in _guard(driving, new):
+            guards.append(guard)
+            fell = f"{guard.by} {guard.name} {{}}: {guard.driving:.3f} -> {guard.candidate:.3f}"
+            if guard.judgement == "lost":
+                reasons.append(fell.format("lost"))
+            elif guard.judgement == "doubted":
+                open_reasons.append(fell.format("may be lost"))
+                wanted = max(wanted, _frames(KEPT * guard.driving - guard.candidate, spread, frames, scenes))
         for label, count in domain.objects.items() if domain is not None else ():
             if count < LEAST_TARGETS:
                 open_reasons.append(f"{plural(count, 'object')} of the class {label}, and {LEAST_TARGETS} are wanted")
@@ -106,9 +113,9 @@ def decide(
         if not whole.high >= -margin:
             reasons.append(said)
         elif not whole.low > -margin:
-            enough = plan_scenes(change + margin, error, scenes, LEVEL)
-            wanted = max(wanted, 0 if enough is None else int(np.ceil(enough * frames / scenes)))
-            open_reasons.append(said if enough is not None else f"{said}: no number of frames would accept this")
+            enough = _frames(change + margin, error, frames, scenes)
+            wanted = max(wanted, enough)
+            open_reasons.append(said if enough else f"{said}: no number of frames would accept this")
     return Verification(
         candidate=candidate.weights,
         driving=candidate.driving,
@@ -143,10 +150,17 @@ def read_verification(folder: Path) -> Verification:
     return found
 
 
-def _guard(driving: Results, new: Results) -> list[Comparison]:
+def _guard(driving: Results, new: Results) -> list[tuple[Comparison, float]]:
+    """Return the comparison of each slice, and its standard error."""
     pairs = [*pair_slices(driving[PLAIN], new[PLAIN])]
     pairs += [pair_whole(driving[name], new[name], "condition", name) for name in CONDITIONS if name in new]
-    return [compare(pair, GUARD_REDRAWS)[0] for pair in pairs if pair.targets >= LEAST_TARGETS]
+    return [compare(pair, GUARD_REDRAWS) for pair in pairs if pair.targets >= LEAST_TARGETS]
+
+
+def _frames(effect: float, error: float, frames: int, scenes: int) -> int:
+    """Return the number of frames that tell an effect; 0 where no number does."""
+    enough = plan_scenes(effect, error, scenes, LEVEL)
+    return 0 if enough is None else int(np.ceil(enough * frames / scenes))
 
 
 def _describe(path: Path, frames: Sequence[VerificationFrame]) -> VerificationData:

@@ -19,8 +19,8 @@ GROUPS = {
     "condition": "Conditions of the sensor",
     "measure": "Other measures",
 }
-MEANINGS = {"kept": "kept", "lost": "lost", "open": "not told"}
-STATES = {"kept": "held", "lost": "did-not-hold", "open": "undecided"}  # classes of style
+MEANINGS = {"kept": "kept", "lost": "lost", "doubted": "in doubt", "open": "not told"}
+STATES = {"kept": "held", "lost": "did-not-hold", "doubted": "did-not-hold", "open": "undecided"}  # classes of style
 
 
 def release_page(
