@@ -84,9 +84,9 @@ def prepare(out: Path) -> dict[str, Dataset]:
     return {name: Dataset.open(out / name) for name in RECORDED}
 
 
-def keep(trained: Second, path: Path, data: Dataset, seed: int, **fields: object) -> None:
+def keep(trained: Second, path: Path, dataset: Dataset, seed: int, **fields: object) -> None:
     """Write a network with its card."""
-    chosen = choose_frames(OBJECTS, pillars_config(CLASSES, GROUND_M), data)
+    chosen = choose_frames(OBJECTS, pillars_config(CLASSES, GROUND_M), dataset)
     card = Card(
         task="objects",
         network="pillars",
@@ -94,7 +94,7 @@ def keep(trained: Second, path: Path, data: Dataset, seed: int, **fields: object
         seed=seed,
         samples=len(chosen.frames),
         training={"steps": 0, "loss": 0.0, "scores": []},
-        data=(data_entry(data, chosen),),
+        data=(data_entry(dataset, chosen),),
         metrics={},
     )
     save_network(OBJECTS, trained.eval(), path, card.model_copy(update=fields))

@@ -15,7 +15,7 @@ from flcav.perception.objects.evaluate import split_parts
 from flcav.perception.objects.truth import FrameTruth
 from flcav.releases.candidates.candidate import CARD, WEIGHTS, DataHash, read_candidate
 from flcav.releases.verification import verify
-from flcav.releases.verification.comparison import pair_slices
+from flcav.releases.verification.comparison import measure_results, pair_slices
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.files import find_faults, find_overlap
 from flcav.releases.verification.records import OddCoverage, Verification, VerificationData, VerifiedDomain
@@ -157,7 +157,7 @@ def test_slices_are_matched_as_the_evaluation_of_objects_matches_them():
         for part in split_parts(tested.detections, tested.truths)
         if part.by in ("distance", "occlusion")
     }
-    pairs = {(pair.by, pair.name): pair for pair in pair_slices(other, tested)}
+    pairs = {(pair.by, pair.name): pair for pair in pair_slices(measure_results(other), measure_results(tested))}
     once = np.ones((1, len(tested.truths)), np.int64)
     for key, part in known.items():
         each = []

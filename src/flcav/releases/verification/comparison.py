@@ -73,32 +73,37 @@ def compare(pair: Pair, redraws: int = REDRAWS) -> tuple[Comparison, float]:
     return Comparison(pair.by, pair.name, pair.targets, pair.scenes, old, new, *bounds, judgement), error
 
 
-def pair_whole(driving: ConditionResults, candidate: ConditionResults, by: str = "whole", name: str = "AP50") -> Pair:
+@dataclass(frozen=True)
+class Measured:
+    """Results of a network, with the overlaps frame by frame of each class with targets."""
+
+    tested: ConditionResults
+    overlaps: dict[str, list[Overlaps]]
+
+
+def measure_results(tested: ConditionResults) -> Measured:
+    """Return results with the overlaps of all detections, which every slice is matched from."""
+    labels = sorted({str(label) for truth in tested.truths for label in truth.targets.label})
+    pairs = [*zip(tested.detections, tested.truths, strict=True)]
+    return Measured(tested, {label: [measure_overlaps(*pair, label) for pair in pairs] for label in labels})
+
+
+def pair_whole(driving: Measured, candidate: Measured, by: str = "whole", name: str = "AP50") -> Pair:
     """Return the pair of the mean AP50 over classes on all frames."""
-    sides = (_match(_measure(tested)) for tested in (driving, candidate))
-    return _pair(by, name, *sides, driving)
+    return _pair(by, name, _match(driving), _match(candidate), driving)
 
 
-def pair_slices(driving: ConditionResults, candidate: ConditionResults) -> Iterator[Pair]:
+def pair_slices(driving: Measured, candidate: Measured) -> Iterator[Pair]:
     """Yield the pairs by class, distance, occlusion, weather, scenario, town and cell of the domain, and by measure."""
-    measured = [_measure(tested) for tested in (driving, candidate)]
-    old, new = (_match(each) for each in measured)
+    both = (driving, candidate)
+    old, new = (_match(each) for each in both)
     for label in old:
         yield _pair("class", label, {label: old[label]}, {label: new[label]}, driving)
-    for by, name, wanted, within in _ranges(driving):
-        sides = [
-            _match(
-                each,
-                0.5,
-                wanted,
-                None if within is None else [_between(_distance(b), *within) for b in tested.detections],
-            )
-            for each, tested in zip(measured, (driving, candidate), strict=True)
-        ]
-        yield _pair(by, name, *sides, driving)
-    for by, name, frames in _groups(candidate):
+    for by, name, wanted, within in _ranges(driving.tested):
+        yield _pair(by, name, *(_match(each, 0.5, wanted, within) for each in both), driving)
+    for by, name, frames in _groups(candidate.tested):
         yield _pair(by, name, old, new, driving, frames)
-    yield _pair("measure", "AP70: accurate boxes", *(_match(each, 0.7) for each in measured), driving)
+    yield _pair("measure", "AP70: accurate boxes", *(_match(each, 0.7) for each in both), driving)
     yield _pair("measure", "AOS: right headings", old, new, driving, measure=_orientation)
     yield _pair("measure", f"found from score {THRESHOLD:g} on", old, new, driving, measure=_recall)
     yield _pair("measure", f"right from score {THRESHOLD:g} on", old, new, driving, measure=_precision)
@@ -136,21 +141,15 @@ def _between(value: Values, low: float, high: float) -> Mask:
     return (value >= low) & (value < high)
 
 
-def _measure(tested: ConditionResults) -> dict[str, list[Overlaps]]:
-    """Return the overlaps frame by frame of each class with targets."""
-    labels = sorted({str(label) for truth in tested.truths for label in truth.targets.label})
-    pairs = [*zip(tested.detections, tested.truths, strict=True)]
-    return {label: [measure_overlaps(boxes, truth, label) for boxes, truth in pairs] for label in labels}
-
-
 def _match(
-    measured: dict[str, list[Overlaps]],
+    measured: Measured,
     least: float = 0.5,
     wanted: Sequence[Mask] | None = None,
-    kept: Sequence[Mask] | None = None,
+    within: tuple[float, float] | None = None,
 ) -> dict[str, Matches]:
-    """Return the matches of each class."""
-    return {label: match_overlaps(each, least, wanted, kept) for label, each in measured.items()}
+    """Return the matches of each class; wanted: targets of a slice; within: distances of detections that count."""
+    kept = None if within is None else [_between(_distance(boxes), *within) for boxes in measured.tested.detections]
+    return {label: match_overlaps(each, least, wanted, kept) for label, each in measured.overlaps.items()}
 
 
 def _pair(
@@ -158,12 +157,12 @@ def _pair(
     name: str,
     old: dict[str, Matches],
     new: dict[str, Matches],
-    tested: ConditionResults,
+    driving: Measured,
     inside: Mask | None = None,
     measure: Callable[[Matches, Times], Values] = weighted_precision,
 ) -> Pair:
     """Return a pair over the classes with targets in the slice; inside: (F,) frames that are in it."""
-    scene = np.array([truth.scene for truth in tested.truths])
+    scene = np.array([truth.scene for truth in driving.tested.truths])
     counted = np.ones(len(scene), np.int64) if inside is None else inside.astype(np.int64)
 
     def mean(matches: dict[str, Matches]) -> Measure:

@@ -47,9 +47,8 @@ def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Seque
     if sha256(driving) != candidate.driving:
         yield f"it is proposed to replace another network than {driving}"
     yield from _compare_interfaces(network, now)
-    for name, values in network.named_buffers():
-        if name.endswith("variance") and bool((values < 0).any()):
-            yield f"a variance below 0 in '{name}': nothing that the network says is a number"
+    if below := [name for name, values in network.named_buffers() if "variance" in name and bool((values < 0).any())]:
+        yield f"a variance below 0 in '{below[0]}': nothing that the network says is a number"
     if not (folder / CARD).is_file() or (folder / CARD).read_text() != card.markdown():
         yield f"{CARD} is not the card in the weights: a card of other weights"
     if card.parameters != sum(each.numel() for each in network.parameters()):
@@ -74,7 +73,7 @@ def find_overlap(candidate: Candidate, tested: Sequence[VerificationData]) -> It
 
 
 def _fits_name(network: Second, name: str) -> bool:
-    """Return whether a network can be of the configuration called `name`: it has that one's layers, whatever its classes.
+    """Return whether a network can be of the configuration called `name`: its layers are, whatever its classes.
 
     A name that is none of flcav's is its owner's.
     """

@@ -1,7 +1,8 @@
 """Verification of a candidate: its files, non-inferiority on the whole, and guards against catastrophes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,16 @@ from flcav.odd.domain import read_domain
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
-from flcav.releases.verification.comparison import KEPT, LEAST_TARGETS, LEVEL, compare, pair_slices, pair_whole
+from flcav.releases.verification.comparison import (
+    KEPT,
+    LEAST_TARGETS,
+    LEVEL,
+    Measured,
+    compare,
+    measure_results,
+    pair_slices,
+    pair_whole,
+)
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.domain import BY, ODD, describe_domain, find_cells
 from flcav.releases.verification.files import describe_data, find_faults
@@ -95,8 +105,9 @@ def decide(
     whole: Comparison | None = None
     guards: list[Comparison] = []
     if driving is not None and new is not None:
-        whole, error = compare(pair_whole(driving[PLAIN], new[PLAIN]))
-        for guard, spread in _guard(driving, new):
+        plain = measure_results(driving[PLAIN]), measure_results(new[PLAIN])
+        whole, error = compare(pair_whole(*plain))
+        for guard, spread in _guard(*plain, driving, new):
             guards.append(guard)
             fell = f"{guard.by} {guard.name} {{}}: {guard.driving:.3f} -> {guard.candidate:.3f}"
             if guard.judgement == "lost":
@@ -150,11 +161,16 @@ def read_verification(folder: Path) -> Verification:
     return found
 
 
-def _guard(driving: Results, new: Results) -> list[tuple[Comparison, float]]:
-    """Return the comparison of each slice, and its standard error."""
-    pairs = [*pair_slices(driving[PLAIN], new[PLAIN])]
-    pairs += [pair_whole(driving[name], new[name], "condition", name) for name in CONDITIONS if name in new]
-    return [compare(pair, GUARD_REDRAWS) for pair in pairs if pair.targets >= LEAST_TARGETS]
+def _guard(old: Measured, new: Measured, driving: Results, candidate: Results) -> Iterator[tuple[Comparison, float]]:
+    """Yield the comparison of each slice and each condition of the sensor, and its standard error."""
+    conditions = (
+        pair_whole(measure_results(driving[name]), measure_results(candidate[name]), "condition", name)
+        for name in CONDITIONS
+        if name in candidate
+    )
+    for pair in chain(pair_slices(old, new), conditions):
+        if pair.targets >= LEAST_TARGETS:
+            yield compare(pair, GUARD_REDRAWS)
 
 
 def _frames(effect: float, error: float, frames: int, scenes: int) -> int:
