@@ -52,4 +52,5 @@ def recorded_frame() -> Frame:
         occlusion=np.zeros(1),
     )
     points = rng.uniform(-20, 20, (500, 4)).astype(np.float32)
+    points[:, 3] = 0.5
     return Frame("s", 0, 0.0, "cav0", np.eye(4), mounts, mounts, {"lidar": points}, known)

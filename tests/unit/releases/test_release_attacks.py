@@ -341,7 +341,7 @@ def test_what_each_stolen_key_can_do(parties: Parties, stolen: str):
     assert (drives(parties) == 2) == other_choice
     evil = parties.folder / "evil"
     shutil.copytree(parties.candidate(2), evil)
-    described = read_candidate(evil).model_copy(update={"release": 3})
+    described = read_candidate(evil).model_copy(update={"release": 3, "rolls_back": 2})
     (evil / CANDIDATE).write_text(described.model_dump_json())
     for party, keys in (("image", provider), ("director", customer)):
         directive = Directive(release=3, share_ppm=ALL) if party == "director" else None

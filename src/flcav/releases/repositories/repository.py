@@ -321,14 +321,22 @@ def _stage(
 
 
 def _check_rising(out: Path, candidate: Candidate, files: Mapping[str, "TargetFile"]) -> None:
+    """Raise `InputError` for a number that does not rise, and for earlier weights that are no roll-back to them."""
     known = load_targets(out).signed.targets
     if all(name in known and known[name].hashes == file.hashes for name, file in files.items()):
         return
-    latest = max(list_releases(known, candidate.task), default=0)
-    if candidate.release <= latest:
+    releases = list_releases(known, candidate.task)
+    if releases and candidate.release <= releases[-1]:
         raise InputError(
-            f"{out}: release {candidate.release} of {candidate.task} does not rise above {latest}, which it names"
+            f"{out}: release {candidate.release} of {candidate.task} does not rise above {releases[-1]}, which it names"
         )
+    for number in releases:
+        weights = known[target_names(candidate.task, number)[0]]
+        if weights.hashes["sha256"] == candidate.weights and candidate.rolls_back is None:
+            raise InputError(
+                f"{out}: release {candidate.release} has the weights of release {number}; a roll-back says so "
+                "(`flcav release rollback`)"
+            )
 
 
 def _check_clock(out: Path, at: datetime) -> None:

@@ -151,13 +151,19 @@ def write_verification(folder: Path, verification: Verification) -> None:
 
 
 def read_verification(folder: Path) -> Verification:
-    """Return the verification in a candidate's folder; raises `InputError` for none, and one of other weights."""
+    """Return the verification in a candidate's folder.
+
+    Raises `InputError` for none, one of other weights, and one whose acceptance its own numbers contradict.
+    """
     path = folder / VERIFICATION
     if not path.is_file():
         raise InputError(f"{folder}: was not verified")
     found = Verification.from_json(read_json(path), str(path))
     if found.candidate != read_candidate(folder).weights or sha256(folder / WEIGHTS) != found.candidate:
         raise InputError(f"{path}: is the verification of other weights")
+    refuses = any(each.judgement in ("lost", "doubted") for each in found.guards)
+    if found.accepted and (found.whole is None or refuses or not found.whole.low > -found.margin):
+        raise InputError(f"{path}: says that the candidate is accepted, and its own numbers say that it is not")
     return found
 
 
