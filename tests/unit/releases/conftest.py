@@ -7,7 +7,8 @@ from release_parties import Parties, write_weights
 
 from flcav.geometry import Boxes, pose
 from flcav.releases.candidates.proposal import propose
-from flcav.releases.repositories.repository import create_repository, read_root
+from flcav.releases.repositories.creation import create_repository
+from flcav.releases.repositories.metadata import read_root
 from flcav.releases.vehicles.checking import trust_roots
 from flcav.sensors.frame import Annotations, Calibration, Frame
 

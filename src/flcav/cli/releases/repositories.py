@@ -38,7 +38,7 @@ def init(
     threshold: int = typer.Option(2, "--threshold", min=1, max=16, help="Signatures that a release needs."),
 ) -> None:
     """Create a party's keys and its empty repository of The Update Framework."""
-    from flcav.releases.repositories.repository import create_repository
+    from flcav.releases.repositories.creation import create_repository
 
     made = create_repository(out, party.value, keys, threshold)
     typer.echo(f"{out}: repository of the {party.value}, {threshold} of {plural(len(made), 'key')} sign a release")
@@ -65,7 +65,8 @@ def sign(
     """Acknowledge a verified candidate, and sign its place in the party's repository; `publish` makes it current."""
     from flcav.releases.candidates.acknowledgement import acknowledge
     from flcav.releases.repositories.directive import MILLION, Directive
-    from flcav.releases.repositories.repository import read_party, stage_release
+    from flcav.releases.repositories.metadata import read_party
+    from flcav.releases.repositories.repository import stage_release
     from flcav.releases.verification.verify import read_verification
 
     found, party = read_verification(candidate), read_party(repository)

@@ -21,8 +21,10 @@ from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import WEIGHTS, Candidate, check_files, read_candidate
+from flcav.releases.repositories.creation import create_repository
 from flcav.releases.repositories.directive import MILLION, Directive, is_assigned
-from flcav.releases.repositories.repository import create_repository, publish, read_root, stage_release
+from flcav.releases.repositories.metadata import read_root
+from flcav.releases.repositories.repository import publish, stage_release
 from flcav.releases.rollout.delivery import Delivered
 from flcav.releases.rollout.fleet import (
     Drive,

@@ -18,7 +18,8 @@ from flcav.releases.candidates.candidate import (
     read_candidate,
 )
 from flcav.releases.repositories.directive import MILLION, Directive
-from flcav.releases.repositories.repository import Staged, load_targets, read_directives, stage_directive
+from flcav.releases.repositories.metadata import load_targets, read_directives
+from flcav.releases.repositories.repository import Staged, stage_directive
 from flcav.releases.rollout.shadow import ShadowDecision
 from flcav.storage.files import write_json
 
