@@ -15,7 +15,7 @@ from flcav.perception.objects.evaluate import split_parts
 from flcav.perception.objects.truth import FrameTruth
 from flcav.releases.candidates.candidate import CARD, WEIGHTS, DataHash, read_candidate
 from flcav.releases.verification import verify
-from flcav.releases.verification.comparison import measure_results, pair_slices
+from flcav.releases.verification.comparison import Pair, compare, measure_results, pair_slices
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.files import find_faults, find_overlap
 from flcav.releases.verification.records import OddCoverage, Verification, VerificationData, VerifiedDomain
@@ -175,6 +175,46 @@ def test_slices_are_matched_as_the_evaluation_of_objects_matches_them():
                 each.append(average_precision(match(found, wanted, others, 0.5)))
         if each:
             assert pairs[key].candidate(once)[0] == pytest.approx(np.mean(each), abs=1e-12), key
+
+
+def test_a_class_that_is_never_found_any_more_refuses_however_weak_it_was():
+    def rare(boxes: Boxes, _: FrameTruth) -> Boxes:
+        """Pedestrians are found, but nowhere near one."""
+        away = np.where((boxes.label == "Pedestrian")[:, None], [0, 300, 0], 0)
+        return replace(boxes, center=boxes.center + away)
+
+    data = [VerificationData("d", "a" * 64, "grid", 1, SCENES * FRAMES, SCENES)]
+    driving = run(1, rare)
+    same, silent = (
+        decide(read_candidate_like(), driving, new, data, None) for new in (driving, run(1, without("Pedestrian")))
+    )
+    assert same.accepted
+    assert [each for each in silent.reasons if "never found" in each][0].startswith("class Pedestrian is never found")
+
+
+def pair_of(by: str, driving: list[float], candidate: list[float]) -> Pair:
+    """A pair whose measures are means of numbers of scenes."""
+
+    def mean(values: list[float]):
+        return lambda times: times @ np.array(values) / times.sum(axis=1)
+
+    return Pair(by, "x", mean(driving), mean(candidate), np.array(["a", "b", "c"]), 3, 50)
+
+
+@pytest.mark.parametrize(
+    ("by", "driving", "candidate", "judgement"),
+    [
+        ("class", [0.9, 0.2, 0.1], [0.1, 0.2, 0.1], "doubted"),  # falls in one scene of three: not told at .05
+        ("cell", [0.9, 0.2, 0.1], [0.1, 0.2, 0.1], "open"),
+        ("class", [0.04, 0.01, 0.0], [0.0, 0.01, 0.0], "open"),  # of which the driving network hardly finds any
+        ("class", [0.5, 0.5, 0.5], [0.3, 0.3, 0.3], "lost"),
+        ("class", [0.5, 0.5, 0.5], [0.45, 0.45, 0.45], "kept"),
+    ],
+)
+def test_a_class_of_which_less_than_half_is_left_is_in_doubt(
+    by: str, driving: list[float], candidate: list[float], judgement: str
+):
+    assert compare(pair_of(by, driving, candidate))[0].judgement == judgement
 
 
 def test_few_scenes_decide_nothing_and_say_how_many_would():

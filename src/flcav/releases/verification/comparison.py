@@ -4,7 +4,8 @@ The bootstrap draws whole scenes, the same for both networks. On the whole, non-
 JAMA 308, 2012): the lower bound of the difference at .05, one-sided, lies above minus the margin. Slices are many, so
 that the same claim would refuse good networks by chance: they guard against catastrophes alone. A slice is lost where
 the candidate keeps less than a share of the driving network's measure, and the test says so at .05. A class, a distance
-or a weather of which it keeps less than half is in doubt even where the test does not say so.
+or a weather of which it keeps less than half is in doubt even where the test does not say so. Where the driving network
+itself reaches next to nothing, shares of it are lost and won by chance: such a slice is not judged.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -28,6 +29,7 @@ from flcav.statistics.streams import stream
 LEVEL = 0.05  # one-sided
 KEPT = 0.8  # share of the driving network's measure that every slice keeps
 DOUBTED = 0.5  # share below which a slice of `FIRST` is in doubt
+LEAST_MEASURE = 0.05  # of the driving network in a slice that is judged
 FIRST = ("class", "distance", "weather")
 LEAST_TARGETS = 10  # of a slice that is compared
 Times = NDArray[np.int64]
@@ -63,7 +65,7 @@ def compare(pair: Pair, redraws: int = REDRAWS) -> tuple[Comparison, float]:
     known = np.isfinite(drawn[1] - drawn[0])
     before, after = drawn[0][known], drawn[1][known]
     judgement: Judgement = "open"
-    if len(after) and old > 0:
+    if len(after) and old >= LEAST_MEASURE:
         least, most = np.quantile(after - KEPT * before, (LEVEL, 1 - LEVEL))
         doubted = pair.by in FIRST and new < DOUBTED * old
         judgement = "lost" if most < 0 else "kept" if least >= 0 else "doubted" if doubted else "open"

@@ -1,5 +1,6 @@
 """Verification of a candidate: its files, non-inferiority on the whole, and guards against catastrophes."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -115,6 +116,7 @@ def decide(
             elif guard.judgement == "doubted":
                 open_reasons.append(fell.format("may be lost"))
                 wanted = max(wanted, _frames(KEPT * guard.driving - guard.candidate, spread, frames, scenes))
+        reasons += _find_silent(driving[PLAIN], new[PLAIN])
         for label, count in domain.objects.items() if domain is not None else ():
             if count < LEAST_TARGETS:
                 open_reasons.append(f"{plural(count, 'object')} of the class {label}, and {LEAST_TARGETS} are wanted")
@@ -177,6 +179,18 @@ def _guard(old: Measured, new: Measured, driving: Results, candidate: Results) -
     for pair in chain(pair_slices(old, new), conditions):
         if pair.targets >= LEAST_TARGETS:
             yield compare(pair, GUARD_REDRAWS)
+
+
+def _find_silent(driving: ConditionResults, candidate: ConditionResults) -> list[str]:
+    """Return a reason for each class that the candidate never finds, rightly or wrongly, and the driving one does."""
+    before, after = (
+        Counter(str(label) for boxes in tested.detections for label in boxes.label) for tested in (driving, candidate)
+    )
+    return [
+        f"class {label} is never found: {plural(count, 'detection')} before, none now"
+        for label, count in sorted(before.items())
+        if not after[label]
+    ]
 
 
 def _frames(effect: float, error: float, frames: int, scenes: int) -> int:
