@@ -162,7 +162,7 @@ EDITS: dict[str, Edit] = {
     "normalisation reset": set_statistics(0.0, 1.0),
     "a number that is none": spoil_numbers,
 }
-TRAININGS: dict[str, tuple[Spoil | None, str | None]] = {  # what becomes of a sample; the only weather, or None
+TRAININGS: dict[str, tuple[Spoil | None, str | None]] = {  # of a sample; the only weather, from the start
     "input in other units": (rescale, None),
     "labels elsewhere": (mislabel, None),
     "far objects as background": (beyond(20), None),

@@ -185,11 +185,9 @@ def test_a_class_that_is_never_found_any_more_refuses_however_weak_it_was():
 
     data = [VerificationData("d", "a" * 64, "grid", 1, SCENES * FRAMES, SCENES)]
     driving = run(1, rare)
-    same, silent = (
-        decide(read_candidate_like(), driving, new, data, None) for new in (driving, run(1, without("Pedestrian")))
-    )
-    assert same.accepted
-    assert [each for each in silent.reasons if "never found" in each][0].startswith("class Pedestrian is never found")
+    assert decide(read_candidate_like(), driving, driving, data, None).accepted
+    silent = decide(read_candidate_like(), driving, run(1, without("Pedestrian")), data, None)
+    assert [each.partition(":")[0] for each in silent.reasons] == ["class Pedestrian is never found"]
 
 
 def pair_of(by: str, driving: list[float], candidate: list[float]) -> Pair:

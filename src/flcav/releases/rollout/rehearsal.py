@@ -59,11 +59,11 @@ class Turn:
     def describe(self) -> str:
         """Return the turn in words."""
         times = sorted(each.at_s for each in self.arrivals if each.at_s is not None)
-        after = f" after {float(np.median(times)):.2f} s, the last after {times[-1]:.2f} s" if times else ""
+        after = f", half of the new ones after {float(np.median(times)):.2f} s, all after {times[-1]:.2f} s"
         said = f"; {self.decision.describe()}" if self.decision is not None else ""
         return (
-            f"release {self.release}, {self.share:.0%} of the fleet: {self.reached} of "
-            f"{plural(self.assigned, 'vehicle')} have it{after}; {self.wireless_mb:.2f} MB wireless, "
+            f"release {self.release}, {self.share:.0%} of the fleet: reaches {self.reached} of "
+            f"{plural(self.assigned, 'vehicle')}{after if times else ''}; {self.wireless_mb:.2f} MB wireless, "
             f"{self.wireline_mb:.2f} MB wireline{said}"
         )
 
