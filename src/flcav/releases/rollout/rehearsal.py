@@ -59,11 +59,13 @@ class Turn:
     def describe(self) -> str:
         """Return the turn in words."""
         times = sorted(each.at_s for each in self.arrivals if each.at_s is not None)
-        after = f", half of the new ones after {float(np.median(times)):.2f} s, all after {times[-1]:.2f} s"
+        after = (
+            f", {len(times)} now, half of these by {np.median(times):.2f} s, all by {times[-1]:.2f} s" if times else ""
+        )
         said = f"; {self.decision.describe()}" if self.decision is not None else ""
         return (
             f"release {self.release}, {self.share:.0%} of the fleet: reaches {self.reached} of "
-            f"{plural(self.assigned, 'vehicle')}{after if times else ''}; {self.wireless_mb:.2f} MB wireless, "
+            f"{plural(self.assigned, 'vehicle')}{after}; {self.wireless_mb:.2f} MB wireless, "
             f"{self.wireline_mb:.2f} MB wireline{said}"
         )
 
