@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ class Drives:
     def __init__(self, seen: Frame) -> None:
         self.seen = seen
 
-    def describe(self) -> dict[str, object]:
+    def describe(self) -> dict[str, Any]:
         return {"town": "none", "split": "test", "seed": 0}
 
     def scenes(self) -> list[str]:

@@ -227,6 +227,13 @@ def test_few_scenes_decide_nothing_and_say_how_many_would():
     assert "frames would decide" in found.lines()[-1]
 
 
+def test_a_single_scene_accepts_nothing():
+    found = judge(run(1, scenes=1), scenes=1)
+    assert found.undecided
+    assert "1 scene, and 10 are wanted" in found.reasons
+    assert found.frames_to_decide == 10
+
+
 def test_retrainings_equal_to_the_driving_network_are_accepted_and_worse_ones_are_not():
     margin = 0.15  # of a network whose misses are drawn anew, on so few scenes
     assert judge(run(10), margin=margin).accepted

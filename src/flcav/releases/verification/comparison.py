@@ -3,9 +3,9 @@
 The bootstrap draws whole scenes, the same for both networks. On the whole, non-inferiority is claimed (Piaggio et al.,
 JAMA 308, 2012): the lower bound of the difference at .05, one-sided, lies above minus the margin. Slices are many, so
 that the same claim would refuse good networks by chance: they guard against catastrophes alone. A slice is lost where
-the candidate keeps less than a share of the driving network's measure, and the test says so at .05. A class, a distance
-or a weather of which it keeps less than half is in doubt even where the test does not say so. Where the driving network
-itself reaches next to nothing, shares of it are lost and won by chance: such a slice is not judged.
+the candidate keeps less than a share of the driving network's measure, and the test says so at .05. One of `FIRST` of
+which it keeps less than half is in doubt even where the test does not say so. Where the driving network itself reaches
+next to nothing, shares of it are lost and won by chance: such a slice is not judged.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -30,8 +30,9 @@ LEVEL = 0.05  # one-sided
 KEPT = 0.8  # share of the driving network's measure that every slice keeps
 DOUBTED = 0.5  # share below which a slice of `FIRST` is in doubt
 LEAST_MEASURE = 0.05  # of the driving network in a slice that is judged
-FIRST = ("class", "distance", "weather")
+FIRST = ("class", "distance", "weather", "scenario", "town")
 LEAST_TARGETS = 10  # of a slice that is compared
+LEAST_SCENES = 10  # of a verification: the bootstrap of fewer is too sure of itself
 Times = NDArray[np.int64]
 Values = NDArray[np.float64]
 Measure = Callable[[Times], Values]
@@ -102,10 +103,11 @@ def pair_slices(driving: Measured, candidate: Measured) -> Iterator[Pair]:
     for label in old:
         yield _pair("class", label, {label: old[label]}, {label: new[label]}, driving)
     for by, name, wanted, within in _ranges(driving.tested):
-        yield _pair(by, name, *(_match(each, 0.5, wanted, within) for each in both), driving)
+        sides = [_match(each, 0.5, wanted, within) for each in both]
+        yield _pair(by, name, sides[0], sides[1], driving)
     for by, name, frames in _groups(candidate.tested):
         yield _pair(by, name, old, new, driving, frames)
-    yield _pair("measure", "AP70: accurate boxes", *(_match(each, 0.7) for each in both), driving)
+    yield _pair("measure", "AP70: accurate boxes", _match(driving, 0.7), _match(candidate, 0.7), driving)
     yield _pair("measure", "AOS: right headings", old, new, driving, measure=_orientation)
     yield _pair("measure", f"found from score {THRESHOLD:g} on", old, new, driving, measure=_recall)
     yield _pair("measure", f"right from score {THRESHOLD:g} on", old, new, driving, measure=_precision)

@@ -52,7 +52,7 @@ def find_cells(
     axes = [full_name(domain, name) for name in by]
     folders = dict.fromkeys(each.data for each in frames)
     cells: dict[tuple[Path, int], str] = {}
-    counts = dict.fromkeys((INSIDE, OUTSIDE, UNKNOWN), 0)
+    counts: dict[str, int] = {INSIDE: 0, OUTSIDE: 0, UNKNOWN: 0}
     documents: dict[str, Document] = {}
     for number, folder in enumerate(folders):
         data = Dataset.open(folder, checked=False)
@@ -60,7 +60,8 @@ def find_cells(
         names = (" x ".join(cell) for cell in cells_of(domain, measured, axes))
         cells |= {(folder, frame): name for frame, name in zip(measured.frames, names, strict=True)}
         verdicts = judge(domain, measured)
-        counts = {verdict: count + verdicts.count(verdict) for verdict, count in counts.items()}
+        for verdict in counts:
+            counts[verdict] += verdicts.count(verdict)
         documents |= {f"{number}_{name}": run for name, run in collect_runs(domain, data, measured).items()}
     wanted = {*domain.tested, *axes}
     rows = [row for row in list_covered(merge_runs([*documents.values()])) if row.attribute in wanted]

@@ -18,6 +18,7 @@ from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
 from flcav.releases.verification.comparison import (
     KEPT,
+    LEAST_SCENES,
     LEAST_TARGETS,
     LEVEL,
     Measured,
@@ -121,6 +122,9 @@ def decide(
             if count < LEAST_TARGETS:
                 open_reasons.append(f"{plural(count, 'object')} of the class {label}, and {LEAST_TARGETS} are wanted")
                 wanted = max(wanted, -(-frames * LEAST_TARGETS // max(count, 1)))
+        if whole.scenes < LEAST_SCENES:
+            open_reasons.append(f"{plural(whole.scenes, 'scene')}, and {LEAST_SCENES} are wanted")
+            wanted = max(wanted, -(-frames * LEAST_SCENES // whole.scenes))
         change = whole.candidate - whole.driving
         said = f"AP50 on the whole {change:+.3f} ({whole.low:+.3f} to {whole.high:+.3f}), margin {margin:g}"
         if not whole.high >= -margin:
