@@ -234,6 +234,13 @@ def test_a_single_scene_accepts_nothing():
     assert found.frames_to_decide == 10
 
 
+def test_a_driving_network_that_finds_nothing_is_no_measure():
+    data = [VerificationData("d", "a" * 64, "grid", 1, SCENES * FRAMES, SCENES)]
+    nothing = run(1, found=0.0)
+    found = decide(read_candidate_like(), nothing, run(2), data, None)
+    assert found.reasons == ("AP50 0.000 of the network that drives: nothing that could be kept",)
+
+
 def test_retrainings_equal_to_the_driving_network_are_accepted_and_worse_ones_are_not():
     margin = 0.15  # of a network whose misses are drawn anew, on so few scenes
     assert judge(run(10), margin=margin).accepted

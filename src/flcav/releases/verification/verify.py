@@ -18,6 +18,7 @@ from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
 from flcav.releases.verification.comparison import (
     KEPT,
+    LEAST_MEASURE,
     LEAST_SCENES,
     LEAST_TARGETS,
     LEVEL,
@@ -122,6 +123,8 @@ def decide(
             if count < LEAST_TARGETS:
                 open_reasons.append(f"{plural(count, 'object')} of the class {label}, and {LEAST_TARGETS} are wanted")
                 wanted = max(wanted, -(-frames * LEAST_TARGETS // max(count, 1)))
+        if whole.driving < LEAST_MEASURE:
+            reasons.append(f"AP50 {whole.driving:.3f} of the network that drives: nothing that could be kept")
         if whole.scenes < LEAST_SCENES:
             open_reasons.append(f"{plural(whole.scenes, 'scene')}, and {LEAST_SCENES} are wanted")
             wanted = max(wanted, -(-frames * LEAST_SCENES // whole.scenes))
