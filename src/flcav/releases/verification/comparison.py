@@ -20,7 +20,7 @@ from flcav.perception.metrics import Matches, weighted_precision
 from flcav.perception.metrics.operating_point import DISTANCES_M
 from flcav.perception.objects.evaluate import BORDER_M, OCCLUSIONS
 from flcav.releases.verification.matching import Mask, Overlaps, match_overlaps, measure_overlaps
-from flcav.releases.verification.records import Comparison, Judgement
+from flcav.releases.verification.records import LEAST_MEASURE, Comparison, Judgement
 from flcav.releases.verification.testing import ConditionResults
 from flcav.statistics.bootstrap import REDRAWS, bootstrap_over_scenes
 from flcav.statistics.estimates import TAILS
@@ -29,7 +29,6 @@ from flcav.statistics.streams import stream
 LEVEL = 0.05  # one-sided
 KEPT = 0.8  # share of the driving network's measure that every slice keeps
 DOUBTED = 0.5  # share below which a slice of `FIRST` is in doubt
-LEAST_MEASURE = 0.05  # of the driving network in a slice that is judged
 FIRST = ("class", "distance", "weather", "scenario", "town")
 LEAST_TARGETS = 10  # of a slice that is compared
 LEAST_SCENES = 10  # of a verification: the bootstrap of fewer is too sure of itself

@@ -7,6 +7,7 @@ from typing import Literal
 from flcav.interface.wording import plural
 from flcav.storage.records import Record
 
+LEAST_MEASURE = 0.05  # of the driving network in a slice that is judged
 Judgement = Literal["kept", "lost", "doubted", "open"]
 
 

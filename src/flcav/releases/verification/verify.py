@@ -18,7 +18,6 @@ from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
 from flcav.releases.verification.comparison import (
     KEPT,
-    LEAST_MEASURE,
     LEAST_SCENES,
     LEAST_TARGETS,
     LEVEL,
@@ -31,7 +30,13 @@ from flcav.releases.verification.comparison import (
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.domain import BY, ODD, describe_domain, find_cells
 from flcav.releases.verification.files import describe_data, find_faults
-from flcav.releases.verification.records import Comparison, Verification, VerificationData, VerifiedDomain
+from flcav.releases.verification.records import (
+    LEAST_MEASURE,
+    Comparison,
+    Verification,
+    VerificationData,
+    VerifiedDomain,
+)
 from flcav.releases.verification.testing import ConditionResults, VerificationFrame, choose_test_frames, run_tests
 from flcav.statistics.power import plan_scenes
 from flcav.storage.files import sha256, write_json

@@ -7,7 +7,7 @@ from typing import Any
 from flcav.releases.candidates.acknowledgement import Acknowledgement
 from flcav.releases.candidates.candidate import Candidate
 from flcav.releases.verification.conditions import WORDS
-from flcav.releases.verification.records import Comparison, OddCoverage, Verification
+from flcav.releases.verification.records import LEAST_MEASURE, Comparison, OddCoverage, Verification
 from flcav.report.pages import html
 
 GROUPS = {
@@ -21,6 +21,7 @@ GROUPS = {
     "condition": "Conditions of the sensor",
     "measure": "Other measures",
 }
+WEAK = "not judged"  # of which the driving network reaches next to nothing
 PARTIES = ("provider", "customer")
 MEANINGS = {"kept": "kept", "lost": "lost", "doubted": "in doubt", "open": "not told"}
 STATES = {"kept": "held", "lost": "did-not-hold", "doubted": "did-not-hold", "open": "undecided"}  # classes of style
@@ -42,7 +43,8 @@ def release_page(
         if any(each.by == by for each in verification.guards)
     }
     whole = None if verification.whole is None else _row(verification.whole)
-    left = [row for rows in groups.values() for row in rows if row["judgement"] in ("open", "doubted")]
+    every = [row for rows in groups.values() for row in rows]
+    left = [row for row in every if row["judgement"] in ("open", "doubted") and row["word"] != WEAK]
     values = {
         "candidate": candidate.model_dump(mode="json"),
         "verification": asdict(verification),
@@ -50,6 +52,7 @@ def release_page(
         "whole": whole,
         "scale": _scale(verification),
         "groups": groups,
+        "weak": [row for row in every if row["word"] == WEAK],
         "left": sorted(left, key=lambda row: row["low"]),
         "domain": None if verification.domain is None else _domain(verification),
         "hashes": hashes,
@@ -68,7 +71,7 @@ def _row(each: Comparison) -> dict[str, Any]:
         **asdict(each),
         "name": name,
         "change": change,
-        "word": MEANINGS[each.judgement],
+        "word": WEAK if each.driving < LEAST_MEASURE and each.judgement == "open" else MEANINGS[each.judgement],
         "state": STATES[each.judgement],
     }
 
@@ -103,7 +106,7 @@ def _domain(verification: Verification) -> list[tuple[str, str]]:
         ("towns", ", ".join(domain.towns)),
         ("scenarios", "; ".join(domain.scenarios).replace("_", " ")),
         ("weather", ", ".join(domain.weathers).replace("_", " ")),
-        *((name, f"{span[0]:g} to {span[1]:g} {unit}") for name, (span, unit) in spans.items() if span is not None),
+        *((name, f"{span[0]:.4g} to {span[1]:.4g} {unit}") for name, (span, unit) in spans.items() if span is not None),
         ("objects", ", ".join(f"{count} {label}" for label, count in domain.objects.items())),
         ("LiDARs", ", ".join(domain.lidars)),
         (f"OpenODD domain {domain.odd.domain}", _judged(domain.odd)),
