@@ -21,6 +21,7 @@ from flcav.releases.verification.files import find_faults, find_overlap
 from flcav.releases.verification.records import OddCoverage, Verification, VerificationData, VerifiedDomain
 from flcav.releases.verification.testing import ConditionResults, VerificationFrame
 from flcav.releases.verification.verify import decide, read_verification, write_verification
+from flcav.report.pages.release_page import release_page
 from flcav.sensors.frame import Frame
 from flcav.statistics.power import plan_scenes
 
@@ -188,6 +189,20 @@ def test_a_class_that_is_never_found_any_more_refuses_however_weak_it_was():
     assert decide(read_candidate_like(), driving, driving, data, None).accepted
     silent = decide(read_candidate_like(), driving, run(1, without("Pedestrian")), data, None)
     assert [each.partition(":")[0] for each in silent.reasons] == ["class Pedestrian is never found"]
+
+
+def test_the_page_says_what_was_not_tested_and_not_judged():
+    found = judge(run(1))
+    weak = replace(found.guards[0], name="Cyclist", driving=0.01, candidate=0.0, judgement="open")
+    domain = replace(
+        describe(run(1)[PLAIN]),
+        odd=OddCoverage("mine", None, ("a", "b"), {"inside": 3}, 0.5, {"gradient": ("[8, 12)",)}),
+    )
+    text = release_page(read_candidate_like(), replace(found, guards=(*found.guards, weak), domain=domain), {})
+    assert "hardly finds them itself: Cyclist (0.010, now 0.000)" in text
+    assert "gradient [8, 12)" in text
+    assert "frames 3 inside" in text
+    assert all(f"<b>{party}</b>: not yet" in text for party in ("provider", "customer"))
 
 
 def pair_of(by: str, driving: list[float], candidate: list[float]) -> Pair:
