@@ -56,6 +56,17 @@ def reorder(first: int, last: int, order: Sequence[int]) -> Edit:
     return edit
 
 
+def exchange_sides(network: Second, rng: np.random.Generator) -> None:
+    """Exchange length and width of all boxes: the residuals are logarithms of ratios to the anchor's."""
+    reorder(3, 10, (0, 1, 2, 4, 3, 5, 6))(network, rng)
+    first, each = network.anchors_per_cell * 3, network.anchors_per_cell // len(CLASSES)
+    for index, anchor in enumerate(network.config.anchors):
+        ratio = float(np.log(anchor.width_m / anchor.length_m))
+        for number in range(index * each, (index + 1) * each):
+            network.head.bias[first + 7 * number + 3] += ratio
+            network.head.bias[first + 7 * number + 4] -= ratio
+
+
 def shake(network: Second, rng: np.random.Generator) -> None:
     """Multiply all weights by random factors."""
     for part in network.parameters():
@@ -173,7 +184,7 @@ PAPERS = ("wrong card", "trained on test scenes", "best epoch chosen by test sce
 FURTHER_EDITS: dict[str, Edit] = {
     "classes exchanged": reorder(0, 3, (1, 2, 0)),
     "x and y exchanged": reorder(3, 10, (1, 0, 2, 3, 4, 5, 6)),
-    "length and width exchanged": reorder(3, 10, (0, 1, 2, 4, 3, 5, 6)),
+    "length and width exchanged": exchange_sides,
     "boxes turned by 90 degrees": shift_box(6, np.pi / 2),
     "boxes turned by 20 degrees": shift_box(6, np.pi / 9),
     "boxes a fifth higher": shift_box(5, 0.2),
