@@ -7,6 +7,7 @@ block of steps each, in turns, since other load only makes blocks slower.
 """
 
 import multiprocessing
+import os
 import sys
 import tempfile
 import time
@@ -21,10 +22,10 @@ from flcav.sensors.rig import lidar32
 from flcav.world.commands import Controls, Spawn
 from flcav.world.live import LiveWorld, Settings
 from flcav.world.map.town import Town, load_town
+from flcav.world.scenarios.stage import STEP_S
 from flcav.world.scene import Scene
-from flcav.world.traffic.live import write_job
-from flcav.world.traffic.live_process import LiveTraffic
-from flcav.world.traffic.sumo_process import STEP_S
+from flcav.world.traffic.live import write_live_job
+from flcav.world.traffic.simulation import Simulation
 
 TOWN = "grid"
 VEHICLES = 50
@@ -51,7 +52,9 @@ def run_alone(pipe: Connection, folder: str) -> None:
     """Run SUMO alone with the same traffic: so many seconds of it for each number that comes through the pipe."""
     import libsumo
 
-    sumo = LiveTraffic(libsumo, write_job(load_town(TOWN), Path(folder), seed=1, vehicles=VEHICLES, pedestrians=0)).sumo
+    job = write_live_job(load_town(TOWN), Path(folder), seed=1, vehicles=VEHICLES, pedestrians=0)
+    os.chdir(folder)
+    sumo = Simulation(libsumo, job).sumo
     while (time_s := pipe.recv()) > 0:
         for _ in range(round(time_s / STEP_S)):
             sumo.simulationStep()

@@ -28,7 +28,7 @@ def task_named(name: str) -> "Task":
 
     >>> from flcav import task_named
     >>> list(task_named("objects").configurations)  # networks, the default first
-    ['tiny', 'small', 'road', 'paper', 'pillars']
+    ['pillars', 'tiny', 'small', 'road', 'paper']
     """
     from flcav.perception.task import Task
 

@@ -23,11 +23,11 @@ from flcav.world.dynamics.contacts import Contacts, Footprints, find_overlaps, r
 from flcav.world.dynamics.obstacles import corners, join_footprints, list_obstacles, outline
 from flcav.world.dynamics.standing import Ground
 from flcav.world.map.town import Town
+from flcav.world.scenarios.stage import STEP_S
 from flcav.world.snapshot import Collision, Snapshot
 from flcav.world.trace import Trace
 from flcav.world.traffic.lights import Lights, read_light_programs
 from flcav.world.traffic.live import WARM_UP_S, SumoTraffic, stand_parked
-from flcav.world.traffic.sumo_process import STEP_S
 
 Array = NDArray[np.float64]
 

@@ -143,7 +143,7 @@ def test_other_bad_input_is_one_sentence(data, weights, tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     cases = {
         "task 'poetry': choose one of weather, signs": ("train", "poetry", "--data", data, "--out", tmp_path / "o"),
-        "choose one of tiny, small, road, paper": (
+        "choose one of pillars, tiny, small, road, paper": (
             *("train", "objects", "--data", data, "--out", tmp_path / "o", "--network", "huge"),
         ),
         "manifest": ("train", "objects", "--data", tmp_path / "empty", "--out", tmp_path / "o"),

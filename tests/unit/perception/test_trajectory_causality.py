@@ -20,9 +20,9 @@ from flcav.perception.trajectory.roads import RoadMap, road_map
 from flcav.perception.trajectory.samples import extract_columns, find_near, find_pictured, surround
 from flcav.perception.trajectory.tracks import OFFSETS_S, extrapolate, tracks_around, tracks_at
 from flcav.world.map.town import load_town
+from flcav.world.scenarios.stage import STEP_S
 from flcav.world.trace import Trace
 from flcav.world.traffic import traffic
-from flcav.world.traffic.sumo_process import STEP_S
 from flcav.world.traffic.traffic import REACH_S, simulate
 
 AHEAD_S = np.array([0.1, 0.25, 0.5, 0.8])

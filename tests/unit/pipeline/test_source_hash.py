@@ -237,6 +237,6 @@ def test_everything_that_a_step_loads_of_flcav_and_runs_is_among_what_it_reaches
 def test_a_recording_reaches_what_drives_the_traffic_in_a_process_beside_it():
     reached = Sources().hashes(find_definitions(record_split))
     assert {
-        "flcav.world.traffic.sumo_process",
+        "flcav.world.traffic.process",
         "flcav.world.scenarios.director",
     } <= reached.keys()

@@ -388,7 +388,7 @@ def test_the_sumo_process_ends_with_the_one_that_started_it():
         "from flcav.world.live import LiveWorld, Settings\n"
         "world = LiveWorld(load_town('suburb'), Settings(traffic=2))\n"
         "world.step()\n"
-        "print(world._traffic._process.pid, flush=True)\n"
+        "print(world._traffic._sumo._process.pid, flush=True)\n"
         "import time; time.sleep(600)\n"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}

@@ -15,9 +15,12 @@ from flcav.world.map.roads import Edge, Lane, RoadNet
 from flcav.world.scenarios.scenario import NEAR_M, Scenario
 
 State = tuple[float, float, float, float]  # SUMO's: front x, y [m], angle [deg clockwise from north], speed [m/s]
-STEP_S = 0.1
+STEP_S = 0.1  # of SUMO
 ALERT = 0.1  # [s] action step of vehicles in a scenario: they decide at every step
 CAREFUL_MPS2 = 4.5  # deceleration with which drivers brake for a prop
+CROSSING = 0.5  # sine of the angle from which on somebody's way is crossed
+Danger = Sequence[float]
+"""A place to brake for: x, y, half width [m], cosine and sine of the heading of what crosses; 0 and 0: all brake."""
 
 
 class Spot(NamedTuple):
@@ -42,8 +45,8 @@ class Stage:
         self.past: dict[str, list[tuple[int, State]]] = {}  # SUMO's vehicle -> step and state since it came
         self.engaged: dict[str, int] = {}  # vehicle under test -> step until which it is not free
         self._edge_of = {lane.id: (edge, lane) for edge in net.edges.values() for lane in edge.lanes}
-        self._braking: set[str] = set()
-        self._dangers: list[tuple[float, float, float]] = []  # x, y, half width [m] of this step
+        self._brakes = Brakes(sumo.vehicle)
+        self._dangers: list[Danger] = []  # of this step
         self._cast = 0
 
     def look(self) -> None:
@@ -150,27 +153,12 @@ class Stage:
 
     def brake_for(self, places: Sequence[tuple[float, float]], half_width_m: float) -> None:
         """Mark places x, y [m] for which vehicles brake in this step: see `react`."""
-        self._dangers += [(x, y, half_width_m) for x, y in places]
+        self._dangers += [[x, y, half_width_m, 0.0, 0.0] for x, y in places]
 
     def react(self, careless: Set[str]) -> None:
-        """Let vehicles brake for the places marked in this step, and let those go that need not brake any more.
-
-        A vehicle brakes for a place within its braking distance ahead and the place's half width of its path. Those
-        that are `careless` are left to their scripts.
-        """
-        x, y, half_width_m = np.array(self._dangers, np.float64).reshape(-1, 3).T
+        """Let vehicles brake for the places marked in this step; the `careless` are left to their scripts."""
+        self._brakes.apply(self._dangers, careless)
         self._dangers.clear()
-        for name in set(self.sumo.vehicle.getIDList()) - careless:
-            front_x, front_y, angle, speed = self.state(name)
-            heading = math.radians(90.0 - angle)
-            ahead, left = rotate(x - front_x, y - front_y, -heading)
-            if ((ahead > -1.0) & (ahead < braking_m(speed)) & (np.abs(left) < half_width_m)).any():
-                self.take(name)
-                self.sumo.vehicle.setSpeed(name, 0.0)
-                self._braking.add(name)
-            elif name in self._braking:
-                self.sumo.vehicle.setSpeed(name, -1.0)
-                self._braking.discard(name)
 
     def gap_ahead(self, lane: Lane, along: float) -> float:
         """Return the gap from a place of a lane to the rear of the next vehicle on it [m]; inf where there is none."""
@@ -203,6 +191,42 @@ class Stage:
             if travelled >= behind_m:
                 x, y, angle = (np.interp(travelled - behind_m, done, values) for values in (*at.T, angles))
                 yield step, (float(x), float(y), float(angle), state[3])
+
+
+class Brakes:
+    """The braking of SUMO's vehicles for what SUMO does not know."""
+
+    def __init__(self, vehicle: Any) -> None:
+        """Start with nobody braking; `vehicle` is that domain of libsumo."""
+        self._vehicle = vehicle
+        self._braking: set[str] = set()
+
+    def apply(self, dangers: Sequence[Danger], careless: Set[str]) -> None:
+        """Let vehicles brake for the dangers ahead, and let those go that need not any more; all but the `careless`.
+
+        A vehicle brakes for a place within its braking distance ahead and the place's half width of its path.
+        """
+        vehicle = self._vehicle
+        names = [name for name in vehicle.getIDList() if name not in careless] if dangers or self._braking else ()
+        if not names:
+            return
+        x, y = np.array([vehicle.getPosition(name) for name in names]).T
+        turned = np.pi / 2 - np.radians([vehicle.getAngle(name) for name in names])
+        reach = np.array([braking_m(vehicle.getSpeed(name)) for name in names])[:, None]
+        at_x, at_y, half, heading_x, heading_y = np.array(dangers, np.float64).reshape(-1, 5).T
+        dx, dy = at_x - x[:, None], at_y - y[:, None]
+        cos, sin = np.cos(turned)[:, None], np.sin(turned)[:, None]
+        ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
+        crosses = (np.abs(heading_y * cos - heading_x * sin) > CROSSING) | (heading_x**2 + heading_y**2 < 0.5)
+        brakes = (crosses & (ahead > -1.0) & (ahead < reach) & (np.abs(left) < half)).any(axis=1)
+        now = {name for name, brake in zip(names, brakes.tolist()) if brake}
+        for name in names:
+            if name in now:
+                vehicle.setActionStepLength(name, ALERT)
+                vehicle.setSpeed(name, 0.0)
+            elif name in self._braking:
+                vehicle.setSpeed(name, -1.0)
+        self._braking = now
 
 
 def braking_m(speed: float) -> float:

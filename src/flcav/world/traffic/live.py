@@ -1,14 +1,8 @@
-"""Client of the SUMO process of a live world: its traffic between the steps of SUMO."""
+"""The traffic of a live world: SUMO's, between the steps of SUMO."""
 
-import atexit
-import contextlib
-import json
-import os
-import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +15,16 @@ from flcav.world.dynamics.blueprints import VEHICLES
 from flcav.world.dynamics.standing import Ground
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import Town
+from flcav.world.scenarios.stage import STEP_S
 from flcav.world.shapes import SHAPES
 from flcav.world.traffic.bridges import find_footing
+from flcav.world.traffic.client import Sumo, write_job
 from flcav.world.traffic.demand import list_vehicle_types, park, write_demand
-from flcav.world.traffic.sumo import start_server
-from flcav.world.traffic.sumo_process import STEP_S
+from flcav.world.traffic.simulation import Body, Job, Request
 from flcav.world.traffic.traffic import number_of
 
 Array = NDArray[np.float64]
 
-SERVE = "flcav.world.traffic.live_process:serve"
 FILL_S = 20.0  # all actors have departed by then
 WARM_UP_S = 30.0  # time of SUMO at the start of a live world
 TOUR_S = 900.0  # length of a vehicle's tour, at least; it then sets out again
@@ -39,11 +33,9 @@ DANGERS = (-0.4, 0.0, 0.4)  # places to brake for, over a body's length from its
 SOON_S = 0.7  # so far ahead traffic looks at who crosses its way
 BERTH_M = 1.0  # half the width of a vehicle that passes
 
-_idle: list[tuple[int, subprocess.Popen[str]]] = []  # processes without a world, with the id of their parent
 
-
-def write_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians: int) -> dict[str, Any]:
-    """Return the first request for a live world, see `live_process`, whose files are in `folder`.
+def write_live_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians: int) -> Job:
+    """Return the job of a live world's run, whose files are in `folder`.
 
     Raises `InputError` as `write_demand`.
     """
@@ -53,19 +45,11 @@ def write_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians
         demand = write_demand(net, parameters, seed=seed, cavs=0, from_s=0.0, until_s=TOUR_S, fill_s=FILL_S)
     except InputError as error:
         raise InputError(f"{town.name}: {error}") from None
-    linked, routes = folder / "town.net.xml", folder / "town.rou.xml"  # SUMO takes no commas or ${...} in paths
-    linked.symlink_to(town.net.absolute())
-    routes.write_text(demand.routes, encoding="utf-8")
-    return {
-        "net": str(linked),
-        "routes": str(routes),
-        "followers": demand.followers,
-        "next": vehicles + len(demand.followers),
-        "seed": derive_seed(seed, "sumo"),
-        # a route of those under control; SUMO does not see them where there is none
-        "edge": next((edge.id for edge in net.streets if edge.lanes_of("driving")), ""),
-        "steps": round(WARM_UP_S / STEP_S),
-    }
+    return write_job(folder, town.net, demand, derive_seed(seed, "sumo"))._replace(
+        again=vehicles + len(demand.followers),
+        edge=next((edge.id for edge in net.streets if edge.lanes_of("driving")), ""),
+        steps=round(WARM_UP_S / STEP_S),
+    )
 
 
 class SumoTraffic:
@@ -78,11 +62,10 @@ class SumoTraffic:
         self._ground, self._town = ground, town
         self._kinds = {name: (category, shape) for name, category, shape in list_vehicle_types()}
         self._lights: dict[str, str] = {}
-        self._process: subprocess.Popen[str] | None = None
         with tempfile.TemporaryDirectory(prefix="flcav_live_") as folder:
-            job = write_job(town, Path(folder), seed=seed, vehicles=vehicles, pedestrians=pedestrians)
-            self._process = _take_process()
-            self._after = self._before = self._ask(job)
+            job = write_live_job(town, Path(folder), seed=seed, vehicles=vehicles, pedestrians=pedestrians)
+            self._sumo = Sumo(job)
+        self._after = self._before = self._sumo.begun
         self.advance(NOBODY, {}, [])
 
     def advance(self, bodies: Actors, lights: Mapping[str, str], halted: Sequence[str]) -> None:
@@ -93,13 +76,8 @@ class SumoTraffic:
         """
         changed = {name: state for name, state in lights.items() if self._lights.get(name) != state}
         self._lights |= changed
-        request = {
-            "bodies": _list_vehicles(bodies),
-            "dangers": _list_dangers(bodies),
-            "lights": changed,
-            "halted": list(halted),
-        }
-        self._before, self._after = self._after, self._ask(request)
+        request = Request(_list_vehicles(bodies), _list_dangers(bodies), changed, halted)
+        self._before, self._after = self._after, self._sumo.step(request)
         self.ticks += 1
         names = sorted((name for name in self._before if name in self._after), key=number_of)
         self._ends = tuple(
@@ -167,45 +145,11 @@ class SumoTraffic:
         self._walks = np.array([category == "pedestrian" for category, _ in kinds], np.bool_)
 
     def close(self) -> None:
-        """End the world's SUMO; its process is kept for the next world."""
-        if self._process is None:
-            return
-        process, self._process = self._process, None
-        with contextlib.suppress(BrokenPipeError):
-            assert process.stdin is not None
-            process.stdin.write("\n")
-            process.stdin.flush()
-            _idle.append((os.getpid(), process))
-
-    def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the answer to a request: type and state by name."""
-        if self._process is None:
-            raise RuntimeError("the live world is closed")
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        try:
-            self._process.stdin.write(json.dumps(request) + "\n")
-            self._process.stdin.flush()
-            line = self._process.stdout.readline()
-        except BrokenPipeError:
-            line = ""
-        except BaseException:
-            self._kill()  # or its answer would be taken for that to the next request
-            raise
-        answer = json.loads(line) if line else {"error": "its process has ended"}
-        if "error" in answer:
-            self._kill()
-            raise RuntimeError(f"SUMO failed: {answer['error']}")
-        return answer
-
-    def _kill(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.communicate()
-            self._process = None
+        """End SUMO's run."""
+        self._sumo.close()
 
 
-def _list_vehicles(bodies: Actors) -> list[tuple[str | float, ...]]:
+def _list_vehicles(bodies: Actors) -> list[Body]:
     """Return the rows of `bodies` in a request."""
     front = bodies.position[:, :2] + bodies.size[:, :1] / 2 * heading_vectors(bodies.yaw)
     angle = (90.0 - np.degrees(bodies.yaw)) % 360.0
@@ -213,7 +157,7 @@ def _list_vehicles(bodies: Actors) -> list[tuple[str | float, ...]]:
     numbers = np.column_stack((bodies.size[:, :2], front, angle, speed)).tolist()
     kinds = zip(bodies.name, bodies.category, bodies.shape.tolist(), numbers)
     return [
-        (name, f"{category}.{SHAPES[category][shape].name}", *row)
+        (name, f"{category}.{SHAPES[category][shape].name}", row)
         for name, category, shape, row in kinds
         if category in VEHICLES
     ]
@@ -235,25 +179,6 @@ def _list_dangers(bodies: Actors) -> list[list[float]]:
     ]
     row = np.column_stack((BERTH_M + bodies.size[:, 1] / 2, moves[:, None] * heading))
     return np.column_stack((np.concatenate(places), np.tile(row, (len(places), 1)))).tolist()
-
-
-def _take_process() -> subprocess.Popen[str]:
-    """Return a SUMO process without a world, started where there is none."""
-    while _idle:
-        parent, process = _idle.pop()
-        if parent == os.getpid() and process.poll() is None:
-            return process
-    return start_server(SERVE)
-
-
-@atexit.register
-def _stop() -> None:
-    """Kill the idle processes that this process started."""
-    for parent, process in _idle:
-        if parent == os.getpid():
-            process.kill()
-            process.communicate()
-    _idle.clear()
 
 
 def stand_parked(town: Town, ground: Ground, seed: int) -> Actors:

@@ -1,5 +1,6 @@
 """Traffic simulation of a town by SUMO: the smoothed motion of all actors and the parked vehicles, as a `Trace`."""
 
+import contextlib
 import json
 import tempfile
 from collections.abc import Sequence
@@ -18,13 +19,14 @@ from flcav.world.map.roads import read_net
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import KERB_M, Town
 from flcav.world.scenarios.scenario import Scenario
+from flcav.world.scenarios.stage import STEP_S
 from flcav.world.shapes import SHAPES
 from flcav.world.trace import Event, Trace
 from flcav.world.traffic.bridges import find_footing
+from flcav.world.traffic.client import Sumo, write_job
 from flcav.world.traffic.climb import stand_on_relief
 from flcav.world.traffic.demand import Demand, Parked, list_vehicle_types, park, write_demand
-from flcav.world.traffic.sumo import simulate_in
-from flcav.world.traffic.sumo_process import STEP_S
+from flcav.world.traffic.recording import Recorded
 
 Array = NDArray[np.float64]
 
@@ -83,13 +85,10 @@ def simulate_drives(
     return trace, _build_trace(town, (driven * np.float64(STEP_S)).round(1), _of_cavs(raw), drive_rows, [])
 
 
-def _of_cavs(raw: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Return the arrays of `sumo_process.run_sumo` with the states of CAVs alone."""
-    own = np.char.startswith(raw["id"], "cav")
-    kept = own[raw["row"][:, 1]]
-    row = raw["row"][kept]
-    row[:, 1] = (np.cumsum(own) - 1)[row[:, 1]]
-    return raw | {"id": raw["id"][own], "type": raw["type"][own], "row": row, "state": raw["state"][kept]}
+def _of_cavs(raw: Recorded) -> Recorded:
+    """Return the states of CAVs alone."""
+    own = np.char.startswith(raw.id, "cav")
+    return raw._replace(id=raw.id[own], type=raw.type[own], state=raw.state[:, own])
 
 
 def _windows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -97,29 +96,20 @@ def _windows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.maximum(steps[:, None] + np.arange(-SMOOTHING_STEPS, SMOOTHING_STEPS + 1), 1)
 
 
-def _run(
-    net: Path, demand: Demand, seed: int, steps: NDArray[np.int64], scenarios: Sequence[Scenario]
-) -> dict[str, NDArray]:
-    """Return the arrays of `sumo_process.run`; raises `RuntimeError` where SUMO fails."""
+def _run(net: Path, demand: Demand, seed: int, steps: NDArray[np.int64], scenarios: Sequence[Scenario]) -> Recorded:
+    """Return the states at these steps of a run with nobody under control; raises `RuntimeError` where SUMO fails."""
     with tempfile.TemporaryDirectory(prefix="flcav_traffic_") as name:
-        folder = Path(name)
-        (folder / "routes.rou.xml").write_text(demand.routes, encoding="utf-8")
-        asked = [scenario.model_dump() for scenario in scenarios]
-        files = {"net": str(net.absolute()), "routes": str(folder.absolute() / "routes.rou.xml")}
-        values = files | {"seed": seed, "steps": steps.tolist(), "followers": demand.followers, "scenarios": asked}
-        (folder / "job.json").write_text(json.dumps(values))
-        try:
-            simulate_in(folder)
-        except RuntimeError as error:
-            raise RuntimeError(f"SUMO failed on {net}: {error}") from None
-        with np.load(folder / "out.npz") as arrays:
-            return dict(arrays)
+        job = write_job(Path(name), net, demand, seed)._replace(scenarios=[each.model_dump() for each in scenarios])
+        with contextlib.closing(Sumo(job, f"SUMO failed on {net}")) as sumo:
+            sumo.record(steps.tolist(), out := Path(name) / "out.npz")
+        with np.load(out) as arrays:
+            return Recorded(**arrays)
 
 
 def _build_trace(
     town: Town,
     time_s: Array,
-    raw: dict[str, NDArray],
+    raw: Recorded,
     windows: tuple[NDArray[np.int64], ...],
     parked: list[Parked],
 ) -> Trace:
@@ -128,9 +118,9 @@ def _build_trace(
     earlier, state, later = (_smooth(raw, window) for window in (before, now, after))
     rates = _rates(earlier, state, later)
     seen = np.flatnonzero(~np.isnan(state[..., 0]).all(axis=0))
-    order = np.array(sorted(seen, key=lambda i: number_of(str(raw["id"][i]))), dtype=np.int64)
+    order = np.array(sorted(seen, key=lambda i: number_of(str(raw.id[i]))), dtype=np.int64)
     known = {name: (category, shape) for name, category, shape in list_vehicle_types()}
-    kinds = [known[str(raw["type"][i])] for i in order] + [(car.category, car.shape) for car in parked]
+    kinds = [known[str(raw.type[i])] for i in order] + [(car.category, car.shape) for car in parked]
     size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], dtype=np.float64).reshape(-1, 3)
     half_length = size[: len(order), 0] / 2  # from an actor's front, SUMO's reference point, to its centre
     walk = _walk(*(_centre(step[:, order], half_length) for step in (earlier, state, later)))
@@ -152,14 +142,12 @@ def _build_trace(
         heights = find_footing(town.relief, town.net, centre, yaw)
         ground = stand_on_relief(heights, centre, yaw, velocity, acceleration, size, pedestrian)
         z, tilt, velocity, acceleration = z + ground.height, ground.tilt, ground.velocity, ground.acceleration
-    lights = [(light, len(letters)) for light, letters in zip(raw["light"], raw["light_state"][0])]
-    letters = [list("".join(row)) for row in raw["light_state"][now[:, SMOOTHING_STEPS]]]
+    lights = [(light, len(letters)) for light, letters in zip(raw.light, raw.light_state[0])]
+    letters = [list("".join(row)) for row in raw.light_state[now[:, SMOOTHING_STEPS]]]
     return Trace(
         town=town.name,
         time_s=time_s,
-        actor=np.array(
-            [*(str(raw["id"][i]) for i in order), *(f"parked{i}" for i in range(len(parked)))], dtype=np.str_
-        ),
+        actor=np.array([*(str(raw.id[i]) for i in order), *(f"parked{i}" for i in range(len(parked)))], dtype=np.str_),
         category=np.array([category for category, _ in kinds], dtype=np.str_),
         shape=np.array([shape for _, shape in kinds], dtype=np.int64),
         size=size,
@@ -171,14 +159,12 @@ def _build_trace(
         yaw_rate=rates[..., 3],
         light=np.array([f"{light}:{i}" for light, links in lights for i in range(links)], dtype=np.str_),
         light_state=np.array(letters, dtype="<U1").reshape(len(time_s), -1),
-        events=tuple(
-            Event(row["kind"], row["begins_s"], tuple(row["actors"])) for row in json.loads(str(raw["events"]))
-        ),
+        events=tuple(Event(row["kind"], row["begins_s"], tuple(row["actors"])) for row in json.loads(str(raw.events))),
         tilt=tilt,
     )
 
 
-def _smooth(raw: dict[str, NDArray], windows: NDArray[np.int64]) -> Array:
+def _smooth(raw: Recorded, windows: NDArray[np.int64]) -> Array:
     """Return front x, y, yaw, speed (T, A, 4), averaged over each window (T, W); NaN where absent at its middle."""
     rows = np.unique(windows)
     dense, windows = _dense(raw, rows), np.searchsorted(rows, windows)
@@ -193,11 +179,9 @@ def _smooth(raw: dict[str, NDArray], windows: NDArray[np.int64]) -> Array:
     return out
 
 
-def _dense(raw: dict[str, NDArray], rows: NDArray[np.int64]) -> Array:
+def _dense(raw: Recorded, rows: NDArray[np.int64]) -> Array:
     """Return front x, y, unwrapped yaw, speed (R, A, 4) at `rows` (R,) of the steps read; NaN where absent."""
-    out = np.full((len(raw["light_state"]), len(raw["id"]), 4), np.nan)
-    out[raw["row"][:, 0], raw["row"][:, 1]] = raw["state"]
-    out = out[rows]
+    out = raw.state[rows]
     yaw = np.pi / 2 - np.radians(out[..., 2])
     out[..., 2] = np.where(np.isnan(yaw), np.nan, np.unwrap(np.nan_to_num(yaw), axis=0))
     return out
@@ -241,13 +225,13 @@ def _walk(before: Array, now: Array, after: Array) -> tuple[Array, Array]:
     return next(motions), next(motions)
 
 
-def _drop_obstructing(raw: dict[str, NDArray], parked: list[Parked]) -> list[Parked]:
+def _drop_obstructing(raw: Recorded, parked: list[Parked]) -> list[Parked]:
     """Return the parked vehicles that do not overlap the paths of actors created for scenarios."""
-    scripted = np.flatnonzero(np.char.startswith(raw["id"], "scripted"))
+    scripted = np.flatnonzero(np.char.startswith(raw.id, "scripted"))
     ways = []
     for actor in scripted:
-        at = raw["state"][raw["row"][:, 1] == actor]
-        category, _, shape = str(raw["type"][actor]).partition(".")
+        at = raw.state[~np.isnan(raw.state[:, actor, 0]), actor]
+        category, _, shape = str(raw.type[actor]).partition(".")
         length, width = next(row[1:3] for row in SHAPES[category] if row.name == shape)
         yaw = np.pi / 2 - np.radians(at[:, 2])
         middle = at[:, :2] - length / 2 * heading_vectors(yaw)

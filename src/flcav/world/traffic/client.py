@@ -1,0 +1,106 @@
+"""Client of the SUMO process, which is kept for the next run when one has ended."""
+
+import atexit
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from flcav.world.traffic.demand import Demand
+from flcav.world.traffic.simulation import NET, ROUTES, Job, Request, States
+
+SERVE = "flcav.world.traffic.process:serve"  # what that process runs
+ROOT = str(Path(__file__).parents[3])  # where flcav is, installed or not
+
+_idle: list[tuple[int, subprocess.Popen[str]]] = []  # processes without a run, with the id of their parent
+
+
+def write_job(folder: Path, net: Path, demand: Demand, seed: int) -> Job:
+    """Return the job of a run, whose files are in `folder` until it has begun."""
+    (folder / NET).symlink_to(net.absolute())
+    (folder / ROUTES).write_text(demand.routes, encoding="utf-8")
+    return Job(str(folder.absolute()), seed, demand.followers)
+
+
+class Sumo:
+    """A SUMO run in a process beside this one, which it has until it is closed."""
+
+    def __init__(self, job: Job, failure: str = "SUMO failed") -> None:
+        """Start a run; where SUMO fails, now or later, that is a `RuntimeError` that begins with `failure`."""
+        self._failure = failure
+        self._process: subprocess.Popen[str] | None = _take_process()
+        self.begun: States = self._ask(job._asdict())
+
+    def step(self, request: Request) -> States:
+        """Make a step, and return the states after it."""
+        return self._ask({"step": request._asdict()})
+
+    def record(self, steps: Sequence[int], out: Path) -> None:
+        """Record a run that has made no step yet, see `recording.record`."""
+        self._ask({"record": {"steps": steps, "out": str(out.absolute())}})
+
+    def close(self) -> None:
+        """End the run; its process is kept for the next one."""
+        if self._process is not None:
+            with contextlib.suppress(RuntimeError):
+                self._ask(None)
+                _idle.append((os.getpid(), self._process))
+            self._process = None
+
+    def _ask(self, request: Any) -> dict[str, Any]:
+        """Return the answer to a request."""
+        if self._process is None:
+            raise RuntimeError("the live world is closed")
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        except BaseException:
+            self._kill()  # or its answer would be taken for that to the next request
+            raise
+        answer = json.loads(line) if line else {"error": "its process has ended"}
+        if "error" in answer:
+            self._kill()
+            raise RuntimeError(f"{self._failure}: {answer['error']}".strip())
+        return answer
+
+    def _kill(self) -> None:
+        if self._process is not None:
+            _end(self._process)
+            self._process = None
+
+
+def _take_process() -> subprocess.Popen[str]:
+    """Return a SUMO process without a run, started where there is none; a fork of this process starts its own."""
+    with contextlib.suppress(IndexError):  # there is none, or another thread has taken it
+        while True:
+            parent, process = _idle.pop()
+            if parent == os.getpid() and process.poll() is None:
+                return process
+    module, name = SERVE.split(":")
+    code = f"import sys; sys.path.append({ROOT!r}); from {module} import {name}; {name}()"
+    command = [sys.executable, "-P", "-c", code]  # -P: a user's json.py in the working directory is not imported
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+@atexit.register
+def _stop() -> None:
+    """Kill the idle processes that this process started."""
+    for parent, process in _idle:
+        if parent == os.getpid():
+            _end(process)
+    _idle.clear()
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """Kill a process, without waiting for its run, which ends when it would answer."""
+    with contextlib.suppress(BrokenPipeError), process:
+        process.kill()

@@ -1,0 +1,166 @@
+"""Stepped traffic: a SUMO run that is the same for recordings and for live worlds, and reacts to what is driven there.
+
+A step of `STEP_S` obeys a `Request`: the vehicles under control are placed, SUMO's brake for what is in their way, and
+then all move. Nobody is under control in a recording.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from flcav.world.scenarios.director import Director
+from flcav.world.scenarios.scenario import Scenario
+from flcav.world.scenarios.stage import STEP_S, Brakes, Danger, State
+from flcav.world.traffic.walkers import Walkers
+
+OWN = "own:"  # begins the names of vehicles under control
+NEAR_LANE_M = 5.0  # a vehicle under control is on a lane whose middle is so near, else off the road
+HALT_STEPS = round(5.0 / STEP_S)  # for so long a vehicle stands after a collision
+NET, ROUTES = "town.net.xml", "town.rou.xml"
+
+States = dict[str, tuple[str, float, float, float, float]]
+"""By name of a vehicle or pedestrian: SUMO's type, front x, y [m], angle [deg clockwise from north], speed [m/s]."""
+
+Body = tuple[str, str, Sequence[float]]
+"""A vehicle under control: name, SUMO's type; length, width, front x, y [m], angle [deg], speed [m/s]."""
+
+
+class Job(NamedTuple):
+    """What a run is started with; the files `NET` and `ROUTES` of its folder are SUMO's."""
+
+    folder: str
+    seed: int
+    followers: Mapping[str, tuple[str, str, list[str]]]  # name, type and edges of who enters when a vehicle has left
+    again: int | None = None  # vehicles without one set out again, numbered from this; None where they do not
+    edge: str = ""  # a route of those under control, whom SUMO does not see without one
+    scenarios: Sequence[Mapping[str, object]] = ()  # as JSON
+    steps: int = 0  # that are made at the start
+
+
+class Request(NamedTuple):
+    """What a step obeys."""
+
+    bodies: Sequence[Body] = ()  # under control
+    dangers: Sequence[Danger] = ()  # to brake for
+    lights: Mapping[str, str] = {}  # letters of each junction's links, where they changed
+    halted: Sequence[str] = ()  # vehicles that a collision has stopped
+
+
+class Simulation:
+    """A SUMO run, step by step."""
+
+    def __init__(self, sumo: Any, job: Job) -> None:
+        """Start libsumo, the module `sumo`, in the job's folder, which is the working directory."""
+        options = {
+            "net-file": NET,
+            "route-files": ROUTES,
+            "seed": job.seed,
+            "step-length": STEP_S,
+            "default.action-step-length": 0.5,  # drivers decide twice a second: the simulation is three times as fast
+            "lanechange.duration": 2,
+            "time-to-teleport": -1,  # vehicles in a jam are not removed
+            "collision.action": "none",
+            "no-step-log": "true",
+            "no-warnings": "true",
+        }
+        sumo.start(["sumo", *(part for name, value in options.items() for part in (f"--{name}", str(value)))])
+        self.sumo = sumo
+        scenarios = [Scenario.model_validate(scenario) for scenario in job.scenarios]
+        self.director = Director(sumo, Path(NET), scenarios) if scenarios else None
+        self._walkers = Walkers(STEP_S)
+        self._brakes = Brakes(sumo.vehicle)
+        self._followers, self._again = job.followers, job.again
+        self._tours: dict[str, tuple[str, list[str]]] = {}  # of SUMO's vehicles: type and edges
+        self._own: set[str] = set()
+        self._halted: dict[str, int] = {}  # vehicle -> steps that it still stands
+        self._drives = bool(job.edge)
+        if self._drives:
+            sumo.route.add("own", [job.edge])
+        for _ in range(job.steps):
+            self.advance()
+
+    def step(self, request: Request) -> None:
+        """Make a step that obeys the request."""
+        for light, state in request.lights.items():
+            self.sumo.trafficlight.setRedYellowGreenState(light, state)
+        self._mirror(request.bodies if self._drives else ())
+        for name in request.halted:
+            if name in self._tours:
+                self.sumo.vehicle.setSpeed(name, 0.0)
+                self._halted[name] = HALT_STEPS
+        self._brakes.apply(request.dangers, self._own | self._halted.keys())
+        self.advance()
+
+    def states(self) -> States:
+        """Return the states of SUMO's own vehicles and pedestrians, as scenarios have them seen."""
+        seen = self.director.stage.seen if self.director else None
+        out: States = {}
+        for name in self.sumo.vehicle.getIDList():
+            if name not in self._own:
+                state = _state_of(self.sumo.vehicle, name)
+                out[name] = (self._tours[name][0], *(seen(name, state) if seen else state))
+        for name, state in self._walkers.states.items():
+            out[name] = (_type_of(self.sumo.person, name), *state)
+        return out
+
+    def advance(self) -> None:
+        """Make a step with nobody under control; vehicles that have arrived are followed, or set out again."""
+        sumo = self.sumo
+        sumo.simulationStep()
+        for name in sumo.simulation.getArrivedIDList():
+            self._halted.pop(name, None)
+            self._own.discard(name)
+            if name in self._tours:
+                self._follow(name, *self._tours.pop(name))
+        for name, left in list(self._halted.items()):
+            if left > 1:
+                self._halted[name] = left - 1
+            else:
+                del self._halted[name]
+                sumo.vehicle.setSpeed(name, -1.0)
+        self._walkers.follow({name: _state_of(sumo.person, name) for name in sumo.person.getIDList()})
+        if self.director:
+            self.director.direct()
+        for name in sumo.simulation.getDepartedIDList():  # those whom a script has entered, too
+            if name not in self._own:
+                self._tours[name] = _type_of(sumo.vehicle, name), list(sumo.vehicle.getRoute(name))
+
+    def _follow(self, name: str, kind: str, edges: list[str]) -> None:
+        """Let the next vehicle enter when one has arrived, if there is a next one."""
+        if name in self._followers:
+            follower, kind, edges = self._followers[name]
+        elif self._again is not None:
+            follower = f"veh{self._again}"
+            self._again += 1
+        else:
+            return
+        self.sumo.route.add(follower, edges)
+        self.sumo.vehicle.add(follower, follower, kind, departPos="base", departSpeed="max", departLane="best")
+
+    def _mirror(self, bodies: Sequence[Body]) -> None:
+        """Place the vehicles under control; those that are not among `bodies` any more leave."""
+        vehicle = self.sumo.vehicle
+        names = {OWN + row[0] for row in bodies}
+        for name in sorted(self._own - names):
+            vehicle.remove(name)
+        self._own &= names
+        for body, kind, (length, width, x, y, angle, speed) in bodies:
+            name = OWN + body
+            if name not in self._own:
+                vehicle.add(name, "own", typeID=kind)
+                vehicle.setLength(name, length)
+                vehicle.setWidth(name, width)
+                vehicle.setSpeedMode(name, 0)
+                self._own.add(name)
+            vehicle.moveToXY(name, "", -1, x, y, angle, keepRoute=2, matchThreshold=NEAR_LANE_M)
+            vehicle.setPreviousSpeed(name, speed)
+
+
+def _state_of(domain: Any, name: str) -> State:
+    """Return the state of a vehicle or pedestrian of SUMO."""
+    return (*domain.getPosition(name), domain.getAngle(name), domain.getSpeed(name))
+
+
+def _type_of(domain: Any, name: str) -> str:
+    """Return the type of a vehicle or pedestrian; "type@vehicle" is SUMO's copy of a type for one vehicle."""
+    return domain.getTypeID(name).partition("@")[0]
