@@ -201,6 +201,8 @@ def test_the_page_says_what_was_not_tested_and_not_judged():
     text = release_page(read_candidate_like(), replace(found, guards=(*found.guards, weak), domain=domain), {})
     assert "hardly finds them itself: Cyclist (0.010, now 0.000)" in text
     assert "gradient [8, 12)" in text
+    told = "tested in grid | everyday traffic | clear | mine: frames 3 inside; 50% of its buckets, not gradient [8, 12)"
+    assert told in replace(found, domain=domain).lines()
     assert "frames 3 inside" in text
     assert all(f"<b>{party}</b>: not yet" in text for party in ("provider", "customer"))
 

@@ -109,6 +109,9 @@ class Verification(Record):
                     f"{guard.by:<10}{guard.name:<34}{guard.driving:.3f} -> {guard.candidate:.3f}  "
                     f"({guard.low:+.3f} to {guard.high:+.3f})  {guard.judgement}  (objects: {guard.targets})"
                 )
+        if self.domain is not None:
+            lists = ("; ".join(each) for each in (self.domain.towns, self.domain.scenarios, self.domain.weathers))
+            lines.append(f"tested in {' | '.join(lists)} | {self.domain.odd.describe()}")
         more = (
             f"; about {self.frames_to_decide} frames would decide" if self.undecided and self.frames_to_decide else ""
         )
