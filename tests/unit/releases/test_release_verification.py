@@ -110,6 +110,10 @@ def turned(boxes: Boxes, _: FrameTruth) -> Boxes:
     return replace(boxes, yaw=boxes.yaw + np.pi)
 
 
+def hushed_far(boxes: Boxes, _: FrameTruth) -> Boxes:
+    return replace(boxes, score=np.asarray(boxes.score) * np.where(boxes.center[:, 0] > 20, 0.3, 1.0))
+
+
 def hushed(boxes: Boxes, _: FrameTruth) -> Boxes:
     return replace(boxes, score=np.asarray(boxes.score) * 0.3)
 
@@ -125,6 +129,7 @@ def test_the_driving_network_itself_is_accepted():
         "occlusion",
         "weather",
         "cell",
+        "found",
         "measure",
         "condition",
     }
@@ -138,6 +143,7 @@ def test_the_driving_network_itself_is_accepted():
         (blind_in_fog, "weather fog lost"),
         (lifted, "measure AP70: accurate boxes lost"),
         (turned, "measure AOS: right headings lost"),
+        (hushed_far, "found 20-40 m lost"),
         (hushed, "measure found from score 0.3 on lost"),
     ],
 )

@@ -5,7 +5,8 @@ JAMA 308, 2012): the lower bound of the difference at .05, one-sided, lies above
 that the same claim would refuse good networks by chance: they guard against catastrophes alone. A slice is lost where
 the candidate keeps less than a share of the driving network's measure, and the test says so at .05. One of `FIRST` of
 which it keeps less than half is in doubt even where the test does not say so. Where the driving network itself reaches
-next to nothing, shares of it are lost and won by chance: such a slice is not judged.
+next to nothing, shares of it are lost and won by chance: such a slice is not judged. Average precision ranks, so that
+scores which fall below their use in one slice do not show in it: what is found at that score is guarded, too.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -100,12 +101,17 @@ def pair_slices(driving: Measured, candidate: Measured) -> Iterator[Pair]:
     both = (driving, candidate)
     old, new = (_match(each) for each in both)
     for label in old:
-        yield _pair("class", label, {label: old[label]}, {label: new[label]}, driving)
+        sides = [{label: each[label]} for each in (old, new)]
+        yield _pair("class", label, sides[0], sides[1], driving)
+        yield _pair("found", label, sides[0], sides[1], driving, measure=_recall)
     for by, name, wanted, within in _ranges(driving.tested):
         sides = [_match(each, 0.5, wanted, within) for each in both]
         yield _pair(by, name, sides[0], sides[1], driving)
+        yield _pair("found", name, sides[0], sides[1], driving, measure=_recall)
     for by, name, frames in _groups(candidate.tested):
         yield _pair(by, name, old, new, driving, frames)
+        if by != "cell":
+            yield _pair("found", name, old, new, driving, frames, _recall)
     yield _pair("measure", "AP70: accurate boxes", _match(driving, 0.7), _match(candidate, 0.7), driving)
     yield _pair("measure", "AOS: right headings", old, new, driving, measure=_orientation)
     yield _pair("measure", f"found from score {THRESHOLD:g} on", old, new, driving, measure=_recall)

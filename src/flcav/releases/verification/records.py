@@ -15,7 +15,7 @@ Judgement = Literal["kept", "lost", "doubted", "open"]
 class Comparison:
     """A measure of the driving network and of the candidate on the same frames, and their difference's interval."""
 
-    by: str  # whole, class, distance, occlusion, weather, scenario, town, cell, condition, measure
+    by: str  # whole, class, distance, occlusion, weather, scenario, town, cell, found, condition, measure
     name: str
     targets: int
     scenes: int

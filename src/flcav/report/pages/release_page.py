@@ -18,6 +18,7 @@ GROUPS = {
     "scenario": "Scenarios",
     "town": "Towns",
     "cell": "Cells of the domain",
+    "found": "Found at the score of use",
     "condition": "Conditions of the sensor",
     "measure": "Other measures",
 }
