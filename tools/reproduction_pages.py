@@ -34,6 +34,10 @@ from flcav.experiments.fig6a import tables as fig6a_tables
 from flcav.experiments.fig6a.results import AllocationResult
 from flcav.experiments.gap.run import GapResult
 from flcav.experiments.gap.tables import gap_tables
+from flcav.experiments.groups.run import GroupsResult
+from flcav.experiments.groups.tables import groups_tables
+from flcav.experiments.lifelong.run import LifelongResult
+from flcav.experiments.lifelong.tables import lifelong_tables
 from flcav.experiments.networks.run import NetworksResult
 from flcav.experiments.networks.tables import networks_tables
 from flcav.experiments.placement import tables as placement_tables
@@ -85,6 +89,8 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "fig3b": _told(Fig3b, fig3b_tables.tables),
     "fig4": _told(Fig4, roadside_tables.fig4_tables),
     "fig6a-allocation": _told(AllocationResult, fig6a_tables.tables),
+    "groups": _told(GroupsResult, groups_tables),
+    "lifelong": _told(LifelongResult, lifelong_tables),
     "leakage": _told(LeakageResult, attack_tables.leakage_tables),
     "networks": _told(NetworksResult, networks_tables),
     "placement": _told(PlacementProof, placement_tables.tables),

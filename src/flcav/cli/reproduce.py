@@ -40,6 +40,7 @@ class Target(StrEnum):
     federation_exchange = "federation-exchange"
     federation_exchange_objects = "federation-exchange-objects"
     federation_faults = "federation-faults"
+    federation_groups = "federation-groups"
     federation_leakage = "federation-leakage"
     fig1b = "fig1b"
     fig3a = "fig3a"
@@ -47,6 +48,7 @@ class Target(StrEnum):
     fig4 = "fig4"
     fig6a_allocation = "fig6a-allocation"
     gap = "gap"
+    lifelong = "lifelong"
     networks = "networks"
     placement = "placement"
     road_average = "road-average"
@@ -70,6 +72,7 @@ EXCHANGES: Mapping[str, str] = {  # recipe of each
 DRIVES = (  # one recording, several seeds
     Target.federation_asynchrony,
     Target.federation_faults,
+    Target.federation_groups,
     Target.federation_leakage,
 )
 
@@ -92,8 +95,9 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.sim_to_real: (*RUN, *REAL),
 }
 SEEDS: Mapping[str, int] = {
-    **dict.fromkeys((Target.corner_cases, Target.demo_arms, *EXCHANGES, *DRIVES), 5),
+    **dict.fromkeys((Target.corner_cases, Target.demo_arms, Target.lifelong, *EXCHANGES, *DRIVES), 5),
     **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
+    Target.federation_groups: 10,
     Target.safety_distance: 1,
 }
 
@@ -119,8 +123,8 @@ def reproduce(
         None,
         "--seeds",
         min=1,
-        help="Number of seeds, from 1: 8 of federation-exchange and placement, 5 of corner-cases, demo-arms and the "
-        "other federation-*, 3 of the others if not given.",
+        help="Number of seeds, from 1: 10 of federation-groups, 8 of federation-exchange and placement, 5 of "
+        "corner-cases, demo-arms, lifelong and the other federation-*, 3 of the others if not given.",
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
@@ -216,6 +220,8 @@ def _repeat_drives(target: Target, out: Path, seeds: int) -> None:
             from flcav.experiments.asynchrony.run import compare_asynchrony as repeat
         elif target == Target.federation_faults:
             from flcav.experiments.attacks.faults import repeat_faults as repeat
+        elif target == Target.federation_groups:
+            from flcav.experiments.groups.run import compare_groups as repeat
         else:
             from flcav.experiments.attacks.leakage import repeat_leakage as repeat
         results, pictures = repeat(out, seeds, report)
@@ -360,6 +366,15 @@ def _corner_cases(out: Path, seeds: int, scale: str, jobs: int, engine: EngineNa
     _write_figures(out, results.as_json(), {"arms.png": draw_corner_cases(results)}, results.sentences())
 
 
+def _lifelong(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
+    from flcav.experiments.lifelong.run import compare_lifelong, draw_lifelong
+    from flcav.experiments.scales import shrink_recipe
+
+    how: Any = (seeds, scale, jobs, engine, stale, shrink_recipe)
+    results = compare_lifelong(*_run_seeds(Target.lifelong, "lifelong", out, *how))
+    _write_figures(out, results.as_json(), {"lifelong.png": draw_lifelong(results)}, results.sentences())
+
+
 COMPARISONS: Mapping[str, Callable[[Path, int, str, int, EngineName, Stale], None]] = {
     Target.corner_cases: _corner_cases,
     Target.demo_arms: _demo_arms,
@@ -367,6 +382,7 @@ COMPARISONS: Mapping[str, Callable[[Path, int, str, int, EngineName, Stale], Non
     **{target: partial(_federation_exchange, Target(target)) for target in EXCHANGES},
     Target.fig6a_allocation: _fig6a_allocation,
     Target.gap: _gap,
+    Target.lifelong: _lifelong,
     Target.networks: _networks,
     Target.placement: _placement,
     Target.safety_distance: _safety_distance,

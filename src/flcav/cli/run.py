@@ -142,6 +142,8 @@ def _tell(results: "list[Run]", summary: "Summary | None") -> None:
         for name, arm in results[0].arms.items():
             if arm.privacy is not None:
                 typer.echo(f"{name}, {TOGETHER}: {arm.privacy.describe()}")
+        for arm in results[0].lifelong or ():
+            typer.echo(f"lifelong, {arm.task}, {arm.describe()}")
         if PLACED_BARE in results[0].caveats:
             typer.echo(f"privacy: {PLACED_BARE}")
         return

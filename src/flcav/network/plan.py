@@ -32,12 +32,19 @@ class StagePlan:
     cloud_rounds: int  # stage III rounds
     edge_groups: tuple[int, ...]  # vehicles per edge server
     edge_rounds_per_cloud_round: int = 1  # k: stage III
+    called: int | None = None  # vehicles of each edge server in rounds of stage II, at most; None: all
+
+    @property
+    def edge_vehicles(self) -> int:
+        """Number of vehicles in a round of stage II."""
+        return sum(self.edge_groups if self.called is None else (min(self.called, own) for own in self.edge_groups))
 
 
 def price(plan: StagePlan, sizes: MessageSizes) -> LinkMegabytes:
     """Return the uplink traffic of `plan` on each link [MB].
 
-    wireless = samples * sample + vehicles * ((edge_rounds + k * cloud_rounds) * exchange + labellings * labels);
+    wireless = samples * sample + (called * edge_rounds + vehicles * k * cloud_rounds) * exchange
+    + (called * edge_rounds + vehicles if cloud_rounds) * labels;
     wireline = samples * sample + cloud_rounds * edge_servers * model.
 
     Samples are labelled before each edge round of stage II, and once before the first cloud round.
@@ -50,13 +57,12 @@ def price(plan: StagePlan, sizes: MessageSizes) -> LinkMegabytes:
     >>> price(plan, MessageSizes(sample_mb=0.5, model_mb=1.0, exchange_mb=0.01, labels_mb=0.02))
     LinkMegabytes(wireless_mb=101.61, wireline_mb=106.0)
     """
-    wireless_rounds = plan.edge_rounds + plan.edge_rounds_per_cloud_round * plan.cloud_rounds
-    labellings = plan.edge_rounds + (plan.cloud_rounds > 0)
     uploaded, vehicles = plan.samples * sizes.sample_mb, sum(plan.edge_groups)
+    of_edge = plan.edge_rounds * plan.edge_vehicles
+    updates = of_edge + plan.edge_rounds_per_cloud_round * plan.cloud_rounds * vehicles
+    labellings = of_edge + (plan.cloud_rounds > 0) * vehicles
     exchange_mb = sizes.model_mb if sizes.exchange_mb is None else sizes.exchange_mb
     return LinkMegabytes(
-        wireless_mb=uploaded
-        + wireless_rounds * vehicles * exchange_mb
-        + labellings * vehicles * (sizes.labels_mb or 0.0),
+        wireless_mb=uploaded + updates * exchange_mb + labellings * (sizes.labels_mb or 0.0),
         wireline_mb=uploaded + plan.cloud_rounds * len(plan.edge_groups) * sizes.model_mb,
     )

@@ -9,7 +9,17 @@ from pydantic import Field, model_validator
 
 from flcav.config import Config
 from flcav.network.plan import MessageSizes
-from flcav.optimization.curves.curves import STAGES, Additive, Curve, NonNegative, OwnCurve, Positive, SharedCurve
+from flcav.optimization.curves.curves import (
+    STAGES,
+    Additive,
+    Curve,
+    Effective,
+    Federated,
+    NonNegative,
+    OwnCurve,
+    Positive,
+    SharedCurve,
+)
 from flcav.storage.records import LEFT_OUT
 
 MOST = 10**9  # largest count
@@ -18,6 +28,7 @@ BITS_PER_BYTE = 8
 Count = Annotated[int, Field(ge=0, le=MOST)]
 Vehicles = Annotated[int, Field(ge=1, le=MOST)]
 Range = tuple[Count, Count]  # least and most, both allowed
+Called = tuple[Vehicles, Vehicles]  # least and most, both allowed
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(min_length=1)]
 Objective = Literal["weighted", "max-min", "area"]
@@ -84,6 +95,12 @@ class AllocationTask(Quantities):
         None  # what it sends to have its samples labelled: before each edge round of stage II, once before stage III
     )
     edge_groups: Annotated[tuple[Vehicles, ...], Field(min_length=1)]  # vehicles per edge server
+    called: Annotated[Called | None, LEFT_OUT] = (
+        None  # vehicles of each edge server that a plan may call to a round of stage II; curves are of the most of them
+    )
+    worth: Annotated[tuple[Positive, ...] | None, LEFT_OUT] = (
+        None  # of the data of an edge server's vehicles, in the order in which they are called; None: equal
+    )
     uplink_mbps: Mapping[str, Uplink] | None = None  # by vehicle, in the order of the edge groups
     samples_held: Mapping[str, Count] = {}  # by vehicle; not limited for one that is not named
     data_quality: Mapping[str, Positive] = {}  # by vehicle: worth of one of its samples; 1 if not named
@@ -115,6 +132,11 @@ class AllocationTask(Quantities):
         """Sizes of the messages."""
         return MessageSizes(self.sample_mb, self.model_mb, self.exchange_mb, self.labels_mb)
 
+    def weigh_groups(self, called: int) -> tuple[float, ...]:
+        """Return the worth of the data of each edge server's vehicles where so many of them are called."""
+        worth = self.worth or (1.0,) * max(self.edge_groups)
+        return tuple(sum(worth[: min(called, own)]) for own in self.edge_groups)
+
     def sample_s(self, vehicle: str) -> float:
         """Return the time in which a vehicle sends one sample [s]; 0 where its link is not known."""
         return self._sending_s(vehicle, self.sample_mb)
@@ -139,6 +161,28 @@ class AllocationTask(Quantities):
             for vehicle in getattr(self, field):
                 if vehicle not in known:
                     raise ValueError(f"{field} of task {self.name!r} names {vehicle!r}, which {naming} does not")
+        return self
+
+    @model_validator(mode="after")
+    def _callable(self) -> Self:
+        if self.called is None:
+            if self.worth is not None:
+                raise ValueError(f"worth of task {self.name!r} is of vehicles that are called: 'called' is missing")
+            return self
+        if self.worth is not None and len(self.worth) < max(self.edge_groups):
+            raise ValueError(
+                f"worth of task {self.name!r} is of {len(self.worth)} vehicles, and an edge server has "
+                f"{max(self.edge_groups)}"
+            )
+        if self.called[0] > self.called[1] or self.called[1] > max(self.edge_groups):
+            raise ValueError(
+                f"called of task {self.name!r} is from {self.called[0]} to {self.called[1]}: least and most vehicles, "
+                f"of {max(self.edge_groups)} at an edge server"
+            )
+        if self.vehicles:
+            raise ValueError(f"called of task {self.name!r}: vehicles with names join rounds by a plan of their own")
+        if any(not isinstance(each, Effective | Federated) for each in (self.curve, self.upper or self.curve)):
+            raise ValueError(f"called of task {self.name!r}: its curve does not know what data vehicles bring")
         return self
 
     @model_validator(mode="after")

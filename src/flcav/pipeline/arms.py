@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from flcav.config import InputError
 from flcav.federation.checks import check_rules
@@ -35,9 +35,9 @@ from flcav.pipeline.recipe import (
 )
 
 PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
-PLANNED = ("plan",)  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
-PLACED = ("plan", "placement")  # those that decide where sensors stand
-PRETRAINED = ("plan", "pretraining", "pretrain_repeat")  # those that decide pretraining
+PLANNED = ("plan", "calls")  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
+PLACED = (*PLANNED, "placement")  # those that decide where sensors stand
+PRETRAINED = (*PLANNED, "pretraining", "pretrain_repeat")  # those that decide pretraining
 OF_ROUNDS = (  # fields of `Training` of federations alone
     "local_steps",
     "local_rate",
@@ -46,7 +46,7 @@ OF_ROUNDS = (  # fields of `Training` of federations alone
     "start_share",
 )
 LEARNED = (  # those that decide a federation
-    "plan",
+    *PLANNED,
     "training",
     "repeat",
     "placement",
@@ -59,6 +59,14 @@ TRACKED = (*PRETRAINED, "placement", "labels")  # those that decide the vehicles
 OF_EDGE = (*LEARNED[:-1], "edge_federation")  # those that decide a federation without the cloud
 
 
+class Calls(NamedTuple):
+    """The numbers of vehicles that a plan chooses a group's from."""
+
+    least: int
+    most: int
+    overlap: float  # share of a further vehicle's data that those called before it have
+
+
 @dataclass(frozen=True)
 class Setting:
     """The complete settings of one arm, those it takes over from the recipe included."""
@@ -67,6 +75,7 @@ class Setting:
     repeat: int  # 0: the arm itself; n: its n-th retraining
     pretrain_repeat: int  # of its pretraining; 0 where retrainings share it
     plan: PlanRule
+    calls: Calls | None  # vehicles that the plan calls to a group; None: it does not decide
     placement: PlacementSettings
     labels: Mapping[str, str]  # kind of labels, by task
     fault: Fault | None  # of the labels, the rest of which are ground truth
@@ -115,16 +124,19 @@ def name_repeat(arm: str, repeat: int) -> str:
 
 def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: int, arm: Arm) -> Setting:
     learned = _learns(recipe, arm.plan)
+    federation = Federation.model_validate(recipe.federation.model_dump() | dict(arm.federation))
+    calls = _find_calls(recipe, federation) if learned else None
     return Setting(
         name,
         repeat,
         repeat if recipe.retrain_from == PRETRAIN else 0,
         arm.plan,
+        calls,
         PlacementSettings.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
         dict(labels) | dict(arm.labels),
         arm.fault,
         Distillation.model_validate((recipe.distillation or Distillation()).model_dump() | dict(arm.distillation)),
-        Federation.model_validate(recipe.federation.model_dump() | dict(arm.federation)),
+        federation,
         {
             task: Training.model_validate(recipe.training_of(task).model_dump() | dict(arm.training))
             for task in recipe.tasks
@@ -133,8 +145,16 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         arm.uploads,
         arm.regions or recipe.with_role("federate"),
         (CENTRAL,) if arm.central else arm.stages,
-        learned and recipe.replan != "none",
+        learned and recipe.replan != "none" and calls == _find_calls(recipe, recipe.federation),
     )
+
+
+def _find_calls(recipe: RunRecipe, how: Federation) -> Calls | None:
+    """Return what a plan chooses the vehicles of a group on request from; None for a fixed roster."""
+    if how.requests is None:
+        return None
+    most = how.requests.most or max(map(recipe.vehicles, recipe.with_role("federate")))
+    return Calls(1, most, how.requests.overlap)
 
 
 def _learns(recipe: RunRecipe, rule: PlanRule) -> bool:
@@ -184,7 +204,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
     selection, privacy = how.selection, how.privacy
     if isinstance(edge, FedBuff) and setting.central is None:
         _check_buffers(recipe, setting)
-    if how.requests is not None and setting.central is None:
+    lifelong = recipe.lifelong is not None and setting.name == MAIN
+    if (how.requests is not None or lifelong) and setting.central is None:
         _check_requests(recipe, setting, edge)
     if how.network is not None and selection.rule == "importance":
         raise InputError("federation.network: importance selection draws the clients after they have trained")
@@ -270,6 +291,13 @@ def _check_requests(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> 
         raise InputError("privacy: requests and offers tell of a vehicle's data, and no noise covers them")
     if _plans_joiners(recipe, setting):
         raise InputError("requests: nobody joins rounds by a plan; leave out horizon_s")
+    if how.requests is not None and how.requests.roadside:
+        for task, kind in setting.labels.items():
+            if not LABEL_SOURCES[kind].trained or LABEL_SOURCES[kind].averaged:
+                raise InputError(
+                    f"requests.roadside: units label by their trained detector, and the labels of '{task}' are "
+                    f"'{kind}'; choose 'road' or 'road+tracks'"
+                )
     if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
         raise InputError("requests: vehicles check the network by labels of their own, not by those of 'road-average'")
 

@@ -24,6 +24,7 @@ from flcav.perception.tasks import task_named
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import Setting, check_federations
 from flcav.pipeline.frames import Frames, deal_frames, make_recording_recipe, record_frames
+from flcav.pipeline.lifelong import LEARNING, Lifelong
 from flcav.pipeline.plan.allocation import PlanRequest, make_plan
 from flcav.pipeline.plan.exchanges import measure_exchange
 from flcav.pipeline.plan.updates import model_mb
@@ -267,3 +268,16 @@ def _list_seconds(
                 rounds_done = {PRETRAIN: 0, EDGE: main.edge_rounds, CLOUD: main.cloud_rounds}.get(stage, 0)
                 trained = names.stage(MAIN, stage, region, task)
                 yield once(names.rounds(trained, region), (1 + rounds_done) * watched * own.test_s)
+        if recipe.lifelong is not None:
+            yield _count_lifelong_s(graph, recipe.lifelong, task, plans[MAIN][task].edge_rounds, own)
+
+
+def _count_lifelong_s(graph: Graph, lifelong: Lifelong, task: str, rounds: int, own: _Measured) -> float:
+    """Return the time of lifelong learning [s], if a group of all vehicles forms in every condition of both arms."""
+    size, steps = graph.recipe.sized_splits, graph.settings[MAIN].training[task].local_steps
+    count = len(lifelong.conditions)
+    trained = rounds * steps * sum(graph.vehicles[each] for each in lifelong.conditions)
+    tested = count**2 * size.test.scenes * size.test.spins * size.test.cavs
+    watched = size.validation.scenes * size.validation.spins * size.validation.cavs
+    watched *= (1 + rounds) * count * (count + 1) // 2
+    return len(LEARNING) * (trained * own.step_s + (tested + watched) * own.test_s)

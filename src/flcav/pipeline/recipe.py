@@ -17,6 +17,7 @@ from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.problem import Budgets
+from flcav.pipeline.lifelong import Lifelong
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
 from flcav.statistics.streams import stream
@@ -138,9 +139,15 @@ class Requests(Config):
     )  # a vehicle asks whose loss on held-back frames is above so many times that at the end of pretraining
     held_back: float = Field(default=0.25, gt=0, lt=1)  # share of its labelled frames that a vehicle does not train on
     range_m: float = Field(default=300.0, gt=0, le=10_000)  # of V2X, between vehicles and from them to an edge server
-    most: int | None = Field(default=None, ge=1, le=1000)  # members at most, with those that ask; default: all
+    most: int | None = Field(
+        default=None, ge=1, le=1000
+    )  # members at most, with those that ask; a plan by a history chooses from 1 to that many; default: all
+    overlap: float = Field(
+        default=0.0, ge=0, lt=1
+    )  # share of a further vehicle's data that those called before it have, in such a plan
     least_quality: float = Field(default=0.5, ge=0, le=1)  # of a member's data, relative to the best that are offered
     link_s: float = Field(default=10.0, gt=0)  # longest time of an update alone on the air, where there is a network
+    roadside: bool = False  # whether units on poles in range join, with what they see and their own detector's labels
     patience: int = Field(default=2, ge=1, le=1000)  # rounds by which the loss on held-back frames has to fall
     least_gain: float = Field(default=0.01, ge=0, lt=1)  # share of the loss that these have to gain
 
@@ -382,6 +389,7 @@ class RunRecipe(Config):
     )  # errors of vehicles' poses and clocks, in labels of tracks and road sensors; or "estimated"
     recording: Recording = Recording()  # changes to how all regions are recorded
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
+    lifelong: Lifelong | None = None  # conditions that come one after another; None: no lifelong learning
     primary_claims: tuple[str, ...] = Field(
         default=(), max_length=3
     )  # what the run is made to decide: edge, cloud, elsewhere, or arms by name; they are corrected apart from others
@@ -425,6 +433,8 @@ class RunRecipe(Config):
         )
         if replays and not all(task.pretrains for task in self.tasks.values()):
             raise ValueError("federation.replay: the cloud trains on samples of stage I, and a plan has none")
+        if self.lifelong is not None:
+            self._check_lifelong(self.lifelong)
         if MAIN in self.arms:
             raise ValueError(f"arms: '{MAIN}' is the run itself; choose another name")
         for name, arm in self.arms.items():
@@ -437,6 +447,26 @@ class RunRecipe(Config):
                 f"placement.tasks: '{sorted(unknown)[0]}' is none of the run's tasks: {', '.join(self.tasks)}"
             )
         return self
+
+    def _check_lifelong(self, own: Lifelong) -> None:
+        federating = self.with_role("federate")
+        if odd := [each for each in own.conditions if each not in federating]:
+            raise ValueError(f"lifelong.conditions: '{odd[0]}' is none of {', '.join(federating)}")
+        if not all(task.pretrains for task in self.tasks.values()):
+            raise ValueError("lifelong: vehicles ask by the loss at the end of pretraining, and a plan has none")
+        try:
+            parse_config(Requests, self._name_requests(own), "lifelong.requests")
+        except InputError as error:
+            raise ValueError(str(error)) from None
+
+    def _name_requests(self, own: Lifelong) -> dict[str, Any]:
+        return (self.federation.requests or Requests()).model_dump() | dict(own.requests)
+
+    def lifelong_requests(self) -> Requests:
+        """Return the groups on request of lifelong learning; raises ValueError of a recipe without it."""
+        if self.lifelong is None:
+            raise ValueError("lifelong: the recipe has none")
+        return Requests.model_validate(self._name_requests(self.lifelong))
 
     def _check_arm(self, name: str, arm: Arm) -> None:
         if arm.central == PRETRAIN and not all(task.pretrains for task in self.tasks.values()):

@@ -1,5 +1,6 @@
 """Groups on request: who is called, who leads, what an offer costs, and when a group dissolves."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 from safetensors.numpy import load
 
 from flcav.config import InputError
+from flcav.federation.leads import Term
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.perception.weather.samples import Sample
@@ -18,6 +20,7 @@ from flcav.pipeline.arms import check_federations, resolve_settings
 from flcav.pipeline.recipe import Requests, RunRecipe
 from flcav.pipeline.results.groups import Checked, Group
 from flcav.pipeline.training.groups import (
+    FULL,
     NOT_NEEDED,
     SKETCH,
     GroupWatch,
@@ -25,6 +28,7 @@ from flcav.pipeline.training.groups import (
     Picked,
     choose_members,
     count_labels,
+    find_gradient,
     find_in_range,
     find_lead,
     has_levelled,
@@ -38,7 +42,7 @@ PLACES = {name: np.array([x, 0.0, 0.0]) for name, x in {"a": 0.0, "b": 250.0, "c
 
 @pytest.mark.parametrize(("count", "held"), [(8, [2, 6]), (4, [2]), (2, [1]), (1, []), (12, [2, 6, 10])])
 def test_frames_are_held_back_evenly_and_none_is_in_both(count: int, held: list[int]) -> None:
-    train, found = hold_back([None] * count, 0.25)
+    train, found = hold_back(count, 0.25)
     assert found == held
     assert sorted([*train, *found]) == [*range(count)]
 
@@ -82,8 +86,10 @@ def test_members_are_those_that_asked_and_the_best_of_the_others() -> None:
     chosen = choose_members(Requests(), ["a"], quality, {"e": "not in the town"})
     assert chosen.members == ("a", "c", "b")
     assert chosen.stayed == {"e": "not in the town", "d": NOT_NEEDED}
-    assert choose_members(Requests(most=2), ["a"], quality, {}).members == ("a", "c")
-    assert choose_members(Requests(most=1), ["a", "d"], quality, {}).members == ("a", "d")
+    few = choose_members(Requests(most=2), ["a"], quality, {})
+    assert (few.members, few.stayed) == (("a", "c"), {"d": NOT_NEEDED, "b": FULL})
+    assert choose_members(Requests(most=1), ["a", "d"], quality, {}).members == ("a",)  # no more than that
+    assert choose_members(Requests(most=2), ["a", "d"], quality, {}).members == ("a", "d")  # those that asked first
 
 
 def test_an_offer_is_a_message_of_some_hundred_bytes() -> None:
@@ -129,7 +135,7 @@ def test_labels_are_counted_by_class_and_sketches_keep_angles() -> None:
             def train(self, weights: Any, **how: Any) -> LocalUpdate:
                 return LocalUpdate(weights, 1, 0.0, {"w": gradients[row]})
 
-        return sketch_gradient(Client(), {}, 7)  # type: ignore[arg-type]
+        return sketch_gradient(find_gradient(Client(), {}, 7), 7)  # type: ignore[arg-type]
 
     cosine = lambda one, other: one @ other / np.linalg.norm(one) / np.linalg.norm(other)  # noqa: E731
     found = [sketch(row) for row in range(3)]
@@ -145,9 +151,21 @@ def test_the_record_says_who_asked_why_who_came_and_what_it_mended() -> None:
     )
     assert group.describe() == (
         "grid/a asked, with a loss above 0.900 on frames held back; pole3 led 2 vehicles for 2 of 6 rounds; 1234 bytes "
-        "of requests and offers; grid/a 1.400 to 0.600; grid/c stayed (no link to spare); the loss has levelled off"
+        "of requests and offers; mended: 1 of 1; grid/a 1.400 to 0.600; grid/c stayed (no link to spare); the loss has "
+        "levelled off"
     )
     assert Group.from_json(group.as_json(), "here") == group
+    lasting = replace(group, vehicles={**vehicles, "grid/a": Checked(3, 1.4, 1.0, asks=True)}, scores=(0.5, 0.25))
+    assert lasting.mended == ()
+    assert "mended: 0 of 1" in lasting.describe()
+    assert "on validation frames 0.500 to 0.250, which nobody acts on" in lasting.describe()
+    terms = (Term("grid/a", 1, 2, 1), Term("grid/b", 2, 3), Term("grid/c", 3))
+    adhoc = replace(group, lead="grid/a", terms=terms, roadside=("grid/pole3",))
+    assert "grid/a led 2 vehicles and 1 roadside unit (pole3) for 2" in adhoc.describe()
+    assert "grid/a left in round 2 with 1 update, and the round began again; grid/b was gone before round 3" in (
+        adhoc.describe()
+    )
+    assert Group.from_json(adhoc.as_json(), "here") == adhoc
     calm = Group(0.9, {"grid/b": vehicles["grid/b"]}, "")
     assert calm.describe() == "nobody asked: the largest loss on held-back frames is 0.200, and 0.900 the limit"
 

@@ -11,6 +11,7 @@ import typer
 
 from flcav.cli.options import join_choices
 from flcav.cli.terminal import print_json
+from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -140,7 +141,7 @@ def _as_json(plan: "Allocation", shares: "Shares", more: "Sequence[Saving]") -> 
 def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
     """Return the plan as a JSON value: links by name, without empty optional fields."""
     values = dataclasses.asdict(plan)
-    values["tasks"] = [_given(task, "upper_error", "members") for task in values["tasks"]]
+    values["tasks"] = [_given(task, "upper_error", "members", "called") for task in values["tasks"]]
     for name in ("used_mb", "marginal_error_per_gb"):
         if name in values:
             values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
@@ -157,6 +158,8 @@ def _show(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") -> N
 
     console, measure = plain_console(), MEASURES[problem.objective]
     console.print(_table(plan))
+    for task in (task for task in plan.tasks if task.called is not None):
+        console.print(f"{task.name}: {plural(task.called, 'vehicle')} at most of each edge server in its edge rounds")
     curves = "the fitted curves" if len(plan.tasks) > 1 else "the fitted curve"
     console.print(f"{measure} {plan.objective:{SHOWN}}, {plan.status} for {curves} ({_proven(plan.gap)})")
     console.print(f"{measure.capitalize()}: {explain_objective(problem, plan.objective)}")

@@ -6,7 +6,7 @@ the first two have a proven lower bound. Source: Wang et al., IEEE Network 37(3)
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.curves.curves import Curve, SharedCurve
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.area import area, maximise_area
-from flcav.optimization.solvers.branches import solve_branches
+from flcav.optimization.solvers.branches import call_vehicles, solve_branches
 from flcav.optimization.solvers.fairness import minimise_largest_error
 from flcav.optimization.solvers.instance import Clock, Instance, build_instance, price_counts, shared_clock
 from flcav.optimization.solvers.weighted import minimise_weighted_error
@@ -51,6 +51,7 @@ class TaskAllocation:
     wireline_mb: float
     upper_error: float | None = None  # of robust plans: predicted by the upper band
     members: tuple[LearnerError, ...] = ()  # of a cluster
+    called: int | None = None  # vehicles of each edge server in the rounds of stage II; None: all
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ class _Best:
     lower: float | None
     rates: Array
     dual: Dual | None
+    branch: Problem | None = None
 
 
 def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = ()) -> Allocation:
@@ -113,9 +115,11 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
     asked = resolve_problem(problem)
     sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
     method = _METHODS[problem.objective]
-    found = solve_branches(asked, lambda branch: method(branch, build_instance(branch, clocks), sought, clocks))
+    found = solve_branches(
+        asked, lambda branch: replace(method(branch, build_instance(branch, clocks), sought, clocks), branch=branch)
+    )
     best = (max if problem.objective == "area" else min)(found, key=lambda each: each.objective)
-    plans = build_task_plans(problem, best.x)
+    plans = build_task_plans(_call(problem, best.branch or asked), best.x)
     bounds = [each.lower for each in found if each.lower is not None]
     lower = min(*bounds, best.objective) if bounds else None
     achieved = None if lower is None else relative_gap(best.objective, lower)
@@ -140,6 +144,15 @@ def _busy_s(problem: Problem, plans: Sequence[TaskAllocation]) -> float | None:
     if clock is None:
         return None
     return sum(each * (plan.edge_rounds + k * plan.cloud_rounds) for each, plan in zip(clock.per_round, plans))
+
+
+def _call(problem: Problem, branch: Problem) -> Problem:
+    """Return the problem with as many vehicles called as in one of its branches."""
+    tasks = tuple(
+        task if own.called is None else call_vehicles(task, *own.called, problem.edge_rounds_per_cloud_round)
+        for task, own in zip(problem.tasks, branch.tasks, strict=True)
+    )
+    return problem.model_copy(update={"tasks": tasks})
 
 
 def relative_gap(objective: float, lower: float) -> float:
@@ -180,6 +193,7 @@ def _task_plan(problem: Problem, task: AllocationTask, row: Array) -> TaskAlloca
         *(task.name, samples, edge_rounds, cloud_rounds, error(task.curve), cost.wireless_mb, cost.wireline_mb),
         upper_error=error(task.upper) if problem.robust and task.upper is not None else None,
         members=tuple(members) if isinstance(task.curve, SharedCurve) else (),
+        called=None if task.called is None else task.called[1],
     )
 
 

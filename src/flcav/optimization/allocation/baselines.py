@@ -20,7 +20,7 @@ from flcav.optimization.allocation.allocate import (
     sum_prices,
 )
 from flcav.optimization.allocation.vehicles import split_plan, trains
-from flcav.optimization.problem import Problem
+from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.branches import solve_branches
 from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
 from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance, price_once
@@ -50,11 +50,12 @@ class Baseline:
 def baseline(problem: Problem, name: str) -> Baseline:
     """Return the plan of `BASELINES[name]` with its predicted objective.
 
-    Baselines respect the fleet's budgets alone: `note` says where the vehicles' samples or links do not suffice. Raises
-    `Infeasible` as `allocate` does, `InputError` for an unknown name.
+    Baselines call as many vehicles as may be, and respect the fleet's budgets alone: `note` says where the vehicles'
+    samples or links do not suffice. Raises `Infeasible` as `allocate` does, `InputError` for an unknown name.
     """
     if name not in BASELINES:
         raise InputError(f"baseline {shorten(name)}: unknown; known baselines: {', '.join(BASELINES)}")
+    problem = problem.model_copy(update={"tasks": tuple(map(_call_most, problem.tasks))})
     asked = resolve_problem(problem)
     plans = build_task_plans(problem, BASELINES[name](asked, build_instance(asked)))
     try:
@@ -63,6 +64,10 @@ def baseline(problem: Problem, name: str) -> Baseline:
         note = NOT_IN_TIME if trains(problem) else NOT_CARRIED
         return Baseline(name, evaluate_objective(asked, plans), plans, sum_prices(plans), note)
     return Baseline(name, evaluate_objective(asked, plans), plans, sum_prices(plans))
+
+
+def _call_most(task: AllocationTask) -> AllocationTask:
+    return task if task.called is None else task.model_copy(update={"called": (task.called[1], task.called[1])})
 
 
 def equal_stages(problem: Problem, made: Instance) -> Array:

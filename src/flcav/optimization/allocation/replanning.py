@@ -10,7 +10,8 @@ from pydantic import Field
 
 from flcav.config import Config, InputError
 from flcav.optimization.curves.curves import STAGES, Additive, Curve, Decay, Effective, Federated, NonNegative
-from flcav.optimization.problem import AllocationTask, Budgets, Count, Fraction, Problem
+from flcav.optimization.problem import AllocationTask, Budgets, Count, Fraction, Problem, Vehicles
+from flcav.optimization.solvers.branches import call_vehicles
 from flcav.optimization.solvers.instance import price_counts
 
 LEAST_ERROR = 1e-6  # error assumed for an accuracy of 1: test sets are finite
@@ -22,6 +23,9 @@ class TaskState(Config):
     samples: Count  # samples uploaded so far
     edge_rounds: Count = 0  # edge rounds done
     cloud_rounds: Count = 0  # cloud rounds done
+    called: Vehicles | None = (
+        None  # vehicles of each edge server that were called to its edge rounds, where a plan says
+    )
     accuracy: Fraction | None = (
         None  # accuracy now; None: not measured; of a cluster: the weighted mean of its members'
     )
@@ -62,11 +66,23 @@ def condition_problem(problem: Problem, progress: PlanState) -> Problem:
     for name in progress.tasks:
         if name not in names:
             raise InputError(f"progress.tasks names {name!r}, which is none of {', '.join(names)}")
-    tasks = tuple(
-        _continued(problem, task, progress.tasks[task.name]) if task.name in progress.tasks else task
-        for task in problem.tasks
+    called = problem.model_copy(
+        update={"tasks": tuple(_call(problem, task, progress.tasks.get(task.name)) for task in problem.tasks)}
     )
-    return problem.model_copy(update={"tasks": tasks, "budgets_mb": _left(problem, progress)})
+    tasks = tuple(
+        _continued(called, task, progress.tasks[task.name]) if task.name in progress.tasks else task
+        for task in called.tasks
+    )
+    return problem.model_copy(update={"tasks": tasks, "budgets_mb": _left(called, progress)})
+
+
+def _call(problem: Problem, task: AllocationTask, spent: TaskState | None) -> AllocationTask:
+    """Return the task with the vehicles that were called to the edge rounds done."""
+    if spent is None or spent.called is None:
+        return task
+    if task.called is None or not task.called[0] <= spent.called <= task.called[1]:
+        raise InputError(f"progress.tasks.{task.name}.called = {spent.called}: the problem does not call so many")
+    return call_vehicles(task, spent.called, spent.called, problem.edge_rounds_per_cloud_round)
 
 
 def _continued(problem: Problem, task: AllocationTask, spent: TaskState) -> AllocationTask:

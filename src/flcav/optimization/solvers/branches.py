@@ -1,29 +1,32 @@
-"""Problems whose first cloud rounds cost accuracy, as problems in which none does.
+"""Problems whose first cloud rounds cost accuracy, or whose plan calls vehicles, as problems without either.
 
 An additive curve with a `merge` is not convex in the cloud rounds. It is convex without any, and from the first on,
 where the cost is part of its floor. Labels that are sent once before the first cloud round (`labels_mb`) cost megabytes
-in the same way. So each such task has two branches. The best plan of all branches is the best plan of the problem, and
-the least of their lower bounds is one.
+in the same way. So each such task has two branches. How many vehicles are called to the rounds of stage II multiplies
+what a round costs and what it brings: a task has as many branches as there are numbers to choose from. The best plan of
+all branches is the best plan of the problem, and the least of their lower bounds is one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import product
+from math import prod
 from typing import TypeVar
 
 from flcav.config import InputError
-from flcav.optimization.curves.curves import Additive, Curve, SharedCurve
+from flcav.optimization.curves.curves import Additive, Curve, Effective, Federated, SharedCurve, split_regions
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible
 
 T = TypeVar("T")
 MOST_BRANCHING = 8  # tasks, each of which doubles the number of problems
+MOST_CALLS = 2**MOST_BRANCHING  # combinations of numbers of vehicles
 
 
 def solve_branches(problem: Problem, solve: Callable[[Problem], T]) -> list[T]:
     """Return the result of `solve` for each branch that has a plan; the first has the fewest cloud rounds.
 
     Raises `Infeasible`, that of the first branch, where none has a plan, and `InputError` for more than
-    `MOST_BRANCHING` tasks with two branches.
+    `MOST_BRANCHING` tasks with two branches, or more than `MOST_CALLS` choices of vehicles.
     """
     found: list[T] = []
     refused: list[Infeasible] = []
@@ -37,9 +40,56 @@ def solve_branches(problem: Problem, solve: Callable[[Problem], T]) -> list[T]:
     return found
 
 
+def call_vehicles(task: AllocationTask, least: int, most: int, k: int) -> AllocationTask:
+    """Return the task with `least` to `most` vehicles called to stage II, and curves by what `most` bring to it.
+
+    Of what the vehicles of an edge server hold they bring the share of their `worth`. Stage III has all vehicles, so
+    that the rest is learned in cloud rounds: z of them bring the share 1 - 1 / (z + 1) of it, which for `k` > 1 edge
+    rounds in each is less than it would be; for k = 0 nobody trains in them.
+    """
+    before = task.weigh_groups(max(task.edge_groups) if task.called is None else task.called[1])
+    after = task.weigh_groups(most)
+    shares = [one / all_ for one, all_ in zip(after, before, strict=True)]
+    whole = sum(after) / sum(before)
+
+    def share(curve: Curve | None) -> Curve | None:
+        if isinstance(curve, Effective) and whole < 1:
+            held = whole * curve.group_samples
+            others = 0.0 if k == 0 else (1 - whole) / whole
+            values = {name: getattr(curve, name) for name in ("floor", "a", "b", "alpha", "beta")}
+            return Federated(model="federated", **values, group_samples=(held, held), gamma=others)
+        if isinstance(curve, Federated):
+            parts = shares if len(shares) == len(curve.group_samples) else [whole] * len(curve.group_samples)
+            brought = tuple(part * own for part, own in zip(parts, curve.group_samples, strict=True))
+            (own, others), (new_own, new_others) = split_regions(curve.group_samples), split_regions(brought)
+            rest = curve.gamma * others + (own - new_own) * (k > 0)
+            return curve.model_copy(
+                update={"group_samples": brought, "gamma": rest / new_others if new_others else curve.gamma}
+            )
+        return curve
+
+    update = {"called": (least, most), "curve": share(task.curve), "upper": share(task.upper)}
+    return task.model_copy(update=update)
+
+
+def list_calls(task: AllocationTask, k: int) -> Iterator[AllocationTask]:
+    """Yield the task with each number of vehicles that a plan may call, the fewest first; or itself."""
+    if task.called is None:
+        yield task
+        return
+    for number in range(task.called[0], task.called[1] + 1):
+        yield call_vehicles(task, number, number, k)
+
+
 def _list_branches(problem: Problem) -> list[Problem]:
-    options = [_branch(task) for task in problem.tasks]
-    branching = sum(len(each) > 1 for each in options)
+    choices = prod(1 if task.called is None else 1 + task.called[1] - task.called[0] for task in problem.tasks)
+    if choices > MOST_CALLS:
+        raise InputError(
+            f"called: {choices} combinations of vehicles, and {MOST_CALLS} at most can be planned; narrow the ranges"
+        )
+    k = problem.edge_rounds_per_cloud_round
+    options = [[each for called in list_calls(task, k) for each in _branch(called)] for task in problem.tasks]
+    branching = sum(len(_branch(task)) > 1 for task in problem.tasks)
     if branching > MOST_BRANCHING:
         raise InputError(
             f"the first cloud round costs accuracy ('merge') or labels ('labels_mb') in {branching} tasks that may do "

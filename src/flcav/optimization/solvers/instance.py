@@ -171,9 +171,10 @@ def build_instance(problem: Problem, clocks: Sequence[Clock] = ()) -> Instance:
 
 
 def stage_plan(problem: Problem, task: AllocationTask, counts: Sequence[int]) -> StagePlan:
-    """Return the plan of `task` with `counts` = samples, edge rounds, cloud rounds."""
+    """Return the plan of `task` with `counts` = samples, edge rounds, cloud rounds, and the most vehicles called."""
     samples, edge_rounds, cloud_rounds = counts
-    return StagePlan(samples, edge_rounds, cloud_rounds, task.edge_groups, problem.edge_rounds_per_cloud_round)
+    k, most = problem.edge_rounds_per_cloud_round, None if task.called is None else task.called[1]
+    return StagePlan(samples, edge_rounds, cloud_rounds, task.edge_groups, k, most)
 
 
 def price_counts(problem: Problem, task: AllocationTask, counts: Sequence[int]) -> LinkMegabytes:

@@ -37,7 +37,8 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
     problem, plan = json.loads(problem_json), json.loads(plan_json)
     k, kind = problem["edge_rounds_per_cloud_round"], problem["objective"]
     lower, duals = plan["lower_bound"], plan.get("certificate", ())
-    tasks, budgets = read_tasks(problem, k)
+    asked, budgets = read_tasks(problem, k)
+    tasks = [own.calls.get(each.get("called"), own) for own, each in zip(asked, plan["tasks"], strict=True)]
     counts = [[each[name] for name in QUANTITIES] for each in plan["tasks"]]
     costs = [task.cost(own) for task, own in zip(tasks, counts, strict=True)]
     told = [plan["used_mb"].values(), *((each["wireless_mb"], each["wireline_mb"]) for each in plan["tasks"])]
@@ -50,6 +51,9 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
         value = float(np.sin(2 * np.pi / len(corners)) / 2 * (corners @ np.roll(corners, 1)))
     spent = sum(costs, np.zeros(1, dtype=object))
     claims = {
+        "the vehicles called": all(
+            not own.calls or each["called"] in own.calls for own, each in zip(asked, plan["tasks"])
+        ),
         "the limits": all(a <= n <= b for task, own in zip(tasks, counts) for n, (a, b) in zip(own, task.limits)),
         "the budgets": bool(np.all(spent <= budgets * (1 + Fraction(NEAR)))),
         "the megabytes": all(near(float(a), b) for own, said in zip([spent, *costs], told) for a, b in zip(own, said)),
@@ -59,7 +63,7 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
     if kind == "area":
         claims["that there is no bound"] = lower is None and plan["gap"] is None and plan["status"] == "feasible"
         return judge(value, spent, None, claims, trusted)
-    branches = [own for own in list_branches(tasks) if np.all(least_cost(own) <= budgets)]
+    branches = [own for own in list_branches(asked) if np.all(least_cost(own) <= budgets)]
     proven = [_prove(kind, own, each, budgets, k) for own, each in zip(branches, duals)]
     bound = min([*proven, value]) if len(branches) == len(duals) else 0.0
     claims["the duals"] = len(branches) == len(duals) and all(

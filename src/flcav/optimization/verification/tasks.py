@@ -27,6 +27,7 @@ class VerifiedTask(NamedTuple):
     limits: list[list[int]]  # least and most samples, edge rounds, cloud rounds
     unit: Array  # (3, L) cost of one of each
     once: Array  # (L,) cost of the first cloud round
+    calls: Mapping[int, Any] = {}  # the task with each number of vehicles that a plan may call, the fewest first
 
     def cost(self, counts: Sequence[int]) -> Array:
         """Return the cost (L,) of samples, edge rounds and cloud rounds."""
@@ -60,21 +61,56 @@ def read_tasks(problem: Data, k: int) -> tuple[list[VerifiedTask], Array]:
         cars, servers = sum(task["edge_groups"]), len(task["edge_groups"])
         rounds = [[cars * (sent + labels), 0, train_s], [k * cars * sent, servers * model, k * train_s]]
         costs = np.array([[sample, sample, 0], *rounds, [cars * labels, 0, 0]], dtype=object)
-        tasks.append(VerifiedTask(curves, limits, costs[:3], costs[3]))
+        own = VerifiedTask(curves, limits, costs[:3], costs[3])
+        tasks.append(own._replace(calls=_list_calls(task, own, sent + labels, k)) if task.get("called") else own)
     budgets += [horizon_s] * (horizon_s is not None and any(task.unit[1, 2] for task in tasks))
     kept = slice(len(budgets))
-    tasks = [task._replace(unit=task.unit[:, kept], once=task.once[kept]) for task in tasks]
+    tasks = [_keep(task, kept) for task in tasks]
     return tasks, np.array([exact(budget) * SLACK for budget in budgets])
 
 
+def _list_calls(task: Data, own: VerifiedTask, sent: Fraction, k: int) -> dict[int, VerifiedTask]:
+    """Return the task by the number of vehicles called: they pay the edge rounds, and bring their share of the data.
+
+    The rest of it comes with cloud rounds, if anybody trains in them.
+    """
+    (least, most), found = task["called"], {}
+    worth = task.get("worth") or [1.0] * max(task["edge_groups"])
+    before = [fsum(worth[: min(most, size)]) for size in task["edge_groups"]]
+    for number in range(least, most + 1):
+        after = [fsum(worth[: min(number, size)]) for size in task["edge_groups"]]
+        shares = [one / all_ for one, all_ in zip(after, before)]
+        cars = sum(min(number, size) for size in task["edge_groups"])
+        whole = fsum(after) / fsum(before)
+        unit, curves = own.unit.copy(), []
+        unit[1, 0] = cars * sent
+        for weight, curve in own.curves:
+            held = curve["group_samples"]
+            by = [whole] if not isinstance(held, list) else shares if len(shares) == len(held) else [whole] * len(held)
+            left = [(1 - share) * each for share, each in zip(by, np.atleast_1d(held))]
+            curves.append((weight, {**curve, "left": fsum(left) / len(left), "trained": k > 0}))
+        found[number] = own._replace(curves=curves, unit=unit)
+    return found
+
+
+def _keep(task: VerifiedTask, budgets: slice) -> VerifiedTask:
+    """Return the task under those budgets alone that there are."""
+    calls = {number: _keep(own, budgets) for number, own in task.calls.items()}
+    return task._replace(unit=task.unit[:, budgets], once=task.once[budgets], calls=calls)
+
+
 def list_branches(tasks: Sequence[VerifiedTask]) -> Iterator[tuple[VerifiedTask, ...]]:
-    """Yield the tasks with limits without and with cloud rounds, where the first of these is paid for once."""
+    """Yield the tasks with each number of vehicles called, and limits without and with cloud rounds.
+
+    The latter are two branches where the first cloud round is paid for once.
+    """
     options = []
     for task in tasks:
         *others, (least, most) = task.limits
         once = any(task.once) or any(curve.get("merge") for _, curve in task.curves)
         parts = [[0, 0], [1, most]] if once and least == 0 < most else [[least, most]]
-        options.append([task._replace(limits=[*others, part]) for part in parts])
+        called = task.calls.values() or (task,)
+        options.append([own._replace(limits=[*others, part]) for own in called for part in parts])
     yield from product(*options)
 
 
@@ -91,9 +127,10 @@ def error(curve: Data, counts: Sequence[Any], k: int) -> Any:
 
 def held_samples(curve: Data, y: Any, z: Any, k: int) -> Any:
     """Return the effective samples that rounds bring."""
-    groups, t = np.atleast_1d(curve["group_samples"]), y + k * z
+    groups, t, left = np.atleast_1d(curve["group_samples"]), y + k * z, curve.get("left", 0.0)
     own = fsum(groups) / len(groups)
-    return curve["beta"] * (own * t / (t + 1) + curve.get("gamma", 0.0) * own * (len(groups) - 1) * z / (z + 1))
+    later = curve.get("gamma", 0.0) * own * (len(groups) - 1) + left * curve.get("trained", False)
+    return curve["beta"] * ((own - left) * t / (t + 1) + later * z / (z + 1))
 
 
 def drift_part(curve: Data, z: Any) -> Any:

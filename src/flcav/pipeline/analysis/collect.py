@@ -16,6 +16,7 @@ from flcav.pipeline.analysis.differences import (
 )
 from flcav.pipeline.analysis.findings import findings
 from flcav.pipeline.analysis.histories import gaps_closed
+from flcav.pipeline.analysis.lifelong import collect_lifelong
 from flcav.pipeline.arms import Setting, name_repeat
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.provenance import provenance
@@ -57,6 +58,7 @@ def collect_results(graph: Graph, work: Path) -> Run:
         gap_closed=gaps_closed(tests, recipe),
         provenance=provenance(recipe.seed),
         home=collect_home_costs(graph, work) or None,
+        lifelong=collect_lifelong(graph, work) or None,
         caveats=(
             *list_caveats(recipe, main.labels.values(), settings.values()),
             *list_unreached(arms, settings, recipe.placement.group_range_m),

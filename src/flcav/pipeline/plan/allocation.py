@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from flcav.optimization.allocation.vehicles import Shares
 from flcav.optimization.curves.fitting import fit
 from flcav.optimization.curves.history import History
 from flcav.optimization.problem import Problem
+from flcav.optimization.solvers.branches import call_vehicles
 from flcav.pipeline.arms import PlanRule
 from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, PlanLimits
 from flcav.pipeline.results.plans import Plan, TaskPlan
@@ -48,6 +49,8 @@ class PlanSettings:
     group_samples: tuple[int, ...] = ()  # samples that the vehicles of each edge server hold, of each task
     horizon_s: float | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]
     speeds: Mapping[str, float] = field(default_factory=dict)  # of every vehicle, in the order of the edge servers
+    called: tuple[int, int] | None = None  # least and most vehicles of a group on request; None: the plan calls nobody
+    overlap: float = 0.0  # share of a further vehicle's data that those called before it have
 
     def stage_plan(self, samples: int, edge_rounds: int, cloud_rounds: int) -> StagePlan:
         """Return the transfers of a task with these counts."""
@@ -95,13 +98,18 @@ def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarr
         "horizon_s": frame.horizon_s,
         "tasks": [_task(task, frame) for task in tasks],
     }
-    return parse_config(Problem, values, "the run's allocation problem")
+    problem = parse_config(Problem, values, "the run's allocation problem")
+    if frame.called is None:
+        return problem
+    least, most = (min(each, max(frame.edge_groups)) for each in frame.called)
+    narrowed = (call_vehicles(task, least, most, frame.edge_rounds_per_cloud_round) for task in problem.tasks)
+    return problem.model_copy(update={"tasks": tuple(narrowed)})
 
 
 def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
     assert task.history is not None
-    k = frame.edge_rounds_per_cloud_round
-    found = fit(task.history, model="best", group_samples=frame.group_samples, k=k)
+    k, all_ = frame.edge_rounds_per_cloud_round, max(frame.edge_groups)
+    found = fit(task.history, model=_choose_model(task.history, frame), group_samples=frame.group_samples, k=k)
     least, most = frame.limits.samples
     most = task.pool if most is None else min(most, task.pool)
     measured = task.history.resources.max(axis=0)
@@ -117,6 +125,8 @@ def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
         "exchange_mb": task.sizes.exchange_mb,
         "labels_mb": task.sizes.labels_mb,
         "edge_groups": list(frame.edge_groups),
+        "called": None if frame.called is None else [1, all_],
+        "worth": None if frame.called is None else [(1 - frame.overlap) ** number for number in range(all_)],
         "limits": {
             "samples": [min(least, most), most],
             "edge_rounds": edge,
@@ -131,6 +141,14 @@ def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
     }
 
 
+def _choose_model(history: History, frame: PlanSettings) -> Literal["best", "effective", "federated"]:
+    """Return the model of the learning curve: the best, or where the plan calls vehicles one that knows their data."""
+    if frame.called is None:
+        return "best"
+    several = len(frame.group_samples) > 1 and np.ptp(history.resources[:, 2]) > 0
+    return "federated" if several else "effective"
+
+
 def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan:
     if fixed.samples > task.pool:
         raise InputError(f"tasks.{task.name}.plan: {plural(fixed.samples, 'sample')}; the pools hold {task.pool}")
@@ -141,12 +159,13 @@ def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan
 
 def make_task_plan(sizes: MessageSizes, own: TaskAllocation, problem: Problem, shares: Shares) -> TaskPlan:
     """Return the plan of a task by its allocation in `problem`: scores predicted after each stage, rounds to join."""
-    curve = next(each.curve for each in problem.tasks if each.name == own.name)
+    task = next(each for each in problem.tasks if each.name == own.name)
     k, counts = problem.edge_rounds_per_cloud_round, (own.samples, own.edge_rounds, own.cloud_rounds)
+    curve = task.curve if own.called is None else call_vehicles(task, own.called, own.called, k).curve
     spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}
     predicted = {stage: max(1 - float(curve.error(*each, k)), 0.0) for stage, each in spent.items()}
     joins = {each.vehicle: each.rounds for each in shares[own.name]} if own.name in shares else None
-    return _task_plan(counts, LinkMegabytes(own.wireless_mb, own.wireline_mb), sizes, predicted, joins)
+    return _task_plan(counts, LinkMegabytes(own.wireless_mb, own.wireline_mb), sizes, predicted, joins, own.called)
 
 
 def _task_plan(
@@ -155,6 +174,7 @@ def _task_plan(
     sizes: MessageSizes,
     predicted: Mapping[str, float] | None,
     joins: Mapping[str, tuple[int, ...]] | None = None,
+    called: int | None = None,
 ) -> TaskPlan:
     return TaskPlan(
         *counts,
@@ -166,4 +186,5 @@ def _task_plan(
         joins=joins,
         exchange_mb=sizes.exchange_mb,
         labels_mb=sizes.labels_mb,
+        called=called,
     )

@@ -42,7 +42,11 @@ def remake_plan(
         predicted = float(task.curve.error(*counts, problem.edge_rounds_per_cloud_round))
         known = 0 < predicted < np.inf  # a curve without points before the first round has no error there
         states[task.name] = TaskState(
-            samples=counts[0], edge_rounds=counts[1], accuracy=reached[task.name] if known else None, ended=stage
+            samples=counts[0],
+            edge_rounds=counts[1],
+            called=own.called if stage == EDGE else None,
+            accuracy=reached[task.name] if known else None,
+            ended=stage,
         )
     sent = Sent(wireless=used_mb.wireless_mb, wireline=used_mb.wireline_mb)
     rest = condition_problem(problem, PlanState(tasks=states, used_mb=sent))

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from flcav.federation.leads import Term
 from flcav.interface.wording import plural
 from flcav.storage.records import Record
 
@@ -31,11 +32,21 @@ class Group(Record):
     most_rounds: int = 0  # of the plan
     losses: tuple[float, ...] = ()  # on the members' held-back frames, mean: before the first round, and after each
     dissolved: str = ""  # why
+    roadside: tuple[str, ...] = ()  # units that joined, as clients
+    scores: tuple[float, ...] = ()  # the task's measure on the region's validation frames before the rounds and after
+    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group; none: an edge server led
 
     @property
     def asked(self) -> tuple[str, ...]:
         """Return the clients that sent a request."""
         return tuple(name for name, each in self.vehicles.items() if each.asks)
+
+    @property
+    def mended(self) -> tuple[str, ...]:
+        """Return the clients that asked and would not ask again: the group's network is below the limit."""
+        return tuple(
+            name for name in self.asked if (own := self.vehicles[name].after) is not None and own <= self.limit
+        )
 
     def describe(self) -> str:
         """Return the group in words."""
@@ -44,12 +55,28 @@ class Group(Record):
             return f"nobody asked: the largest loss on held-back frames is {worst:.3f}, and {self.limit:.3f} the limit"
         told = [
             f"{', '.join(self.asked)} asked, with a loss above {self.limit:.3f} on frames held back",
-            f"{self.lead} led {plural(len(self.members), 'vehicle')} for {max(len(self.losses) - 1, 0)} of "
-            f"{plural(self.most_rounds, 'round')}",
+            f"{self.lead} led {plural(len(self.members), 'vehicle')}{self._describe_units()} for "
+            f"{max(len(self.losses) - 1, 0)} of {plural(self.most_rounds, 'round')}",
             f"{self.request_bytes} bytes of requests and offers",
         ]
+        told += [_describe_end(term) for term in self.terms[:-1]]
+        told.append(f"mended: {len(self.mended)} of {len(self.asked)}")
         for name in self.asked:
             own = self.vehicles[name]
             told.append(f"{name} {own.before:.3f} to {own.after:.3f}" if own.after is not None else name)
+        if self.scores:
+            before, after = self.scores
+            told.append(f"on validation frames {before:.3f} to {after:.3f}, which nobody acts on")
         told += [f"{name} stayed ({why})" for name, why in self.stayed.items()]
         return "; ".join([*told, *([self.dissolved] if self.dissolved else [])])
+
+    def _describe_units(self) -> str:
+        names = [name.rpartition("/")[2] for name in self.roadside]
+        return f" and {plural(len(names), 'roadside unit')} ({', '.join(names)})" if names else ""
+
+
+def _describe_end(term: Term) -> str:
+    """Return in words how the term of a lead ended."""
+    if term.received is None:
+        return f"{term.lead} was gone before round {term.left}"
+    return f"{term.lead} left in round {term.left} with {plural(term.received, 'update')}, and the round began again"

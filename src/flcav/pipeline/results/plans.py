@@ -37,6 +37,8 @@ class TaskPlan:
         None  # what it sends to have its samples labelled: before each round of stage II, once before stage III
     )
 
+    called: Annotated[int | None, LEFT_OUT] = None  # vehicles of a group on request; None: the plan does not decide
+
     @property
     def sizes(self) -> MessageSizes:
         """Sizes of the task's messages."""

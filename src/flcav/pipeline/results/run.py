@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 from flcav.pipeline.arms import Names, name_steps
 from flcav.pipeline.provenance import Provenance
 from flcav.pipeline.recipe import RunRecipe
+from flcav.pipeline.results.lifelong import LifelongArm
 from flcav.pipeline.results.plans import Placed, Plan
 from flcav.pipeline.results.saved import Saved
 from flcav.pipeline.results.tests import Difference, HomeCost, RegionalTest, RunFinding, Test, Tested
@@ -100,6 +101,7 @@ class Run(Saved):
     elapsed_s: float = 0.0  # wall time of all starts together
     costs: Annotated[tuple[ArmCost, ...] | None, LEFT_OUT] = None  # of each arm and task
     home: Annotated[tuple[HomeCost, ...] | None, LEFT_OUT] = None  # of further measures than the tasks' own
+    lifelong: Annotated[tuple[LifelongArm, ...] | None, LEFT_OUT] = None  # of each task and arm; None: not asked for
 
     @property
     def steps(self) -> Names:

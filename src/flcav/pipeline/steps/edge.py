@@ -10,8 +10,9 @@ from typing import Any
 from safetensors.numpy import load_file
 
 from flcav.federation.buffered_rounds import Buffers, afford_buffers
+from flcav.federation.leads import Term, federate_led, follow_leads
 from flcav.federation.privacy import count_affordable
-from flcav.federation.rounds import BeforeRound, Schedule, federate
+from flcav.federation.rounds import BeforeRound, OnRound, Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.link import Runtime, open_runtime
 from flcav.federation.runtimes.metered import Account, Outage
@@ -20,7 +21,7 @@ from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.trainable import Trainable, Weights
+from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
 from flcav.perception.client import TaskClient
@@ -38,6 +39,7 @@ from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.steps.groups import call_group
+from flcav.pipeline.steps.memory import Memory, remember
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.regions import (
     LabelledSamples,
@@ -88,6 +90,8 @@ class EdgeFederation:
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
     relabel: BeforeRound | None = None  # changes the clients' labels before each round
     watch: GroupWatch | None = None  # over a group, which dissolves when its loss has levelled off
+    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group; none: an edge server leads
+    roadside: frozenset[str] = frozenset()  # clients at the edge server itself, whose messages cross no radio
 
     @property
     def start_share(self) -> float:
@@ -164,22 +168,31 @@ def federate_edge(
         if own.watch is not None and own.watch.over:
             raise Levelled
         if done < own.afford(rules, own.schedule.rounds, buffers):
-            federate(
-                clients,
-                start,
-                own.schedule,
-                Account(own.book, EDGE, learning.task.name, "wireless", outages),
-                strategy=own.strategy,
-                rules=rules,
-                state=state,
-                done=done,
-                earlier=own.earlier,
-                before_round=partial(own.prepare, clients, where),
-                on_round=partial(_keep_round, own.watch, checkpoints),
-                runtime=where,
-                distiller=own.shared,
-                buffers=buffers,
-            )
+            account = Account(own.book, EDGE, learning.task.name, "wireless", outages, own.roadside)
+            keep = partial(_keep_round, own.watch, checkpoints)
+
+            def run(weights: Weights, account: Account, done: int, on_round: OnRound) -> LocalUpdate:
+                return federate(
+                    clients,
+                    weights,
+                    own.schedule,
+                    account,
+                    strategy=own.strategy,
+                    rules=rules,
+                    state=state,
+                    done=done,
+                    earlier=own.earlier,
+                    before_round=partial(own.prepare, clients, where),
+                    on_round=on_round,
+                    runtime=where,
+                    distiller=own.shared,
+                    buffers=buffers,
+                )
+
+            if own.terms:
+                federate_led(run, start, account, own.terms, keep, state=state, done=done)
+            else:
+                run(start, account, done, keep)
     return checkpoints.finish(own.network, learning.training.average_rounds, own.start_share)
 
 
@@ -200,13 +213,16 @@ class EdgeSettings(FederationSettings):
 
     inputs: RegionInputs
     validation: Mapping[str, str] = {}  # recordings of the frames that each round is scored on, by region
+    shown: str = ""  # recording of the region's validation frames, on which a group's score is told; "": it is not
     scored: bool = False  # whether the labels are compared with ground truth
     last: bool = False  # whether the arm ends with it
+    memory: Memory | None = None  # that its vehicles replay, of conditions that they were in before
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Return the names of the steps whose results it takes."""
-        return (*self.inputs.needs, *self.validation.values())
+        remembered = () if self.memory is None else self.memory.needs
+        return (*self.inputs.needs, *self.validation.values(), *((self.shown,) if self.shown else ()), *remembered)
 
     @property
     def stage(self) -> str:
@@ -229,10 +245,16 @@ def edge_step(
     inputs, stage, plan = settings.inputs, settings.stage, Plan.load(work.inputs[settings.inputs.plan])
     book = _open_book(work, settings, plan)
     before, labelled = len(book.entries), label_samples(work, settings, inputs, book, EDGE)
-    called = None
+    called, whole = None, labelled.samples
     if stage == EDGE and settings.federation.requests is not None:
-        called = call_group(work, settings, inputs, settings.federation.requests, labelled.samples, book)
+        most = plan.tasks[settings.learning.task].called
+        called = call_group(
+            work, settings, inputs, settings.federation.requests, labelled.samples, book, most, labelled.poles
+        )
         labelled = replace(labelled, samples=called.samples)
+    if settings.memory is not None:
+        replayed = remember(work, settings, settings.memory, inputs.region, labelled.samples)
+        labelled = replace(labelled, samples=replayed)
     if stage == MORE_EDGE and isinstance(labelled.samples, RoadAverageLabels):
         _label_once(work, settings, plan, labelled.samples)
     noise = _find_noise(work, settings, plan)
@@ -242,14 +264,19 @@ def edge_step(
     if called is not None and not called.samples:
         rounds = 0
     federation = _open_federation(work, settings, labelled, rounds, book)
-    federation = federation if called is None else replace(federation, watch=called.watch)
+    if called is not None:
+        federation = replace(federation, watch=called.watch, roadside=frozenset(called.group.roadside))
     driven = _drive(work, settings, federation, own)
+    if called is not None and called.group.lead in called.vehicles:  # ad hoc
+        terms = follow_leads(called.vehicles, called.group.lead, driven.records, inputs.region)
+        federation, called = replace(federation, terms=terms), replace(called, terms=terms)
     where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
     where["fleet"] = Path(fleet) if fleet else None
     losses = federate_edge(federation, driven.rules, driven.outages, buffers=driven.buffers, **where)
     clients, labels = federation.clients, None
+    shown = Frames.open(work.inputs[settings.shown]) if settings.shown else None
     if settings.scored and stage == EDGE and clients:
-        labels = score_labels(work, inputs, federation.network.config, labelled.samples)
+        labels = score_labels(work, inputs, federation.network.config, whole)
     StageResult(
         stage=stage,
         task=settings.learning.task,
@@ -262,14 +289,16 @@ def edge_step(
         records=read_rounds(work.folder, inputs.region, before, {inputs.region: driven.seconds}),
         labels=labels,
         noise=noise,
-        group=None if called is None else called.dissolve(work.folder, rounds),
+        group=None if called is None else called.dissolve(work.folder, work.inputs[inputs.pretrain], shown, rounds),
     ).save(work.folder)
 
 
 def _open_book(work: Work, settings: EdgeSettings, plan: Plan) -> Ledger:
-    """Return the ledger of the region, with what it sent before."""
+    """Return the ledger of the region, with what it sent before; its share is by the vehicles that a plan calls."""
     inputs, share = settings.inputs, share_plan_budget(plan, settings.budgets_mb, settings.learning.task)
-    book = open_region_book(work, share, inputs.pretrain, settings.vehicles, inputs.region)
+    called = plan.tasks[settings.learning.task].called
+    vehicles = {name: count if called is None else min(called, count) for name, count in settings.vehicles.items()}
+    book = open_region_book(work, share, inputs.pretrain, vehicles, inputs.region)
     before = inputs.edge or inputs.errors  # the ledger of stage II includes that of the errors
     return book if before is None else Ledger(book.budget, read_entries(work, before))
 
@@ -354,7 +383,8 @@ def _drive(work: Work, settings: EdgeSettings, federation: EdgeFederation, plan:
         return driven
     seeds = [own.schedule.work(number).seed for number in range(1, rounds + 1)]
     rules = follow_plan(settings.federation, plan, after_edge=bool(own.earlier))
-    return drive_region(work, settings, own.learning, inputs, [*own.clients], own.earlier, rules, seeds)
+    vehicles = [name for name in own.clients if name not in own.roadside]
+    return drive_region(work, settings, own.learning, inputs, vehicles, own.earlier, rules, seeds)
 
 
 def list_edge_steps(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
@@ -363,7 +393,9 @@ def list_edge_steps(outline: Outline, arm: Setting, task: str) -> Iterator[Step]
     for region in arm.regions:
         name, inputs = outline.names.edge(arm.name, region, task), outline.inputs(arm, region, task, EDGE)
         about = outline.federation(arm, task, EDGE)
-        settings = EdgeSettings(**about, inputs=inputs, scored=scored, last=arm.stages[-1] == EDGE)
+        asks = arm.federation.requests is not None
+        shown = outline.names.recording(region, "validation", task) if asks else ""
+        settings = EdgeSettings(**about, inputs=inputs, shown=shown, scored=scored, last=arm.stages[-1] == EDGE)
         yield make_step(name, edge_step, settings, outline.vehicles[region])
 
 

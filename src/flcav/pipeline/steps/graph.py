@@ -1,4 +1,7 @@
-"""The steps of a run in their order: plan, pretrain, register errors, place sensors, edge FL, cloud FL, test."""
+"""The steps of a run in their order: plan, pretrain, register errors, place sensors, edge FL, cloud FL, test.
+
+After them come those of lifelong learning.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +12,7 @@ from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRec
 from flcav.pipeline.steps.centralised import list_central_steps, list_pretraining
 from flcav.pipeline.steps.cloud import make_cloud_step
 from flcav.pipeline.steps.edge import list_edge_steps, list_more_edge_steps
+from flcav.pipeline.steps.lifelong import list_lifelong_steps
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.placing import list_placements
 from flcav.pipeline.steps.planning import make_plan_step, make_replan_step
@@ -55,6 +59,7 @@ class Graph(Outline):
                 elif MORE_EDGE in arm.stages:
                     yield from list_more_edge_steps(self, arm, task)
             yield from list_tests(self, arm)
+        yield from list_lifelong_steps(self)
 
     def _start(self, arm: Setting) -> Iterator[Step]:
         """Yield the steps of an arm before it federates."""

@@ -9,13 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
+from flcav.federation.leads import Term
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.network.ledger import Ledger
 from flcav.network.messages import pack, send
 from flcav.perception.client import TaskClient
+from flcav.perception.objects.samples import Sample
+from flcav.perception.outcomes import score_network
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames
+from flcav.pipeline.labels.roadside import label_roadside
 from flcav.pipeline.poles import find_sites
 from flcav.pipeline.radio.driving import link_scenes
 from flcav.pipeline.recipe import EDGE, Requests
@@ -32,6 +36,7 @@ from flcav.pipeline.training.groups import (
     Picked,
     choose_members,
     count_labels,
+    find_gradient,
     find_in_range,
     find_lead,
     hold_back,
@@ -52,16 +57,31 @@ class Called:
     group: Group
     samples: Mapping[str, Sequence[Any]]  # that its members train on, by client
     watch: GroupWatch
+    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group
 
-    def dissolve(self, folder: Path, most_rounds: int) -> Group:
-        """Return the group after its rounds, with what the network in `folder` does on what members held back."""
+    @property
+    def vehicles(self) -> list[str]:
+        """Return the members that are vehicles."""
+        return [*self.group.members]
+
+    def dissolve(self, folder: Path, before: Path, shown: Frames | None, most_rounds: int) -> Group:
+        """Return the group after its rounds, with what the network in `folder` does on what members held back.
+
+        Of the frames `shown` its score is told beside that of the network in the folder `before`.
+        """
         if not self.group.members:
             return self.group
-        reached = self.watch.measure(to_arrays(load_stage_network(self.watch.task, folder)))
+        task, ended = self.watch.task, load_stage_network(self.watch.task, folder)
+        reached, scores = self.watch.measure(to_arrays(ended)), tuple[float, ...]()
+        if shown is not None:
+            networks = (load_stage_network(task, before), ended)
+            scores = tuple(score_network(task, each, shown.data, shown.vehicles) for each in networks)
         vehicles = {name: replace(each, after=reached.get(name)) for name, each in self.group.vehicles.items()}
         over = "the loss has levelled off" if self.watch.over else "the plan's rounds are over"
         losses = tuple(self.watch.losses)
-        return replace(self.group, vehicles=vehicles, losses=losses, most_rounds=most_rounds, dissolved=over)
+        led = tuple(term for term in self.terms if term.first < len(losses) or term.first == 1)
+        about: Any = {"losses": losses, "most_rounds": most_rounds, "dissolved": over, "terms": led, "scores": scores}
+        return replace(self.group, vehicles=vehicles, **about)
 
 
 def call_group(
@@ -71,8 +91,12 @@ def call_group(
     how: Requests,
     samples: Mapping[str, Sequence[Any]],
     book: Ledger,
+    most: int | None = None,
+    poles: Sequence[int] = (),
 ) -> Called:
-    """Return the group that a region's vehicles form; requests and offers enter `book`.
+    """Return the group that a region's vehicles form, `most` of them by the plan; requests and offers enter `book`.
+
+    Units on the `poles` join, if `how` says so, that are in range of one that asked; what they send crosses no radio.
 
     Who asks is there when the vehicle that errs most is first there. Raises `InputError` where pretraining has no loss,
     and `BudgetExceeded`.
@@ -84,7 +108,7 @@ def call_group(
         raise InputError("requests: vehicles ask by the loss at the end of pretraining, and there is no pretraining")
     limit = how.excess * validated[-1].loss
     clients = [name for name in sorted(samples) if len(samples[name])]
-    parts = {name: hold_back(samples[name], how.held_back) for name in clients}
+    parts = {name: hold_back(len(samples[name]), how.held_back) for name in clients}
     held = {name: Picked(samples[name], own) for name, (_, own) in parts.items()}
     vehicles: dict[str, Checked] = {}
     for name, own in held.items():
@@ -113,17 +137,40 @@ def call_group(
     for name in linked:
         own = Picked(samples[name], parts[name][0])
         client = TaskClient(task, frozen.config, own, batch=learning.batch)
-        sketch = sketch_gradient(client, weights, derive_seed(learning.seed, "offer"))
+        seed = derive_seed(learning.seed, "offer")
+        sketch = sketch_gradient(find_gradient(client, weights, seed), seed)
         offers[name] = Offer(len(own), count_labels(own), sketch)
         send(book, offers[name].message(), client=name, **where)
     if not offers:
         return Called(Group(limit, vehicles, lead, stayed=stayed), {}, watch)
-    chosen = choose_members(how, [name for name in present if name in linked], weigh_offers(offers), stayed)
+    asking = sorted((name for name in present if name in linked), key=lambda name: -vehicles[name].before)
+    chosen = choose_members(how, asking, weigh_offers(offers), stayed, most)
     watch.held = {name: held[name] for name in chosen.members}
     watch.note(weights)
     sent = sum(entry.bytes for entry in book.entries[before:] if entry.direction == "up")
-    group = Group(limit, vehicles, lead, chosen.members, chosen.quality, chosen.stayed, sent)
-    return Called(group, {name: Picked(samples[name], parts[name][0]) for name in chosen.members}, watch)
+    trained: dict[str, Sequence[Any]] = {name: Picked(samples[name], parts[name][0]) for name in chosen.members}
+    units: dict[str, list[Sample]] = {}
+    if how.roadside:
+        there = find_units(split, inputs, poles, positions, present, how.range_m)
+        spins = {(split.data.keys[i].scene, split.data.keys[i].index) for i in split.vehicles}
+        units = label_roadside(split, there, spins, frozen.config, inputs.region)
+    group = Group(limit, vehicles, lead, chosen.members, chosen.quality, chosen.stayed, sent, roadside=tuple(units))
+    return Called(group, trained | units, watch)
+
+
+def find_units(
+    split: Frames,
+    inputs: RegionInputs,
+    poles: Sequence[int],
+    positions: Mapping[str, NDArray[np.float64]],
+    asked: Sequence[str],
+    range_m: float,
+) -> list[int]:
+    """Return those of the poles that are in range of one that asked."""
+    sites = find_sites(split, split if inputs.recorded else None)
+    places = {f"pole{n}": at for n, at in zip(sites.number.tolist(), sites.position, strict=True) if n in poles}
+    near = find_in_range({**positions, **places}, asked, range_m)
+    return [pole for pole in poles if f"pole{pole}" in near]
 
 
 def find_positions(

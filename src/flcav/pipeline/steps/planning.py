@@ -91,6 +91,8 @@ class FirstPlanSettings(StepSettings):
     tasks: Mapping[str, PlannedTask]
     held: Mapping[str, Mapping[str, int]]  # numbers of training frames, by federating region and vehicle
     speeds: Mapping[str, float]  # of every vehicle, "region/vehicle"; empty: all train at the same speed
+    called: tuple[int, int] | None = None  # least and most vehicles of a group on request; None: it does not decide
+    overlap: float = 0.0  # share of a further vehicle's data that those called before it have
     updates: tuple[UpdateForm, ...]  # forms of the arms' updates, of which the largest is planned with
     uploads: UploadSettings | None  # None: uploads are drawn
     air: AirSettings | None  # None: messages take no time
@@ -147,6 +149,8 @@ def frame_plan(settings: FirstPlanSettings) -> PlanSettings:
         group_samples=tuple(sum(own.values()) for own in settings.held.values()),
         horizon_s=settings.horizon_s,
         speeds=settings.speeds,
+        called=settings.called,
+        overlap=settings.overlap,
     )
 
 
@@ -274,6 +278,8 @@ def make_plan_step(outline: Outline, arm: Setting) -> Step:
         tasks={task: _plan_task(outline, task) for task in recipe.tasks},
         held=held,
         speeds=_list_speeds(outline, held, timed=air is not None),
+        called=None if arm.calls is None else arm.calls[:2],
+        overlap=0.0 if arm.calls is None else arm.calls.overlap,
         updates=tuple(update_forms(outline.settings.values())),
         uploads=uploads,
         air=air,

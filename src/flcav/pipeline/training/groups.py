@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import Ledger
 from flcav.network.messages import from_names, pack, send
-from flcav.optimization.quality import data_quality, gradient_novelty, label_distribution_distance
+from flcav.optimization.quality import data_quality, gradient_novelty, label_distribution_distance, visible_objects
 from flcav.perception.client import TaskClient
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays
@@ -31,6 +31,7 @@ SERVER_RANGE = "out of V2X range of whoever asked"
 ABSENT = "not in the town"
 NO_LINK = "no link to spare"
 NOT_NEEDED = "its data add less"
+FULL = "the group is full"
 
 
 @dataclass(frozen=True)
@@ -63,12 +64,11 @@ class Chosen:
     stayed: Mapping[str, str]
 
 
-def hold_back(samples: Sequence[Any], share: float) -> tuple[list[int], list[int]]:
-    """Return the places of the samples to train on, and of those held back: evenly spread, one of each at least.
+def hold_back(count: int, share: float) -> tuple[list[int], list[int]]:
+    """Return the places of `count` samples to train on, and of those held back: evenly spread, one of each at least.
 
     Of a single sample nothing is held back.
     """
-    count = len(samples)
     held = min(max(round(share * count), 1), count - 1) if count > 1 else 0
     places = {int((number + 0.5) * count / held) for number in range(held)}
     return [i for i in range(count) if i not in places], sorted(places)
@@ -98,12 +98,16 @@ def count_labels(samples: Sequence[Any]) -> dict[str, int]:
     return dict(sorted(counts.items()))
 
 
-def sketch_gradient(client: TaskClient, weights: Weights, seed: int) -> Array:
-    """Return a random projection (SKETCH,) of the gradient of a client's loss on one batch, at `weights`.
+def find_gradient(client: TaskClient, weights: Weights, seed: int) -> Weights:
+    """Return the gradient of a client's loss on one batch, at `weights`."""
+    return client.train(weights, steps=1, learning_rate=1e-9, seed=seed, shift={}).gradient
+
+
+def sketch_gradient(gradient: Weights, seed: int) -> Array:
+    """Return a random projection (SKETCH,) of a gradient.
 
     Projections of all clients by one seed keep the angles between their gradients up to some 1 / sqrt(SKETCH).
     """
-    gradient = client.train(weights, steps=1, learning_rate=1e-9, seed=seed, shift={}).gradient
     sketch = np.zeros(SKETCH)
     for name, array in gradient.items():
         flat = np.asarray(array, np.float64).ravel()
@@ -114,7 +118,7 @@ def sketch_gradient(client: TaskClient, weights: Weights, seed: int) -> Array:
 
 
 def weigh_offers(offers: Mapping[str, Offer]) -> dict[str, float]:
-    """Return the quality in (0, 1] of each offer's data: by label distribution and novelty of the gradient.
+    """Return the quality in (0, 1] of each offer's data: by labels, objects seen and novelty of the gradient.
 
     A task without classes is judged by its gradients alone.
     """
@@ -122,7 +126,8 @@ def weigh_offers(offers: Mapping[str, Offer]) -> dict[str, float]:
     counts = np.array([[offer.labels.get(label, 0) for label in classes] for offer in offers.values()])
     distance = label_distribution_distance(counts) if classes else np.zeros(len(offers))
     novelty = gradient_novelty([offer.sketch for offer in offers.values()])
-    return dict(zip(offers, data_quality(distance, None, novelty).tolist(), strict=True))
+    seen = visible_objects(counts.sum(axis=1), [offer.samples for offer in offers.values()]) if classes else None
+    return dict(zip(offers, data_quality(distance, seen, novelty).tolist(), strict=True))
 
 
 def find_in_range(positions: Mapping[str, Array], of: Sequence[str], range_m: float) -> list[str]:
@@ -152,17 +157,22 @@ def find_lead(
 
 
 def choose_members(
-    how: Requests, asked: Sequence[str], quality: Mapping[str, float], stayed: Mapping[str, str]
+    how: Requests,
+    asked: Sequence[str],
+    quality: Mapping[str, float],
+    stayed: Mapping[str, str],
+    most: int | None = None,
 ) -> Chosen:
     """Return the group: who asked, and of the others those whose data are good enough, the best first.
 
-    quality: of all who made an offer; stayed: why others made none.
+    asked: those that made an offer, who errs most first; quality: of all who made one; stayed: why others made none;
+    most: members by the plan, None: those of `how`.
     """
     others = sorted((name for name in quality if name not in asked), key=lambda name: (-quality[name], name))
     good = [name for name in others if quality[name] >= how.least_quality * max(quality.values())]
-    came = good if how.most is None else good[: max(how.most - len(asked), 0)]
-    unneeded = {name: NOT_NEEDED for name in others if name not in came}
-    return Chosen((*asked, *came), quality, {**stayed, **unneeded})
+    came = (*asked, *good)[: most or how.most]
+    left = {name: NOT_NEEDED for name in others if name not in good} | dict.fromkeys((*asked, *good)[len(came) :], FULL)
+    return Chosen(came, quality, {**stayed, **left})
 
 
 def has_levelled(losses: Sequence[float], how: Requests) -> bool:

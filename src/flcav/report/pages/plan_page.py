@@ -110,7 +110,7 @@ def _parts(problem: Problem, plan: Allocation) -> list[plans.StageTraffic]:
 
 
 def _stage_prices(problem: Problem, task: AllocationTask, row: TaskAllocation) -> dict[str, LinkMegabytes]:
-    none = StagePlan(0, 0, 0, task.edge_groups, problem.edge_rounds_per_cloud_round)
+    none = StagePlan(0, 0, 0, task.edge_groups, problem.edge_rounds_per_cloud_round, row.called)
     return {name: price(replace(none, **{field: getattr(row, field)}), task.sizes) for field, name in STAGES.items()}
 
 

@@ -31,6 +31,7 @@ from flcav.pipeline.steps.testing import LOOK
 from flcav.pipeline.training.records import list_rounds
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.report.charts.lifelong import draw_rounds
 from flcav.report.charts.runs import STAGES, Row
 from flcav.report.charts.timeline import timeline_of_rounds
 from flcav.report.pages import html
@@ -119,6 +120,8 @@ def page(run: Run) -> dict[str, Any]:
             for stage in result.stages
             if stage.group is not None
         ],
+        "lifelong": run.lifelong or (),
+        "conditions": [(arm, passed) for arm in run.lifelong or () for passed in arm.passed if passed.asked],
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
@@ -162,6 +165,8 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
     for task, chart in charts.items():
         drawn[f"rounds_{_file_name(task)}"] = figures.by_round(*chart)
     drawn |= _timelines(run, work)
+    for task in run.recipe.tasks if run.lifelong else ():
+        drawn[f"lifelong_{_file_name(task)}"] = draw_rounds([arm for arm in run.lifelong or () if arm.task == task])
     drawn["megabytes"] = figures.megabytes(_sent(run), {link: use.budget_mb for link, use in main.links.items()})
     if costs := [each for each in _list_costs(run) if each.gain_per_mb is not None]:
         drawn["gain"] = figures.gains({task: _list_gains(costs, task) for task in {each.task: None for each in costs}})

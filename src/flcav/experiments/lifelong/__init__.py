@@ -1,0 +1,1 @@
+"""Lifelong learning: with replay, without, and doing nothing."""

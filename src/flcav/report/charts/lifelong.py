@@ -1,0 +1,71 @@
+"""Lifelong learning: a measure on each condition, by round of one run and by condition over seeds."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from flcav.pipeline.results.lifelong import LifelongArm
+from flcav.report import style
+from flcav.statistics.estimates import Estimate
+
+COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY)  # of conditions, in turn
+ARM_COLOURS = (style.BLUE, style.ORANGE, style.MUTED)  # of arms, in turn
+APART = 0.06  # of arms along the horizontal axis
+
+
+@style.styled
+def draw_rounds(arms: Sequence[LifelongArm]) -> Figure:
+    """Return a measure on validation frames of each condition from when it comes, by round: a panel per arm.
+
+    Points at the beginning of a condition are of the network that drives there. Dashes: what a condition can reach.
+    """
+    figure = style.canvas(6.4, 0.6 + 1.8 * len(arms))
+    panels = figure.subplots(len(arms), sharex=True, sharey=True, squeeze=False)[:, 0]
+    for panel, arm in zip(panels, arms, strict=True):
+        start = 0
+        for number, passed in enumerate(arm.passed):
+            panel.axvline(start - 0.5, color=style.RULE, linewidth=0.8)
+            for condition, scores in passed.scores.items():
+                colour = COLOURS[arm.conditions.index(condition) % len(COLOURS)]
+                rounds = start + np.arange(len(scores))
+                panel.plot(rounds, scores, color=colour, marker="o", markersize=3, linewidth=1.2)
+            length = max(len(each.passed[number].scores[passed.condition]) for each in arms)
+            own = COLOURS[number % len(COLOURS)]
+            panel.hlines(passed.reachable, start, start + length - 1, color=own, linestyle="dashed", linewidth=0.8)
+            start += length
+        panel.set(title=arm.arm, ylabel=arm.measure)
+        panel.grid(axis="y")
+    panels[-1].set(xlabel="rounds of all conditions, one after another")
+    panels[-1].set_xticks([])
+    lines = [
+        panels[0].plot([], [], color=COLOURS[number % len(COLOURS)], label=condition)[0]
+        for number, condition in enumerate(arms[0].conditions)
+    ]
+    style.key(figure, lines)
+    return figure
+
+
+@style.styled
+def draw_conditions(found: Mapping[str, Mapping[str, Sequence[Estimate]]], measure: str) -> Figure:
+    """Return a measure with its interval on each condition, a panel each: pretrained, and after each condition.
+
+    found: by condition, in their order, and arm.
+    """
+    conditions = [*found]
+    figure = style.canvas(2.4 * len(conditions), 3.2)
+    panels = figure.subplots(1, len(conditions), sharey=True, squeeze=False)[0]
+    for number, (panel, (condition, arms)) in enumerate(zip(panels, found.items(), strict=True)):
+        for place, ((arm, means), colour) in enumerate(zip(arms.items(), ARM_COLOURS, strict=False)):
+            at = np.arange(len(means)) + APART * (place - (len(arms) - 1) / 2)
+            panel.plot(at, [each.mean for each in means], color=colour, marker="o", markersize=3, label=arm)
+            for x, each in zip(at.tolist(), means, strict=True):
+                if each.low is not None and each.high is not None:
+                    panel.plot([x, x], [each.low, each.high], color=colour, linewidth=1.0)
+        panel.axvspan(number + 0.5, number + 1.5, color=style.SIDEWALK, zorder=0)
+        panel.set_xticks(range(len(conditions) + 1), ["start", *conditions], rotation=40, ha="right")
+        panel.set(title=f"tested in {condition}")
+        panel.grid(axis="y")
+    panels[0].set(ylabel=f"{measure} (95 % interval)")
+    style.key(figure, panels[0].get_legend_handles_labels()[0])
+    return figure

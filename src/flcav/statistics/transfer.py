@@ -1,0 +1,36 @@
+"""Final mean, backward and forward transfer of a learner to which tasks come one after another.
+
+`scores` (T + 1, T) has the score on each of T tasks, in the order in which they come: in row 0 before the first of
+them, in row i after task i. Source: Lopez-Paz and Ranzato, "Gradient Episodic Memory for Continual Learning", NeurIPS
+2017, equations 2 to 4. There the first row is of random weights; here it is of the network that learning begins with.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def compute_final_mean(scores: ArrayLike) -> float:
+    """Return the mean score over all tasks after the last; raises ValueError as all functions here."""
+    return float(_check(scores)[-1].mean())
+
+
+def compute_backward_transfer(scores: ArrayLike) -> float:
+    """Return the mean change of the score on a task by all later ones: forgetting where it is negative."""
+    table = _check(scores)
+    learned = np.diagonal(table[1:])
+    return float((table[-1] - learned)[:-1].mean())
+
+
+def compute_forward_transfer(scores: ArrayLike) -> float:
+    """Return the mean change of the score on a task by all earlier ones, before it is learned."""
+    table = _check(scores)
+    before = np.diagonal(table[:-1])
+    return float((before - table[0])[1:].mean())
+
+
+def _check(scores: ArrayLike) -> NDArray[np.float64]:
+    """Return the table; raises ValueError where it is not (T + 1, T) of two tasks or more."""
+    table = np.asarray(scores, np.float64)
+    if table.ndim != 2 or table.shape[1] < 2 or table.shape[0] != table.shape[1] + 1:
+        raise ValueError(f"scores of shape {table.shape}, expected (T + 1, T) of T >= 2 tasks")
+    return table
