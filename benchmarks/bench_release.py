@@ -19,8 +19,10 @@ import numpy as np
 from safetensors.numpy import save_file
 
 from flcav.releases.candidates.candidate import CANDIDATE, CARD_KEY, WEIGHTS, Candidate, hash_card
+from flcav.releases.repositories.creation import create_repository
 from flcav.releases.repositories.directive import MILLION, Directive
-from flcav.releases.repositories.repository import create_repository, publish, read_root, stage_release
+from flcav.releases.repositories.metadata import read_root
+from flcav.releases.repositories.repository import publish, stage_release
 from flcav.releases.vehicles.checking import Refused, Sources, check_release, open_sources, trust_roots
 from flcav.releases.vehicles.installation import CURRENT, read_installed, update_vehicle
 from flcav.storage.files import sha256

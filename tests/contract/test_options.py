@@ -74,7 +74,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "release propose": dict.fromkeys(
         ("--driving", "--release", "--changes", "--for", "--data", "--recipe", "--ledger", "--task"), ALWAYS
     ),
-    "release verify": dict.fromkeys(("--driving", "--data", "--margin", "--frames", "--jobs"), ALWAYS),
+    "release verify": dict.fromkeys(("--driving", "--data", "--margin", "--frames", "--odd", "--by", "--jobs"), ALWAYS),
     "release sign": dict.fromkeys(("--repository", "--key", "--share", "--vehicle", "--revoke"), ALWAYS),
     "release publish": {},
     "release install": dict.fromkeys(
@@ -83,6 +83,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "release shadow": dict.fromkeys(("--driving", "--data"), ALWAYS),
     "release rollout": dict.fromkeys(("--key", "--shadows", "--share", "--revoke", "--task"), ALWAYS),
     "release deliver": dict.fromkeys(("--data", "--pole", "--scene", "--network", "--seed"), ALWAYS),
+    "release rehearse": dict.fromkeys(("--earlier", "--data", "--vehicles", "--pole", "--network", "--seed"), ALWAYS),
     "release rollback": dict.fromkeys(("--driving", "--release", "--reason"), ALWAYS),
     "release status": dict.fromkeys(("--candidate", "--task"), ALWAYS),
     "record": {"--frames": ALWAYS, "--seed": ALWAYS, "--jobs": ALWAYS, "--engine": ALWAYS},

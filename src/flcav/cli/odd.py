@@ -207,16 +207,13 @@ def cover(
     From a domain to where the network errs to where to look: a cell is a bucket of each of two attributes.
     """
     use_threads(1)
-    from flcav.cli.options import refuse_unused
-    from flcav.config import InputError
+    from flcav.cli.options import parse_axes, refuse_unused
     from flcav.interface import progress
     from flcav.odd.covering import cover_domain
     from flcav.odd.domain import read_domain
     from flcav.storage.files import check_writable
 
-    axes = tuple(name.strip() for name in by.split(","))
-    if len(axes) != 2 or axes[0] == axes[1]:
-        raise InputError(f"--by {by}: two attributes are wanted, with a comma between them, as in junction,light")
+    axes = parse_axes(by)
     if not detect:
         refuse_unused("odd cover without --detect", "weights", "range_m", "device")
     check_writable(out)

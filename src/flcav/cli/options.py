@@ -116,6 +116,14 @@ def check_png(parameter: click.Parameter, value: Path | None) -> Path | None:
     return value
 
 
+def parse_axes(by: str) -> tuple[str, str]:
+    """Return the two attributes in `--by X,Y`; raises `InputError` for any other text."""
+    axes = tuple(name.strip() for name in by.split(","))
+    if len(axes) != 2 or axes[0] == axes[1]:
+        raise InputError(f"--by {by}: two attributes are wanted, with a comma between them, as in junction,light")
+    return axes
+
+
 def refuse_unused(what: str, *names: str) -> None:
     """Raise `InputError` where an option of the parameters `names` was given, which has no effect on `what`."""
     context = click.get_current_context()

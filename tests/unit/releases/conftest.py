@@ -7,7 +7,8 @@ from release_parties import Parties, write_weights
 
 from flcav.geometry import Boxes, pose
 from flcav.releases.candidates.proposal import propose
-from flcav.releases.repositories.repository import create_repository, read_root
+from flcav.releases.repositories.creation import create_repository
+from flcav.releases.repositories.metadata import read_root
 from flcav.releases.vehicles.checking import trust_roots
 from flcav.sensors.frame import Annotations, Calibration, Frame
 
@@ -52,4 +53,5 @@ def recorded_frame() -> Frame:
         occlusion=np.zeros(1),
     )
     points = rng.uniform(-20, 20, (500, 4)).astype(np.float32)
+    points[:, 3] = 0.5
     return Frame("s", 0, 0.0, "cav0", np.eye(4), mounts, mounts, {"lidar": points}, known)

@@ -18,17 +18,10 @@ from flcav.config import InputError
 from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS, Candidate, read_candidate
 from flcav.releases.keys import generate_key, read_private_key
 from flcav.releases.repositories import repository
+from flcav.releases.repositories.creation import create_repository, replace_online_key
 from flcav.releases.repositories.directive import Directive
-from flcav.releases.repositories.repository import (
-    create_repository,
-    load_targets,
-    publish,
-    read_root,
-    replace_online_key,
-    stage_directive,
-    stage_release,
-    target_names,
-)
+from flcav.releases.repositories.metadata import load_targets, read_root, sign_online, target_names
+from flcav.releases.repositories.repository import publish, stage_directive, stage_release
 from flcav.releases.vehicles.checking import Refused, check_release, trust_roots
 from flcav.releases.vehicles.fetching import RepositoryFetcher
 from flcav.releases.vehicles.installation import read_installed, update_vehicle, weights_path
@@ -120,7 +113,7 @@ def test_a_server_that_publishes_one_signature_of_two(parties: Parties):
     online = read_private_key(parties.image / "keys" / "online.pem")
     metadata = parties.image / "repository" / "metadata"
     snapshot, timestamp = (Metadata.from_file(str(metadata / name)) for name in ("2.snapshot.json", "timestamp.json"))
-    repository._sign_online(metadata, snapshot, timestamp, online, datetime.now(UTC), 3)
+    sign_online(metadata, snapshot, timestamp, online, datetime.now(UTC), 3)
     refuses(parties, "1/2")
 
 
@@ -325,7 +318,7 @@ def force(parties: Parties, party: str, online: bool) -> None:
         timestamp = Metadata.from_file(str(metadata / "timestamp.json"))
         snapshot = Metadata.from_file(str(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json"))
         key = read_private_key(parties.folder / party / "keys" / "online.pem")
-        repository._sign_online(metadata, snapshot, timestamp, key, datetime.now(UTC), version)
+        sign_online(metadata, snapshot, timestamp, key, datetime.now(UTC), version)
 
 
 @pytest.mark.parametrize("stolen", STOLEN)
@@ -341,7 +334,7 @@ def test_what_each_stolen_key_can_do(parties: Parties, stolen: str):
     assert (drives(parties) == 2) == other_choice
     evil = parties.folder / "evil"
     shutil.copytree(parties.candidate(2), evil)
-    described = read_candidate(evil).model_copy(update={"release": 3})
+    described = read_candidate(evil).model_copy(update={"release": 3, "rolls_back": 2})
     (evil / CANDIDATE).write_text(described.model_dump_json())
     for party, keys in (("image", provider), ("director", customer)):
         directive = Directive(release=3, share_ppm=ALL) if party == "director" else None

@@ -10,8 +10,15 @@ import pytest
 from release_parties import Parties
 
 from flcav.cli.main import run
-from flcav.releases.candidates.candidate import ACKNOWLEDGEMENTS, CANDIDATE, REPORT, WEIGHTS, read_candidate
-from flcav.releases.verification.records import Verification
+from flcav.releases.candidates.candidate import (
+    ACKNOWLEDGEMENTS,
+    CANDIDATE,
+    REPORT,
+    VERIFICATION,
+    WEIGHTS,
+    read_candidate,
+)
+from flcav.releases.verification.records import Comparison, Verification
 from flcav.releases.verification.verify import write_verification
 
 Call = Callable[..., tuple[int, str]]
@@ -43,7 +50,7 @@ def accept(folder: Path, accepted: bool = True) -> None:
         frames=0,
         scenes=0,
         frames_to_decide=None,
-        whole=None,
+        whole=Comparison("whole", "AP50", 50, 20, 0.5, 0.51, 0.4, 0.6, -0.01 if accepted else -0.2, 0.03, "kept"),
         guards=(),
         data=(),
         domain=None,
@@ -72,6 +79,15 @@ def test_from_a_proposal_to_a_vehicle(parties: Parties, call: Call):
     page = (candidate / REPORT).read_text()
     assert "acknowledged by both parties" in page
     assert read_candidate(candidate).weights in page
+
+
+def test_an_acceptance_that_its_own_numbers_contradict_is_not_signed(parties: Parties, call: Call):
+    candidate, key = parties.candidate(2), parties.image / "keys" / "1.pem"
+    accept(candidate, accepted=False)
+    path = candidate / VERIFICATION
+    path.write_text(path.read_text().replace('"accepted": false', '"accepted": true'))
+    code, said = call("sign", candidate, "--repository", parties.image, "--key", key)
+    assert (code, "its own numbers say that it is not" in said) == (2, True)
 
 
 def test_signatures_are_verified_by_the_signers_own_tool(parties: Parties, call: Call):

@@ -10,14 +10,18 @@ from release_parties import Parties
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
+from flcav.perception.metrics import average_precision, match
+from flcav.perception.objects.evaluate import split_parts
 from flcav.perception.objects.truth import FrameTruth
 from flcav.releases.candidates.candidate import CARD, WEIGHTS, DataHash, read_candidate
 from flcav.releases.verification import verify
+from flcav.releases.verification.comparison import Pair, compare, measure_results, pair_slices
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.files import find_faults, find_overlap
-from flcav.releases.verification.records import Verification, VerificationData
+from flcav.releases.verification.records import OddCoverage, Verification, VerificationData, VerifiedDomain
 from flcav.releases.verification.testing import ConditionResults, VerificationFrame
 from flcav.releases.verification.verify import decide, read_verification, write_verification
+from flcav.report.pages.release_page import release_page
 from flcav.sensors.frame import Frame
 from flcav.statistics.power import plan_scenes
 
@@ -66,7 +70,8 @@ def run(
         if change is not None:
             boxes = [change(one, truth) for one, truth in zip(boxes, truths, strict=True)]
         frames = tuple(
-            VerificationFrame(Path("d"), number, "grid", "everyday traffic") for number in range(len(truths))
+            VerificationFrame(Path("d"), number, "grid", "everyday traffic", ("none", "crossroad")[number % 2])
+            for number in range(len(truths))
         )
         results[name] = ConditionResults(frames, tuple(boxes), tuple(truths))
     return results
@@ -105,6 +110,10 @@ def turned(boxes: Boxes, _: FrameTruth) -> Boxes:
     return replace(boxes, yaw=boxes.yaw + np.pi)
 
 
+def hushed_far(boxes: Boxes, _: FrameTruth) -> Boxes:
+    return replace(boxes, score=np.asarray(boxes.score) * np.where(boxes.center[:, 0] > 20, 0.3, 1.0))
+
+
 def hushed(boxes: Boxes, _: FrameTruth) -> Boxes:
     return replace(boxes, score=np.asarray(boxes.score) * 0.3)
 
@@ -120,6 +129,7 @@ def test_the_driving_network_itself_is_accepted():
         "occlusion",
         "weather",
         "cell",
+        "found",
         "measure",
         "condition",
     }
@@ -133,6 +143,7 @@ def test_the_driving_network_itself_is_accepted():
         (blind_in_fog, "weather fog lost"),
         (lifted, "measure AP70: accurate boxes lost"),
         (turned, "measure AOS: right headings lost"),
+        (hushed_far, "found 20-40 m lost"),
         (hushed, "measure found from score 0.3 on lost"),
     ],
 )
@@ -146,6 +157,87 @@ def test_what_is_lost_refuses_by_name(change: Change, lost: str):
         assert found.whole.candidate == pytest.approx(found.whole.driving, abs=0.02)
 
 
+def test_slices_are_matched_as_the_evaluation_of_objects_matches_them():
+    tested, other = run(1, found=0.7)[PLAIN], run(1)[PLAIN]
+    known = {
+        (part.by, part.name): part
+        for part in split_parts(tested.detections, tested.truths)
+        if part.by in ("distance", "occlusion")
+    }
+    pairs = {(pair.by, pair.name): pair for pair in pair_slices(measure_results(other), measure_results(tested))}
+    once = np.ones((1, len(tested.truths)), np.int64)
+    for key, part in known.items():
+        each = []
+        for label in ("Car", "Pedestrian"):
+            wanted = [
+                truth.targets[inside & (truth.targets.label == label)]
+                for truth, inside in zip(tested.truths, part.wanted, strict=True)
+            ]
+            others = [
+                truth.targets[~inside & (truth.targets.label == label)]
+                for truth, inside in zip(tested.truths, part.wanted, strict=True)
+            ]
+            found = [boxes[boxes.label == label] for boxes in part.detections]
+            if sum(map(len, wanted)):
+                each.append(average_precision(match(found, wanted, others, 0.5)))
+        if each:
+            assert pairs[key].candidate(once)[0] == pytest.approx(np.mean(each), abs=1e-12), key
+
+
+def test_a_class_that_is_never_found_any_more_refuses_however_weak_it_was():
+    def rare(boxes: Boxes, _: FrameTruth) -> Boxes:
+        """Pedestrians are found, but nowhere near one."""
+        away = np.where((boxes.label == "Pedestrian")[:, None], [0, 300, 0], 0)
+        return replace(boxes, center=boxes.center + away)
+
+    data = [VerificationData("d", "a" * 64, "grid", 1, SCENES * FRAMES, SCENES)]
+    driving = run(1, rare)
+    assert decide(read_candidate_like(), driving, driving, data, None).accepted
+    silent = decide(read_candidate_like(), driving, run(1, without("Pedestrian")), data, None)
+    assert [each.partition(":")[0] for each in silent.reasons] == ["class Pedestrian is never found"]
+
+
+def test_the_page_says_what_was_not_tested_and_not_judged():
+    found = judge(run(1))
+    weak = replace(found.guards[0], name="Cyclist", driving=0.01, candidate=0.0, judgement="open")
+    domain = replace(
+        describe(run(1)[PLAIN]),
+        odd=OddCoverage("mine", None, ("a", "b"), {"inside": 3}, 0.5, {"gradient": ("[8, 12)",)}),
+    )
+    text = release_page(read_candidate_like(), replace(found, guards=(*found.guards, weak), domain=domain), {})
+    assert "hardly finds them itself: Cyclist (0.010, now 0.000)" in text
+    assert "gradient [8, 12)" in text
+    told = "tested in grid | everyday traffic | clear | mine: frames 3 inside; 50% of its buckets, not gradient [8, 12)"
+    assert told in replace(found, domain=domain).lines()
+    assert "frames 3 inside" in text
+    assert all(f"<b>{party}</b>: not yet" in text for party in ("provider", "customer"))
+
+
+def pair_of(by: str, driving: list[float], candidate: list[float]) -> Pair:
+    """A pair whose measures are means of numbers of scenes."""
+
+    def mean(values: list[float]):
+        return lambda times: times @ np.array(values) / times.sum(axis=1)
+
+    return Pair(by, "x", mean(driving), mean(candidate), np.array(["a", "b", "c"]), 3, 50)
+
+
+@pytest.mark.parametrize(
+    ("by", "driving", "candidate", "judgement"),
+    [
+        ("class", [0.9, 0.2, 0.1], [0.1, 0.2, 0.1], "doubted"),  # falls in one scene of three: not told at .05
+        ("cell", [0.9, 0.2, 0.1], [0.1, 0.2, 0.1], "open"),
+        ("class", [0.04, 0.01, 0.0], [0.0, 0.01, 0.0], "open"),  # of which the driving network hardly finds any
+        ("class", [0.5, 0.5, 0.5], [0.3, 0.3, 0.3], "lost"),
+        ("class", [0.5, 0.5, 0.5], [0.45, 0.45, 0.45], "kept"),
+    ],
+)
+def test_a_class_of_which_less_than_half_is_left_is_in_doubt(
+    by: str, driving: list[float], candidate: list[float], judgement: str
+):
+    assert compare(pair_of(by, driving, candidate))[0].judgement == judgement
+
+
 def test_few_scenes_decide_nothing_and_say_how_many_would():
     whole = judge(run(3, scenes=4), scenes=4).whole
     assert whole is not None
@@ -156,6 +248,20 @@ def test_few_scenes_decide_nothing_and_say_how_many_would():
     assert found.frames_to_decide is not None
     assert found.frames_to_decide > 4 * FRAMES
     assert "frames would decide" in found.lines()[-1]
+
+
+def test_a_single_scene_accepts_nothing():
+    found = judge(run(1, scenes=1), scenes=1)
+    assert found.undecided
+    assert "1 scene, and 10 are wanted" in found.reasons
+    assert found.frames_to_decide == 10
+
+
+def test_a_driving_network_that_finds_nothing_is_no_measure():
+    data = [VerificationData("d", "a" * 64, "grid", 1, SCENES * FRAMES, SCENES)]
+    nothing = run(1, found=0.0)
+    found = decide(read_candidate_like(), nothing, run(2), data, None)
+    assert found.reasons == ("AP50 0.000 of the network that drives: nothing that could be kept",)
 
 
 def test_retrainings_equal_to_the_driving_network_are_accepted_and_worse_ones_are_not():
@@ -184,9 +290,9 @@ def test_an_own_class_without_objects_is_undecided():
 
 
 def describe(_: ConditionResults):
-    from flcav.releases.verification.records import Domain
-
-    return Domain(("grid",), ("everyday traffic",), ("clear",), None, None, None, (0, 1), (0, 1), {}, ("lidar",))
+    odd = OddCoverage("urban", None, ("junction", "visibility"), {"inside": 24}, 0.5, {})
+    own = (("grid",), ("everyday traffic",), ("clear",), None, None, None, (0, 1), (0, 1), {}, ("lidar",))
+    return VerifiedDomain(*own, odd)
 
 
 def test_scenes_of_the_training_are_found_by_manifest_and_by_town_and_seed():

@@ -1,5 +1,6 @@
 """Roll-outs: shares that nest, shadow runs that stop, roll-backs that rise, and delivery that is priced."""
 
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,7 +14,7 @@ from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.network.radio.budget import Radio, lone_rate_bps
 from flcav.network.radio.links import RadioLinks
-from flcav.releases.candidates.candidate import WEIGHTS, read_candidate
+from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS, read_candidate
 from flcav.releases.repositories.directive import Directive, is_assigned
 from flcav.releases.repositories.repository import publish
 from flcav.releases.rollout.delivery import deliver
@@ -105,6 +106,16 @@ def test_a_rollback_has_a_rising_number(parties: Parties):
     installed = parties.update()
     assert installed is not None
     assert (installed.release, installed.weights) == (3, read_candidate(parties.candidate(1)).weights)
+
+
+def test_an_older_release_under_a_new_number_is_no_release(parties: Parties):
+    parties.release("image", 2)
+    older = parties.candidate(3)
+    shutil.copytree(parties.candidate(1), older)
+    description = read_candidate(older).model_copy(update={"release": 3, "changes": "Much better."})
+    (older / CANDIDATE).write_text(description.model_dump_json())
+    with pytest.raises(InputError, match="has the weights of release 1; a roll-back says so"):
+        parties.release("image", 3)
 
 
 def test_delivery_takes_as_long_as_the_rate_says_and_is_priced():

@@ -72,17 +72,22 @@ def on_neutral(detections: Boxes, neutral: Boxes) -> NDArray[np.bool_]:
     The intersection is divided by the area of the detection. IoU would not do: a car detected on a bus covers a small
     part of the bus.
     """
-    out = np.zeros(len(detections), dtype=bool)
-    if not len(neutral):
+    return lies_on(detections, neutral).any(axis=1)
+
+
+def lies_on(detections: Boxes, objects: Boxes) -> NDArray[np.bool_]:
+    """Return (D, N) whether at least half of a detection's footprint lies on each of N objects."""
+    out = np.zeros((len(detections), len(objects)), dtype=bool)
+    if not len(objects):
         return out
     radius = np.hypot(detections.size[:, :1], detections.size[:, 1:2]) + np.hypot(
-        neutral.size[:, 0], neutral.size[:, 1]
+        objects.size[:, 0], objects.size[:, 1]
     )
-    distance = np.linalg.norm(detections.center[:, None, :2] - neutral.center[None, :, :2], axis=2)
+    distance = np.linalg.norm(detections.center[:, None, :2] - objects.center[None, :, :2], axis=2)
     of, on = np.nonzero(distance < radius / 2)
-    rows, boxes = torch.from_numpy(detections.array()[of]), torch.from_numpy(neutral.array()[on])
+    rows, boxes = torch.from_numpy(detections.array()[of]), torch.from_numpy(objects.array()[on])
     shared = intersection_area(rows, boxes).numpy()
-    out[of[shared >= 0.5 * detections.size[of, 0] * detections.size[of, 1]]] = True
+    out[of, on] = shared >= 0.5 * detections.size[of, 0] * detections.size[of, 1]
     return out
 
 

@@ -68,6 +68,7 @@ class Candidate(Config):
     recipe: Sha256 | None = None
     ledger: Sha256 | None = None
     spent: tuple[LedgerSum, ...] = ()  # sums of the ledger
+    rolls_back: int | None = None  # release whose weights are to drive again
 
 
 def read_candidate(folder: Path) -> Candidate:

@@ -1,41 +1,38 @@
-"""A party's repository of The Update Framework, with thresholds and a stage for signatures given one after another.
+"""A party's repository of The Update Framework, with a stage for signatures that are given one after another.
 
 The provider's is Uptane's image repository: it names every release. The customer's is Uptane's director repository: it
-names the release that its vehicles are to run, with a `Directive`. Both have roots of their own. Root and targets are
-signed by n of the party's m keys, snapshot and timestamp by its online key (TUF specification 1.0.34, sections 4, 6).
-
-    OUT/keys/{1..m,online}.pem    private keys, to be given to their owners
-    OUT/repository/metadata/      what vehicles fetch
-    OUT/repository/targets/       weights and descriptions of releases
-    OUT/staged/targets.json       the next targets metadata, while it lacks signatures
+names the release that its vehicles are to run, with a `Directive`. Both have roots of their own.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from flcav.config import InputError, check_is_file
-from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS, Candidate, check_files, read_candidate
-from flcav.releases.keys import PrivateKey, PublicKey, check_distinct, generate_key, read_private_key
+from flcav.config import InputError
+from flcav.releases.candidates.candidate import Candidate, check_files, read_candidate
+from flcav.releases.keys import check_distinct, read_private_key
+from flcav.releases.repositories.creation import ONLINE
 from flcav.releases.repositories.directive import Directive
+from flcav.releases.repositories.metadata import (
+    DIRECTIVE,
+    LIFETIME,
+    expiry_of,
+    list_releases,
+    load_metadata,
+    load_root,
+    load_targets,
+    read_party,
+    root_keys,
+    sign_online,
+    target_names,
+    write_metadata,
+)
 from flcav.storage.files import write_bytes
 
 if TYPE_CHECKING:
-    from tuf.api.metadata import Metadata, Root, Snapshot, TargetFile, Targets, Timestamp
-
-Party = Literal["provider", "customer"]
-LIFETIME = {  # of metadata, from its signature on
-    "root": timedelta(days=365),
-    "targets": timedelta(days=90),
-    "snapshot": timedelta(days=7),
-    "timestamp": timedelta(days=1),
-}
-DIRECTIVE = "directive"  # key of the directive among a target's custom fields
-PARTY = "flcav-party"  # key of the party's name among a root's fields
-ONLINE = "online"
-MOST_KEYS = 16
+    from tuf.api.metadata import Metadata, Snapshot, TargetFile, Targets, Timestamp
 
 
 @dataclass(frozen=True)
@@ -50,76 +47,6 @@ class Staged:
     def complete(self) -> bool:
         """Return whether it has as many signatures as its threshold wants."""
         return self.signatures >= self.threshold
-
-
-def create_repository(
-    out: Path, party: Party, keys: int = 3, threshold: int = 2, own: Sequence[Path] = (), now: datetime | None = None
-) -> tuple[PublicKey, ...]:
-    """Create a party's keys and its empty repository at `out`; return its public keys.
-
-    Args:
-        out: the folder, which may not exist yet.
-        party: whose it is.
-        keys: number of keys m that are generated, unless `own` are given.
-        threshold: number of signatures n that root and targets want.
-        own: private keys of the party (PEM files).
-        now: time of the signatures; None: by this machine's clock.
-
-    Raises:
-        InputError: for a folder that exists, a threshold above the number of keys, or a key given twice.
-    """
-    from tuf.api.metadata import Metadata, Root, Snapshot, Targets, Timestamp
-
-    if out.exists():
-        raise InputError(f"{out}: exists already; a repository is a new folder")
-    owned = [read_private_key(path) for path in own]
-    check_distinct([key.public for key in owned], f"the keys of the {party}")
-    count = len(owned) or keys
-    if not 1 <= threshold <= count <= MOST_KEYS:
-        raise InputError(f"{threshold} of {count} signatures: at least 1 of at most {MOST_KEYS} keys is wanted")
-    owned = owned or [generate_key(out / "keys" / f"{number}.pem") for number in range(1, count + 1)]
-    online = generate_key(out / "keys" / f"{ONLINE}.pem")
-    at = now or datetime.now(UTC)
-    root = Root(expires=_until("root", at), consistent_snapshot=True, unrecognized_fields={PARTY: party})
-    for role in ("root", "targets"):
-        for key in owned:
-            root.add_key(key.signer().public_key, role)
-        root.roles[role].threshold = threshold
-    for role in ("snapshot", "timestamp"):
-        root.add_key(online.signer().public_key, role)
-    signed = Metadata(root)
-    targets = Metadata(Targets(expires=_until("targets", at)))
-    for key in owned[:threshold]:
-        signed.sign(key.signer(), append=True)
-        targets.sign(key.signer(), append=True)
-    metadata = out / "repository" / "metadata"
-    _write(signed, metadata / "1.root.json")
-    _write(targets, metadata / "1.targets.json")
-    (out / "repository" / "targets").mkdir()
-    snapshot, timestamp = Metadata(Snapshot(expires=_until("snapshot", at))), Metadata(Timestamp())
-    _sign_online(metadata, snapshot, timestamp, online, at, targets_version=1, first=True)
-    return tuple(key.public for key in owned)
-
-
-def read_root(out: Path) -> bytes:
-    """Return the first root metadata of a party's repository, which its vehicles are delivered with."""
-    path = out / "repository" / "metadata" / "1.root.json"
-    if not path.is_file():
-        raise InputError(f"{out}: no repository of a party, since it has no repository/metadata/1.root.json")
-    return path.read_bytes()
-
-
-def read_party(out: Path) -> Party:
-    """Return whose repository it is."""
-    party = load_root(out).signed.unrecognized_fields.get(PARTY)
-    if party not in ("provider", "customer"):
-        raise InputError(f"{out}: a repository of nobody: neither the provider's nor the customer's")
-    return party
-
-
-def target_names(task: str, release: int) -> tuple[str, str]:
-    """Return the names of a release's targets: its weights and its description."""
-    return f"{task}/{release}/{WEIGHTS}", f"{task}/{release}/{CANDIDATE}"
 
 
 def stage_release(
@@ -187,102 +114,23 @@ def publish(out: Path, now: datetime | None = None) -> int:
     _check_clock(out, at)
     version = load_targets(out).signed.version
     if staged.is_file():
-        targets = _load(staged)
+        targets = load_metadata(staged)
         state = _count(out, targets)
         if not state.complete:
             raise InputError(f"{out}: {state.signatures} of {state.threshold} signatures of the {read_party(out)}")
         version = targets.signed.version
-        _write(targets, metadata / f"{version}.targets.json")
+        write_metadata(targets, metadata / f"{version}.targets.json")
     online = read_private_key(out / "keys" / f"{ONLINE}.pem")
-    timestamp: Metadata[Timestamp] = _load(metadata / "timestamp.json")
-    snapshot: Metadata[Snapshot] = _load(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")
-    _sign_online(metadata, snapshot, timestamp, online, at, version)
+    timestamp: Metadata[Timestamp] = load_metadata(metadata / "timestamp.json")
+    snapshot: Metadata[Snapshot] = load_metadata(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")
+    sign_online(metadata, snapshot, timestamp, online, at, version)
     staged.unlink(missing_ok=True)
     return version
 
 
-def replace_online_key(out: Path, keys: Sequence[Path], now: datetime | None = None) -> None:
-    """Replace the online key by a new root, signed by the party's keys, and sign snapshot and timestamp anew.
-
-    What a thief of the old key signed is worth nothing from then on, high version numbers included. Raises `InputError`
-    for fewer keys than the root's threshold, keys of nobody, and one given twice.
-    """
-    at, metadata = now or datetime.now(UTC), out / "repository" / "metadata"
-    owned, party = [read_private_key(path) for path in keys], read_party(out)
-    check_distinct([key.public for key in owned], f"the keys of the {party}")
-    signed = load_root(out)
-    root: Root = signed.signed
-    lost = root.roles["timestamp"].keyids[0]
-    (out / "keys" / f"{ONLINE}.pem").unlink(missing_ok=True)
-    online = generate_key(out / "keys" / f"{ONLINE}.pem")
-    for role in ("snapshot", "timestamp"):
-        root.revoke_key(lost, role)
-        root.add_key(online.signer().public_key, role)
-    root.version, root.expires = root.version + 1, _until("root", at)
-    signed.signatures.clear()
-    for key in owned:
-        signed.sign(key.signer(), append=True)
-    if (
-        len(root.get_verification_result("root", signed.signed_bytes, signed.signatures).signed)
-        < root.roles["root"].threshold
-    ):
-        raise InputError(f"{out}: fewer signatures of the {party} than its root wants")
-    version = max(int(path.name.partition(".")[0]) for path in metadata.glob("*.targets.json"))
-    _write(signed, metadata / f"{root.version}.root.json")
-    timestamp: Metadata[Timestamp] = _load(metadata / "timestamp.json")
-    snapshot: Metadata[Snapshot] = _load(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")
-    _sign_online(metadata, snapshot, timestamp, online, at, version)
-
-
-def load_root(out: Path) -> "Metadata[Root]":
-    """Return the repository's latest root; raises `InputError` where `out` is none of a party."""
-    read_root(out)
-    metadata = out / "repository" / "metadata"
-    latest = max(int(path.name.partition(".")[0]) for path in metadata.glob("*.root.json"))
-    return _load(metadata / f"{latest}.root.json")
-
-
-def load_timestamp(out: Path) -> "Metadata[Timestamp]":
-    """Return the repository's timestamp."""
-    return _load(out / "repository" / "metadata" / "timestamp.json")
-
-
-def load_targets(out: Path) -> "Metadata[Targets]":
-    """Return the repository's current targets metadata."""
-    metadata = out / "repository" / "metadata"
-    timestamp = _load(metadata / "timestamp.json")
-    snapshot = _load(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")
-    return _load(metadata / f"{snapshot.signed.meta['targets.json'].version}.targets.json")
-
-
-def read_directives(targets: Mapping[str, "TargetFile"]) -> dict[str, Directive]:
-    """Return the directives in a director's targets by task; raises `InputError` where one is malformed."""
-    found = {}
-    for name, file in targets.items():
-        task, _, rest = name.partition("/")
-        custom = file.custom
-        if rest.endswith(WEIGHTS) and custom is not None:
-            try:
-                found[task] = Directive.model_validate(custom[DIRECTIVE])
-            except (ValueError, TypeError, KeyError):
-                raise InputError(f"{name}: its directive is malformed") from None
-    return found
-
-
-def list_releases(targets: Mapping[str, "TargetFile"], task: str) -> list[int]:
-    """Return the numbers of the releases of a task, rising."""
-    parts = [name.split("/") for name in targets]
-    return sorted({int(part[1]) for part in parts if len(part) == 3 and part[0] == task and part[1].isdigit()})
-
-
 def read_staged(out: Path) -> Staged | None:
     """Return the state of the staged targets metadata; None without one."""
-    return _count(out, _load(_staged_path(out))) if _staged_path(out).is_file() else None
-
-
-def root_keys(root: "Root") -> list[PublicKey]:
-    """Return the keys of a root's targets role."""
-    return [PublicKey(root.keys[name].keyval["public"]) for name in root.roles["targets"].keyids]
+    return _count(out, load_metadata(_staged_path(out))) if _staged_path(out).is_file() else None
 
 
 def _stage(
@@ -307,33 +155,41 @@ def _stage(
     }
     wanted |= files
     path = _staged_path(out)
-    staged = _load(path) if path.is_file() else None
+    staged = load_metadata(path) if path.is_file() else None
     if staged is None or staged.signed.version <= current.signed.version or staged.signed.targets != wanted:
         staged = current
         staged.signed.targets = dict(wanted)
         staged.signed.version += 1
-        staged.signed.expires = _until("targets", at)
+        staged.signed.expires = expiry_of("targets", at)
         staged.signatures.clear()
     for key in owned:
         staged.sign(key.signer(), append=True)
-    _write(staged, path)
+    write_metadata(staged, path)
     return _count(out, staged)
 
 
 def _check_rising(out: Path, candidate: Candidate, files: Mapping[str, "TargetFile"]) -> None:
+    """Raise `InputError` for a number that does not rise, and for earlier weights that are no roll-back to them."""
     known = load_targets(out).signed.targets
     if all(name in known and known[name].hashes == file.hashes for name, file in files.items()):
         return
-    latest = max(list_releases(known, candidate.task), default=0)
-    if candidate.release <= latest:
+    releases = list_releases(known, candidate.task)
+    if releases and candidate.release <= releases[-1]:
         raise InputError(
-            f"{out}: release {candidate.release} of {candidate.task} does not rise above {latest}, which it names"
+            f"{out}: release {candidate.release} of {candidate.task} does not rise above {releases[-1]}, which it names"
         )
+    for number in releases:
+        weights = known[target_names(candidate.task, number)[0]]
+        if weights.hashes["sha256"] == candidate.weights and candidate.rolls_back is None:
+            raise InputError(
+                f"{out}: release {candidate.release} has the weights of release {number}; a roll-back says so "
+                "(`flcav release rollback`)"
+            )
 
 
 def _check_clock(out: Path, at: datetime) -> None:
     """Raise `InputError` where the clock is behind the repository's latest signatures."""
-    timestamp = _load(out / "repository" / "metadata" / "timestamp.json")
+    timestamp = load_metadata(out / "repository" / "metadata" / "timestamp.json")
     made = timestamp.signed.expires - LIFETIME["timestamp"]
     if at < made - timedelta(minutes=5):
         raise InputError(
@@ -347,46 +203,5 @@ def _count(out: Path, targets: "Metadata[Targets]") -> Staged:
     return Staged(targets.signed.version, len(result.signed), root.roles["targets"].threshold)
 
 
-def _sign_online(
-    metadata: Path,
-    snapshot: "Metadata[Snapshot]",
-    timestamp: "Metadata[Timestamp]",
-    online: PrivateKey,
-    at: datetime,
-    targets_version: int,
-    first: bool = False,
-) -> None:
-    """Sign snapshot and timestamp; the timestamp is written last, so that a crash leaves the old state whole."""
-    snapshot.signed.meta["targets.json"].version = targets_version
-    snapshot.signed.version += 0 if first else 1
-    snapshot.signed.expires = _until("snapshot", at)
-    snapshot.sign(online.signer())
-    _write(snapshot, metadata / f"{snapshot.signed.version}.snapshot.json")
-    timestamp.signed.snapshot_meta.version = snapshot.signed.version
-    timestamp.signed.version += 0 if first else 1
-    timestamp.signed.expires = _until("timestamp", at)
-    timestamp.sign(online.signer())
-    _write(timestamp, metadata / "timestamp.json")
-
-
-def _load(path: Path) -> "Metadata":
-    from tuf.api.exceptions import RepositoryError
-    from tuf.api.metadata import Metadata
-
-    check_is_file(path)
-    try:
-        return Metadata.from_bytes(path.read_bytes())
-    except RepositoryError as error:
-        raise InputError(f"{path}: no metadata of The Update Framework ({error})") from None
-
-
-def _write(metadata: "Metadata", path: Path) -> None:
-    write_bytes(path, metadata.to_bytes())
-
-
 def _staged_path(out: Path) -> Path:
     return out / "staged" / "targets.json"
-
-
-def _until(role: str, at: datetime) -> datetime:
-    return (at + LIFETIME[role]).replace(microsecond=0)

@@ -7,17 +7,16 @@ from typing import Annotated
 
 from flcav.interface.wording import plural
 from flcav.releases.candidates.acknowledgement import Acknowledgement, find_acknowledgements
-from flcav.releases.repositories.repository import (
-    Staged,
+from flcav.releases.repositories.metadata import (
     list_releases,
     load_root,
     load_targets,
     load_timestamp,
     read_directives,
     read_party,
-    read_staged,
     root_keys,
 )
+from flcav.releases.repositories.repository import Staged, read_staged
 from flcav.storage.records import LEFT_OUT, Record
 
 

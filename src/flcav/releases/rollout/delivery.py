@@ -37,16 +37,18 @@ def deliver(
     settings: NetworkSettings,
     ledger: Ledger,
     task: str = "objects",
+    fetched: set[str] | None = None,
 ) -> tuple[Delivered, ...]:
     """Return when each of `vehicles` has a release of `size_bytes`; what is sent enters the ledger.
 
-    Downlinks count against no budget, but are entered message by message, and those of lost attempts too.
+    Downlinks count against no budget, but are entered message by message, and those of lost attempts too. fetched:
+    units that have the files already, to which those are added that fetch them now; None: none has.
     """
     waiting = dict.fromkeys(vehicles)
     attempts, moved = dict.fromkeys(vehicles, 0), dict.fromkeys(vehicles, 0)
     reasons = dict.fromkeys(vehicles, "never in the town")
     arrived: dict[str, float] = {}
-    units: set[str] = set()
+    units = set() if fetched is None else fetched
     now, end = float(links.time_s[0]), float(links.time_s[-1])
     while waiting and now < end:
         instant = int(np.searchsorted(links.time_s, now, side="right")) - 1

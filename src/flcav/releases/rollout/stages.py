@@ -18,7 +18,8 @@ from flcav.releases.candidates.candidate import (
     read_candidate,
 )
 from flcav.releases.repositories.directive import MILLION, Directive
-from flcav.releases.repositories.repository import Staged, load_targets, read_directives, stage_directive
+from flcav.releases.repositories.metadata import load_targets, read_directives
+from flcav.releases.repositories.repository import Staged, stage_directive
 from flcav.releases.rollout.shadow import ShadowDecision
 from flcav.storage.files import write_json
 
@@ -77,7 +78,8 @@ def roll_back(earlier: Path, release: int, reason: str, out: Path, driving: str)
     if out.exists():
         raise InputError(f"{out}: exists already; a candidate is a new folder")
     changes = f"Roll-back to release {candidate.release}. {reason}"
-    changed = candidate.model_copy(update={"release": release, "changes": changes, "driving": driving})
+    updates = {"release": release, "changes": changes, "driving": driving, "rolls_back": candidate.release}
+    changed = candidate.model_copy(update=updates)
     shutil.copytree(earlier, out, ignore=shutil.ignore_patterns(ACKNOWLEDGEMENTS, REPORT))
     write_json(out / CANDIDATE, changed.model_dump(mode="json"), sort=False)
     return changed

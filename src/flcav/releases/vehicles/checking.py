@@ -15,7 +15,7 @@ from flcav.config import InputError
 from flcav.releases.candidates.candidate import Candidate, parse_candidate
 from flcav.releases.keys import check_distinct
 from flcav.releases.repositories.directive import Directive, is_assigned
-from flcav.releases.repositories.repository import LIFETIME, PARTY, read_directives, root_keys, target_names
+from flcav.releases.repositories.metadata import LIFETIME, PARTY, read_directives, root_keys, target_names
 from flcav.releases.vehicles.fetching import RepositoryFetcher, locate
 
 if TYPE_CHECKING:

@@ -14,6 +14,7 @@ from flcav.releases.candidates.candidate import CARD, WEIGHTS, Candidate, check_
 from flcav.releases.verification.records import VerificationData
 from flcav.storage.files import sha256
 
+LAYERS = ("sparse_channels", "pillar_channels", "bev_layers", "bev_channels", "bev_up_channels", "voxel_m")
 FREE = ("calibration", "augmentation", "bfloat16")  # settings in which an update may differ
 
 
@@ -46,11 +47,13 @@ def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Seque
     if sha256(driving) != candidate.driving:
         yield f"it is proposed to replace another network than {driving}"
     yield from _compare_interfaces(network, now)
+    if below := [name for name, values in network.named_buffers() if "variance" in name and bool((values < 0).any())]:
+        yield f"a variance below 0 in '{below[0]}': nothing that the network says is a number"
     if not (folder / CARD).is_file() or (folder / CARD).read_text() != card.markdown():
         yield f"{CARD} is not the card in the weights: a card of other weights"
     if card.parameters != sum(each.numel() for each in network.parameters()):
         yield "a card of other weights: it names another number of parameters"
-    if card.task != candidate.task or card.network != candidate.network:
+    if card.task != candidate.task or card.network != candidate.network or not _fits_name(network, card.network):
         yield "a card of other weights: it names another task or network"
     if not candidate.data:
         yield "its provenance names no training data"
@@ -67,6 +70,15 @@ def find_overlap(candidate: Candidate, tested: Sequence[VerificationData]) -> It
             same = known.seed is not None and (known.town, known.seed) == (test.town, test.seed)
             if known.manifest == test.manifest or same:
                 yield f"{known.use} on test scenes: {known.name} has those of {test.name}"
+
+
+def _fits_name(network: Second, name: str) -> bool:
+    """Return whether a network can be of the configuration called `name`: its layers are, whatever its classes.
+
+    A name that is none of flcav's is its owner's.
+    """
+    known = OBJECTS.configurations.get(name)
+    return known is None or all(getattr(known, layer) == getattr(network.config, layer) for layer in LAYERS)
 
 
 def _compare_interfaces(network: Second, driving: Second) -> Iterator[str]:

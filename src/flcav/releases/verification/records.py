@@ -7,26 +7,47 @@ from typing import Literal
 from flcav.interface.wording import plural
 from flcav.storage.records import Record
 
-Judgement = Literal["kept", "lost", "open"]
+LEAST_MEASURE = 0.05  # of the driving network in a slice that is judged
+Judgement = Literal["kept", "lost", "doubted", "open"]
 
 
 @dataclass(frozen=True)
 class Comparison:
     """A measure of the driving network and of the candidate on the same frames, and their difference's interval."""
 
-    by: str  # whole, class, distance, weather, scenario, cell, condition, measure
+    by: str  # whole, class, distance, occlusion, weather, scenario, town, cell, found, condition, measure
     name: str
     targets: int
     scenes: int
     driving: float  # in [0, 1]
     candidate: float
+    candidate_low: float  # ends of the candidate's 95 % interval over scenes; NaN where the frames give none
+    candidate_high: float
     low: float  # ends of the 90 % interval of candidate minus driving: each is a one-sided bound at .05
     high: float
-    judgement: Judgement  # of a guard: kept, lost (refuses), or open where the frames do not tell
+    judgement: Judgement  # of a guard: kept; lost, which refuses; else the frames do not tell: doubted refuses, too
 
 
 @dataclass(frozen=True)
-class Domain:
+class OddCoverage:
+    """How much of an operational design domain, as ASAM OpenODD describes it, the test frames cover."""
+
+    domain: str
+    revision: str | None  # digest of the domain's files
+    by: tuple[str, ...]  # the two attributes of cells
+    frames: Mapping[str, int]  # inside, outside, unknown
+    grade: float  # share of the buckets inside the domain that are covered, mean over its attributes
+    holes: Mapping[str, tuple[str, ...]]  # attribute -> buckets inside the domain that no frame was in
+
+    def describe(self) -> str:
+        """Return the coverage in words."""
+        frames = ", ".join(f"{count} {verdict}" for verdict, count in self.frames.items())
+        missing = "; ".join(f"{name} {', '.join(buckets)}" for name, buckets in self.holes.items())
+        return f"{self.domain}: frames {frames}; {self.grade:.0%} of its buckets, not {missing or '-'}"
+
+
+@dataclass(frozen=True)
+class VerifiedDomain:
     """The operational design domain that a candidate was tested in: the ranges of what the test frames hold."""
 
     towns: tuple[str, ...]
@@ -39,6 +60,7 @@ class Domain:
     distance_m: tuple[float, float]  # of the targets
     objects: Mapping[str, int]  # targets by class
     lidars: tuple[str, ...]  # names of the rigs or sensors
+    odd: OddCoverage
 
 
 @dataclass(frozen=True)
@@ -70,7 +92,7 @@ class Verification(Record):
     whole: Comparison | None  # None where the files alone refuse it
     guards: tuple[Comparison, ...]
     data: tuple[VerificationData, ...]
-    domain: Domain | None
+    domain: VerifiedDomain | None
 
     def lines(self) -> list[str]:
         """Return the verification in words."""
@@ -87,6 +109,9 @@ class Verification(Record):
                     f"{guard.by:<10}{guard.name:<34}{guard.driving:.3f} -> {guard.candidate:.3f}  "
                     f"({guard.low:+.3f} to {guard.high:+.3f})  {guard.judgement}  (objects: {guard.targets})"
                 )
+        if self.domain is not None:
+            lists = ("; ".join(each) for each in (self.domain.towns, self.domain.scenarios, self.domain.weathers))
+            lines.append(f"tested in {' | '.join(lists)} | {self.domain.odd.describe()}")
         more = (
             f"; about {self.frames_to_decide} frames would decide" if self.undecided and self.frames_to_decide else ""
         )

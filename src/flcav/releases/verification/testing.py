@@ -5,8 +5,6 @@ from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
 
-import numpy as np
-
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
@@ -20,7 +18,6 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.weights import load_network
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
-from flcav.releases.verification.records import Domain
 from flcav.sensors.frame import Frame
 
 Work = tuple[Path, Sequence["VerificationFrame"], str]  # weights, frames, condition
@@ -36,6 +33,7 @@ class VerificationFrame:
     number: int
     town: str
     scenario: str
+    cell: str = ""  # of the operational design domain; "" where it is not known
 
 
 @dataclass(frozen=True)
@@ -108,34 +106,6 @@ def run_tests(
     with process_pool(jobs, _nothing) as pool:
         waiting = [pool.submit(_run, *work) for work in works]
         return _collect(networks, works, (each.result() for each in waiting), progress)
-
-
-def describe_domain(
-    frames: Sequence[VerificationFrame], truths: Sequence[FrameTruth], classes: Sequence[str]
-) -> Domain:
-    """Return the domain that frames cover, for a network of `classes`."""
-    opened = {folder: Dataset.open(folder, checked=False) for folder in {each.data for each in frames}}
-    read = [opened[each.data].frame(each.number) for each in frames]
-    weather = [frame.weather for frame in read if frame.weather is not None]
-    speeds = [np.linalg.norm(np.nan_to_num(frame.annotations.velocity), axis=1) for frame in read]
-    far = [np.hypot(truth.targets.center[:, 0], truth.targets.center[:, 1]) for truth in truths]
-    lidars = {str(name) for frame in read for name in frame.lidar}
-    return Domain(
-        towns=tuple(sorted({each.town for each in frames})),
-        scenarios=tuple(sorted({each.scenario for each in frames})),
-        weathers=tuple(sorted({truth.weather for truth in truths if truth.weather is not None})),
-        visibility_m=_span([each.visibility_m for each in weather]),
-        rain_mm_h=_span([each.rain_mm_h for each in weather]),
-        sun_elevation_deg=_span([each.sun_elevation_deg for each in weather]),
-        speed_m_s=_span(np.concatenate(speeds).tolist()) or (0.0, 0.0),
-        distance_m=_span(np.concatenate(far).tolist()) or (0.0, 0.0),
-        objects={label: int(sum((truth.targets.label == label).sum() for truth in truths)) for label in classes},
-        lidars=tuple(sorted(lidars)),
-    )
-
-
-def _span(values: Sequence[float]) -> tuple[float, float] | None:
-    return (round(min(values), 3), round(max(values), 3)) if len(values) else None
 
 
 def _run(weights: Path, frames: Sequence[VerificationFrame], condition: str) -> ConditionResults:

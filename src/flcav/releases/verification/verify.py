@@ -1,6 +1,9 @@
 """Verification of a candidate: its files, non-inferiority on the whole, and guards against catastrophes."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -9,20 +12,32 @@ from flcav.config import InputError, read_json
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
+from flcav.odd.domain import read_domain
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
-from flcav.releases.verification.comparison import KEPT, LEAST_TARGETS, LEVEL, compare, pair_slices, pair_whole
-from flcav.releases.verification.conditions import CONDITIONS, PLAIN
-from flcav.releases.verification.files import describe_data, find_faults
-from flcav.releases.verification.records import Comparison, Domain, Verification, VerificationData
-from flcav.releases.verification.testing import (
-    ConditionResults,
-    VerificationFrame,
-    choose_test_frames,
-    describe_domain,
-    run_tests,
+from flcav.releases.verification.comparison import (
+    KEPT,
+    LEAST_SCENES,
+    LEAST_TARGETS,
+    LEVEL,
+    Measured,
+    compare,
+    measure_results,
+    pair_slices,
+    pair_whole,
 )
+from flcav.releases.verification.conditions import CONDITIONS, PLAIN
+from flcav.releases.verification.domain import BY, ODD, describe_domain, find_cells
+from flcav.releases.verification.files import describe_data, find_faults
+from flcav.releases.verification.records import (
+    LEAST_MEASURE,
+    Comparison,
+    Verification,
+    VerificationData,
+    VerifiedDomain,
+)
+from flcav.releases.verification.testing import ConditionResults, VerificationFrame, choose_test_frames, run_tests
 from flcav.statistics.power import plan_scenes
 from flcav.storage.files import sha256, write_json
 
@@ -38,6 +53,8 @@ def verify(
     *,
     margin: float = MARGIN,
     most: int | None = None,
+    odd: str | Path = ODD,
+    by: Sequence[str] = BY,
     jobs: int = 1,
     known: Results | None = None,
     progress: Report = ignore_progress,
@@ -50,6 +67,8 @@ def verify(
         data: datasets of scenes that no network was trained on.
         margin: by which AP50 may be lower on the whole.
         most: frames of each dataset at most; None: all.
+        odd: operational design domain, by name or as an OpenODD file, whose coverage is told.
+        by: two attributes of it: a cell is a bucket of each, and a slice.
         jobs: worker processes.
         known: results of the driving network on the same frames, from an earlier verification.
         progress: callback for the tests done and in total.
@@ -60,10 +79,12 @@ def verify(
     candidate = read_candidate(folder)
     if candidate.task != OBJECTS.name:
         raise InputError(f"{folder}: a network of '{candidate.task}', and those of '{OBJECTS.name}' are verified")
-    network = load_network(OBJECTS, driving)
+    network, allowed = load_network(OBJECTS, driving), read_domain(odd)
     frames = choose_test_frames(data, network, most)
     if not frames:
         raise InputError(f"no frame to verify with in {', '.join(map(str, data))}")
+    cells, coverage = find_cells(frames, allowed, by)
+    frames = tuple(replace(frame, cell=cell) for frame, cell in zip(frames, cells, strict=True))
     tested = [_describe(path, frames) for path in data]
     faults = list(find_faults(folder, candidate, driving, tested))
     if faults:
@@ -71,7 +92,9 @@ def verify(
     own = [] if known is not None else [driving]
     results = run_tests([*own, folder / WEIGHTS], frames, jobs=jobs, progress=progress)
     old, new = known if known is not None else results[0], results[-1]
-    domain = describe_domain(frames, old[PLAIN].truths, network.config.classes)
+    if not any(len(truth.targets) for truth in new[PLAIN].truths):
+        raise InputError(f"no object to be found in {', '.join(map(str, data))}")
+    domain = describe_domain(frames, new[PLAIN].truths, network.config.classes, coverage)
     return decide(candidate, old, new, tested, domain, margin)
 
 
@@ -80,7 +103,7 @@ def decide(
     driving: Results | None,
     new: Results | None,
     data: Sequence[VerificationData],
-    domain: Domain | None,
+    domain: VerifiedDomain | None,
     margin: float = MARGIN,
     faults: Sequence[str] = (),
 ) -> Verification:
@@ -90,25 +113,34 @@ def decide(
     whole: Comparison | None = None
     guards: list[Comparison] = []
     if driving is not None and new is not None:
-        whole, error = compare(pair_whole(driving[PLAIN], new[PLAIN]))
-        guards = _guard(driving, new)
-        reasons += [
-            f"{each.by} {each.name} lost: {each.driving:.3f} -> {each.candidate:.3f}"
-            for each in guards
-            if each.judgement == "lost"
-        ]
+        plain = measure_results(driving[PLAIN]), measure_results(new[PLAIN])
+        whole, error = compare(pair_whole(*plain))
+        for guard, spread in _guard(*plain, driving, new):
+            guards.append(guard)
+            fell = f"{guard.by} {guard.name} {{}}: {guard.driving:.3f} -> {guard.candidate:.3f}"
+            if guard.judgement == "lost":
+                reasons.append(fell.format("lost"))
+            elif guard.judgement == "doubted":
+                open_reasons.append(fell.format("may be lost"))
+                wanted = max(wanted, _frames(KEPT * guard.driving - guard.candidate, spread, frames, scenes))
+        reasons += _find_silent(driving[PLAIN], new[PLAIN])
         for label, count in domain.objects.items() if domain is not None else ():
             if count < LEAST_TARGETS:
                 open_reasons.append(f"{plural(count, 'object')} of the class {label}, and {LEAST_TARGETS} are wanted")
                 wanted = max(wanted, -(-frames * LEAST_TARGETS // max(count, 1)))
+        if whole.driving < LEAST_MEASURE:
+            reasons.append(f"AP50 {whole.driving:.3f} of the network that drives: nothing that could be kept")
+        if whole.scenes < LEAST_SCENES:
+            open_reasons.append(f"{plural(whole.scenes, 'scene')}, and {LEAST_SCENES} are wanted")
+            wanted = max(wanted, -(-frames * LEAST_SCENES // whole.scenes))
         change = whole.candidate - whole.driving
         said = f"AP50 on the whole {change:+.3f} ({whole.low:+.3f} to {whole.high:+.3f}), margin {margin:g}"
         if not whole.high >= -margin:
             reasons.append(said)
         elif not whole.low > -margin:
-            enough = plan_scenes(change + margin, error, scenes, LEVEL)
-            wanted = max(wanted, 0 if enough is None else int(np.ceil(enough * frames / scenes)))
-            open_reasons.append(said if enough is not None else f"{said}: no number of frames would accept this")
+            enough = _frames(change + margin, error, frames, scenes)
+            wanted = max(wanted, enough)
+            open_reasons.append(said if enough else f"{said}: no number of frames would accept this")
     return Verification(
         candidate=candidate.weights,
         driving=candidate.driving,
@@ -133,20 +165,50 @@ def write_verification(folder: Path, verification: Verification) -> None:
 
 
 def read_verification(folder: Path) -> Verification:
-    """Return the verification in a candidate's folder; raises `InputError` for none, and one of other weights."""
+    """Return the verification in a candidate's folder.
+
+    Raises `InputError` for none, one of other weights, and one whose acceptance its own numbers contradict.
+    """
     path = folder / VERIFICATION
     if not path.is_file():
         raise InputError(f"{folder}: was not verified")
     found = Verification.from_json(read_json(path), str(path))
     if found.candidate != read_candidate(folder).weights or sha256(folder / WEIGHTS) != found.candidate:
         raise InputError(f"{path}: is the verification of other weights")
+    refuses = any(each.judgement in ("lost", "doubted") for each in found.guards)
+    if found.accepted and (found.whole is None or refuses or not found.whole.low > -found.margin):
+        raise InputError(f"{path}: says that the candidate is accepted, and its own numbers say that it is not")
     return found
 
 
-def _guard(driving: Results, new: Results) -> list[Comparison]:
-    pairs = [*pair_slices(driving[PLAIN], new[PLAIN])]
-    pairs += [pair_whole(driving[name], new[name], "condition", name) for name in CONDITIONS if name in new]
-    return [compare(pair, GUARD_REDRAWS)[0] for pair in pairs if pair.targets >= LEAST_TARGETS]
+def _guard(old: Measured, new: Measured, driving: Results, candidate: Results) -> Iterator[tuple[Comparison, float]]:
+    """Yield the comparison of each slice and each condition of the sensor, and its standard error."""
+    conditions = (
+        pair_whole(measure_results(driving[name]), measure_results(candidate[name]), "condition", name)
+        for name in CONDITIONS
+        if name in candidate
+    )
+    for pair in chain(pair_slices(old, new), conditions):
+        if pair.targets >= LEAST_TARGETS:
+            yield compare(pair, GUARD_REDRAWS)
+
+
+def _find_silent(driving: ConditionResults, candidate: ConditionResults) -> list[str]:
+    """Return a reason for each class that the candidate never finds, rightly or wrongly, and the driving one does."""
+    before, after = (
+        Counter(str(label) for boxes in tested.detections for label in boxes.label) for tested in (driving, candidate)
+    )
+    return [
+        f"class {label} is never found: {plural(count, 'detection')} before, none now"
+        for label, count in sorted(before.items())
+        if not after[label]
+    ]
+
+
+def _frames(effect: float, error: float, frames: int, scenes: int) -> int:
+    """Return the number of frames that tell an effect; 0 where no number does."""
+    enough = plan_scenes(effect, error, scenes, LEVEL)
+    return 0 if enough is None else int(np.ceil(enough * frames / scenes))
 
 
 def _describe(path: Path, frames: Sequence[VerificationFrame]) -> VerificationData:

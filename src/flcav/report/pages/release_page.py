@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from typing import Any
 
 from flcav.releases.candidates.acknowledgement import Acknowledgement
 from flcav.releases.candidates.candidate import Candidate
 from flcav.releases.verification.conditions import WORDS
-from flcav.releases.verification.records import Comparison, Verification
+from flcav.releases.verification.records import LEAST_MEASURE, Comparison, OddCoverage, Verification
 from flcav.report.pages import html
 
 GROUPS = {
@@ -15,12 +16,16 @@ GROUPS = {
     "occlusion": "Occlusion",
     "weather": "Weather",
     "scenario": "Scenarios",
+    "town": "Towns",
     "cell": "Cells of the domain",
+    "found": "Found at the score of use",
     "condition": "Conditions of the sensor",
     "measure": "Other measures",
 }
-MEANINGS = {"kept": "kept", "lost": "lost", "open": "not told"}
-STATES = {"kept": "held", "lost": "did-not-hold", "open": "undecided"}  # classes of style
+WEAK = "not judged"  # of which the driving network reaches next to nothing
+PARTIES = ("provider", "customer")
+MEANINGS = {"kept": "kept", "lost": "lost", "doubted": "in doubt", "open": "not told"}
+STATES = {"kept": "held", "lost": "did-not-hold", "doubted": "did-not-hold", "open": "undecided"}  # classes of style
 
 
 def release_page(
@@ -39,6 +44,8 @@ def release_page(
         if any(each.by == by for each in verification.guards)
     }
     whole = None if verification.whole is None else _row(verification.whole)
+    every = [row for rows in groups.values() for row in rows]
+    left = [row for row in every if row["judgement"] in ("open", "doubted") and row["word"] != WEAK]
     values = {
         "candidate": candidate.model_dump(mode="json"),
         "verification": asdict(verification),
@@ -46,23 +53,26 @@ def release_page(
         "whole": whole,
         "scale": _scale(verification),
         "groups": groups,
+        "weak": [row for row in every if row["word"] == WEAK],
+        "left": sorted(left, key=lambda row: row["low"]),
         "domain": None if verification.domain is None else _domain(verification),
         "hashes": hashes,
         "acknowledgements": [asdict(each) for each in acknowledgements],
+        "missing": [party for party in PARTIES if party not in {each.party for each in acknowledgements}],
         "complete": bool(acknowledgements) and all(len(each.keys) >= each.threshold for each in acknowledgements),
         "spent": [{**each.model_dump(), "mb": each.bytes / 1e6} for each in candidate.spent],
     }
     return html.render(values, {}, "release.html.j2")
 
 
-def _row(each: Comparison) -> dict[str, object]:
-    name = WORDS.get(each.name, each.name.replace("_", " "))
+def _row(each: Comparison) -> dict[str, Any]:
+    name = WORDS.get(each.name, each.name.replace("_", " ").replace(" x ", " × "))
     change = each.candidate - each.driving
     return {
         **asdict(each),
         "name": name,
         "change": change,
-        "word": MEANINGS[each.judgement],
+        "word": WEAK if each.driving < LEAST_MEASURE and each.judgement == "open" else MEANINGS[each.judgement],
         "state": STATES[each.judgement],
     }
 
@@ -97,8 +107,19 @@ def _domain(verification: Verification) -> list[tuple[str, str]]:
         ("towns", ", ".join(domain.towns)),
         ("scenarios", "; ".join(domain.scenarios).replace("_", " ")),
         ("weather", ", ".join(domain.weathers).replace("_", " ")),
-        *((name, f"{span[0]:g} to {span[1]:g} {unit}") for name, (span, unit) in spans.items() if span is not None),
+        *((name, f"{span[0]:.4g} to {span[1]:.4g} {unit}") for name, (span, unit) in spans.items() if span is not None),
         ("objects", ", ".join(f"{count} {label}" for label, count in domain.objects.items())),
         ("LiDARs", ", ".join(domain.lidars)),
+        (f"OpenODD domain {domain.odd.domain}", _judged(domain.odd)),
+        (
+            "not covered of it",
+            "; ".join(f"{name.replace('_', ' ')} {', '.join(buckets)}" for name, buckets in domain.odd.holes.items())
+            or "nothing",
+        ),
     ]
     return rows
+
+
+def _judged(odd: OddCoverage) -> str:
+    frames = ", ".join(f"{count} {verdict}" for verdict, count in odd.frames.items())
+    return f"frames {frames}; {odd.grade:.0%} of the buckets inside it, mean over its attributes"

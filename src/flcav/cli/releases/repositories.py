@@ -1,0 +1,145 @@
+"""`flcav release init`, `sign`, `publish`, `install`, `status`: the repositories of both parties, and a vehicle."""
+
+from enum import StrEnum
+from pathlib import Path
+
+import typer
+
+from flcav.cli.options import check_finite
+from flcav.cli.releases.options import (
+    AS_JSON,
+    CANDIDATE,
+    KEYS,
+    REVOKE,
+    TASK,
+    describe_candidate,
+    draw_page,
+    tell_signatures,
+)
+from flcav.cli.terminal import only_writer_of, print_json
+from flcav.config import InputError
+from flcav.interface.wording import plural
+
+IMAGE = typer.Option(..., "--image", help="The provider's repository: folder or http(s) address.")
+DIRECTOR = typer.Option(..., "--director", help="The customer's repository: folder or http(s) address.")
+
+
+class PartyName(StrEnum):
+    """The two parties of a release."""
+
+    provider = "provider"
+    customer = "customer"
+
+
+def init(
+    party: PartyName = typer.Argument(metavar="PARTY", help="Whose repository: provider or customer."),
+    out: Path = typer.Option(..., "--out", help="New folder of repository and keys."),
+    keys: int = typer.Option(3, "--keys", min=1, max=16, help="Keys that are generated, one for each who signs."),
+    threshold: int = typer.Option(2, "--threshold", min=1, max=16, help="Signatures that a release needs."),
+) -> None:
+    """Create a party's keys and its empty repository of The Update Framework."""
+    from flcav.releases.repositories.creation import create_repository
+
+    made = create_repository(out, party.value, keys, threshold)
+    typer.echo(f"{out}: repository of the {party.value}, {threshold} of {plural(len(made), 'key')} sign a release")
+    for number, key in enumerate(made, start=1):
+        typer.echo(f"    {out / 'keys' / f'{number}.pem'}: {key.short}")
+
+
+@only_writer_of("repository")
+def sign(
+    candidate: Path = CANDIDATE,
+    repository: Path = typer.Option(..., "--repository", help="Folder of the party that signs."),
+    key: list[Path] = KEYS,
+    share: float = typer.Option(
+        0.01,
+        "--share",
+        min=0,
+        max=1,
+        callback=check_finite,
+        help="customer: share of the fleet that installs it first.",
+    ),
+    vehicle: list[str] = typer.Option([], "--vehicle", help="customer: vehicle that installs it besides; repeatable."),
+    revoke: list[str] = REVOKE,
+) -> None:
+    """Acknowledge a verified candidate, and sign its place in the party's repository; `publish` makes it current."""
+    from flcav.releases.candidates.acknowledgement import acknowledge
+    from flcav.releases.repositories.directive import MILLION, Directive
+    from flcav.releases.repositories.metadata import read_party
+    from flcav.releases.repositories.repository import stage_release
+    from flcav.releases.verification.verify import read_verification
+
+    found, party = read_verification(candidate), read_party(repository)
+    if not found.accepted:
+        raise InputError(f"{candidate}: was refused by its verification, so nobody signs it")
+    if party == "provider" and (vehicle or revoke):
+        raise InputError("--vehicle and --revoke are the customer's: the provider does not choose vehicles")
+    directive = None
+    if party == "customer":
+        directive = Directive(
+            release=describe_candidate(candidate).release,
+            share_ppm=round(share * MILLION),
+            vehicles=tuple(vehicle),
+            revoked=tuple(revoke),
+        )
+    state = stage_release(repository, candidate, key, directive)
+    for each in key:
+        acknowledge(candidate, each)
+    draw_page(candidate, [repository])
+    tell_signatures(repository, state)
+
+
+@only_writer_of("repository")
+def publish(repository: Path = typer.Argument(help="Folder of a party.")) -> None:
+    """Make what a party has signed its repository's current state; without anything, renew its timestamp."""
+    from flcav.releases.repositories.repository import publish as publish_staged
+
+    typer.echo(f"{repository}: version {publish_staged(repository)} of its targets is current")
+
+
+@only_writer_of("folder")
+def install(
+    folder: Path = typer.Argument(metavar="VEHICLE", help="Folder of the vehicle."),
+    name: str = typer.Option(..., "--name", help="The vehicle's name."),
+    image: str = IMAGE,
+    director: str = DIRECTOR,
+    image_root: Path | None = typer.Option(None, "--image-root", help="First call: root.json of the provider."),
+    director_root: Path | None = typer.Option(None, "--director-root", help="First call: root.json of the customer."),
+    task: str = TASK,
+) -> None:
+    """Install in a vehicle what both repositories name with the same hash; refuse anything else."""
+    from flcav.config import check_is_file
+    from flcav.releases.vehicles.checking import open_sources, trust_roots
+    from flcav.releases.vehicles.installation import update_vehicle
+
+    if (image_root is None) != (director_root is None):
+        raise InputError("--image-root and --director-root: a vehicle is delivered with both")
+    if image_root is not None and director_root is not None:
+        for path in (image_root, director_root):
+            check_is_file(path)
+        trust_roots(folder, image_root.read_bytes(), director_root.read_bytes())
+    driving = update_vehicle(folder, name, open_sources(image, director), task)
+    typer.echo(
+        f"{name}: " + ("drives no network" if driving is None else f"drives release {driving.release} of {task}")
+    )
+
+
+def status(
+    repository: list[Path] = typer.Argument(help="Folders of parties."),
+    candidate: Path | None = typer.Option(
+        None, "--candidate", help="Folder of a candidate: its page is drawn anew with the signatures of these parties."
+    ),
+    task: str = TASK,
+    as_json: bool = AS_JSON,
+) -> None:
+    """Show what repositories name: releases, the customer's directive, signatures on their way, times of expiry."""
+    from flcav.releases.repositories.status import read_status
+
+    found = [read_status(folder, task) for folder in repository]
+    if candidate is not None:
+        draw_page(candidate, repository)
+    if as_json:
+        print_json({"repositories": [each.as_json() for each in found]})
+        return
+    for each in found:
+        typer.echo("\n".join(each.lines()))

@@ -1,0 +1,140 @@
+"""Metadata of a party's repository: The Update Framework's roles, read, written, and signed by the online key.
+
+Root and targets are signed by n of the party's m keys, snapshot and timestamp by its online key (TUF specification
+1.0.34, sections 4 and 6).
+"""
+
+from collections.abc import Mapping
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from flcav.config import InputError, check_is_file
+from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS
+from flcav.releases.keys import PrivateKey, PublicKey
+from flcav.releases.repositories.directive import Directive
+from flcav.storage.files import write_bytes
+
+if TYPE_CHECKING:
+    from tuf.api.metadata import Metadata, Root, Snapshot, TargetFile, Targets, Timestamp
+
+Party = Literal["provider", "customer"]
+LIFETIME = {  # of metadata, from its signature on
+    "root": timedelta(days=365),
+    "targets": timedelta(days=90),
+    "snapshot": timedelta(days=7),
+    "timestamp": timedelta(days=1),
+}
+DIRECTIVE = "directive"  # key of the directive among a target's custom fields
+PARTY = "flcav-party"  # key of the party's name among a root's fields
+
+
+def read_root(out: Path) -> bytes:
+    """Return the first root metadata of a party's repository, which its vehicles are delivered with."""
+    path = out / "repository" / "metadata" / "1.root.json"
+    if not path.is_file():
+        raise InputError(f"{out}: no repository of a party, since it has no repository/metadata/1.root.json")
+    return path.read_bytes()
+
+
+def read_party(out: Path) -> Party:
+    """Return whose repository it is."""
+    party = load_root(out).signed.unrecognized_fields.get(PARTY)
+    if party not in ("provider", "customer"):
+        raise InputError(f"{out}: a repository of nobody: neither the provider's nor the customer's")
+    return party
+
+
+def load_root(out: Path) -> "Metadata[Root]":
+    """Return the repository's latest root; raises `InputError` where `out` is none of a party."""
+    read_root(out)
+    metadata = out / "repository" / "metadata"
+    latest = max(int(path.name.partition(".")[0]) for path in metadata.glob("*.root.json"))
+    return load_metadata(metadata / f"{latest}.root.json")
+
+
+def load_timestamp(out: Path) -> "Metadata[Timestamp]":
+    """Return the repository's timestamp."""
+    return load_metadata(out / "repository" / "metadata" / "timestamp.json")
+
+
+def load_targets(out: Path) -> "Metadata[Targets]":
+    """Return the repository's current targets metadata."""
+    metadata = out / "repository" / "metadata"
+    timestamp = load_metadata(metadata / "timestamp.json")
+    snapshot = load_metadata(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")
+    return load_metadata(metadata / f"{snapshot.signed.meta['targets.json'].version}.targets.json")
+
+
+def load_metadata(path: Path) -> "Metadata":
+    """Return the metadata in a file; raises `InputError` for any other file."""
+    from tuf.api.exceptions import RepositoryError
+    from tuf.api.metadata import Metadata
+
+    check_is_file(path)
+    try:
+        return Metadata.from_bytes(path.read_bytes())
+    except RepositoryError as error:
+        raise InputError(f"{path}: no metadata of The Update Framework ({error})") from None
+
+
+def write_metadata(metadata: "Metadata", path: Path) -> None:
+    """Write metadata, atomically."""
+    write_bytes(path, metadata.to_bytes())
+
+
+def read_directives(targets: Mapping[str, "TargetFile"]) -> dict[str, Directive]:
+    """Return the directives in a director's targets by task; raises `InputError` where one is malformed."""
+    found = {}
+    for name, file in targets.items():
+        task, _, rest = name.partition("/")
+        custom = file.custom
+        if rest.endswith(WEIGHTS) and custom is not None:
+            try:
+                found[task] = Directive.model_validate(custom[DIRECTIVE])
+            except (ValueError, TypeError, KeyError):
+                raise InputError(f"{name}: its directive is malformed") from None
+    return found
+
+
+def list_releases(targets: Mapping[str, "TargetFile"], task: str) -> list[int]:
+    """Return the numbers of the releases of a task, rising."""
+    parts = [name.split("/") for name in targets]
+    return sorted({int(part[1]) for part in parts if len(part) == 3 and part[0] == task and part[1].isdigit()})
+
+
+def root_keys(root: "Root") -> list[PublicKey]:
+    """Return the keys of a root's targets role."""
+    return [PublicKey(root.keys[name].keyval["public"]) for name in root.roles["targets"].keyids]
+
+
+def target_names(task: str, release: int) -> tuple[str, str]:
+    """Return the names of a release's targets: its weights and its description."""
+    return f"{task}/{release}/{WEIGHTS}", f"{task}/{release}/{CANDIDATE}"
+
+
+def expiry_of(role: str, at: datetime) -> datetime:
+    """Return until when metadata of a role hold that are signed now."""
+    return (at + LIFETIME[role]).replace(microsecond=0)
+
+
+def sign_online(
+    metadata: Path,
+    snapshot: "Metadata[Snapshot]",
+    timestamp: "Metadata[Timestamp]",
+    online: PrivateKey,
+    at: datetime,
+    targets_version: int,
+    first: bool = False,
+) -> None:
+    """Sign snapshot and timestamp; the timestamp is written last, so that a crash leaves the old state whole."""
+    snapshot.signed.meta["targets.json"].version = targets_version
+    snapshot.signed.version += 0 if first else 1
+    snapshot.signed.expires = expiry_of("snapshot", at)
+    snapshot.sign(online.signer())
+    write_metadata(snapshot, metadata / f"{snapshot.signed.version}.snapshot.json")
+    timestamp.signed.snapshot_meta.version = snapshot.signed.version
+    timestamp.signed.version += 0 if first else 1
+    timestamp.signed.expires = expiry_of("timestamp", at)
+    timestamp.sign(online.signer())
+    write_metadata(timestamp, metadata / "timestamp.json")

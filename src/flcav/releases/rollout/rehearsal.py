@@ -1,0 +1,273 @@
+"""A rehearsal of a roll-out on a simulated fleet: shares, downloads over the radio, shadow runs, a stop, a roll-back.
+
+Both parties get repositories and keys for it, so that no key of an owner is needed. Canaries run the network that they
+drove before beside the new one on what they meet; the next share follows, or the roll-out stops and is rolled back.
+"""
+
+import shutil
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
+from flcav.network.clock.rounds import NetworkSettings
+from flcav.network.ledger import Ledger, LinkMegabytes
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.weights import load_network
+from flcav.releases.candidates.candidate import WEIGHTS, Candidate, check_files, read_candidate
+from flcav.releases.repositories.creation import create_repository
+from flcav.releases.repositories.directive import MILLION, Directive, is_assigned
+from flcav.releases.repositories.metadata import read_root
+from flcav.releases.repositories.repository import publish, stage_release
+from flcav.releases.rollout.delivery import Delivered
+from flcav.releases.rollout.fleet import (
+    Drive,
+    SimulatedFleet,
+    SimulatedRadio,
+    build_fleet,
+    list_drives,
+    update_over_radio,
+)
+from flcav.releases.rollout.shadow import ShadowDecision, ShadowReport, judge_shadows, run_shadow
+from flcav.releases.rollout.stages import STAGES, change_share, next_share, roll_back
+from flcav.releases.vehicles.checking import Sources, open_sources
+from flcav.storage.records import Record
+
+MOST_TURNS = 12  # of the whole rehearsal; a vehicle drives once a turn
+KEYS = (1, 2)  # of each party, that sign
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One turn: a share of the fleet, what was delivered in it, and what the shadow runs said."""
+
+    release: int
+    share: float
+    assigned: int  # vehicles of the share
+    reached: int  # of these, have the release by the end of the turn
+    arrivals: tuple[Delivered, ...]  # seconds from the beginning of each vehicle's drive
+    wireless_mb: float
+    wireline_mb: float
+    decision: ShadowDecision | None  # None without shadow runs
+
+    def describe(self) -> str:
+        """Return the turn in words."""
+        times = sorted(each.at_s for each in self.arrivals if each.at_s is not None)
+        after = (
+            f", {len(times)} now, half of these by {np.median(times):.2f} s, all by {times[-1]:.2f} s" if times else ""
+        )
+        said = f"; {self.decision.describe()}" if self.decision is not None else ""
+        return (
+            f"release {self.release}, {self.share:.0%} of the fleet: reaches {self.reached} of "
+            f"{plural(self.assigned, 'vehicle')}{after}; {self.wireless_mb:.2f} MB wireless, "
+            f"{self.wireline_mb:.2f} MB wireline{said}"
+        )
+
+
+@dataclass(frozen=True)
+class Rehearsal(Record):
+    """What became of a roll-out: stopped or not, its turns, and how many vehicles drive which release in the end."""
+
+    stopped: bool
+    complete: bool  # every vehicle drives the new release, or after a stop the earlier weights
+    turns: tuple[Turn, ...]
+    drive: Mapping[int, int]  # release -> vehicles
+
+    def lines(self) -> list[str]:
+        """Return the rehearsal in words."""
+        held = ", ".join(f"release {release}: {plural(count, 'vehicle')}" for release, count in self.drive.items())
+        end = "stopped and rolled back" if self.stopped else "complete" if self.complete else "not complete"
+        return [*(turn.describe() for turn in self.turns), f"{end}; in the end {held}"]
+
+
+@dataclass(frozen=True)
+class _Parties:
+    """Repositories and keys of both parties, in one folder."""
+
+    folder: Path
+    task: str
+
+    def keys(self, party: str) -> list[Path]:
+        return [self.folder / party / "keys" / f"{number}.pem" for number in KEYS]
+
+    def release(self, candidate: Path, share: float) -> None:
+        """Let both sign a candidate for a share of the fleet, and publish."""
+        directive = Directive(release=read_candidate(candidate).release, share_ppm=round(share * MILLION))
+        for party, own in (("provider", None), ("customer", directive)):
+            stage_release(self.folder / party, candidate, self.keys(party), own)
+            publish(self.folder / party)
+
+    def widen(self, share: float) -> None:
+        """Let the customer sign another share, and publish."""
+        change_share(self.folder / "customer", self.task, share, self.keys("customer"))
+        publish(self.folder / "customer")
+
+    def sources(self) -> Sources:
+        return open_sources(*(str(self.folder / party / "repository") for party in ("provider", "customer")))
+
+
+def rehearse(
+    candidate: Path,
+    earlier: Path,
+    data: Path,
+    out: Path,
+    ledger: Ledger | None = None,
+    *,
+    vehicles: int = 200,
+    poles: Sequence[int] = (),
+    settings: NetworkSettings | None = None,
+    seed: int = 0,
+    progress: Report = ignore_progress,
+) -> Rehearsal:
+    """Return what became of the roll-out of a candidate to a simulated fleet that drives an earlier release.
+
+    Args:
+        candidate: folder of the new release.
+        earlier: folder of the release that drives.
+        data: dataset with the vehicles' drives, the traffic and the town.
+        out: new folder of both parties' repositories; the fleet's is removed in the end.
+        ledger: where every downlink is entered; None: nowhere.
+        vehicles: number of vehicles.
+        poles: numbers of the town's poles with roadside units; empty: those recorded from.
+        settings: of the network.
+        seed: of shadowing and losses.
+        progress: callback for the turns done and at most.
+
+    Raises:
+        InputError: for a folder that exists, candidates that do not follow each other, and a dataset without drives,
+            traffic or poles.
+    """
+    new, old = _check_sequence(candidate, earlier)
+    if out.exists():
+        raise InputError(f"{out}: exists already; a rehearsal is a new folder")
+    opened, spent = Dataset.open(data), ledger if ledger is not None else Ledger(LinkMegabytes(0, 0))
+    radio = SimulatedRadio(opened, settings or NetworkSettings(), tuple(poles), seed)
+    drives = list_drives(opened)
+    radio.links(drives[0].scene)  # refuses what has no traffic or poles before anything is written
+    parties = _Parties(out, new.task)
+    try:
+        for party in ("provider", "customer"):
+            create_repository(out / party, party)
+        parties.release(earlier, 1.0)
+        roots = (read_root(out / "provider"), read_root(out / "customer"))
+        fleet = build_fleet(out / "fleet", vehicles, drives, roots, parties.sources(), new.task)
+        shadows = _Shadows(opened, earlier / WEIGHTS, candidate / WEIGHTS, old.weights, new.weights)
+        turns = _roll_out(candidate, parties, fleet, radio, spent, shadows, progress)
+        stopped = turns[-1].decision is not None and turns[-1].decision.judgement == "stop"
+        if stopped:
+            parties.widen(0.0)
+            back = out / "rollback"
+            roll_back(earlier, new.release + 1, "Shadow runs disagree.", back, new.weights)
+            parties.release(back, 1.0)
+            turns += _spread(new.release + 1, parties, fleet, radio, spent, len(turns))
+        drive = Counter(fleet.installed(name).release for name in fleet.names)
+        wanted = new.release + 1 if stopped else new.release
+        return Rehearsal(stopped, drive[wanted] == vehicles, tuple(turns), dict(sorted(drive.items())))
+    finally:
+        shutil.rmtree(out / "fleet", ignore_errors=True)
+
+
+class _Shadows:
+    """Shadow runs of drives, each computed once."""
+
+    def __init__(self, data: Dataset, driving: Path, candidate: Path, old: str, new: str) -> None:
+        self.data = data
+        self.networks = ((load_network(OBJECTS, driving), old), (load_network(OBJECTS, candidate), new))
+        self.reports: dict[Drive, ShadowReport] = {}
+
+    def run(self, drives: Sequence[Drive]) -> ShadowDecision | None:
+        """Return what follows from all drives so far and these; None without any."""
+        for drive in drives:
+            if drive not in self.reports:
+                numbers = self.data.select(agents=[drive.agent], scenes=[drive.scene])
+                self.reports[drive] = run_shadow(drive.name, map(self.data.frame, numbers), *self.networks)
+        return judge_shadows([*self.reports.values()]) if self.reports else None
+
+
+def _roll_out(
+    candidate: Path,
+    parties: _Parties,
+    fleet: SimulatedFleet,
+    radio: SimulatedRadio,
+    ledger: Ledger,
+    shadows: _Shadows,
+    progress: Report,
+) -> list[Turn]:
+    """Return the turns until the whole fleet has the release, it is stopped, or there were `MOST_TURNS`."""
+    release, share = read_candidate(candidate).release, STAGES[0]
+    parties.release(candidate, share)
+    turns: list[Turn] = []
+    fetched: set[str] = set()
+    while len(turns) < MOST_TURNS:
+        number = len(turns)
+        moved = _turn(release, share, parties, fleet, radio, ledger, number, fetched)
+        having = [name for name in fleet.names if fleet.installed(name).release == release]
+        decision = shadows.run([fleet.drive_of(name, number) for name in having])
+        turns.append(Turn(*moved, decision))
+        progress(len(turns), MOST_TURNS, turns[-1].describe())
+        if (decision is not None and decision.judgement == "stop") or len(having) == len(fleet.names):
+            break
+        wider = next_share(share, decision) if decision is not None else share
+        if not any(is_assigned(name, fleet.task, _directive(release, share)) for name in fleet.names):
+            wider = next(stage for stage in STAGES if stage > share)  # a small fleet has no vehicle in the first share
+        if wider != share:
+            share = wider
+            parties.widen(share)
+    return turns
+
+
+def _spread(
+    release: int, parties: _Parties, fleet: SimulatedFleet, radio: SimulatedRadio, ledger: Ledger, first: int
+) -> list[Turn]:
+    """Return the turns until every vehicle has a release that is for all, or there were `MOST_TURNS`."""
+    turns: list[Turn] = []
+    fetched: set[str] = set()
+    while len(turns) < MOST_TURNS and not (turns and turns[-1].reached == turns[-1].assigned):
+        number = first + len(turns)
+        turns.append(Turn(*_turn(release, 1.0, parties, fleet, radio, ledger, number, fetched), None))
+    return turns
+
+
+def _turn(
+    release: int,
+    share: float,
+    parties: _Parties,
+    fleet: SimulatedFleet,
+    radio: SimulatedRadio,
+    ledger: Ledger,
+    number: int,
+    fetched: set[str],
+) -> tuple[int, float, int, int, tuple[Delivered, ...], float, float]:
+    """Deliver to the vehicles of a share that lack a release; return the fields of a `Turn` but the decision."""
+    assigned = [name for name in fleet.names if is_assigned(name, fleet.task, _directive(release, share))]
+    lacking = [name for name in assigned if fleet.installed(name).release != release]
+    before = [ledger.used_mb(link, direction="down") for link in ("wireless", "wireline")]
+    arrivals = update_over_radio(fleet, lacking, number, radio, parties.sources(), ledger, fetched)
+    after = [ledger.used_mb(link, direction="down") for link in ("wireless", "wireline")]
+    reached = sum(fleet.installed(name).release == release for name in assigned)
+    moved = (after[0] - before[0], after[1] - before[1])
+    return release, share, len(assigned), reached, tuple(arrivals), *moved
+
+
+def _directive(release: int, share: float) -> Directive:
+    return Directive(release=release, share_ppm=round(share * MILLION))
+
+
+def _check_sequence(candidate: Path, earlier: Path) -> tuple[Candidate, Candidate]:
+    """Return both descriptions; raises `InputError` where the candidate does not follow the earlier release."""
+    new, old = read_candidate(candidate), read_candidate(earlier)
+    for folder, described in ((candidate, new), (earlier, old)):
+        check_files(folder, described)
+    if new.task != old.task or new.task != OBJECTS.name:
+        raise InputError(f"{candidate}: a rehearsal takes two releases of '{OBJECTS.name}'")
+    if new.driving != old.weights:
+        raise InputError(f"{candidate}: is proposed to replace another network than that of {earlier}")
+    if new.release <= old.release:
+        raise InputError(f"{candidate}: release {new.release} does not rise above {old.release}, which drives")
+    return new, old
