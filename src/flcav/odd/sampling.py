@@ -227,9 +227,7 @@ def sample_domain(
     samples: list[Sample] = []
     refused = 0
     points = (
-        _draw_covering(space, count, seed, covered)
-        if method == "coverage"
-        else _draw_points(space, count, method, seed)
+        _draw_covering(space, count, seed, covered) if method == "coverage" else draw_points(space, count, method, seed)
     )
     for values, case, place in points:
         found = space.realise(values, case, place)
@@ -241,6 +239,11 @@ def sample_domain(
         samples.append(found)
         if len(samples) == count:
             break
+    return count_pairs(space, samples, refused)
+
+
+def count_pairs(space: Space, samples: Sequence[Sample], refused: int = 0) -> Sampled:
+    """Return samples of a space with the pairs of buckets that they have."""
     possible = space.possible_pairs()
     order = [axis.attribute for axis in space.axes] + [CASE]
     had = {
@@ -251,7 +254,7 @@ def sample_domain(
     return Sampled(tuple(samples), len(had & possible), len(possible), refused)
 
 
-def _draw_points(space: Space, count: int, method: str, seed: int) -> Iterator[tuple[dict[str, Value], float, float]]:
+def draw_points(space: Space, count: int, method: str, seed: int) -> Iterator[tuple[dict[str, Value], float, float]]:
     """Yield values by attribute and the shares of case and place, without end, in batches of quasi-random points."""
     axes, rng = space.axes, stream(seed, "odd", method)
     sobol = qmc.Sobol(len(axes) + 2, scramble=True, rng=rng)
