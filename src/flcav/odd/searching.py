@@ -121,7 +121,7 @@ def search_failures(
         rng = stream(seed, "odd", rule, str(number))
         few = [next(points) for _ in range(POINTS if rule == "failures" else 1)]
         sample = choose_scenario(few, model, rng)
-        told = json.dumps([detector, rule, seed, number, scenarios, sample.as_json()], sort_keys=True)
+        told = json.dumps([detector, rule, seed, number, sample.as_json()], sort_keys=True)
         key = hashlib.sha256(told.encode()).hexdigest()[:24]
         tested = known.get(key)
         if tested is None:
