@@ -28,7 +28,8 @@ Array = NDArray[np.float64]
 
 KEPT_S = 0.45
 EVERY_S = 0.5  # between two forecasts of a track
-SLOW_MPS = 0.5  # below it a track stands, and is not forecast
+SLOW_MPS = 0.5  # below it the heading of a track is left as it is
+MOVED_M = 1.0  # in two seconds: a track that moves less stands, whatever its velocity seems to be, and is not forecast
 WALKS = "Pedestrian"
 MOTIONS = ("stands", "drives", "forecast", "walks")  # whose paths are differently good; "forecast" is by the network
 CATEGORY = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
@@ -149,8 +150,9 @@ class Following:
 
 
 def _is_due(each: _Known, time_s: float) -> bool:
-    long = bool(each.past) and each.past[0][0] <= time_s - PAST * STEP_S + 0.15
-    moves = float(np.hypot(*each.velocity)) > SLOW_MPS
+    long = each.past[0][0] <= time_s - PAST * STEP_S + 0.15
+    first, last = each.past[0], each.past[-1]
+    moves = float(np.hypot(last[1] - first[1], last[2] - first[2])) > MOVED_M
     if not (long and moves) or str(each.box.label[0]) == WALKS:
         each.forecast = None
         return False
