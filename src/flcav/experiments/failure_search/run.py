@@ -27,7 +27,7 @@ from flcav.storage.records import Record
 from flcav.world.map.town import TOWNS, load_town
 
 DOMAIN = "urban"
-SCENARIOS, SEEDS = 10, 5
+SCENARIOS, SEEDS = 6, 5
 APART = 10_000  # between the seeds of two searches, which give their scenarios the seeds that follow
 SOBOL, PATH, SEARCH = RULES
 PAIRS = ((SEARCH, SOBOL), (SEARCH, PATH), (PATH, SOBOL))
