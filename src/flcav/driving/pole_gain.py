@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.driving.hidden import Hidden, find_hidden, summarise_hidden
+from flcav.driving.importance import paired_difference
 from flcav.driving.loop import LOOP, Loop, drive
 from flcav.driving.measures import Drive
 from flcav.driving.networks import NetworkPerception
@@ -24,6 +25,7 @@ from flcav.world.snapshot import Snapshot
 Array = NDArray[np.float64]
 
 RANGE_M = 40.0  # of a pole's sensor
+GAINS = {"least_ttc_s": "least time to collision [s]", "score": "driving score"}
 OVERLAP = 0.3  # bird's-eye IoU of a found car: what braking needs, when boxes are half a second old
 
 
@@ -97,6 +99,11 @@ class PoleGain(Record):
                 f"{name}: least time to collision {ttc:.2f} s, below 1.5 s for {near:.1%} of the time, "
                 f"{faults} collisions at fault, driving score {score:.2f}"
             )
+        names = [own.scenario for own in self.without]
+        if len(set(names)) > 1:
+            gaps = {each: paired_difference(self.without, self.with_poles, names, each) for each in GAINS}
+            told = ", ".join(f"{words} {gaps[each].describe(sign=True)}" for each, words in GAINS.items())
+            lines.append(f"with less without, paired: {told}")
         return [*lines, late]
 
 

@@ -13,10 +13,11 @@ from flcav.driving import jobs as driven
 from flcav.driving.error_measurement import Tally, summarise
 from flcav.driving.errors import CLASSES, load_errors
 from flcav.driving.following import CERTAIN, Following
-from flcav.driving.hidden import find_hidden, summarise_hidden
+from flcav.driving.hidden import Hidden, find_hidden, summarise_hidden
 from flcav.driving.jobs import Job, Sensed, read_kept, run_jobs
-from flcav.driving.measures import Drive
+from flcav.driving.measures import Drive, Hit
 from flcav.driving.networks import load_roads
+from flcav.driving.pole_gain import PoleGain
 from flcav.driving.road import fuse, pack_tracks
 from flcav.driving.scenarios import list_scenarios
 from flcav.driving.seen import TIMES_S
@@ -141,6 +142,21 @@ def test_an_error_model_without_a_kind_of_motion_is_refused(tmp_path: Path) -> N
     path.write_text(json.dumps(replace(model, growth={"drives": model.growth["drives"]}).as_json()))
     with pytest.raises(InputError, match="no growth of 'stands'"):
         load_errors(path)
+
+
+def test_the_gain_of_poles_is_told_with_paired_differences() -> None:
+    def driven(name: str, ttc: float, hits: int = 0) -> Drive:
+        hit = Hit(1.0, "veh0", "vehicle", 5.0, at_fault=True)
+        return Drive(name, 1, 10.0, 0.5, 5.0, ttc, 0.0, 0, 0, (hit,) * hits, 0.5)
+
+    without, with_poles = [driven("a", 1.0, 1), driven("b", 2.0)], [driven("a", 1.5), driven("b", 2.5)]
+    gain = PoleGain((1, 3), Hidden(0, None, None, None), 0.5, 0.75, 0.1, tuple(without), tuple(with_poles))
+    told = gain.lines()
+    assert told[1] == "AP of the vehicle alone 0.500, with the poles 0.750"
+    assert "without poles: least time to collision 1.50 s" in told[2]
+    assert "1 collisions at fault" in told[2]
+    assert "least time to collision [s] +0.500 (+0.500 to +0.500)" in told[4]
+    assert len(replace(gain, without=tuple(without[:1]), with_poles=tuple(with_poles[:1])).lines()) == len(told) - 1
 
 
 def standing(places: list[tuple[float, float, float]]) -> Trace:

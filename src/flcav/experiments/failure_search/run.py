@@ -3,6 +3,9 @@
 All rules (`odd.searching.RULES`) test as many scenarios, and as many frames of each, in the same domain and towns with
 the same detector. The rule "path" chooses frames as the search may, and learns nothing: it separates the two. Distinct
 are failures in different cells of a grid (`odd.failures.GRID`).
+
+Expected, before any run with these seeds: the search finds two to four times as many as Sobol points, and most of that
+is from choosing frames in which there is somebody to miss; against such frames drawn at random it gains little.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +30,7 @@ from flcav.storage.records import Record
 from flcav.world.map.town import TOWNS, load_town
 
 DOMAIN = "urban"
-SCENARIOS, SEEDS = 6, 5
+SCENARIOS, SEEDS = 60, 5
 APART = 10_000  # between the seeds of two searches, which give their scenarios the seeds that follow
 SOBOL, PATH, SEARCH = RULES
 PAIRS = ((SEARCH, SOBOL), (SEARCH, PATH), (PATH, SOBOL))
