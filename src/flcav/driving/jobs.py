@@ -88,7 +88,8 @@ def run_jobs(
                 known[key] = own
                 done += 1
                 if book is not None:
-                    book.write(json.dumps({"key": key, "drive": own.as_json()}) + "\n")
+                    row = {"key": key, "drive": own.as_json()}
+                    book.write("\n" + json.dumps(row))  # on a line of its own, also after one that was cut off
                     book.flush()
                 progress(done, len(jobs), own.scenario)
     return [known[key] for key in keys]

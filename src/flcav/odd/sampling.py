@@ -42,6 +42,7 @@ CASE = "corner case"  # name of its axis
 RAIN_MM_H, RAIN_CLOUDS = 0.3, 60.0  # rain from there on needs clouds of that share [%]
 WETTEST_MM_H = 20.0  # rain rate at which the road is as wet as rain makes it
 MOST_TRIES = 50  # points per recipe before the domain is taken to have none
+HARDLY = "hardly any weather and place together are inside it"
 
 
 @dataclass(frozen=True)
@@ -234,7 +235,7 @@ def sample_domain(
         if found is None:
             refused += 1
             if refused > MOST_TRIES * max(count, 10):
-                raise InputError(f"{space.domain.name}: hardly any weather and place together are inside it")
+                raise InputError(f"{space.domain.name}: {HARDLY}")
             continue
         samples.append(found)
         if len(samples) == count:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flcav.config import Json
+from flcav.config import InputError, Json
 from flcav.interface.progress import Report, ignore_progress
 from flcav.odd.failures import (
     CLASSES,
@@ -32,7 +32,7 @@ from flcav.odd.failures import (
     weather_buckets,
 )
 from flcav.odd.recipes import make_recipe
-from flcav.odd.sampling import Sample, Space, draw_points
+from flcav.odd.sampling import HARDLY, MOST_TRIES, Sample, Space, draw_points
 from flcav.odd.scenery import Scenery
 from flcav.perception.objects.model import Second
 from flcav.sources.embedded import EmbeddedSource
@@ -180,11 +180,17 @@ def _context(sample: Sample) -> tuple[str, ...]:
 
 
 def _realise(space: Space, scenarios: int, seed: int) -> Iterator[Sample]:
-    """Yield the samples of Sobol points, those that the domain refuses left out."""
+    """Yield the samples of Sobol points, those that the domain refuses left out; raises `InputError` if all are."""
+    refused = 0
     for point in draw_points(space, scenarios, "sobol", seed):
         sample = space.realise(*point)
         if sample is not None:
+            refused = 0
             yield sample
+            continue
+        refused += 1
+        if refused > 10 * MOST_TRIES:
+            raise InputError(f"{space.domain.name}: {HARDLY}")
 
 
 def _hash_weights(network: Second) -> str:
@@ -210,4 +216,5 @@ def _keep(path: Path | None, key: str, tested: tuple[TriedFrame, ...]) -> None:
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a", encoding="utf-8") as book:
-            book.write(json.dumps({"key": key, "tested": to_json(tested, tuple[TriedFrame, ...])}) + "\n")
+            row = {"key": key, "tested": to_json(tested, tuple[TriedFrame, ...])}
+            book.write("\n" + json.dumps(row))  # on a line of its own, also after one that was cut off

@@ -140,13 +140,16 @@ def test_scenarios_that_are_kept_are_not_tested_again(
     kept = tmp_path / "tested.jsonl"
     plant = Plant(monkeypatch)
     whole = search(space, ring, "failures", scenarios=6, kept=kept)
-    lines = kept.read_text().splitlines()
+    lines = kept.read_text().splitlines()[1:]
     assert [json.loads(line)["key"] for line in lines] == list(dict.fromkeys(json.loads(line)["key"] for line in lines))
     kept.write_text("\n".join(lines[:4]) + "\n" + lines[4][:30])  # cut off
     plant = Plant(monkeypatch)
     plant.number = 4
     assert search(space, ring, "failures", scenarios=6, kept=kept) == whole
     assert plant.tested == 2 * searching.FRAMES
+    plant = Plant(monkeypatch)
+    assert search(space, ring, "failures", scenarios=6, kept=kept) == whole  # those after the line that was cut off
+    assert plant.tested == 0
 
 
 def test_a_cell_with_a_failure_promises_less(sample: Sample):
@@ -163,6 +166,6 @@ def test_the_command_writes_recipes_with_their_failures(capsys: pytest.CaptureFi
     assert ended.value.code == 0
     assert "in 4 frames" in capsys.readouterr().out
     told = json.loads((out / "samples.json").read_text())["samples"]
-    kept = [json.loads(line)["tested"] for line in (out / "tested.jsonl").read_text().splitlines()]
+    kept = [json.loads(line)["tested"] for line in (out / "tested.jsonl").read_text().splitlines() if line]
     assert told[0]["failures"] == [failure for frame in kept[0] for failure in frame["failures"]]
     assert (out / "1.yaml").exists()
