@@ -26,6 +26,8 @@ from flcav.experiments.distillation import tables as distillation_tables
 from flcav.experiments.distillation.run import DistillationResult
 from flcav.experiments.exchanges import tables as exchange_tables
 from flcav.experiments.exchanges.run import ExchangeResult
+from flcav.experiments.failure_search.run import FailureSearchResult
+from flcav.experiments.failure_search.tables import failure_search_tables
 from flcav.experiments.fig3a import tables as fig3a_tables
 from flcav.experiments.fig3a.run import Fig3a
 from flcav.experiments.fig3b import tables as fig3b_tables
@@ -84,6 +86,7 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "distillation": _told(DistillationResult, distillation_tables.tables),
     "exchange": _told(ExchangeResult, exchange_tables.tables),
     "exchange-objects": _told(ExchangeResult, exchange_tables.tables),
+    "failure-search": _told(FailureSearchResult, failure_search_tables),
     "faults": _told(FaultsResult, attack_tables.fault_tables),
     "fig3a": _told(Fig3a, fig3a_tables.tables),
     "fig3b": _told(Fig3b, fig3b_tables.tables),

@@ -67,7 +67,9 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "odd of": {},
     "odd inside": dict.fromkeys(("--perceived", "--weather", "--objects", "--device", "--frames"), ALWAYS),
     "odd cover": dict.fromkeys(("--data", "--by", "--detect", "--weights", "--range", "--device"), ALWAYS),
-    "odd sample": dict.fromkeys(("--count", "--town", "--method", "--covered", "--seed", "--openscenario"), ALWAYS),
+    "odd sample": dict.fromkeys(
+        ("--count", "--town", "--method", "--covered", "--weights", "--seed", "--openscenario"), ALWAYS
+    ),
     "odd tasks": dict.fromkeys(("--data", "--errors", "--pretrain", "--wireless", "--wireline"), ALWAYS),
     "carla serve": dict.fromkeys(("--port", "--seed", "--traffic", "--maps", "--host"), ALWAYS),
     "release init": {"--keys": ALWAYS, "--threshold": ALWAYS},

@@ -36,6 +36,7 @@ class Target(StrEnum):
     corner_cases = "corner-cases"
     demo_arms = "demo-arms"
     distillation = "distillation"
+    failure_search = "failure-search"
     federation_asynchrony = "federation-asynchrony"
     federation_exchange = "federation-exchange"
     federation_exchange_objects = "federation-exchange-objects"
@@ -91,11 +92,14 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
     Target.fig3a: (),
     **dict.fromkeys(RECORDED, ()),
     **dict.fromkeys(DRIVES, ("seeds",)),
+    Target.failure_search: ("seeds", "scale"),
     Target.safety_distance: ("seeds", "scale", "jobs"),
     Target.sim_to_real: (*RUN, *REAL),
 }
 SEEDS: Mapping[str, int] = {
-    **dict.fromkeys((Target.corner_cases, Target.demo_arms, Target.lifelong, *EXCHANGES, *DRIVES), 5),
+    **dict.fromkeys(
+        (Target.corner_cases, Target.demo_arms, Target.failure_search, Target.lifelong, *EXCHANGES, *DRIVES), 5
+    ),
     **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
     Target.federation_groups: 10,
     Target.safety_distance: 1,
@@ -124,7 +128,7 @@ def reproduce(
         "--seeds",
         min=1,
         help="Number of seeds, from 1: 10 of federation-groups, 8 of federation-exchange and placement, 5 of "
-        "corner-cases, demo-arms, lifelong and the other federation-*, 3 of the others if not given.",
+        "corner-cases, demo-arms, failure-search, lifelong and the other federation-*, 3 of the others if not given.",
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
@@ -352,6 +356,16 @@ def _safety_distance(out: Path, seeds: int, scale: str, jobs: int, engine: Engin
     _write_figures(out, results.as_json(), {"trade_off.png": results.picture()}, results.sentences())
 
 
+@when_interrupted()
+def _failure_search(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
+    from flcav.experiments.failure_search.run import SCENARIOS, compare_searches
+    from flcav.interface import progress
+
+    with progress.show_progress(Target.failure_search.value) as report:
+        results = compare_searches(out, seeds, SCENARIOS if scale == "paper" else 4, report)
+    _write_figures(out, results.as_json(), {"growth.png": results.picture()}, results.sentences())
+
+
 def _corner_cases(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
     from flcav.experiments.corner_cases.run import compare_corner_cases, draw_corner_cases
     from flcav.experiments.scales import shrink_recipe
@@ -380,6 +394,7 @@ COMPARISONS: Mapping[str, Callable[[Path, int, str, int, EngineName, Stale], Non
     Target.demo_arms: _demo_arms,
     Target.distillation: _distillation,
     **{target: partial(_federation_exchange, Target(target)) for target in EXCHANGES},
+    Target.failure_search: _failure_search,
     Target.fig6a_allocation: _fig6a_allocation,
     Target.gap: _gap,
     Target.lifelong: _lifelong,

@@ -1,31 +1,29 @@
-"""A model of the networks' errors, measured on drives: perception of the same quality at a small part of the time.
+"""A model of the networks' errors: perception of the same quality at a small part of the time.
 
 A perception error model (Piazzoni et al., "Modeling perception errors towards robust decision making in autonomous
 vehicles", IJCAI 2020): road users in sight are detected with the measured probability for their class and distance,
 with Gaussian errors of the measured size; lights and weather are read with the measured probabilities. Detections are
 tracked, and forecast by the trajectory network, as those of the networks are. An actor stays detected or missed for
-`HELD_S`. False positives are measured, and not modelled: a single one is never reported by the tracker.
+`HELD_S`. False positives are measured (`error_measurement`), and not modelled: a single one is never reported by the
+tracker.
 """
 
-from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import read_json
-from flcav.driving.following import MOTIONS, Following, Spread, name_motion
-from flcav.driving.loop import Loop, Sensing, drive
-from flcav.driving.networks import LIGHTS_M, NetworkPerception, load_networks, load_roads
-from flcav.driving.scenarios import Scenario, Staged
+from flcav.config import InputError, read_json
+from flcav.driving.following import MOTIONS, Following, Spread
+from flcav.driving.loop import Sensing
+from flcav.driving.networks import LIGHTS_M, load_networks, load_roads
+from flcav.driving.scenarios import Staged
 from flcav.driving.seen import EGO, TIMES_S, WEATHER_SPEED, Perception, Seen
-from flcav.driving.truth import Truth, find_around, read_actors, read_lights
-from flcav.driving.visibility import share_seen
-from flcav.geometry import Boxes, heading_vectors, rotate, wrap_angle
-from flcav.interface.progress import Report, ignore_progress
-from flcav.machine.processes import process_pool
+from flcav.driving.truth import find_around, read_actors, read_lights
+from flcav.driving.visibility import EYE_M, FIELD_M, share_seen
+from flcav.geometry import Boxes, heading_vectors, rotate
 from flcav.perception.objects.truth import DETECTION_CLASS
 from flcav.statistics.streams import stream
 from flcav.storage.records import Record
@@ -36,14 +34,9 @@ Array = NDArray[np.float64]
 
 EDGES_M = (0.0, 15.0, 30.0, 52.0)  # distances between which errors are measured
 CLASSES = ("Car", "Pedestrian", "Cyclist")
-FIELD_M = (51.2, 28.8)  # ahead, and to each side: the field of the network `small`
-EYE_M = 1.85
 SHIPPED = Path(__file__).parent / "shipped" / "errors.json"
-MATCH_M = 2.5
 HELD_S = 1.0
-ONE_SIGMA = 0.6827  # share of a normal distribution within one standard deviation: outliers do not widen that
 LIGHTS_S = 0.5  # between two looks at lights
-HORIZON = slice(0, len(TIMES_S), 2)
 
 
 @dataclass(frozen=True)
@@ -85,179 +78,13 @@ def find_in_field(snapshot: Snapshot, scene: Scene) -> tuple[NDArray[np.int64], 
     return rows[seen], Boxes(kept.center, kept.size, kept.yaw, labels), local[seen]
 
 
-def _by_class() -> defaultdict[str, Counter[str]]:
-    return defaultdict(Counter)
-
-
-@dataclass
-class Tally:
-    """Counts and errors over drives."""
-
-    pairs: list[tuple[str, float, bool, float, float, float]] = field(
-        default_factory=list
-    )  # class, distance, found, errors
-    false_positives: int = 0
-    frames: int = 0
-    lights: Counter[str] = field(default_factory=Counter)
-    weather: defaultdict[str, Counter[str]] = field(default_factory=_by_class)
-    tracks: list[tuple[str, float, Array]] = field(default_factory=list)  # motion, variance, errors (H, 2) at HORIZON
-
-    def add(self, other: "Tally") -> None:
-        """Add the counts of another drive."""
-        self.pairs += other.pairs
-        self.tracks += other.tracks
-        self.false_positives += other.false_positives
-        self.frames += other.frames
-        self.lights += other.lights
-        for name, counts in other.weather.items():
-            self.weather[name] += counts
-
-
-class Comparing:
-    """Perception by the networks, compared with the truth, by which the vehicle is driven."""
-
-    def __init__(self, staged: Staged, seed: int, tally: Tally) -> None:
-        self._networks, self._truth = NetworkPerception(staged, seed), Truth(staged.scenario.weather)
-        self._tally, self._class = tally, staged.scenario.weather
-        self._forecasts: list[tuple[float, str, str, float, Array]] = []
-        self._places: dict[tuple[str, int], Array] = {}
-
-    def look(self, snapshot: Snapshot) -> Seen:
-        """Return the truth; note what the networks make of it."""
-        told = self._networks.look(snapshot)
-        self._compare(snapshot)
-        self._remember(snapshot)
-        if self._networks.lights_read_s == snapshot.time_s:
-            self._tally.weather[self._class][self._networks.named] += 1
-            letters = dict(zip(snapshot.trace.light.tolist(), snapshot.trace.light_state[0].tolist()))
-            for link, letter in self._networks.heads.items():
-                right = letter is not None and (letter == "G") == (letters.get(link) in ("G", "g"))
-                self._tally.lights["unread" if letter is None else "right" if right else "wrong"] += 1
-        assert told is not None
-        return self._truth.look(snapshot)
-
-    def _compare(self, snapshot: Snapshot) -> None:
-        _, boxes, local = find_in_field(snapshot, self._networks.scene)
-        found, own = self._networks.found, snapshot.row(EGO)
-        yaw = float(snapshot.trace.yaw[0, own])
-        free = np.ones(len(found), np.bool_)
-        for row in np.argsort(np.hypot(*local.T)).tolist():
-            away = np.hypot(*(found.center[:, :2] - boxes.center[row, :2]).T)
-            same = free & (found.label == boxes.label[row]) & (away < MATCH_M)
-            label, distance = str(boxes.label[row]), float(np.hypot(*local[row]))
-            if not same.any():
-                self._tally.pairs.append((label, distance, False, 0.0, 0.0, 0.0))
-                continue
-            best = int(np.argmin(np.where(same, away, np.inf)))
-            free[best] = False
-            apart_x, apart_y = (found.center[best, :2] - boxes.center[row, :2]).tolist()
-            x, y = rotate(apart_x, apart_y, -yaw)
-            turn = float(wrap_angle(2 * (found.yaw[best] - boxes.yaw[row]))) / 2  # either way round
-            self._tally.pairs.append((label, distance, True, float(x), float(y), turn))
-        rows = find_around(snapshot, 80.0)
-        everyone = snapshot.trace.position[0, rows, :2]
-        lonely = [np.hypot(*(everyone - each[:2]).T).min(initial=np.inf) > 3.0 for each in found.center[free]]
-        self._tally.false_positives += int(sum(lonely))
-        self._tally.frames += 1
-
-    def _remember(self, snapshot: Snapshot) -> None:
-        """Note forecasts, and the errors of those whose horizon is over."""
-        trace, tick = snapshot.trace, round(snapshot.time_s * 10)
-        for name, place in zip(trace.actor.tolist(), trace.position[0, :, :2]):
-            self._places[name, tick] = place
-        followed = self._networks.followed
-        if followed is not None and tick % 5 == 0:
-            rows = find_around(snapshot, 80.0)
-            for i in range(len(followed.boxes)):
-                away = np.hypot(*(trace.position[0, rows, :2] - followed.boxes.center[i, :2]).T)
-                if len(away) and away.min() < MATCH_M and followed.boxes.variance is not None:
-                    variance = float(followed.boxes.variance[i, :2].mean())
-                    motion = name_motion(str(followed.boxes.label[i]), followed.velocity[i])
-                    name = str(trace.actor[rows[int(away.argmin())]])
-                    self._forecasts.append((snapshot.time_s, name, motion, variance, followed.path[i, HORIZON]))
-        last = TIMES_S[HORIZON][-1]
-        over = [each for each in self._forecasts if each[0] + last <= snapshot.time_s + 1e-6]
-        self._forecasts = self._forecasts[len(over) :]
-        for time_s, name, motion, variance, path in over:
-            ticks = [round(10 * (time_s + float(t))) for t in TIMES_S[HORIZON]]
-            places = [self._places.get((name, each)) for each in ticks]
-            if all(each is not None for each in places):
-                self._tally.tracks.append((motion, variance, path - np.array(places)))
-
-
-def measure_errors(
-    scenarios: Sequence[Scenario],
-    seeds: Sequence[int],
-    loop: Loop,
-    processes: int = 1,
-    progress: Report = ignore_progress,
-) -> ErrorModel:
-    """Return the error model of the package's networks over drives of these scenarios and seeds."""
-    jobs = [(scenario, seed, loop) for scenario in scenarios for seed in seeds]
-    whole = Tally()
-    with process_pool(processes, begin_worker) as pool:
-        for done, own in enumerate(pool.map(tally_drive, *zip(*jobs)), start=1):
-            whole.add(own)
-            progress(done, len(jobs), "")
-    return summarise(whole)
-
-
 def load_errors(path: Path | None = None) -> ErrorModel:
     """Return the error model in a JSON file, by default that of the package; raises `InputError` for another file."""
     path = path or SHIPPED
-    return ErrorModel.from_json(read_json(path), str(path))
-
-
-def begin_worker() -> None:
-    """Begin a worker process, which needs nothing."""
-
-
-def tally_drive(scenario: Scenario, seed: int, loop: Loop) -> Tally:
-    """Return what the networks get wrong in one drive."""
-    tally = Tally()
-    drive(scenario, seed, lambda staged, own: Comparing(staged, own, tally), loop)
-    return tally
-
-
-def summarise(tally: Tally) -> ErrorModel:
-    """Return the model of what was counted; shares have half a success and half a failure added (Jeffreys)."""
-    detected: dict[str, tuple[float, ...]] = {}
-    sd: dict[str, tuple[float, float, float]] = {}
-    for name in CLASSES:
-        rows = np.array([pair[1:] for pair in tally.pairs if pair[0] == name], np.float64).reshape(-1, 5)
-        bins = np.digitize(rows[:, 0], EDGES_M[1:-1])
-        detected[name] = tuple(
-            float((rows[bins == b, 1].sum() + 0.5) / ((bins == b).sum() + 1)) for b in range(len(EDGES_M) - 1)
-        )
-        hit = rows[rows[:, 1] > 0, 2:]
-        x, y, yaw = np.sqrt((hit**2).mean(axis=0)).tolist() if len(hit) else (0.3, 0.3, 0.2)
-        sd[name] = (x, y, yaw)
-    total = max(tally.lights.total(), 1)
-    counted = tally.weather.items()
-    off = [each[2][0] / np.sqrt(each[1]) for each in tally.tracks]
-    factor = float(np.quantile(np.abs(off), ONE_SIGMA)) ** 2 if off else 1.0
-    return ErrorModel(
-        detected=detected,
-        sd=sd,
-        false_positives=float(tally.false_positives) / max(tally.frames, 1),
-        lights=(tally.lights["right"] / total, tally.lights["wrong"] / total),
-        weather={name: {each: n / own.total() for each, n in own.items()} for name, own in counted},
-        spread_factor=factor,
-        growth={motion: _growth(tally, motion, factor) for motion in MOTIONS},
-        seen=len(tally.pairs),
-        frames=tally.frames,
-    )
-
-
-def _growth(tally: Tally, motion: str, factor: float) -> tuple[float, ...]:
-    """Return the standard deviation at `TIMES_S` that forecasts have beyond that of their tracks."""
-    own = [each for each in tally.tracks if each[0] == motion]
-    if not own:
-        return (0.0,) * len(TIMES_S)
-    off = np.abs(np.array([each[2] for each in own])).transpose(1, 0, 2).reshape(len(TIMES_S[HORIZON]), -1)
-    variance = factor * float(np.median([each[1] for each in own]))
-    excess = np.sqrt(np.maximum(np.quantile(off, ONE_SIGMA, axis=1) ** 2 - variance, 0.0))
-    return tuple(np.interp(TIMES_S, TIMES_S[HORIZON], excess).tolist())
+    model = ErrorModel.from_json(read_json(path), str(path))
+    if missing := [name for name in MOTIONS if len(model.growth.get(name, ())) != len(TIMES_S)]:
+        raise InputError(f"{path}: no growth of '{missing[0]}' over {len(TIMES_S)} times; measure the errors again")
+    return model
 
 
 class ModelledPerception:

@@ -1,19 +1,20 @@
 """From detections to what a driver is told: tracks, forecasts of their paths, and how far off these may be.
 
 Tracks come from the tracker of the package, and are kept for `KEPT_S` without a detection. Vehicles that are known for
-two seconds get the single path of the trajectory network, every half second; all others keep their velocity.
+two seconds get the single path of the trajectory network, every half second; all others keep their velocity. Who moves
+looks where it goes: a detector often takes the back of a car for its front, and a track keeps the heading of its first.
 """
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.dataset.layout import FrameKey
 from flcav.driving.seen import TIMES_S, predict_motion
-from flcav.geometry import Boxes, concatenate
+from flcav.geometry import Boxes, concatenate, heading_vectors, wrap_angle
 from flcav.perception.tracking.tracker import Tracker
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
@@ -27,15 +28,24 @@ Array = NDArray[np.float64]
 
 KEPT_S = 0.45
 EVERY_S = 0.5  # between two forecasts of a track
-SLOW_MPS = 0.5  # below it a track stands, and is not forecast
+SLOW_MPS = 0.5  # below it the heading of a track is left as it is
+MOVED_M = 1.0  # in two seconds: a track that moves less stands, whatever its velocity seems to be, and is not forecast
 WALKS = "Pedestrian"
-MOTIONS = ("stands", "drives", "walks")  # whose forecasts are differently good
+MOTIONS = ("stands", "drives", "forecast", "walks")  # whose paths are differently good; "forecast" is by the network
 CATEGORY = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
 
 
-def name_motion(label: str, velocity: Array) -> str:
-    """Return which of `MOTIONS` a track of a detection class has."""
-    return "walks" if label == WALKS else "drives" if float(np.hypot(*velocity)) > 1.0 else "stands"
+def name_motion(label: str, velocity: Array, forecast: bool) -> str:
+    """Return which of `MOTIONS` a track of a detection class has, with a forecast of the network or without."""
+    if label == WALKS:
+        return "walks"
+    return "forecast" if forecast else "drives" if float(np.hypot(*velocity)) > 1.0 else "stands"
+
+
+def head_forward(yaw: Array, velocity: Array) -> Array:
+    """Return headings (N,) [rad], those turned by 180 degrees that are against a velocity (N, 2) above `SLOW_MPS`."""
+    back = (heading_vectors(yaw) * velocity).sum(axis=1) < 0
+    return np.asarray(wrap_angle(yaw + np.pi * (back & (np.linalg.norm(velocity, axis=1) > SLOW_MPS))))
 
 
 @dataclass(frozen=True)
@@ -61,6 +71,7 @@ class Followed:
     path: Array
     yaw: Array
     spread: Array
+    motion: tuple[str, ...]  # (N,) of `MOTIONS`
 
 
 @dataclass
@@ -85,8 +96,9 @@ class Following:
     def step(self, found: Boxes, time_s: float, closed: frozenset[str]) -> Followed:
         """Return the tracks at `time_s` by the detections `found` (world frame) and the lights that are closed."""
         told = self._tracker.step(found, time_s)
+        boxes = replace(told.boxes, yaw=head_forward(told.boxes.yaw, told.velocity))
         for row, number in enumerate(told.track.tolist()):
-            box, velocity = told.boxes[[row]], told.velocity[row]
+            box, velocity = boxes[[row]], told.velocity[row]
             known = self._known.setdefault(number, _Known(box, velocity, time_s, deque(maxlen=24)))
             known.box, known.velocity, known.seen_s = box, velocity, time_s
             speed = float(np.hypot(*velocity))
@@ -102,7 +114,7 @@ class Following:
         if not rows:
             none = np.zeros((0, len(TIMES_S)))
             return Followed(
-                Boxes.empty(), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, len(TIMES_S), 2)), none, none
+                Boxes.empty(), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, len(TIMES_S), 2)), none, none, ()
             )
         boxes, velocity = concatenate([each.box for each in rows]), np.array([each.velocity for each in rows])
         path, yaw = predict_motion(boxes, velocity)
@@ -111,11 +123,11 @@ class Following:
         for row, each in enumerate(rows):
             if each.forecast is not None:
                 path[row], yaw[row] = _shift(each, time_s, float(boxes.yaw[row]))
-        motions = [name_motion(str(label), v) for label, v in zip(boxes.label, velocity)]
+        motions = tuple(name_motion(str(each.box.label[0]), each.velocity, each.forecast is not None) for each in rows)
         growth = np.array([self._spread.growth.get(each, (0.0,) * len(TIMES_S)) for each in motions])
         now = np.zeros(len(rows)) if boxes.variance is None else boxes.variance[:, :2].mean(axis=1)
         spread = np.sqrt(self._spread.factor * now[:, None] + growth**2)
-        return Followed(boxes, np.array(numbers, np.int64), velocity, path, yaw, spread)
+        return Followed(boxes, np.array(numbers, np.int64), velocity, path, yaw, spread, motions)
 
     def _forecast(self, network: TrajectoryNetwork, roads: RoadMap, time_s: float, closed: frozenset[str]) -> None:
         """Give the tracks that have a past of two seconds a new forecast, where their last one is old."""
@@ -138,8 +150,9 @@ class Following:
 
 
 def _is_due(each: _Known, time_s: float) -> bool:
-    long = bool(each.past) and each.past[0][0] <= time_s - PAST * STEP_S + 0.15
-    moves = float(np.hypot(*each.velocity)) > SLOW_MPS
+    long = each.past[0][0] <= time_s - PAST * STEP_S + 0.15
+    first, last = each.past[0], each.past[-1]
+    moves = float(np.hypot(last[1] - first[1], last[2] - first[2])) > MOVED_M
     if not (long and moves) or str(each.box.label[0]) == WALKS:
         each.forecast = None
         return False
@@ -177,7 +190,8 @@ def _record(everybody: list[_Known], time_s: float, closed: frozenset[str]) -> t
         past = np.array(each.past)
         own = np.flatnonzero((times <= time_s + 1e-6) & (times >= past[0, 0] - 0.15))
         position[own, actor] = np.stack([np.interp(times[own], past[:, 0], past[:, axis]) for axis in (1, 2)], axis=1)
-        yaw[own, actor] = np.interp(times[own], past[:, 0], np.unwrap(past[:, 3]))
+        turned = np.unwrap(past[::-1, 3], period=np.pi)[::-1]  # either way round, to that of the present
+        yaw[own, actor] = np.interp(times[own], past[:, 0], turned)
         speed[own, actor] = np.interp(times[own], past[:, 0], past[:, 4])
     links = sorted(closed)
     still = np.zeros((1, count, 3))

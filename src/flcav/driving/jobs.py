@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TextIO
 
 from flcav.driving.couplings import Coupling, Without
-from flcav.driving.errors import ErrorModel, begin_worker, sense_model
+from flcav.driving.errors import ErrorModel, sense_model
 from flcav.driving.loop import LOOP, Loop, Sensing, drive, sense_truth
 from flcav.driving.measures import Drive
 from flcav.driving.networks import sense_networks
@@ -52,6 +52,10 @@ class Job(Record):
         return hashlib.sha256(told.encode()).hexdigest()[:24]
 
 
+def begin_worker() -> None:
+    """Begin a worker process, which needs nothing."""
+
+
 def run_job(job: Job, sensed: Sensed) -> Drive:
     """Return the measures of one drive."""
     whole = sensed.make()
@@ -84,7 +88,8 @@ def run_jobs(
                 known[key] = own
                 done += 1
                 if book is not None:
-                    book.write(json.dumps({"key": key, "drive": own.as_json()}) + "\n")
+                    row = {"key": key, "drive": own.as_json()}
+                    book.write("\n" + json.dumps(row))  # on a line of its own, also after one that was cut off
                     book.flush()
                 progress(done, len(jobs), own.scenario)
     return [known[key] for key in keys]

@@ -8,6 +8,8 @@ from flcav.world.scene import Scene
 
 Array = NDArray[np.float64]
 
+FIELD_M = (51.2, 28.8)  # ahead, and to each side: the field of the vehicle's detector, `small`
+EYE_M = 1.85  # of its LiDAR above the ground
 ACROSS = (0.0, -0.4, 0.4)  # of a road user's extent across the line of sight: where rays end
 START_M = 0.6  # from the place to the start of a ray, outside a mast
 

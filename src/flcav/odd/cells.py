@@ -24,6 +24,8 @@ from flcav.statistics.streams import stream
 from flcav.storage.records import Record
 from flcav.world.map.town import Town
 
+Array = NDArray[np.float64]
+
 MISSING = "<missing>"
 CERTAIN_RETURNS = 20  # LiDAR returns from which a missed object is a failure
 PATH_AHEAD_M, PATH_ASIDE_M = 40.0, 2.0  # the path of a vehicle: so far ahead, and so far to either side
@@ -114,14 +116,21 @@ def measure_cell(measure: Measure, outcomes: Outcomes, inside: NDArray[np.bool_]
 
 
 def find_failures(data: Dataset, found: Mapping[int, Sequence[PerceptionError]]) -> dict[int, bool]:
-    """Return whether each frame has a failure: a missed object of `CERTAIN_RETURNS` or more in the vehicle's path."""
+    """Return whether each frame has a failure, see `locate_failure`."""
+    return {
+        i: any(locate_failure(data.world_from_agent(i), error) is not None for error in errors)
+        for i, errors in found.items()
+    }
 
-    def in_path(i: int, error: PerceptionError) -> bool:
-        x, y = (inverse(data.world_from_agent(i)) @ (error.x, error.y, error.z, 1.0))[:2]
-        certain = error.kind == MISS and error.returns >= CERTAIN_RETURNS
-        return bool(certain and 0 < x <= PATH_AHEAD_M and abs(y) <= PATH_ASIDE_M)
 
-    return {i: any(in_path(i, error) for error in errors) for i, errors in found.items()}
+def locate_failure(world_from_agent: Array, error: PerceptionError) -> float | None:
+    """Return how far ahead [m] a failure is: a missed object of `CERTAIN_RETURNS` or more in the vehicle's path.
+
+    None where the error is no failure. `world_from_agent` is the (4, 4) pose of the vehicle.
+    """
+    x, y = (inverse(world_from_agent) @ (error.x, error.y, error.z, 1.0)).tolist()[:2]
+    certain = error.kind == MISS and error.returns >= CERTAIN_RETURNS
+    return x if certain and 0 < x <= PATH_AHEAD_M and abs(y) <= PATH_ASIDE_M else None
 
 
 def measure_cells(measure: Measure, outcomes: Outcomes, tested: Sequence[Trial], range_m: float) -> list[CellErrors]:

@@ -1,6 +1,6 @@
 """Recipes of sampled scenarios: a recording of each, with its corner case where and when it is to happen."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,12 +44,17 @@ def make_recipe(sample: Sample, scenery: Scenery, seed: int, split: str = "train
 
 
 def write_recipes(
-    drawn: Sampled, sceneries: Sequence[Scenery], out: Path, seed: int, also: Callable[[Sample, Recipe, Path], None]
+    drawn: Sampled,
+    sceneries: Sequence[Scenery],
+    out: Path,
+    seed: int,
+    also: Callable[[Sample, Recipe, Path], None],
+    told: Sequence[Mapping[str, Json]] = (),
 ) -> list[Path]:
     """Write the recipe of each sample as OUT/NUMBER.yaml, and OUT/samples.json last; return the recipes' paths.
 
-    also: called for each sample with its recipe and path. Every recipe has been read before it is written. Raises
-    `InputError` where the folder has recipes already.
+    also: called for each sample with its recipe and path; told: further values of each sample in samples.json. Every
+    recipe has been read before it is written. Raises `InputError` where the folder has recipes already.
     """
     if out.exists() and any(out.glob("*.yaml")):
         raise InputError(f"{out}: has recipes already; name another folder")
@@ -67,7 +72,10 @@ def write_recipes(
         "pairs": drawn.pairs,
         "possible_pairs": drawn.possible,
         "refused": drawn.refused,
-        "samples": [{"recipe": path.name, **each.as_json()} for path, each in zip(paths, drawn.samples, strict=True)],
+        "samples": [
+            {"recipe": path.name, **each.as_json(), **more}
+            for path, each, more in zip(paths, drawn.samples, told or [{}] * len(paths), strict=True)
+        ],
     }
     write_json(out / INDEX, summary, sort=False)
     return paths

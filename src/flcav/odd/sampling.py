@@ -42,6 +42,7 @@ CASE = "corner case"  # name of its axis
 RAIN_MM_H, RAIN_CLOUDS = 0.3, 60.0  # rain from there on needs clouds of that share [%]
 WETTEST_MM_H = 20.0  # rain rate at which the road is as wet as rain makes it
 MOST_TRIES = 50  # points per recipe before the domain is taken to have none
+HARDLY = "hardly any weather and place together are inside it"
 
 
 @dataclass(frozen=True)
@@ -227,20 +228,23 @@ def sample_domain(
     samples: list[Sample] = []
     refused = 0
     points = (
-        _draw_covering(space, count, seed, covered)
-        if method == "coverage"
-        else _draw_points(space, count, method, seed)
+        _draw_covering(space, count, seed, covered) if method == "coverage" else draw_points(space, count, method, seed)
     )
     for values, case, place in points:
         found = space.realise(values, case, place)
         if found is None:
             refused += 1
             if refused > MOST_TRIES * max(count, 10):
-                raise InputError(f"{space.domain.name}: hardly any weather and place together are inside it")
+                raise InputError(f"{space.domain.name}: {HARDLY}")
             continue
         samples.append(found)
         if len(samples) == count:
             break
+    return count_pairs(space, samples, refused)
+
+
+def count_pairs(space: Space, samples: Sequence[Sample], refused: int = 0) -> Sampled:
+    """Return samples of a space with the pairs of buckets that they have."""
     possible = space.possible_pairs()
     order = [axis.attribute for axis in space.axes] + [CASE]
     had = {
@@ -251,7 +255,7 @@ def sample_domain(
     return Sampled(tuple(samples), len(had & possible), len(possible), refused)
 
 
-def _draw_points(space: Space, count: int, method: str, seed: int) -> Iterator[tuple[dict[str, Value], float, float]]:
+def draw_points(space: Space, count: int, method: str, seed: int) -> Iterator[tuple[dict[str, Value], float, float]]:
     """Yield values by attribute and the shares of case and place, without end, in batches of quasi-random points."""
     axes, rng = space.axes, stream(seed, "odd", method)
     sobol = qmc.Sobol(len(axes) + 2, scramble=True, rng=rng)

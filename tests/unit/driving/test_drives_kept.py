@@ -10,18 +10,23 @@ import pytest
 from flcav.cli.importance import set_weights
 from flcav.config import InputError
 from flcav.driving import jobs as driven
-from flcav.driving.errors import CLASSES, Tally, load_errors, summarise
+from flcav.driving.error_measurement import Tally, summarise
+from flcav.driving.errors import CLASSES, load_errors
 from flcav.driving.following import CERTAIN, Following
+from flcav.driving.hidden import Hidden, find_hidden, summarise_hidden
 from flcav.driving.jobs import Job, Sensed, read_kept, run_jobs
-from flcav.driving.measures import Drive
-from flcav.driving.pole_gain import find_hidden, summarise_hidden
+from flcav.driving.measures import Drive, Hit
+from flcav.driving.networks import load_roads
+from flcav.driving.pole_gain import PoleGain
 from flcav.driving.road import fuse, pack_tracks
 from flcav.driving.scenarios import list_scenarios
 from flcav.driving.seen import TIMES_S
 from flcav.geometry import Boxes, left_vectors
 from flcav.network.messages import unpack
 from flcav.optimization.problem import Problem
+from flcav.perception.networks import resolve_network
 from flcav.perception.tracking.tracker import Tracker
+from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.world.map.roads import read_net
 from flcav.world.map.routes import draw_route
 from flcav.world.map.town import load_town
@@ -108,6 +113,50 @@ def test_tracks_are_followed_kept_and_forget() -> None:
     late = following.step(cars(), 2.3, frozenset())
     assert late.path[0, 0] == pytest.approx((21.5, 3.0), abs=0.5)  # moved on without a detection
     assert not len(following.step(cars(), 2.6, frozenset()).boxes)
+
+
+def test_a_heading_the_wrong_way_round_changes_no_forecast() -> None:
+    """A detector that takes the back of a car for its front, always or at times, leaves its path as it was."""
+    network, roads = resolve_network(TRAJECTORY, None), load_roads("ring")
+    route = draw_route(read_net(load_town("ring").net), np.random.default_rng(5), 200.0)
+    poses = [route.at(20.0 + 0.8 * tick) for tick in range(26)]
+    told = []
+    for turned in (lambda tick: False, lambda tick: True, lambda tick: tick % 3 == 0):
+        following = Following(network, roads, CERTAIN)
+        for tick, (x, y, yaw) in enumerate(poses):
+            found = cars((x, y))
+            found = replace(found, yaw=np.full(1, yaw + np.pi * turned(tick)))
+            last = following.step(found, tick / 10, frozenset())
+        assert last.motion == ("forecast",)
+        told.append(last)
+    ahead = route.at(20.0 + 0.8 * 25 + 16.0)[:2]  # in two seconds
+    for other in told:
+        assert other.path[0] == pytest.approx(told[0].path[0], abs=0.5)
+        assert other.yaw[0] == pytest.approx(told[0].yaw[0], abs=0.1)
+        assert np.hypot(*(other.path[0, 8] - ahead)) < 6.0
+
+
+def test_an_error_model_without_a_kind_of_motion_is_refused(tmp_path: Path) -> None:
+    model = load_errors()
+    path = tmp_path / "errors.json"
+    path.write_text(json.dumps(replace(model, growth={"drives": model.growth["drives"]}).as_json()))
+    with pytest.raises(InputError, match="no growth of 'stands'"):
+        load_errors(path)
+
+
+def test_the_gain_of_poles_is_told_with_paired_differences() -> None:
+    def driven(name: str, ttc: float, hits: int = 0) -> Drive:
+        hit = Hit(1.0, "veh0", "vehicle", 5.0, at_fault=True)
+        return Drive(name, 1, 10.0, 0.5, 5.0, ttc, 0.0, 0, 0, (hit,) * hits, 0.5)
+
+    without, with_poles = [driven("a", 1.0, 1), driven("b", 2.0)], [driven("a", 1.5), driven("b", 2.5)]
+    gain = PoleGain((1, 3), Hidden(0, None, None, None), 0.5, 0.75, 0.1, tuple(without), tuple(with_poles))
+    told = gain.lines()
+    assert told[1] == "AP of the vehicle alone 0.500, with the poles 0.750"
+    assert "without poles: least time to collision 1.50 s" in told[2]
+    assert "1 collisions at fault" in told[2]
+    assert "least time to collision [s] +0.500 (+0.500 to +0.500)" in told[4]
+    assert len(replace(gain, without=tuple(without[:1]), with_poles=tuple(with_poles[:1])).lines()) == len(told) - 1
 
 
 def standing(places: list[tuple[float, float, float]]) -> Trace:

@@ -1,0 +1,1 @@
+"""Adaptive search for failures against quasi-random sampling."""

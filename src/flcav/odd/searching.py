@@ -1,0 +1,220 @@
+"""Adaptive search for failures: scenarios and their frames are chosen by what earlier ones have shown.
+
+A naive Bayes model has the rate of failures in each bucket of each axis of a frame's cell, of the corner case and of
+the town; a rate is drawn from its Beta posterior (Thompson sampling: Russo et al., "A tutorial on Thompson sampling",
+2018), so that what is little known is tried. Of a few Sobol points that scenario is taken whose cells without a failure
+so far promise most, and of its traffic those frames. The plain draws it is compared with have as many of both.
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from flcav.config import InputError, Json
+from flcav.interface.progress import Report, ignore_progress
+from flcav.odd.failures import (
+    CLASSES,
+    GRID,
+    NOBODY,
+    Candidate,
+    Cell,
+    Failure,
+    TriedFrame,
+    list_candidates,
+    take_apart,
+    try_frames,
+    weather_buckets,
+)
+from flcav.odd.recipes import make_recipe
+from flcav.odd.sampling import HARDLY, MOST_TRIES, Sample, Space, draw_points
+from flcav.odd.scenery import Scenery
+from flcav.perception.objects.model import Second
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import parse_recipe
+from flcav.statistics.streams import stream
+from flcav.storage.records import Record, from_json, to_json
+
+RULES = ("sobol", "path", "failures")
+TESTED = "tested.jsonl"  # kept results beside recipes
+FRAMES = 4  # of a scenario that are tested
+POINTS = 8  # Sobol points of which one is taken
+PRIOR = 4.0  # tests that a bucket's rate is taken to be known by before the first
+FIRST_RATE = 0.2  # of failures, before the first test
+
+
+@dataclass(frozen=True)
+class Searched(Record):
+    """A scenario of a search, with its tested frames."""
+
+    sample: Sample
+    seed: int  # of its recipe
+    tested: tuple[TriedFrame, ...]
+
+    @property
+    def failures(self) -> tuple[Failure, ...]:
+        """Return the failures of all its frames."""
+        return tuple(failure for frame in self.tested for failure in frame.failures)
+
+    @property
+    def failed(self) -> Mapping[str, Json]:
+        """Return the failures as JSON values."""
+        return {"failures": [failure.as_json() for failure in self.failures]}
+
+
+@dataclass
+class FailureModel:
+    """Rates of failures by bucket, and the cells in which there is one."""
+
+    tests: Counter[str] = field(default_factory=Counter)  # by bucket
+    hits: Counter[str] = field(default_factory=Counter)
+    failed: Counter[Cell] = field(default_factory=Counter)  # by cell without occlusion
+
+    def learn(self, sample: Sample, tested: Sequence[TriedFrame]) -> None:
+        """Take the frames of a scenario into account."""
+        for frame in tested:
+            names = (*frame.cell, *_context(sample), "any")
+            self.tests.update(names)
+            if frame.failures:
+                self.hits.update(names)
+            self.failed.update({failure.cell[:-1] for failure in frame.failures})
+
+    def draw_ratios(self, rng: np.random.Generator) -> Mapping[str, float]:
+        """Return a draw of each bucket's rate over the mean rate; of one not yet tested it is missing."""
+        mean = (self.hits["any"] + PRIOR * FIRST_RATE) / (self.tests["any"] + PRIOR)
+        return {
+            name: float(rng.beta(self.hits[name] + PRIOR * mean, count - self.hits[name] + PRIOR * (1 - mean))) / mean
+            for name, count in self.tests.items()
+        }
+
+    def promise(self, names: Sequence[str], cell: Cell, ratios: Mapping[str, float]) -> float:
+        """Return what a frame in a cell promises: the product of its ratios, less where there are failures already."""
+        rate = float(np.prod([ratios.get(name, 1.0) for name in (*names, *cell)]))
+        return rate / (1 + self.failed[cell]) ** 2
+
+
+def search_failures(
+    space: Space,
+    sceneries: Sequence[Scenery],
+    network: Second,
+    scenarios: int,
+    seed: int,
+    rule: str = "failures",
+    kept: Path | None = None,
+    progress: Report = ignore_progress,
+) -> list[Searched]:
+    """Return so many scenarios of a space with the failures of a detector in `FRAMES` frames of each.
+
+    rule: "failures" searches; "sobol" takes Sobol points as they come, and the frames nearest to the place while the
+    corner case plays; "path" takes frames of them at random, but with somebody in the path. Scenario n has seed + n.
+    With `kept`, a file of JSON lines, scenarios in it are not tested again.
+    """
+    by_name, model = {scenery.town.name: scenery for scenery in sceneries}, FailureModel()
+    points, known, detector = _realise(space, scenarios, seed), _read(kept), _hash_weights(network)
+    done: list[Searched] = []
+    for number in range(scenarios):
+        rng = stream(seed, "odd", rule, str(number))
+        few = [next(points) for _ in range(POINTS if rule == "failures" else 1)]
+        sample = choose_scenario(few, model, rng)
+        told = json.dumps([detector, rule, seed, number, sample.as_json()], sort_keys=True)
+        key = hashlib.sha256(told.encode()).hexdigest()[:24]
+        tested = known.get(key)
+        if tested is None:
+            values = make_recipe(sample, by_name[sample.place.town], seed + number)
+            source = EmbeddedSource(parse_recipe(values, f"sample {number}"))
+            trace = source.trace(source.scenes()[0])
+            every = list_candidates(sample, trace, source.recipe.cavs)
+            tested = tuple(try_frames(sample, source, trace, choose_frames(every, sample, model, rule, rng), network))
+            _keep(kept, key, tested)
+        model.learn(sample, tested)
+        done.append(Searched(sample, seed + number, tested))
+        progress(number + 1, scenarios, f"{len(distinct(done))} distinct failures")
+    return done
+
+
+def distinct(searched: Sequence[Searched]) -> set[Cell]:
+    """Return the cells in which there is a failure: distinct failures."""
+    return {failure.cell for each in searched for failure in each.failures}
+
+
+def choose_scenario(samples: Sequence[Sample], model: FailureModel, rng: np.random.Generator) -> Sample:
+    """Return the sample whose cells promise most, by one draw of the rates."""
+    ratios = model.draw_ratios(rng)
+    agents, distances = ([f"{name} {i}" for i in range(len(GRID[name]) + 1)] for name in ("agents", "distance"))
+
+    def promise(sample: Sample) -> float:
+        names, weather = _context(sample), weather_buckets(sample.weather)
+        return sum(
+            model.promise(names, (sample.place.kind, label, *weather, *rest), ratios)
+            for label, *rest in product(CLASSES, agents, distances)
+        )
+
+    return max(samples, key=promise)
+
+
+def choose_frames(
+    every: Sequence[Candidate], sample: Sample, model: FailureModel, rule: str, rng: np.random.Generator
+) -> list[Candidate]:
+    """Return the frames of a scenario to test, by a rule of `RULES`."""
+    near = sorted(every, key=lambda each: (not each.plays, each.away_m))
+    if rule == "sobol":
+        return take_apart(near, FRAMES)
+    path = [each for each in near if each.cell[1] != NOBODY]
+    if rule == "path":
+        order = rng.permutation(len(path)).tolist()
+        return take_apart([path[i] for i in order] + near, FRAMES)
+    ratios, names = model.draw_ratios(rng), _context(sample)
+    ranked = sorted(path, key=lambda each: -model.promise(names, each.cell, ratios))
+    firsts = {each.cell: each for each in reversed(ranked)}  # one of each cell first
+    return take_apart([*(each for each in ranked if firsts[each.cell] is each), *ranked, *near], FRAMES)
+
+
+def _context(sample: Sample) -> tuple[str, ...]:
+    """Return what else a rate depends on, which is not part of a cell."""
+    return f"case {sample.case}", f"town {sample.place.town}"
+
+
+def _realise(space: Space, scenarios: int, seed: int) -> Iterator[Sample]:
+    """Yield the samples of Sobol points, those that the domain refuses left out; raises `InputError` if all are."""
+    refused = 0
+    for point in draw_points(space, scenarios, "sobol", seed):
+        sample = space.realise(*point)
+        if sample is not None:
+            refused = 0
+            yield sample
+            continue
+        refused += 1
+        if refused > 10 * MOST_TRIES:
+            raise InputError(f"{space.domain.name}: {HARDLY}")
+
+
+def _hash_weights(network: Second) -> str:
+    whole = hashlib.sha256()
+    for value in network.state_dict().values():
+        whole.update(value.cpu().numpy().tobytes())
+    return whole.hexdigest()
+
+
+def _read(path: Path | None) -> dict[str, tuple[TriedFrame, ...]]:
+    """Return the tested frames in a file of kept ones, by key; a last line that was cut off is left out."""
+    known = {}
+    for line in path.read_text(encoding="utf-8").splitlines() if path is not None and path.exists() else ():
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        known[row["key"]] = from_json(tuple[TriedFrame, ...], row["tested"], str(path))
+    return known
+
+
+def _keep(path: Path | None, key: str, tested: tuple[TriedFrame, ...]) -> None:
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as book:
+            row = {"key": key, "tested": to_json(tested, tuple[TriedFrame, ...])}
+            book.write("\n" + json.dumps(row))  # on a line of its own, also after one that was cut off
