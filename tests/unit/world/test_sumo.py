@@ -129,7 +129,10 @@ def test_an_interrupted_request_leaves_no_answer_to_the_next(tmp_path: Path, mon
     monkeypatch.setattr(sumo._process.stdout, "readline", interrupted)
     with pytest.raises(KeyboardInterrupt):
         sumo.step(Request())
+    monkeypatch.undo()
     os.kill(fork, signal.SIGKILL)
+    with pytest.raises(RuntimeError, match="closed"):
+        sumo.step(Request())
     job = asked(tmp_path / "bad")
     (tmp_path / "bad" / ROUTES).write_text("<routes><vehicle")
     with pytest.raises(RuntimeError, match="unexpected end"):

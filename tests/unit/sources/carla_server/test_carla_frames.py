@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.geometry import angles_of
@@ -23,6 +23,7 @@ def test_a_pose_comes_back(location, rotation, offset):
     assert np.allclose(back[1], rotation, atol=1e-6)
 
 
+@settings(deadline=None)  # the first one loads the client
 @given(places, turns)
 def test_poses_are_those_of_the_genuine_client(location, rotation):
     carla = pytest.importorskip("carla", reason="needs the extra 'carla'")
