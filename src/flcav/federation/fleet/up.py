@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import gc
 import json
 import os
 import socket
@@ -171,12 +172,20 @@ def run_superlink(folder: Path, address: str) -> None:
 
 
 def import_flower() -> None:
-    """Import what SuperLink and SuperNodes need, so that the forks of this process have it."""
+    """Import what SuperLink and SuperNodes need, so that the forks of this process have it.
+
+    Their collectors leave it alone: they look at all that lives only when it has grown by a quarter, and of so much
+    they would keep the bodies of calls that are over.
+    """
     import flwr.superlink.cli.flower_superlink
     import flwr.superlink.main
     import flwr.supernode.cli.flower_supernode
     import flwr.supernode.main
     import flwr.supernode.runtime.run_clientapp  # noqa: F401
+
+    gc.collect()
+    gc.freeze()
+    gc.collect()  # now of next to nothing
 
 
 class _Enrolment:
