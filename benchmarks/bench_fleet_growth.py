@@ -7,7 +7,7 @@
 import os
 import sys
 import time
-from collections import Counter
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ def read_private_mb(pid: int) -> float:
 
 def measure(folder: Path) -> list[float]:
     """Return private memory [MB] of all processes and by kind, open files, files on disk, and their MB without logs."""
-    memory, opened = Counter[str](), 0
+    memory, opened = defaultdict[str, float](float), 0
     for name, pid in read_processes(folder).items():
         memory[name.rpartition("-")[2]] += read_private_mb(pid)
         opened += sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())

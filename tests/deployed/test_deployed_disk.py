@@ -79,13 +79,18 @@ class Filler(threading.Thread):
         self._path.unlink()
 
 
+def tells_no_room(fleet: Path) -> bool:
+    federation = read_status(fleet).federation
+    return federation is not None and "no room on the vehicle's disk" in federation.describe()
+
+
 def test_full_disks(disks):
     fleet, disk = disks
     found_authority(fleet)
     put_on(disk, fleet)
     expected = walk(None, COUNT, 4)
     fillers = {
-        2: Filler(disk, lambda: "no room on the vehicle's disk" in read_status(fleet).federation.describe()),
+        2: Filler(disk, lambda: tells_no_room(fleet)),
         4: Filler(fleet, lambda: read_status(fleet).free < LEAST_ROOM),
     }
 

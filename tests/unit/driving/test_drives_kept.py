@@ -123,12 +123,12 @@ def test_a_heading_the_wrong_way_round_changes_no_forecast() -> None:
     told = []
     for turned in (lambda tick: False, lambda tick: True, lambda tick: tick % 3 == 0):
         following = Following(network, roads, CERTAIN)
-        for tick, (x, y, yaw) in enumerate(poses):
-            found = cars((x, y))
-            found = replace(found, yaw=np.full(1, yaw + np.pi * turned(tick)))
-            last = following.step(found, tick / 10, frozenset())
-        assert last.motion == ("forecast",)
-        told.append(last)
+        steps = [
+            following.step(replace(cars((x, y)), yaw=np.full(1, yaw + np.pi * turned(tick))), tick / 10, frozenset())
+            for tick, (x, y, yaw) in enumerate(poses)
+        ]
+        assert steps[-1].motion == ("forecast",)
+        told.append(steps[-1])
     ahead = route.at(20.0 + 0.8 * 25 + 16.0)[:2]  # in two seconds
     for other in told:
         assert other.path[0] == pytest.approx(told[0].path[0], abs=0.5)

@@ -55,16 +55,19 @@ def test_those_that_meet_what_the_network_does_not_know_ask_and_the_group_spends
     followed = {GROUP: call(fleet, 1), ROSTER: keep(fleet, 1), DRAWN: draw(fleet, 1)}
     group, roster, drawn = (followed[name] for name in (GROUP, ROSTER, DRAWN))
     assert set(group.asked) == set(fleet.meet)
-    assert len(group.members) == REQUESTS.most
+    most = REQUESTS.most
+    assert most is not None
+    assert len(group.members) == most
     assert set(group.members[:MEET]) <= set(group.asked)  # the fourth is called where three ask
     update = roster.up_bytes[1] / 10
-    assert drawn.up_bytes[1] == pytest.approx(REQUESTS.most * update)
+    assert drawn.up_bytes[1] == pytest.approx(most * update)
     offers = group.up_bytes[0]
     assert 0 < offers < update
-    assert group.up_bytes[1] - offers == pytest.approx(REQUESTS.most * update, rel=0.02)  # and what losses take
+    assert group.up_bytes[1] - offers == pytest.approx(most * update, rel=0.02)  # and what losses take
     found, marks = score(followed, DRIVES)
-    assert found[GROUP].at is not None
-    assert found[GROUP].at[MEGABYTES] == found[GROUP].at[WHOLE] == pytest.approx(marks[WHOLE, GROUP].mean())
+    at = found[GROUP].at
+    assert at is not None
+    assert at[MEGABYTES] == at[WHOLE] == pytest.approx(marks[WHOLE, GROUP].mean())
     ends = {name: own.last_within(group.up_bytes[-1]) for name, own in followed.items()}
     assert ends[ROSTER] < ends[DRAWN] <= len(group.weights)
     assert found[ROSTER].accuracy[0] == found[GROUP].accuracy[0] < 0.8  # of a network that lacks two of eight

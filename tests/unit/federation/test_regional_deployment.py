@@ -1,6 +1,7 @@
 """Each region has a fleet of its own, or its vehicles are beside those of the others."""
 
 from dataclasses import asdict
+from typing import Any
 
 import pytest
 
@@ -30,7 +31,7 @@ def fleets(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("region", "folder", "first"), [("ring", ".", 0), ("grid", "grid", 0), ("suburb", ".", 2)])
 def test_region_has_its_vehicles(region, folder, first, fleets):
-    deployment = RegionalDeployment(fleets, {"ring": 2, "grid": 3, "suburb": 1})
+    deployment: Any = RegionalDeployment(fleets, {"ring": 2, "grid": 3, "suburb": 1})
     with pytest.raises(Opened) as told:
         deployment.open({f"{region}/cav0": None}, None, {}, None)
     assert told.value.args == (fleets / folder, first, [f"{region}/cav0"])

@@ -123,7 +123,7 @@ def test_a_stopped_group_goes_on_in_the_term_of_its_round() -> None:
 
 
 def test_what_a_lead_kept_is_lost_with_it() -> None:
-    strategy = {"strategy": strategy_named({"fedavgm": {"momentum": 0.9}})}
+    strategy: Any = {"strategy": strategy_named({"fedavgm": {"momentum": 0.9}})}
     weights, _, _ = led([Term("r/a", 1, 3), Term("r/b", 3)], LEAVES, **strategy)
     first = federate(clients(), START, Schedule(4, 2, 0.1, 0.05, 3), account(LEAVES), **strategy).weights
     assert not np.array_equal(weights["w"], first["w"])  # which has the moments of all rounds

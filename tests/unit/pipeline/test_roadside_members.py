@@ -31,7 +31,9 @@ def seen_by_pole() -> tuple[Frame, Boxes]:
     local = (world - world_from_pole[:3, 3]) @ world_from_pole[:3, :3]
     points = np.c_[local, np.full(len(local), 0.3)].astype(np.float32)
     mounts = Calibration({"lidar": pose(0, 0, 0)})
-    nobody = Annotations(np.zeros(0, str), Boxes.empty(), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+    nobody = Annotations(
+        np.zeros(0, str), Boxes.empty(), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros(0)
+    )
     return Frame("s", 0, 0.0, "pole7", world_from_pole, mounts, mounts, {"lidar": points}, nobody), car
 
 

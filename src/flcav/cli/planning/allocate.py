@@ -158,8 +158,10 @@ def _show(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") -> N
 
     console, measure = plain_console(), MEASURES[problem.objective]
     console.print(_table(plan))
-    for task in (task for task in plan.tasks if task.called is not None):
-        console.print(f"{task.name}: {plural(task.called, 'vehicle')} at most of each edge server in its edge rounds")
+    for task in plan.tasks:
+        if task.called is not None:
+            told = plural(task.called, "vehicle")
+            console.print(f"{task.name}: {told} at most of each edge server in its edge rounds")
     curves = "the fitted curves" if len(plan.tasks) > 1 else "the fitted curve"
     console.print(f"{measure} {plan.objective:{SHOWN}}, {plan.status} for {curves} ({_proven(plan.gap)})")
     console.print(f"{measure.capitalize()}: {explain_objective(problem, plan.objective)}")

@@ -72,7 +72,7 @@ def on_neutral(detections: Boxes, neutral: Boxes) -> NDArray[np.bool_]:
     The intersection is divided by the area of the detection. IoU would not do: a car detected on a bus covers a small
     part of the bus.
     """
-    return lies_on(detections, neutral).any(axis=1)
+    return np.any(lies_on(detections, neutral), axis=1)
 
 
 def lies_on(detections: Boxes, objects: Boxes) -> NDArray[np.bool_]:
