@@ -309,7 +309,7 @@ def test_validation_data_without_its_sensor_are_refused_before_training(task, da
 def test_weights_that_are_no_numbers_are_refused(task, tmp_path):
     network = build_network(task, small(task), 1)
     name, first = next(iter(network.named_parameters()))
-    first.data.flatten()[0] = float("nan")
+    first.data[(0,) * first.dim()] = float("nan")
     save_network(task, network, tmp_path / "weights.safetensors")
     with pytest.raises(InputError, match=rf"weights that are not finite numbers, in '{name}'"):
         load_network(task, tmp_path / "weights.safetensors")

@@ -1,6 +1,7 @@
 """One deployed round: SuperLink, proxy and two vehicles, to the weights of the federation in this process."""
 
 import os
+import time
 from importlib import import_module
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from flcav.federation.runtimes.metered import Account
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 CLIENTS = Path(__file__).parents[1] / "deployed"  # `make test-deployed` has the other tests of a fleet
+COUNTED_S = 10.0  # by then the proxy has saved what it has counted
 
 
 def test_a_deployed_round_ends_with_the_embedded_weights(monkeypatch):
@@ -26,12 +28,16 @@ def test_a_deployed_round_ends_with_the_embedded_weights(monkeypatch):
     account = Account(Ledger(LinkMegabytes(10, 10)), "edge", "walk", "wireless")
     with start_fleet(len(clients)) as deployment:
         found = federate(clients, weights, schedule, account, runtime=deployment)
-        told = read_status(deployment.folder)
+        sent = {direction: account.ledger.used_bytes("wireless", direction=direction) for direction in ("up", "down")}
+        until = time.monotonic() + COUNTED_S
+        while (told := read_status(deployment.folder)) and time.monotonic() < until:
+            if sum(own.content_up for own in told.vehicles) > sent["up"] * 0.9:
+                break
+            time.sleep(0.1)
     np.testing.assert_array_equal(expected.weights["w"], found.weights["w"])
     assert [own.online for own in told.vehicles] == [True, True]
     assert told.federation is not None
     assert [each.clients for each in told.federation.rounds] == [2]
-    sent = {direction: account.ledger.used_bytes("wireless", direction=direction) for direction in ("up", "down")}
     assert sum(own.content_up for own in told.vehicles) > sent["up"] * 0.9  # Flower compresses nothing
     assert sum(own.socket_up for own in told.vehicles) > sum(own.content_up for own in told.vehicles)
     assert sum(own.socket_down for own in told.vehicles) > sent["down"] * 0.9

@@ -50,11 +50,11 @@ def drive(
     """Drive through scenarios in closed loop, and print time to collision, hard brakes, progress and collisions."""
     from flcav.config import InputError
     from flcav.driving.driver import Settings
-    from flcav.driving.error_measurement import measure_errors
     from flcav.driving.jobs import Job, Sensed, run_jobs
     from flcav.driving.loop import Loop
-    from flcav.driving.pole_gain import measure_pole_gain
     from flcav.driving.scenarios import find_scenarios
+    from flcav.driving.studies.error_measurement import measure_errors
+    from flcav.driving.studies.pole_gain import measure_pole_gain
     from flcav.interface.progress import show_progress
     from flcav.storage.files import check_writable, write_json
 

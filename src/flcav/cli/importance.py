@@ -72,9 +72,9 @@ def importance(
     Drives are paired over scenarios and seeds. Beside it: the article's own rule, the loss of the joint objective.
     """
     from flcav.config import InputError, read_yaml
-    from flcav.driving.importance import measure_importance, read_reached
     from flcav.driving.jobs import Sensed
     from flcav.driving.scenarios import spread_scenarios
+    from flcav.driving.studies.importance import measure_importance, read_reached
     from flcav.interface.progress import show_progress
     from flcav.storage.files import check_writable
 

@@ -10,17 +10,17 @@ import pytest
 from flcav.cli.importance import set_weights
 from flcav.config import InputError
 from flcav.driving import jobs as driven
-from flcav.driving.error_measurement import Tally, summarise
 from flcav.driving.errors import CLASSES, load_errors
 from flcav.driving.following import CERTAIN, Following
-from flcav.driving.hidden import Hidden, find_hidden, summarise_hidden
 from flcav.driving.jobs import Job, Sensed, read_kept, run_jobs
 from flcav.driving.measures import Drive, Hit
 from flcav.driving.networks import load_roads
-from flcav.driving.pole_gain import PoleGain
 from flcav.driving.road import fuse, pack_tracks
 from flcav.driving.scenarios import list_scenarios
 from flcav.driving.seen import TIMES_S
+from flcav.driving.studies.error_measurement import Tally, summarise
+from flcav.driving.studies.hidden import Hidden, find_hidden, summarise_hidden
+from flcav.driving.studies.pole_gain import PoleGain
 from flcav.geometry import Boxes, left_vectors
 from flcav.network.messages import unpack
 from flcav.optimization.problem import Problem

@@ -213,7 +213,7 @@ def test_every_command_says_whose_frames_it_uses(street, tmp_path, said):
     assert [entry.agents for entry in (*card.data, card.validation)] == 2 * [("cav0", "cav1")]
     assert "4 frames of cav0, cav1;" in card.markdown()
     evaluated = said("evaluate", "objects", "--data", street.folder, "--weights", weights).splitlines()
-    assert evaluated[:2] == [counts, f"network: tiny, seed 0, {weights}"]
+    assert evaluated[:2] == [counts, f"network: pillars, seed 0, {weights}"]
     assert any("0 to 48 m ahead and 24 m to either side, 5 LiDAR returns or more" in line for line in evaluated[:5])
     assert "intervals: 95 %, over scenes" in evaluated[:5]
     assert said("infer", "objects", street.folder, "--weights", weights).startswith(f"{street.folder}: {counts}\n")

@@ -31,7 +31,7 @@ from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.radio.driving import Fleet
 from flcav.pipeline.recipe import Stragglers, draw_stragglers
 from flcav.report import style
-from flcav.report.charts.asynchrony import draw_trajectories
+from flcav.report.charts.federation.asynchrony import draw_trajectories
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import judge_means
 from flcav.storage.records import Record

@@ -25,7 +25,7 @@ from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.running import WORK
 from flcav.report import style
-from flcav.report.charts.exchanges import Mark, draw_exchanges
+from flcav.report.charts.federation.exchanges import Mark, draw_exchanges
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import Judged, judge_means
 from flcav.storage.records import LEFT_OUT, Record

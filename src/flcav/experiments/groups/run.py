@@ -36,7 +36,7 @@ from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, Requests
 from flcav.pipeline.training.groups import Levelled, choose_members, has_levelled, weigh_offers
 from flcav.report import style
-from flcav.report.charts.groups import draw_by_megabytes
+from flcav.report.charts.federation.groups import draw_by_megabytes
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import judge_means
 from flcav.storage.records import Record

@@ -14,11 +14,11 @@ import numpy as np
 
 from flcav.driving.driver import Settings
 from flcav.driving.errors import ErrorModel, load_errors
-from flcav.driving.importance import paired_difference
 from flcav.driving.jobs import Job, Sensed, run_jobs
 from flcav.driving.loop import Loop
 from flcav.driving.measures import Drive
 from flcav.driving.scenarios import spread_scenarios
+from flcav.driving.studies.importance import paired_difference
 from flcav.interface.progress import Report, ignore_progress
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.driving.hidden import Hidden, find_hidden, summarise_hidden
-from flcav.driving.importance import paired_difference
 from flcav.driving.loop import LOOP, Loop, drive
 from flcav.driving.measures import Drive
 from flcav.driving.networks import NetworkPerception
 from flcav.driving.road import SPIN_S, RoadUnits
 from flcav.driving.scenarios import Scenario, Staged
 from flcav.driving.seen import EGO, Seen
+from flcav.driving.studies.hidden import Hidden, find_hidden, summarise_hidden
+from flcav.driving.studies.importance import paired_difference
 from flcav.driving.visibility import FIELD_M
 from flcav.geometry import Boxes, rotate
 from flcav.interface.progress import Report, ignore_progress
