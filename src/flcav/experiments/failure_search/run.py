@@ -34,6 +34,11 @@ SCENARIOS, SEEDS = 60, 5
 APART = 10_000  # between the seeds of two searches, which give their scenarios the seeds that follow
 SOBOL, PATH, SEARCH = RULES
 PAIRS = ((SEARCH, SOBOL), (SEARCH, PATH), (PATH, SOBOL))
+NAMES: Mapping[str, str] = {
+    SOBOL: "Sobol, frames nearest to the place",
+    PATH: "Sobol, frames with somebody in the path",
+    SEARCH: "search",
+}
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,7 @@ class FailureSearchResult(Record):
 
     def picture(self) -> bytes:
         """Return the growth of distinct failures with the frames as a PNG."""
-        lines = {rule: np.array([each.growth for each in own]) for rule, own in self.found.items()}
+        lines = {NAMES[rule]: np.array([each.growth for each in self.found[rule]]) for rule in RULES}
         return style.png(draw_growth(lines, self.found[SOBOL][0].frames / self.scenarios))
 
 

@@ -2,14 +2,8 @@
 
 import numpy as np
 
-from flcav.experiments.failure_search.run import FailureSearchResult
+from flcav.experiments.failure_search.run import NAMES, FailureSearchResult
 from flcav.storage.markdown import format_table
-
-RULE_NAMES = {
-    "sobol": "Sobol, frames nearest to the place",
-    "path": "Sobol, frames with somebody in the path",
-    "failures": "search",
-}
 
 
 def failure_search_tables(results: FailureSearchResult) -> dict[str, str]:
@@ -22,10 +16,10 @@ def failure_search_tables(results: FailureSearchResult) -> dict[str, str]:
         half = float(np.mean([each.growth[len(each.growth) // 2 - 1] for each in own]))
         mean = results.distinct[rule].describe()
         row = [f"{frames:.0f}", f"{failing:.1f}", f"{failures:.1f}", f"{half:.1f}", mean, str(results.together[rule])]
-        rows.append([RULE_NAMES[rule], *row])
+        rows.append([NAMES[rule], *row])
     columns = ("rule", "frames", "with a failure", "failures", "distinct after half", "distinct", "all seeds together")
     told = [
-        [f"{RULE_NAMES[one]} / {RULE_NAMES[other]}", results.ratios[name].describe()]
+        [f"{NAMES[one]} / {NAMES[other]}", results.ratios[name].describe()]
         for name in results.ratios
         for one, other in [name.split(" / ")]
     ]
