@@ -35,8 +35,8 @@ APART = 10_000  # between the seeds of two searches, which give their scenarios 
 SOBOL, PATH, SEARCH = RULES
 PAIRS = ((SEARCH, SOBOL), (SEARCH, PATH), (PATH, SOBOL))
 NAMES: Mapping[str, str] = {
-    SOBOL: "Sobol, frames nearest to the place",
-    PATH: "Sobol, frames with somebody in the path",
+    SOBOL: "Sobol points",
+    PATH: "Sobol points, somebody in the path",
     SEARCH: "search",
 }
 
