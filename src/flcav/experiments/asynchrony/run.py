@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from flcav.dataset.store import Dataset
 from flcav.experiments.asynchrony.schedules import Rival, Scheduled, schedule_buffers, schedule_rounds
 from flcav.experiments.attacks.drives import Drives, Vehicle, draw_head, find_right, record_drives, spread_over_scenes
+from flcav.experiments.differences import Differences, name_differences, tell_differences
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.runtimes.metered import Account
@@ -33,7 +34,6 @@ from flcav.pipeline.recipe import Stragglers, draw_stragglers
 from flcav.report import style
 from flcav.report.charts.federation.asynchrony import draw_trajectories
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
-from flcav.statistics.verdicts import judge_means
 from flcav.storage.records import Record
 from flcav.world.map.census import measure_traffic_density
 
@@ -78,26 +78,17 @@ class AsynchronyResult(Record):
     stragglers: Mapping[str, tuple[str, ...]]  # by seed
     trajectories: Mapping[str, Mapping[str, Mapping[str, Trajectory]]]  # by setting, seed and rival
     accuracy: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by setting, measure and rival
-    differences: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]
+    differences: Differences
     provenance: Provenance
 
     @property
     def claims(self) -> dict[str, MeanOverSeeds]:
         """Return all differences by name, whose verdicts are corrected together."""
-        return {
-            f"{setting}, {measure}: {rival}": mean
-            for setting, of_setting in self.differences.items()
-            for measure, of_measure in of_setting.items()
-            for rival, mean in of_measure.items()
-        }
+        return name_differences(self.differences)
 
     def sentences(self) -> list[str]:
         """Return the differences in words."""
-        judged = judge_means(self.claims)
-        return [
-            f"{name} - waiting: {mean.describe(sign=True)}, {judged[name].describe()}"
-            for name, mean in self.claims.items()
-        ]
+        return tell_differences(self.differences, "waiting")
 
 
 def compare_asynchrony(

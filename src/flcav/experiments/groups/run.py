@@ -22,6 +22,7 @@ from flcav.experiments.attacks.drives import (
     record_drives,
     spread_over_scenes,
 )
+from flcav.experiments.differences import Differences, name_differences, tell_differences
 from flcav.experiments.groups.vehicles import Fleet, make_offer, open_fleet
 from flcav.federation.rounds import EVERYBODY, Schedule, federate
 from flcav.federation.rules import Rules
@@ -38,7 +39,6 @@ from flcav.pipeline.training.groups import Levelled, choose_members, has_levelle
 from flcav.report import style
 from flcav.report.charts.federation.groups import draw_by_megabytes
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
-from flcav.statistics.verdicts import judge_means
 from flcav.storage.records import Record
 
 ROUNDS, STEPS, LEARNING_RATE = 20, 5, 0.05
@@ -78,26 +78,17 @@ class GroupsResult(Record):
     accuracy: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by setting, measure and rival
     gains: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # per megabyte
     until_mb: Mapping[str, Mapping[str, MeanOverSeeds]]  # by setting and rival
-    differences: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # of accuracy; megabytes saved until `TARGET`
+    differences: Differences  # of accuracy; megabytes saved until `TARGET`
     provenance: Provenance
 
     @property
     def claims(self) -> dict[str, MeanOverSeeds]:
         """Return all differences by name, whose verdicts are corrected together."""
-        return {
-            f"{setting}, {measure}: {rival}": mean
-            for setting, of_setting in self.differences.items()
-            for measure, of_measure in of_setting.items()
-            for rival, mean in of_measure.items()
-        }
+        return name_differences(self.differences)
 
     def sentences(self) -> list[str]:
         """Return the differences in words."""
-        judged = judge_means(self.claims)
-        return [
-            f"{name} - roster: {mean.describe(sign=True)}, {judged[name].describe()}"
-            for name, mean in self.claims.items()
-        ]
+        return tell_differences(self.differences, "roster")
 
 
 @dataclass(frozen=True)
