@@ -22,7 +22,7 @@ from flcav.storage.records import Record, to_json
 
 @dataclass(frozen=True)
 class Sensed(Record):
-    """Which perception drives: of the truth, of the networks, or with the errors of a model."""
+    """Choice of the perception that drives: the truth, the networks, or a model of their errors."""
 
     kind: str  # "truth", "networks", "model"
     model: ErrorModel | None = None

@@ -22,7 +22,7 @@ Sensing = Callable[[Staged, int], Perception]  # makes the perception of a drive
 
 @dataclass(frozen=True)
 class Loop:
-    """How the closed loop is run."""
+    """Settings of the closed loop."""
 
     driver: Settings = DEFAULT
     lasts_s: float = LASTS_S

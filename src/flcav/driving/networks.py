@@ -69,7 +69,7 @@ def load_roads(town: str) -> RoadMap:
 
 
 class LightReader:
-    """Which lights are seen not to be green, remembered for `REMEMBERED_S`."""
+    """Memory of the lights that were seen not to be green, for `REMEMBERED_S`."""
 
     def __init__(self, town: Town) -> None:
         heads = len(town.signals.link) - town.signals.walkers
@@ -113,7 +113,7 @@ class LightReader:
 
 
 class NetworkPerception:
-    """What the networks make of the sensors of a drive."""
+    """Perception of a drive by the networks, from its sensors."""
 
     def __init__(self, staged: Staged, seed: int, *, spread: Spread = CERTAIN, road: RoadUnits | None = None) -> None:
         """Take a drive, its seed, how uncertain tracks are, and the poles that send what they find, if any."""

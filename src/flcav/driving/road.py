@@ -1,4 +1,4 @@
-"""What a pole gives while driving: roadside detections that reach the ego vehicle with the road's latency.
+"""Roadside perception while driving: detections of poles that reach the ego vehicle with the road's latency.
 
 A pole spins its LiDAR every `SPIN_S`; the road detector of the package finds cars in the returns before the pole's
 static background, which a sweep of the town without actors shows. The message is as old on arrival as the detector
@@ -40,7 +40,7 @@ LIDAR = "lidar"
 
 @dataclass(frozen=True)
 class RoadMessage:
-    """What a pole sends: its tracks at one spin, and when they arrive."""
+    """Message of a pole: its tracks at one spin, and the time at which they arrive."""
 
     seen_s: float
     arrives_s: float
