@@ -95,18 +95,18 @@ def test_the_network_in_the_docs_is_trained_and_evaluated(
 ):
     page = (EXAMPLES.parent / "docs" / "tasks.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"^```python\n(from torch .*?)^```$", page, re.M | re.S)
-    (tmp_path / "flat.py").write_text(code)
+    (tmp_path / "depthwise.py").write_text(code)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     record(EmbeddedSource(Recipe(town="suburb", frames=2)), tmp_path / "data")
-    for command in ("train flat:TASK --data data --epochs 1 --out out", "infer flat:TASK data"):
+    for command in ("train depthwise:TASK --data data --epochs 1 --out out", "infer depthwise:TASK data"):
         learned = [] if command.startswith("train") else ["--weights", "out/weights.safetensors"]
         with pytest.raises(SystemExit, match="0"):
             flcav([*command.split(), *learned])
     with pytest.raises(SystemExit, match="2"):
-        flcav(["evaluate", "flat:TASK", "--data", "data"])
-    assert "no weights of 'flat' come with the package" in capsys.readouterr().err
-    task = task_named("flat:TASK")
+        flcav(["evaluate", "depthwise:TASK", "--data", "data"])
+    assert "no weights of 'depthwise' come with the package" in capsys.readouterr().err
+    task = task_named("depthwise:TASK")
     network = load_network(task, "out/weights.safetensors")
     assert sum(each.numel() for each in network.parameters()) != sum(
         each.numel() for each in Second(network.config).parameters()
