@@ -46,7 +46,7 @@ def boxes(*shapes: tuple[str, str], score: float | None = None) -> Boxes:
 
 
 def test_the_arms_and_towns_are_those_of_the_recipe() -> None:
-    assert {arm for arm, _ in ARMS.values()} == {MAIN, *RECIPE.arms}
+    assert {learned.arm for learned in ARMS.values()} == {MAIN, *RECIPE.arms}
     assert {*TOWNS} == {name for name in RECIPE.regions if name != "suburb"}
     assert all({after, before} <= {*TOWNS[town]} for town, after, before, _ in COMPARED)
     drawn = {name: own.recording.rare_splits for name, own in RECIPE.regions.items() if own.recording.rare}

@@ -1,4 +1,4 @@
-"""Comparison of edge FL, edge + cloud FL and further edge FL on rare kinds of objects: recipes/runs/corner_cases.yaml.
+"""Comparison of edge FL, edge + cloud FL, further edge FL and uploads on rare kinds: recipes/runs/corner_cases.yaml.
 
 The article's premise is that the cloud carries what one region knows to another. One region's vehicles meet rare kinds
 while they learn; those of another, and of a town that nobody learns in, meet them in the test alone. AP of the rare
@@ -10,6 +10,7 @@ and traffic.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from flcav.perception.objects.truth import CARS, FrameTruth
 from flcav.perception.weights import load_network
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.report import style
@@ -38,16 +39,29 @@ from flcav.world.shapes import RARE, SHAPES
 
 TASK, OWN, OTHER, UNSEEN = "objects", "grid", "ring", "arterial"
 PRETRAINED, LOCAL, GLOBAL, LONGER = "pretrained", "edge FL", "edge + cloud FL", "further edge FL"
-ARMS: Mapping[str, tuple[str, str]] = {
-    PRETRAINED: (MAIN, PRETRAIN),
-    LOCAL: (MAIN, EDGE),
-    GLOBAL: (MAIN, CLOUD),
-    LONGER: ("longer", MORE_EDGE),
+BORROWED, UPLOADED = f"edge FL of {OTHER}", f"centralised on sweeps of {OTHER}"
+
+
+class Learned(NamedTuple):
+    """Where a network was trained: arm and stage of the run, and the region, None: the one that it is tested in."""
+
+    arm: str
+    stage: str
+    region: str | None = None
+
+
+ARMS: Mapping[str, Learned] = {
+    PRETRAINED: Learned(MAIN, PRETRAIN),
+    LOCAL: Learned(MAIN, EDGE),
+    GLOBAL: Learned(MAIN, CLOUD),
+    LONGER: Learned("longer", MORE_EDGE),
+    BORROWED: Learned(MAIN, EDGE, OTHER),
+    UPLOADED: Learned("sweeps", CENTRAL, OTHER),
 }
 TOWNS: Mapping[str, tuple[str, ...]] = {  # arms that are tested in each town; nobody federates in the unseen one
     OWN: (*ARMS,),
-    OTHER: (*ARMS,),
-    UNSEEN: (PRETRAINED, GLOBAL),
+    OTHER: (PRETRAINED, LOCAL, GLOBAL, LONGER, UPLOADED),
+    UNSEEN: (PRETRAINED, GLOBAL, BORROWED, UPLOADED),
 }
 COMPARED = (  # town, after, before, in what
     (OTHER, LOCAL, PRETRAINED, "rare"),
@@ -56,6 +70,8 @@ COMPARED = (  # town, after, before, in what
     (OWN, GLOBAL, LOCAL, "every"),
     (OTHER, GLOBAL, LOCAL, "rare"),
     (UNSEEN, GLOBAL, PRETRAINED, "rare"),
+    (OTHER, UPLOADED, GLOBAL, "rare"),
+    (OWN, UPLOADED, GLOBAL, "rare"),
 )
 SIZES = np.array([shape[1:] for kind in CARS for shape in SHAPES[kind] if shape.name in RARE])
 NEAR_M = 0.005  # sizes are those of the shapes
@@ -122,8 +138,9 @@ def compare_corner_cases(
 
 def score_arm(run: Run, work: Path, arm: str, town: str) -> RareScore:
     """Return the scores of an arm's network on a town's test frames."""
-    name, stage = ARMS[arm]
-    network = load_network(OBJECTS, work / run.steps.stage(name, stage, town, TASK) / WEIGHTS)
+    learned = ARMS[arm]
+    step = run.steps.stage(learned.arm, learned.stage, learned.region or town, TASK)
+    network = load_network(OBJECTS, work / step / WEIGHTS)
     return score_rare(network, Frames.open(work / run.steps.recording(town, "test", TASK)))
 
 
