@@ -20,8 +20,8 @@ from flcav.pipeline.recipe import Requests, Training
 from flcav.pipeline.results.groups import Group, Term
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.steps import groups
-from flcav.pipeline.steps.edge import EdgeFederation, federate_edge
 from flcav.pipeline.steps.groups import Called
+from flcav.pipeline.training.edge_rounds import EdgeFederation, federate_edge
 from flcav.pipeline.training.groups import GroupWatch
 from flcav.pipeline.training.learning import Learning, load_stage_network, make_clients
 
