@@ -117,8 +117,8 @@ class Registry:
             raise InputError(f"{path}: is no registry of a fleet") from None
         if row != (authority,):
             raise InputError(f"{path}: is the registry of another authority than {path.parent / 'ca.crt'}")
-        known = found._connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'answered'").fetchone()
-        if known is None:
+        known = "SELECT name FROM sqlite_master WHERE name IN ('requests_by_time', 'answered')"
+        if len(found._connection.execute(known).fetchall()) < 2:
             found._connection.executescript(f"BEGIN; {REQUESTS} COMMIT;")
         return found
 

@@ -82,8 +82,7 @@ class Deployment:
     def _open(
         self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
     ) -> Iterator["DeployedGrid"]:
-        vehicles = self._wait([*clients])
-        self._vehicles |= {name: own.name for name, own in zip(clients, vehicles, strict=True)}
+        vehicles = self.choose_vehicles([*clients])
         federation = os.urandom(8).hex()
         for (name, client), vehicle in zip(clients.items(), vehicles, strict=True):
             secret, state = agreed.secrets.get(name), states.get(name, {})
@@ -100,8 +99,11 @@ class Deployment:
             raise
         grid.end()
 
-    def _wait(self, clients: list[str]) -> list[Vehicle]:
-        """Return the vehicles of `clients` once they are in, or others where these do not come; new clients any."""
+    def choose_vehicles(self, clients: list[str]) -> list[Vehicle]:
+        """Return the vehicle of each client, once it is in: its earlier one, or where that does not come in another.
+
+        Raises `InputError` where fewer vehicles are registered, `OSError` where fewer come in.
+        """
         seconds = STARTING_S + STARTING_VEHICLE_S * len(clients)
         end = time.monotonic() + seconds
         while True:
@@ -117,8 +119,9 @@ class Deployment:
                 kept = [own for name in clients if (own := self._vehicles.get(name)) is not None]
                 if len(found) >= len(clients) and (found.keys() >= {*kept} or time.monotonic() > end):
                     free = iter([name for name in found if name not in kept])
-                    own = (self._vehicles.get(name) for name in clients)
-                    return [found[name if name in found else next(free)] for name in own]
+                    own = {name: self._vehicles.get(name, "") for name in clients}
+                    self._vehicles |= {name: old if old in found else next(free) for name, old in own.items()}
+                    return [found[self._vehicles[name]] for name in clients]
             if time.monotonic() > end:
                 raise OSError(f"{self.folder}: fewer than {len(clients)} vehicles are in after {seconds:g} s")
             time.sleep(LOOK_S)
