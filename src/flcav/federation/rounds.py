@@ -45,7 +45,7 @@ from flcav.federation.privacy import (
     least_participations,
 )
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.link import Ask, Runtime, open_link
+from flcav.federation.runtimes.link import ANSWER_S, Ask, Runtime, open_link
 from flcav.federation.runtimes.metered import Account, open_account
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.secure.parties import SumLost
@@ -60,7 +60,6 @@ from flcav.statistics.streams import derive_seed
 
 EVERYBODY = Rules()
 WHOLE = (1, 1.0)  # samples and loss of the one update that a strategy is given where the server averages them itself
-ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere
 BeforeRound = Callable[[int, Weights], None]  # called with the round's number and the weights that it begins with
 AskAfter = Callable[[int, Weights, Ask], None]  # called with number, aggregated weights and a way to ask clients
 OnRound = Callable[[int, Weights, float | None], None]  # called with number, aggregated weights and mean training loss

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 RUNTIMES = "embedded", "ray", "flower"
 NOTHING: Weights = {}  # comes with a question
+ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere
 # where clients train, and how messages reach them
 Runtime = Union[ClientProcesses, "RaySimulation", "Deployment", "RegionalDeployment", "RosTopics"]
 
@@ -160,7 +161,7 @@ def _ask_there(
         content[GRANT] = ConfigRecord()  # filled in as it leaves
     messages = [Message(content, nodes[name], f"{MessageType.QUERY}.{ASK}") for name in clients]
     answers, missing = dict[str, Weights](), dict[str, str]()
-    for event in list_events(clients, grid.send_and_receive(messages) if messages else [], names):
+    for event in list_events(clients, grid.send_and_receive(messages, timeout=ANSWER_S), names):
         if isinstance(event, Arrived):
             try:
                 answers[event.client] = read_arrays(event.content, ARRAYS)
