@@ -66,6 +66,7 @@ if TYPE_CHECKING:
 EVERY_SCENE = 10**6  # more than there are
 UNREADABLE = "an answer that cannot be read"
 AnswerT = TypeVar("AnswerT")
+Places = Mapping[str, NDArray[np.float64]]  # (scenes, 3) [m] by client, see `find_places`
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def call_group(
         raise InputError("requests: vehicles ask by the loss at the end of pretraining, and there is no pretraining")
     limit, split = how.excess * validated[-1].loss, Frames.open(work.inputs[inputs.frames])
     places = find_places(split, inputs.region, [name for name in sorted(samples) if len(samples[name])])
-    members = {name: _make_member(learning, frozen, how, limit, samples[name], at) for name, at in places.items()}
+    members = make_members(learning, frozen, how, limit, samples, places)
     with open_questions(members, deployed, Account(book, EDGE, task.name, "wireless")) as ask:
         uplink, entered = Uplink(ask, book, task.name), len(book.entries)
         vehicles = uplink.check([*members])
@@ -174,13 +175,16 @@ def call_group(
     return Called(group, {name: members[name].data for name in chosen.members} | units, watch, task)
 
 
-def _make_member(
-    learning: Learning, network: Any, how: Requests, limit: float, samples: Sequence[Any], places: NDArray[np.float64]
-) -> Member:
-    """Return a vehicle's part in a group; it holds some of its samples back, and trains on the others."""
-    trained, held = (Picked(samples, own) for own in hold_back(len(samples), how.held_back))
-    about = learning.task, network.config, learning.batch, trained, held, to_arrays(network)
-    return Member(*about, limit, derive_seed(learning.seed, "offer"), places)
+def make_members(
+    learning: Learning, network: Any, how: Requests, limit: float, samples: Mapping[str, Sequence[Any]], places: Places
+) -> dict[str, Member]:
+    """Return the vehicles' parts in a group: each holds some of its samples back, and trains on the others."""
+    weights, seed, members = to_arrays(network), derive_seed(learning.seed, "offer"), dict[str, Member]()
+    for name, at in places.items():
+        trained, held = (Picked(samples[name], own) for own in hold_back(len(samples[name]), how.held_back))
+        about = learning.task, network.config, learning.batch, trained, held, weights
+        members[name] = Member(*about, limit, seed, at)
+    return members
 
 
 @dataclass(frozen=True)
