@@ -49,7 +49,16 @@ from flcav.federation.secure.masks import to_integers
 from flcav.federation.secure.messages import answer_secretly, complain, mask_update
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
-from flcav.federation.trainable import Correction, LocalUpdate, Trainable, Update, Weights, count_samples, learned_names
+from flcav.federation.trainable import (
+    Correction,
+    LocalUpdate,
+    Trainable,
+    Update,
+    Weights,
+    answer_question,
+    count_samples,
+    learned_names,
+)
 from flcav.federation.upload import Arrays, subtract
 from flcav.statistics.streams import derive_seed
 
@@ -80,7 +89,8 @@ def client_app(
     the client's name. `secrets` are those of the clients, by name, that local noise is drawn by unless it is seeded;
     they are in no message. What it answers and what not, see `conduct`; `spent` are the rounds of earlier federations
     that count against its privacy budget. To a query it answers with its place and with what it keeps between rounds;
-    before it has any state, it takes over what the message brings of that.
+    before it has any state, it takes over what the message brings of that. Questions (`ASK`) are for clients that
+    `Answers`.
 
     What error feedback leaves out, and a strategy's own arrays, are taken over where the server gets the update and can
     use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
@@ -137,6 +147,12 @@ def client_app(
                 _record(context, RESIDUAL, left)
                 _record(context, OWN, own)
         return answer
+
+    @app.query(ASK)
+    def answer(message: Message, context: Context) -> Message:
+        client, arrays = trainables[clients[int(context.node_config[PARTITION])]], _optional(message.content, ARRAYS)
+        found = answer_question(client, asked_for(message.content), arrays)
+        return Message(RecordDict({ARRAYS: to_arrays(found)}), reply_to=message)
 
     @app.query()
     def query(message: Message, context: Context) -> Message:

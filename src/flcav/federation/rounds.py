@@ -45,7 +45,7 @@ from flcav.federation.privacy import (
     least_participations,
 )
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.link import Runtime, open_link
+from flcav.federation.runtimes.link import ANSWER_S, Ask, Runtime, open_link
 from flcav.federation.runtimes.metered import Account, open_account
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.secure.parties import SumLost
@@ -60,8 +60,8 @@ from flcav.statistics.streams import derive_seed
 
 EVERYBODY = Rules()
 WHOLE = (1, 1.0)  # samples and loss of the one update that a strategy is given where the server averages them itself
-ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere
 BeforeRound = Callable[[int, Weights], None]  # called with the round's number and the weights that it begins with
+AskAfter = Callable[[int, Weights, Ask], None]  # called with number, aggregated weights and a way to ask clients
 OnRound = Callable[[int, Weights, float | None], None]  # called with number, aggregated weights and mean training loss
 AnswerT = TypeVar("AnswerT")
 logging.getLogger("flwr").setLevel(logging.ERROR)  # Flower logs each message; a stage reports its rounds
@@ -100,6 +100,7 @@ def federate(
     done: int = 0,
     earlier: int = 0,
     before_round: BeforeRound = _do_nothing,
+    ask_after: AskAfter = _do_nothing,
     on_round: OnRound = _do_nothing,
     runtime: Runtime | None = None,
     centre: Weights | None = None,
@@ -128,6 +129,7 @@ def federate(
         earlier: number of rounds of federations before this one with the same clients and rules, which count against
             a privacy budget, and after which the turns of round-robin go on.
         before_round: called before each round.
+        ask_after: called after each round and before `on_round`, to ask clients that `Answers`.
         on_round: called after each round; `state` is then that of the round.
         runtime: where clients train: None: in this process; `ClientProcesses` of the same clients; Flower's simulation
             on Ray. The weights are the same.
@@ -193,6 +195,7 @@ def federate(
                 weights = _imitate(distiller, strategy, weights, combined, schedule.work(number))
                 state.server = {name: np.asarray(array) for name, array in combined.items()}
             link.follow(state.records[-1])
+            ask_after(number, weights, link.ask)
             on_round(number, weights, state.records[-1].loss)
             sent = combined
             if buffering is not None and is_spent(state):

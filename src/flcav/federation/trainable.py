@@ -121,6 +121,22 @@ def count_samples(client: Trainable, steps: int) -> int:
     return client.count_samples(steps)
 
 
+@runtime_checkable
+class Answers(Protocol):
+    """A client that answers questions beside its training, on data that stay with it."""
+
+    def answer(self, question: str, arrays: Weights) -> Weights:
+        """Return the answer to a question; `arrays` come with it, such as the weights to score."""
+        ...
+
+
+def answer_question(client: Trainable, question: str, arrays: Weights) -> Weights:
+    """Return what a client that `Answers` says; raises TypeError of any other."""
+    if not isinstance(client, Answers):
+        raise TypeError(f"{type(client).__name__} answers no questions, such as '{question}'")
+    return client.answer(question, arrays)
+
+
 class Distiller(Protocol):
     """Network of the server in output distillation: its outputs on shared samples, and training towards a mean."""
 

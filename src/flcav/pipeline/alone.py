@@ -13,7 +13,7 @@ from typing import Annotated
 from flcav.config import InputError
 from flcav.interface.progress import DAMAGED
 from flcav.pipeline.arms import check_federations
-from flcav.pipeline.deployment import check_labels
+from flcav.pipeline.deployment import check_clients
 from flcav.pipeline.engine import Notify, Stale, Step, print_steps, run_steps
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.provenance import Provenance, provenance
@@ -80,7 +80,7 @@ def federate_regions(
     if graph.settings[arm].central:
         raise InputError(f"--arm {arm}: it trains centrally, without a federation")
     check_federations(recipe, graph.settings.values())
-    check_labels(graph, [arm], runtime)
+    check_clients(graph, [arm], runtime)
     tell_rigs([graph], notify)
     asked = list_federations(graph, arm)
     means = {"processes": jobs, "runtime": runtime, "timed": 1, "fleet": "" if fleet is None else str(fleet)}

@@ -14,9 +14,12 @@ from flcav.pipeline.steps.graph import Graph
 FEDERATING = (edge_step, cloud_step)
 
 
-def check_labels(graph: Graph, arms: Iterable[str], runtime: str) -> None:
-    """Raise `InputError` where an arm's labels cannot be had by clients of a `runtime` that are elsewhere."""
+def check_clients(graph: Graph, arms: Iterable[str], runtime: str) -> None:
+    """Raise `InputError` where an arm's labels cannot be had by clients of a `runtime` elsewhere, or its units join."""
     for arm in arms if runtime != "embedded" else ():
+        requests = graph.settings[arm].federation.requests
+        if runtime == "flower" and requests is not None and requests.roadside:
+            raise InputError("requests.roadside: units train at the edge server, and on 'flower' all train on vehicles")
         if any(LABEL_SOURCES[kind].averaged for kind in graph.settings[arm].labels.values()):
             raise InputError(
                 "labels 'road-average' are renewed between rounds, and clients elsewhere get them once; "
@@ -36,7 +39,7 @@ def deploy(graph: Graph, runtime: str, fleet: Path | None, engine: str = "proces
         raise InputError(f"runtime '{runtime}': a run has embedded and flower; flcav federate has others")
     if engine != "processes":
         raise InputError(f"runtime '{runtime}': vehicles are reached from this machine; not with engine '{engine}'")
-    check_labels(graph, graph.settings, runtime)
+    check_clients(graph, graph.settings, runtime)
     if fleet is not None:
         from flcav.federation.runtimes.deployed import RegionalDeployment
 

@@ -8,6 +8,7 @@ import pytest
 from flcav.config import InputError
 from flcav.federation.fleet.authority import found_authority, open_registry
 from flcav.federation.fleet.registry import KEPT_S, MOST, WINDOW_S
+from flcav.federation.fleet.status import Asked
 from flcav.federation.messages.fl_request import LARGEST, OLDEST_S, check_age, make_request, parse_request
 
 REQUEST = make_request("weather", 2.5, 12, (10.0, -3.0))
@@ -85,8 +86,35 @@ def test_many_requests_of_one_vehicle(tmp_path):
     assert len(registry.list_requests(1000)) == 2  # a day later the others are gone
 
 
-def test_registry_of_an_earlier_version(tmp_path):
+@pytest.mark.parametrize("table", ["requests", "answered"])
+def test_registry_of_an_earlier_version(tmp_path, table):
     registry = found_authority(tmp_path).registry
-    registry._connection.executescript("DROP TABLE requests;")
+    registry._connection.executescript(f"DROP TABLE {table};")
     registry.close()
-    assert open_registry(tmp_path).list_requests(1) == []
+    again = open_registry(tmp_path)
+    assert (again.list_requests(1), again.list_answered()) == ([], set())
+
+
+def test_a_request_waits_until_it_is_answered_or_old(tmp_path):
+    registry, now = found_authority(tmp_path).registry, 1e9
+    sent = [make_request("weather", loss, 3, (0.0, 0.0)) for loss in (1.0, 2.0, 3.0)]
+    for number, own in enumerate(sent):
+        assert registry.take_request(f"cav-{number % 2}", own.nonce, own.as_bytes(), now + number) is None
+    waiting = [(f"cav-{number % 2}", own.as_bytes()) for number, own in enumerate(sent)]
+    assert registry.list_open_requests(now - 1) == waiting
+    assert registry.list_open_requests(now + 0.5) == waiting[1:]  # the first is too old
+    registry.answer_requests([sent[1].nonce], now + 9)
+    registry.answer_requests([sent[1].nonce], now + 10)  # as after a stop
+    assert open_registry(tmp_path).list_open_requests(now - 1) == [waiting[0], waiting[2]]
+    assert registry.list_answered() == {sent[1].nonce}
+    assert registry.take_request("cav-1", sent[1].nonce, sent[1].as_bytes(), now + 11) is not None  # nor taken again
+    late = make_request("weather", 4.0, 3, (0.0, 0.0))
+    assert registry.take_request("cav-2", late.nonce, late.as_bytes(), now + KEPT_S + 9) is None
+    assert registry.list_answered() == set()  # forgotten with its request
+
+
+def test_status_says_whether_a_group_was_formed():
+    own = make_request("weather", 2.5, 1, (10.0, -3.0))
+    told = "cav-1 asks for federated learning of weather: loss 2.5 on 1 frame held back, at (10, -3) m"
+    assert Asked("cav-1", own).describe() == told
+    assert Asked("cav-1", own, answered=True).describe() == f"{told}; a group was formed"

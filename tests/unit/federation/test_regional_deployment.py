@@ -1,6 +1,6 @@
 """Each region has a fleet of its own, or its vehicles are beside those of the others."""
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import pytest
@@ -8,6 +8,8 @@ import pytest
 from flcav.config import InputError
 from flcav.federation.fleet.authority import found_authority
 from flcav.federation.fleet.up import READY, Ready
+from flcav.federation.messages.fl_request import make_request
+from flcav.federation.runtimes import deployed
 from flcav.federation.runtimes.deployed import Deployment, RegionalDeployment
 from flcav.storage.files import write_json
 
@@ -35,6 +37,74 @@ def test_region_has_its_vehicles(region, folder, first, fleets):
     with pytest.raises(Opened) as told:
         deployment.open({f"{region}/cav0": None}, None, {}, None)
     assert told.value.args == (fleets / folder, first, [f"{region}/cav0"])
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A registered vehicle."""
+
+    name: str
+    node: int
+
+    def describe_state(self):
+        return "registered"
+
+
+@dataclass
+class Fleet:
+    """Registry and SuperLink of a fleet with vehicles a, b and c."""
+
+    online: set[int] = field(default_factory=lambda: {1, 2, 3})
+    requests: list[tuple[str, bytes]] = field(default_factory=list)
+
+    def list_vehicles(self):
+        return [Registered(name, node) for node, name in enumerate("abc", start=1)]
+
+    def list_online(self):
+        return self.online
+
+    def list_open_requests(self, since):
+        return self.requests
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def one(fleets, monkeypatch):
+    fleet: Any = Fleet()
+    monkeypatch.setattr(deployed, "open_registry", lambda _: fleet)
+    monkeypatch.setattr(deployed, "STARTING_S", 0.0)
+    monkeypatch.setattr(deployed, "STARTING_VEHICLE_S", 0.0)
+    deployment: Any = Deployment(fleets)
+    deployment.link = fleet
+    return deployment, fleet
+
+
+def enter(deployment, *clients):
+    """Return the vehicles of clients, as they come in."""
+    return [own.name for own in deployment.choose_vehicles([*clients])]
+
+
+def test_a_client_keeps_its_vehicle(one):
+    deployment, fleet = one
+    assert enter(deployment, "r/1", "r/2") == ["a", "b"]
+    assert enter(deployment, "r/2") == ["b"]
+    assert enter(deployment, "r/2", "r/3") == ["b", "a"]
+    fleet.online = {1, 3}  # its vehicle does not come back
+    assert enter(deployment, "r/1", "r/2") == ["a", "c"]
+    fleet.online = {1}
+    with pytest.raises(OSError, match="fewer than 2 vehicles are in"):
+        enter(deployment, "r/1", "r/2")
+
+
+def test_fl_requests_of_the_vehicles_of_clients(one):
+    deployment, fleet = one
+    enter(deployment, "r/1", "r/2")
+    sent = [make_request(task, loss, 1, (0.0, 0.0)).as_bytes() for task in ("weather", "signs") for loss in (1.0, 2.0)]
+    fleet.requests = [("b", sent[0]), ("b", sent[1]), ("b", sent[2]), ("c", sent[0])]
+    assert deployment.list_requests(["r/1", "r/2"], "weather") == {"r/2": (sent[0], sent[1])}
+    assert deployment.list_requests(["r/2"], "signs") == {"r/2": (sent[2],)}
 
 
 def test_fleet_that_is_not_up(fleets):

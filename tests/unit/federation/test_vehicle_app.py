@@ -12,6 +12,7 @@ from flcav.config import InputError
 from flcav.federation.fleet.vehicle import VehicleSettings
 from flcav.federation.messages.records import (
     ARRAYS,
+    ASK,
     CONFIG,
     GRANT,
     GRANTED,
@@ -100,6 +101,39 @@ def test_answer_over_the_grant_stays(folder):
         if not sent:
             assert answer.error.code == OVER_BUDGET
     assert len(TRAINED) == 1
+
+
+@dataclass(frozen=True)
+class Talking(Counting):
+    """A client that answers any question with what it was asked, and the sum of what came with it."""
+
+    def answer(self, question, arrays):
+        return {question: np.array([sum(array.sum() for array in arrays.values())])}
+
+
+def question(folder: Path, asked: str, arrays: dict[str, np.ndarray], grant: int | None = None) -> Message:
+    content = {ASK: ConfigRecord({ASK: asked}), ARRAYS: to_arrays(arrays)}
+    if grant is not None:
+        content[GRANT] = ConfigRecord({GRANTED: grant})
+    message = Message(RecordDict(content), 2, f"{MessageType.QUERY}.{ASK}")
+    message.metadata.__dict__["_message_id"] = "1"
+    return VehicleApp(folder)(message, Context(1, 2, {}, RecordDict(), {}))
+
+
+def test_questions_beside_training(tmp_path):
+    Assignment("f", "town/cav0", Talking(), strategy_named("fedavg"), Rules()).save(tmp_path)
+    answer = question(tmp_path, "loss", {"w": np.arange(4.0)})
+    assert read_arrays(answer.content, ARRAYS) == {"loss": np.array([6.0])}
+    assert not TRAINED
+    assert not [*tmp_path.glob("*state*")]  # nothing is kept of it
+    size = wire_bytes(answer.content)
+    for grant, sent in ((size, True), (size - 1, False)):
+        assert question(tmp_path, "loss", {"w": np.arange(4.0)}, grant).has_content() == sent
+
+
+def test_a_client_that_answers_no_questions(folder):
+    with pytest.raises(TypeError, match="Counting answers no questions, such as 'loss'"):
+        question(folder, "loss", {})
 
 
 def test_own_client_of_a_vehicle(tmp_path, monkeypatch):

@@ -37,8 +37,8 @@ from flcav.pipeline.steps.cloud import (
     keep_statistics,
     score_statistics,
 )
-from flcav.pipeline.steps.edge import EdgeFederation, federate_edge
 from flcav.pipeline.training import statistics
+from flcav.pipeline.training.edge_rounds import EdgeFederation, federate_edge
 from flcav.pipeline.training.learning import Learning, Strategies, load_stage_network, make_clients
 from flcav.pipeline.training.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
 from flcav.statistics.streams import derive_seed

@@ -10,7 +10,8 @@ import pytest
 from line_task import LineTask, Slope
 
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Outage
+from flcav.federation.runtimes.link import open_questions
+from flcav.federation.runtimes.metered import Outage, open_account
 from flcav.federation.strategies import FEDAVG
 from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
@@ -20,10 +21,11 @@ from flcav.pipeline.recipe import Requests, Training
 from flcav.pipeline.results.groups import Group, Term
 from flcav.pipeline.results.saved import WEIGHTS
 from flcav.pipeline.steps import groups
-from flcav.pipeline.steps.edge import EdgeFederation, federate_edge
 from flcav.pipeline.steps.groups import Called
+from flcav.pipeline.training.edge_rounds import EdgeFederation, federate_edge
 from flcav.pipeline.training.groups import GroupWatch
 from flcav.pipeline.training.learning import Learning, load_stage_network, make_clients
+from flcav.pipeline.training.members import Member, measure_loss
 
 LEARNING = Learning(cast(Task, LineTask()), None, Training(local_steps=2, average_rounds=1, start_share=0.0), 3)
 NAMES = ("a/cav0", "a/cav1", "a/cav2")
@@ -69,9 +71,11 @@ def test_a_group_dissolves_by_the_loss_on_what_it_holds_back_whatever_validation
     held = {"a/cav0": [np.float32(0)], "a/cav1": [np.float32(1)]}
 
     def end(name: str, scores: tuple[float, float]) -> tuple[bytes, Group]:
-        watch = GroupWatch(LEARNING.task, Slope(), 2, Requests(patience=1, least_gain=0.5), held)
         start = LEARNING.build_network()
-        watch.note(to_arrays(start))
+        about = (to_arrays(start), 0.1, 0, np.zeros((1, 3)))
+        members = {who: Member(LEARNING.task, Slope(), 2, own, own, *about) for who, own in held.items()}
+        first = np.mean([measure_loss(LEARNING.task, Slope(), to_arrays(start), own, 2) for own in held.values()])
+        watch = GroupWatch(Requests(patience=1, least_gain=0.5), members, [float(first)])
         weights, book = federate_group(tmp_path / name, {}, 9, watch=watch)
         assert {(e.round, e.client) for e in book if e.bytes < 100} <= {(n, who) for n in range(1, 10) for who in held}
         left = iter(scores)
@@ -80,9 +84,10 @@ def test_a_group_dissolves_by_the_loss_on_what_it_holds_back_whatever_validation
         monkeypatch.setattr(
             groups, "load_stage_network", lambda task, at: start if "start" in str(at) else load_stage_network(task, at)
         )
-        called = Called(Group(0.1, {}, "pole1", NAMES), {}, watch)
+        called = Called(Group(0.1, {}, "pole1", NAMES), {}, watch, LEARNING.task)
         shown: Any = SimpleNamespace(data=None, vehicles=())  # that nobody looks at: their score is given
-        return weights, called.dissolve(tmp_path / name, tmp_path / f"{name}-start", shown, 9)
+        with open_questions(members, None, open_account()) as ask:
+            return weights, called.dissolve(tmp_path / name, tmp_path / f"{name}-start", shown, 9, ask)
 
     (one, group), (other, same) = end("up", (0.1, 0.9)), end("down", (0.9, 0.1))
     assert one == other

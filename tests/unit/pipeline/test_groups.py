@@ -11,8 +11,11 @@ from pydantic import ValidationError
 from safetensors.numpy import load
 
 from flcav.config import InputError
+from flcav.federation.runtimes.link import open_questions
+from flcav.federation.runtimes.metered import open_account
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
+from flcav.network.messages import pack
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.arms import check_federations, resolve_settings
@@ -21,19 +24,21 @@ from flcav.pipeline.results.groups import Checked, Group, Term
 from flcav.pipeline.training.groups import (
     FULL,
     NOT_NEEDED,
-    SKETCH,
     GroupWatch,
-    Offer,
-    Picked,
     choose_members,
-    count_labels,
-    find_gradient,
     find_in_range,
     find_lead,
     has_levelled,
+    weigh_offers,
+)
+from flcav.pipeline.training.members import (
+    MESSAGE,
+    SKETCH,
+    Offer,
+    count_labels,
+    find_gradient,
     hold_back,
     sketch_gradient,
-    weigh_offers,
 )
 
 PLACES = {name: np.array([x, 0.0, 0.0]) for name, x in {"a": 0.0, "b": 250.0, "c": 320.0, "d": 900.0}.items()}
@@ -97,6 +102,9 @@ def test_an_offer_is_a_message_of_some_hundred_bytes() -> None:
     assert len(message) < 1000
     assert (found["samples"].item(), found["counts"].tolist()) == (5, [3, 2])
     assert found["sketch"].dtype == np.float32
+    again = Offer.read(message)
+    assert (again.samples, again.labels) == (5, {"rain": 3, "snow": 2})
+    np.testing.assert_array_equal(again.sketch, found["sketch"])
 
 
 def test_a_group_dissolves_when_rounds_gain_too_little() -> None:
@@ -107,17 +115,29 @@ def test_a_group_dissolves_when_rounds_gain_too_little() -> None:
     assert not has_levelled([1.0, 0.95, 0.80, 0.79], how)
     assert has_levelled([1.0, 0.95, 0.80, 0.79, 0.78], how)
     assert has_levelled([1.0, 1.5, 2.0], how)  # or gets worse
-    watch = GroupWatch(None, None, 1, how, {"a": Picked([1], [])}, [1.0, 1.0, 1.0])  # type: ignore[arg-type]
-    assert not watch.over  # of nobody who holds something back
+    assert not GroupWatch(how, {}, [1.0, 1.0, 1.0]).over  # of nobody who holds something back
 
 
 def test_losses_that_members_tell_are_in_the_ledger_and_held_to_the_budget() -> None:
-    watch = GroupWatch(WEATHER, None, 1, Requests(), {"grid/a": Picked([1], [0]), "grid/b": Picked([1], [])})
-    book = Ledger(LinkMegabytes(1e-4, 0.0))
-    watch.tell(book, 3)
-    assert [(each.client, each.round, each.direction) for each in book] == [("grid/a", 3, "up")]
-    with pytest.raises(BudgetExceeded):
-        watch.tell(book, 4)
+    member: Any = SimpleNamespace(task=WEATHER, answer=lambda question, arrays: {MESSAGE: as_message(loss=0.25)})
+    watch, book = GroupWatch(Requests(), {"grid/a": member}, [0.5]), Ledger(LinkMegabytes(1e-4, 0.0))
+    with open_questions({"grid/a": member}, None, open_account()) as ask:
+        watch.follow(book, 3, {}, ask)
+        assert [(each.client, each.round, each.direction) for each in book] == [("grid/a", 3, "up")]
+        assert watch.losses == [0.5, 0.25]
+        with pytest.raises(BudgetExceeded):
+            watch.follow(book, 4, {}, ask)
+
+
+def as_message(**numbers: float) -> np.ndarray:
+    return np.frombuffer(pack({name: np.array([each], np.float32) for name, each in numbers.items()}), np.uint8)
+
+
+def test_a_loss_that_is_lost_or_cannot_be_read_counts_for_nothing() -> None:
+    watch = GroupWatch(Requests(), {}, [0.5])
+    watch.note({"grid/a": as_message(loss=0.25).tobytes(), "grid/b": b"", "grid/c": as_message(other=9.0).tobytes()})
+    watch.note({"grid/b": b""})
+    assert watch.losses == [0.5, 0.25, 0.25]
 
 
 def test_labels_are_counted_by_class_and_sketches_keep_angles() -> None:
@@ -165,6 +185,11 @@ def test_the_record_says_who_asked_why_who_came_and_what_it_mended() -> None:
         adhoc.describe()
     )
     assert Group.from_json(adhoc.as_json(), "here") == adhoc
+    early = {**vehicles, "grid/b": replace(vehicles["grid/b"], asks=True, told=2.5)}
+    said = replace(group, vehicles=early).describe()
+    assert "grid/a asked, with a loss above 0.900 on frames held back; grid/b had asked its fleet, with a" in said
+    assert "its fleet, with a loss of 2.500; pole3 led" in said
+    assert Group.from_json(replace(group, vehicles=early).as_json(), "here").vehicles == early
     calm = Group(0.9, {"grid/b": vehicles["grid/b"]}, "")
     assert calm.describe() == "nobody asked: the largest loss on held-back frames is 0.200, and 0.900 the limit"
 

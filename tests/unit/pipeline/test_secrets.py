@@ -25,7 +25,7 @@ from flcav.perception.weights import to_arrays
 from flcav.pipeline.recipe import Training
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.steps.cloud import CloudFederation, RegionStart, federate_cloud
-from flcav.pipeline.steps.edge import EdgeFederation, federate_edge
+from flcav.pipeline.training.edge_rounds import EdgeFederation, federate_edge
 from flcav.pipeline.training.learning import Learning, Strategies, make_clients
 from flcav.pipeline.training.secrets import (
     PART,

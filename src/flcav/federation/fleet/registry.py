@@ -6,7 +6,7 @@ by itself. Each change and its entry in `audit` are one transaction; entries are
 
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,6 +47,10 @@ CREATE TABLE IF NOT EXISTS requests (
     content BLOB NOT NULL  -- the request as it was sent
 );
 CREATE INDEX IF NOT EXISTS requests_by_time ON requests (time);
+CREATE TABLE IF NOT EXISTS answered (
+    nonce TEXT PRIMARY KEY,  -- of a request that a group was formed from
+    time REAL NOT NULL  -- when, seconds since 1970
+);
 """  # one who opens a registry of an earlier version makes the table
 KEPT_S = 86400.0  # that an FL request stays
 WINDOW_S, MOST = 300.0, 60  # requests of one vehicle within such a time
@@ -113,8 +117,8 @@ class Registry:
             raise InputError(f"{path}: is no registry of a fleet") from None
         if row != (authority,):
             raise InputError(f"{path}: is the registry of another authority than {path.parent / 'ca.crt'}")
-        known = found._connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'requests_by_time'").fetchone()
-        if known is None:
+        known = "SELECT name FROM sqlite_master WHERE name IN ('requests_by_time', 'answered')"
+        if len(found._connection.execute(known).fetchall()) < 2:
             found._connection.executescript(f"BEGIN; {REQUESTS} COMMIT;")
         return found
 
@@ -186,6 +190,7 @@ class Registry:
         """Keep a vehicle's FL request for a day; return in words why it is refused: it came before, or too many did."""
         with self._change() as cursor:
             cursor.execute("DELETE FROM requests WHERE time < ?", (now - KEPT_S,))
+            cursor.execute("DELETE FROM answered WHERE nonce NOT IN (SELECT nonce FROM requests)")
             if cursor.execute("SELECT 1 FROM requests WHERE nonce = ?", (nonce,)).fetchone():
                 return "a request with this nonce came before"
             since = vehicle, now - WINDOW_S
@@ -199,6 +204,20 @@ class Registry:
         """Return vehicle, time of arrival and content of the last requests, the latest last."""
         asked = "SELECT vehicle, time, content FROM requests ORDER BY time DESC LIMIT ?"
         return [*self._connection.execute(asked, (most,))][::-1]
+
+    def list_open_requests(self, since: float) -> list[tuple[str, bytes]]:
+        """Return vehicle and content of the requests that came after `since` and are not answered, the latest last."""
+        asked = "SELECT vehicle, content FROM requests WHERE time > ? AND nonce NOT IN (SELECT nonce FROM answered)"
+        return [*self._connection.execute(f"{asked} ORDER BY time", (since,))]
+
+    def answer_requests(self, nonces: Iterable[str], now: float) -> None:
+        """Note that a group was formed from the requests with these nonces; one that is noted stays as it is."""
+        with self._change() as cursor:
+            cursor.executemany("INSERT OR IGNORE INTO answered VALUES (?, ?)", [(nonce, now) for nonce in nonces])
+
+    def list_answered(self) -> set[str]:
+        """Return the nonces of the requests that a group was formed from."""
+        return {nonce for (nonce,) in self._connection.execute("SELECT nonce FROM answered")}
 
     def count_changes(self) -> int:
         """Return how many changes the registry has seen."""

@@ -84,12 +84,14 @@ class Asked(Record):
 
     vehicle: str
     request: FLRequest
+    answered: bool = False  # by a group
 
     def describe(self) -> str:
         """Return it in a sentence."""
         own = self.request
         seen = f"loss {own.loss:.3g} on {plural(own.frames, 'frame')} held back, at ({own.x:.0f}, {own.y:.0f}) m"
-        return f"{self.vehicle} asks for federated learning of {own.task}: {seen}"
+        told = f"{self.vehicle} asks for federated learning of {own.task}: {seen}"
+        return f"{told}; a group was formed" if self.answered else told
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def read_status(folder: Path) -> FleetStatus:
     registry = open_registry(folder)
     try:
         registered = registry.list_vehicles()
-        asked = registry.list_requests(SHOWN)
+        asked, answered = registry.list_requests(SHOWN), registry.list_answered()
     finally:
         registry.close()
     traffic, online = read_traffic(folder), set[int]()
@@ -132,7 +134,8 @@ def read_status(folder: Path) -> FleetStatus:
     except FileNotFoundError:
         federation = None
     proxy = None if ready is None else ready.proxy
-    requests = tuple(Asked(vehicle, parse_request(content)) for vehicle, _, content in asked)
+    made = [(vehicle, parse_request(content)) for vehicle, _, content in asked]
+    requests = tuple(Asked(vehicle, own, own.nonce in answered) for vehicle, own in made)
     refused, free = tuple(traffic.refused[-SHOWN:]), shutil.disk_usage(folder).free
     told = tuple(vehicles), requests, refused, free, federation, time.time()
     return FleetStatus(proxy, read_processes(folder), *told)

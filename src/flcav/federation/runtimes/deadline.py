@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
-from flcav.federation.trainable import Trainable, Update, Weights, count_samples
+from flcav.federation.trainable import Trainable, Update, Weights, answer_question, count_samples
 
 ResultT = TypeVar("ResultT")
 
@@ -48,6 +48,9 @@ class _Timed:
 
     def count_samples(self, steps: int) -> int:
         return self._within(lambda: count_samples(self._client, steps))
+
+    def answer(self, question: str, arrays: Weights) -> Weights:
+        return self._within(lambda: answer_question(self._client, question, arrays))
 
     def _within(self, do: Callable[[], ResultT]) -> ResultT:
         if (earlier := _busy.get(id(self._client))) is not None and earlier.is_alive():

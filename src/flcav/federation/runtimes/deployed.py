@@ -1,14 +1,7 @@
-"""The deployed runtime: clients are vehicles of a fleet that is up, reached through Flower's SuperLink.
-
-This process is the server app of a run. Where the SuperLink was killed, Flower gives the run up; then the server begins
-another one, and asks those again whose answers have not come. A vehicle whose node came back is asked again, too. Since
-vehicles keep their last answer, the weights are those of a federation that nothing happened to.
-"""
+"""The deployed runtime: clients are vehicles of a fleet that is up, and this process is the server app of its runs."""
 
 import contextlib
-import errno
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -20,39 +13,28 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from flwr.app import ConfigRecord, Error, Message, MessageType, RecordDict
-from flwr.serverapp import Grid
-
 from flcav.config import InputError
 from flcav.federation.fleet.authority import found_authority, open_registry
 from flcav.federation.fleet.keys import AUTHORITY
 from flcav.federation.fleet.registry import Vehicle
-from flcav.federation.fleet.status import Followed, FollowedRound
 from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost, locked
 from flcav.federation.fleet.supervisor import LOGS, end_with_parent
-from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.fleet.up import READY, VEHICLES, read_ready
-from flcav.federation.messages.records import ARRAYS, GRANT, GRANTED, LOST_BY_NETWORK, OVER_BUDGET, read_arrays
+from flcav.federation.messages.fl_request import parse_request
 from flcav.federation.noise import Secret
 from flcav.federation.rules import Rules
+from flcav.federation.runtimes.deployed_grid import POLL_S, STARTING_S, DeployedGrid
 from flcav.federation.runtimes.embedded import keep_identity
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.vehicle_app import Assignment
-from flcav.federation.runtimes.wrapped import WrappedGrid
-from flcav.federation.state import ClientStates, RoundRecord
+from flcav.federation.state import ClientStates
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable
-from flcav.network.ledger import BudgetExceeded
 
 SERVING = "serving.lock"  # in a fleet's folder: held by the federation that it serves
-STARTING_S = 120.0  # for a fleet to be up, its vehicles to be in, and a SuperLink to come back
 STARTING_VEHICLE_S = 15.0  # more for each vehicle, which may all be on a busy machine
-REJOIN_S = 180.0  # that a vehicle is waited for which the network lost
-POLL_S, PAUSE_S = 0.2, 1.0  # between looks for answers; before a vehicle that was not there is asked again
 LOOK_S = 0.4  # between looks who is in: each is a connection of its own, of some 0.1 s of CPU time
-RAISED = 2  # Flower's error code of an app that raised an exception, whose words are the reason
-FULL = re.compile(rf"\[Errno (?:{errno.ENOSPC}|{errno.EDQUOT}|{errno.EFBIG})\] ([A-Z][A-Za-z ]*)")
-TRANSPORT = (3, 4, 5, 8)  # Flower's error codes of messages and nodes that are not available, and of a crashed app
+OPEN_S = 3600.0  # that an FL request waits for a group
 
 
 @dataclass(frozen=True)
@@ -73,6 +55,7 @@ class Deployment:
     def __init__(self, folder: Path, first: int = 0) -> None:
         """Find the fleet of `folder`; `first` vehicles are another region's. Raises `InputError` where it is not up."""
         self.folder, self.first = folder, first
+        self._vehicles: dict[str, str] = {}  # by client, its vehicle
         self.link = SuperLink(folder, read_ready(folder).superlink)
 
     @contextlib.contextmanager
@@ -81,7 +64,8 @@ class Deployment:
     ) -> Iterator["DeployedGrid"]:
         """Yield the grid of vehicles that `clients` are assigned to, in the order of the vehicles' identifiers.
 
-        A fleet serves one federation at a time: another one waits until this one has ended.
+        A client keeps its vehicle as long as that comes in. A fleet serves one federation at a time: another one waits
+        until this one has ended.
 
         states: what clients have kept from earlier rounds. account: by which vehicles are granted bytes. Raises
         `InputError` where there are fewer vehicles than clients, or they cannot import these, `OSError` where they do
@@ -98,7 +82,7 @@ class Deployment:
     def _open(
         self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
     ) -> Iterator["DeployedGrid"]:
-        vehicles = self._wait([*clients])
+        vehicles = self.choose_vehicles([*clients])
         federation = os.urandom(8).hex()
         for (name, client), vehicle in zip(clients.items(), vehicles, strict=True):
             secret, state = agreed.secrets.get(name), states.get(name, {})
@@ -107,7 +91,7 @@ class Deployment:
                 own.save(self.folder / VEHICLES / vehicle.name)
         names = {vehicle.node or 0: name for vehicle, name in zip(vehicles, clients, strict=True)}
         of_nodes = {vehicle.node or 0: vehicle.name for vehicle in vehicles}
-        grid = DeployedGrid(self, names, of_nodes, account)
+        grid = DeployedGrid(self.folder, self.link, names, of_nodes, account)
         try:
             yield grid
         except BaseException:
@@ -115,8 +99,11 @@ class Deployment:
             raise
         grid.end()
 
-    def _wait(self, clients: list[str]) -> list[Vehicle]:
-        """Return as many vehicles as `clients`, once they are in."""
+    def choose_vehicles(self, clients: list[str]) -> list[Vehicle]:
+        """Return the vehicle of each client, once it is in: its earlier one, or where that does not come in another.
+
+        Raises `InputError` where fewer vehicles are registered, `OSError` where fewer come in.
+        """
         seconds = STARTING_S + STARTING_VEHICLE_S * len(clients)
         end = time.monotonic() + seconds
         while True:
@@ -128,12 +115,37 @@ class Deployment:
                 raise InputError(f"{self.folder}: {told}, and the federation has {len(clients)} clients")
             with contextlib.suppress(*SuperLinkLost):
                 online = self.link.list_online()
-                found = [own for own in able if own.node in online]
-                if len(found) >= len(clients):
-                    return found[: len(clients)]
+                found = {own.name: own for own in able if own.node in online}
+                kept = [own for name in clients if (own := self._vehicles.get(name)) is not None]
+                if len(found) >= len(clients) and (found.keys() >= {*kept} or time.monotonic() > end):
+                    free = iter([name for name in found if name not in kept])
+                    own = {name: self._vehicles.get(name, "") for name in clients}
+                    self._vehicles |= {name: old if old in found else next(free) for name, old in own.items()}
+                    return [found[self._vehicles[name]] for name in clients]
             if time.monotonic() > end:
                 raise OSError(f"{self.folder}: fewer than {len(clients)} vehicles are in after {seconds:g} s")
             time.sleep(LOOK_S)
+
+    def list_requests(self, clients: Iterable[str], task: str) -> dict[str, tuple[bytes, ...]]:
+        """Return the FL requests of the vehicles of `clients` for a task that wait for a group, the latest last."""
+        registry = open_registry(self.folder)
+        try:
+            waiting = registry.list_open_requests(time.time() - OPEN_S)
+        finally:
+            registry.close()
+        found: dict[str, tuple[bytes, ...]] = {}
+        for client in clients:
+            own = tuple(content for vehicle, content in waiting if vehicle == self._vehicles.get(client))
+            found[client] = tuple(content for content in own if parse_request(content).task == task)
+        return {client: own for client, own in found.items() if own}
+
+    def answer_requests(self, requests: Iterable[bytes]) -> None:
+        """Mark FL requests as answered by a group."""
+        registry = open_registry(self.folder)
+        try:
+            registry.answer_requests([parse_request(content).nonce for content in requests], time.time())
+        finally:
+            registry.close()
 
 
 class RegionalDeployment:
@@ -159,184 +171,16 @@ class RegionalDeployment:
         self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
     ) -> contextlib.AbstractContextManager["DeployedGrid"]:
         """Return the grid of a region's `clients`, which are named REGION/VEHICLE, see `Deployment.open`."""
-        return self._fleets[region_of(next(iter(clients)))].open(clients, agreed, states, account)
+        return self.fleet_of(next(iter(clients))).open(clients, agreed, states, account)
+
+    def fleet_of(self, client: str) -> Deployment:
+        """Return the fleet that a client, REGION/VEHICLE, is in."""
+        return self._fleets[region_of(client)]
 
 
 def region_of(client: str) -> str:
     """Return the region of a client that is named REGION/VEHICLE."""
     return client.partition("/")[0]
-
-
-class DeployedGrid(WrappedGrid):
-    """Grid of deployed vehicles, which begins another run where Flower has given the one before up."""
-
-    def __init__(
-        self, deployment: Deployment, names: Mapping[int, str], vehicles: Mapping[int, str], account: Account
-    ) -> None:
-        """Reach nodes with the clients' `names`, which are `vehicles` of the registry."""
-        self._deployment, self.names, self._vehicles, self._account = deployment, names, vehicles, account
-        self._rounds: tuple[FollowedRound, ...] = ()
-        self._waits: dict[str, str] = {}  # by client why it is waited for
-        self._begin()
-
-    def _begin(self) -> None:
-        self._deployment.link.wait(STARTING_S)
-        self._run = self._deployment.link.begin()
-        self._run.identify()
-        self._grid: Grid = self._run.grid
-
-    def _renew(self) -> None:
-        """Begin another run, as soon as the SuperLink lets us."""
-        self._run.end(failed=True)
-        end = time.monotonic() + STARTING_S
-        while True:
-            try:
-                return self._begin()
-            except SuperLinkLost as error:
-                if time.monotonic() > end:
-                    raise OSError(f"{self._deployment.folder}: the SuperLink begins no run: {error}") from None
-                time.sleep(PAUSE_S)
-
-    def follow(self, record: RoundRecord) -> None:
-        """Write a round that has ended to the fleet's folder, where `flcav fleet status` reads it."""
-        about = time.time(), len(record.clients), record.failed, record.loss, record.epsilon
-        self._rounds, self._waits = (*self._rounds, FollowedRound(record.round, *about)), {}
-        self._tell()
-
-    def _tell(self) -> None:
-        account, link = self._account, self._account.link
-        used, left = account.ledger.used_mb(link), account.ledger.left_mb(link)
-        told = Followed(account.stage, account.task, link, used, left, self._rounds, dict(self._waits))
-        with contextlib.suppress(OSError):  # the federation goes on where the disk of its display is full
-            told.save(self._deployment.folder)
-
-    def _wait_for(self, exchange: "_Exchange", node: int, reason: str) -> None:
-        """Ask a node again later, and tell why."""
-        exchange.lost(node)
-        name = self.names[node]
-        if self._waits.get(name) != reason:
-            self._waits[name] = reason
-            self._tell()
-
-    def end(self, failed: bool = False) -> None:
-        """End the run."""
-        self._run.end(failed)
-
-    def get_node_ids(self) -> list[int]:
-        """Return the ids of the nodes, in the order of the clients."""
-        return [*self.names]
-
-    def read_states(self, keys: Iterable[str]) -> ClientStates:
-        """Return the arrays that clients keep between rounds under these records, by client and record."""
-        found: ClientStates = {}
-        for reply in self.send_and_receive(Message(RecordDict(), node, MessageType.QUERY) for node in self.names):
-            if reply.has_content():
-                own = {key: read_arrays(reply.content, key) for key in keys if key in reply.content}
-                found |= {self.names[reply.metadata.src_node_id]: own} if own else {}
-        return {name: found[name] for name in self.names.values() if name in found}
-
-    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
-        """Yield the replies in the order of the messages; raises `BudgetExceeded` where one was kept for its size."""
-        asked = {message.metadata.dst_node_id: message for message in messages}
-        exchange = _Exchange(self._count_losses())
-        answers: dict[int, Message] = {}
-        end = time.monotonic() + (timeout or float("inf"))
-        for node, message in asked.items():
-            while node not in answers:
-                try:
-                    due = [own for own in asked if own not in answers and exchange.is_due(own)]
-                    if due:
-                        self._push(exchange, {own: asked[own] for own in due})
-                    self._pull(exchange, asked, answers)
-                except SuperLinkLost:
-                    self._renew()
-                    exchange = _Exchange(self._count_losses())
-                if node not in answers:
-                    if time.monotonic() > end:
-                        return
-                    exchange.notice(self._count_losses())
-                    time.sleep(POLL_S)
-            reply = answers.pop(node)
-            answers[node] = message  # answered; only its place is looked at
-            if reply.has_error() and reply.error.code == OVER_BUDGET:
-                raise BudgetExceeded(f"{self.names[node]}: {reply.error.reason} on the {self._account.link} uplink")
-            yield reply
-
-    def _push(self, exchange: "_Exchange", due: Mapping[int, Message]) -> None:
-        """Send requests to nodes, with the bytes that their answers may have."""
-        left = max(0, int(self._account.ledger.left_mb(self._account.link) * 1e6))
-        grant = ConfigRecord({GRANTED: min(left, 2**62)})
-        sent = []
-        for node, message in due.items():
-            content = {**message.content}
-            if ARRAYS in content or message.metadata.message_type == MessageType.TRAIN:
-                content[GRANT] = grant
-            sent.append(Message(RecordDict(content), node, message.metadata.message_type))
-        for identifier, node in zip(self._grid.push_messages(sent), due, strict=True):
-            exchange.sent(node, identifier)
-
-    def _pull(self, exchange: "_Exchange", asked: Mapping[int, Message], answers: dict[int, Message]) -> None:
-        """Add the answers that have come; a node that was not available is asked again later."""
-        if not exchange.nodes:
-            return
-        for reply in self._grid.pull_messages([*exchange.nodes]):
-            node = exchange.nodes.pop(reply.metadata.reply_to_message_id, None)
-            if node is None or node in answers:
-                continue
-            reason = _excuse(reply)
-            if reason is not None and not exchange.is_late(node):
-                self._wait_for(exchange, node, reason)
-            elif reason is not None:
-                answers[node] = Message(Error(LOST_BY_NETWORK, reason), reply_to=asked[node])
-            else:
-                answers[node] = reply
-
-    def _count_losses(self) -> dict[int, int]:
-        """Return how often each node may have lost what it was asked: it came in anew, or the SuperLink failed it."""
-        found = read_traffic(self._deployment.folder).vehicles
-        there = {node: found[name] for node, name in self._vehicles.items() if name in found}
-        return {node: own.activations + own.lost for node, own in there.items()}
-
-
-def _excuse(reply: Message) -> str | None:
-    """Return why a vehicle could not answer, where that may pass: it was not there, or its disk is full."""
-    if not reply.has_error():
-        return None
-    if reply.error.code in TRANSPORT:
-        return str(reply.error.reason)
-    if reply.error.code == RAISED and (full := FULL.search(str(reply.error.reason))):
-        return f"no room on the vehicle's disk: {full[1]}"
-    return None
-
-
-class _Exchange:
-    """Who was asked in a run, by which message, and who is to be asked again when."""
-
-    def __init__(self, losses: Mapping[int, int]) -> None:
-        self.nodes: dict[str, int] = {}  # of the messages that are out, by their ids
-        self._losses = dict(losses)
-        self._due: dict[int, float] = {}  # of nodes that were asked: when they are to be asked again
-        self._lost: dict[int, float] = {}  # since when nodes are not available
-
-    def is_due(self, node: int) -> bool:
-        return time.monotonic() >= self._due.get(node, 0.0)
-
-    def is_late(self, node: int) -> bool:
-        return node in self._lost and time.monotonic() > self._lost[node] + REJOIN_S
-
-    def sent(self, node: int, identifier: str) -> None:
-        self.nodes[identifier], self._due[node] = node, float("inf")
-
-    def lost(self, node: int) -> None:
-        self._lost.setdefault(node, time.monotonic())
-        self._due[node] = time.monotonic() + PAUSE_S
-
-    def notice(self, losses: Mapping[int, int]) -> None:
-        """Note that nodes have lost something: they are asked again, and give the same answer."""
-        for node, count in losses.items():
-            if count > self._losses.get(node, count) and node in self._due:
-                self._due[node] = time.monotonic() + PAUSE_S
-        self._losses = dict(losses)
 
 
 @contextlib.contextmanager

@@ -1,20 +1,24 @@
 """Links of a federation's server to its clients, by runtime: this process, client processes, Ray, or a deployed fleet.
 
 What crosses a link is lost where the network loses it, held to the budget where it leaves, and entered in the ledger.
+Questions beside training are asked over it, too; whoever asks enters the answers that count.
 """
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Union
+from typing import TYPE_CHECKING, Protocol, Union
 
+from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
 from flcav.config import InputError
 from flcav.federation.client import client_app
+from flcav.federation.messages.delivery import Arrived, Lost, list_events
+from flcav.federation.messages.records import ARRAYS, ASK, GRANT, read_arrays, to_arrays
 from flcav.federation.noise import Secret
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.deadline import TimedClients
@@ -23,8 +27,8 @@ from flcav.federation.runtimes.metered import Account, BudgetedGrid, MeteredGrid
 from flcav.federation.runtimes.outages import LossyGrid
 from flcav.federation.runtimes.processes import ClientProcesses, RemoteClients
 from flcav.federation.state import ClientStates, ReadStates, RoundRecord
-from flcav.federation.strategies import Strategy
-from flcav.federation.trainable import Trainable
+from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.trainable import Trainable, Weights, answer_question
 from flcav.interface.wording import suggest
 
 if TYPE_CHECKING:
@@ -33,8 +37,31 @@ if TYPE_CHECKING:
     from flcav.federation.runtimes.topics import RosTopics
 
 RUNTIMES = "embedded", "ray", "flower"
+NOTHING: Weights = {}  # comes with a question
+ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere
 # where clients train, and how messages reach them
 Runtime = Union[ClientProcesses, "RaySimulation", "Deployment", "RegionalDeployment", "RosTopics"]
+
+
+@dataclass(frozen=True)
+class Replies:
+    """What clients answered to a question."""
+
+    answers: Mapping[str, Weights]  # by client
+    missing: Mapping[str, str]  # by client why it did not answer
+
+
+class Ask(Protocol):
+    """A way to ask clients."""
+
+    def __call__(
+        self, question: str, clients: Sequence[str], arrays: Weights = NOTHING, *, counted: bool = True
+    ) -> Replies:
+        """Return the replies of `clients`, in their order, to a question that these `arrays` come with.
+
+        A deployed client keeps an answer that is `counted` where it is over the budget: `BudgetExceeded`.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -43,6 +70,7 @@ class Link:
 
     grid: Grid
     names: Mapping[int, str]  # of the clients, by node
+    ask: Ask
     read_states: ReadStates  # of what clients keep between rounds
     follow: Callable[[RoundRecord], None] = lambda _: None  # called with the record of each round that has ended
 
@@ -71,7 +99,7 @@ def open_link(
         spent: rounds of earlier federations that count against their privacy budget.
     """
     make_app = partial(client_app, strategy=strategy, rules=rules, secrets=secrets, spent=spent)
-    limit_s, names = rules.limits.train_s, [*clients]
+    limit_s, names, far = rules.limits.train_s, [*clients], False
     timed = clients if limit_s is None else TimedClients(clients, limit_s)
     if runtime is None:
         opened = EmbeddedGrid(make_app(timed), names, states)
@@ -80,7 +108,7 @@ def open_link(
     elif runtime.deployed is True:
         from flcav.federation.runtimes.deployed import Agreement
 
-        opened = runtime.open(clients, Agreement(strategy, rules, secrets, spent), states, account)
+        opened, far = runtime.open(clients, Agreement(strategy, rules, secrets, spent), states, account), True
     else:
         timing = (lambda each: each) if limit_s is None else (lambda each: TimedClients(each, limit_s))
         opened = runtime.open(clients, lambda each: make_app(timing(each)), states)
@@ -88,7 +116,60 @@ def open_link(
         lossy = LossyGrid(inner, account, inner.names) if account.outages else inner
         metered = MeteredGrid(BudgetedGrid(lossy, account, inner.names), account, inner.names)
         follow = getattr(inner, "follow", lambda _: None)
-        yield Link(metered, inner.names, inner.read_states, follow)
+        ask = partial(_ask_there, inner, inner.names) if far else partial(_ask_here, clients)
+        yield Link(metered, inner.names, ask, inner.read_states, follow)
+
+
+@contextlib.contextmanager
+def open_questions(
+    clients: Mapping[str, Trainable], deployed: "RegionalDeployment | None", account: Account
+) -> Iterator[Ask]:
+    """Yield a way to ask clients outside the rounds of a federation: in this process, or `deployed`.
+
+    By the budget of `account` deployed clients are granted bytes.
+    """
+    if deployed is None or not clients:
+        yield partial(_ask_here, clients)
+        return
+    with open_link(clients, deployed, account, FEDAVG, Rules(), {}, {}, 0) as link:
+        yield link.ask
+
+
+def _ask_here(
+    own: Mapping[str, Trainable],
+    question: str,
+    clients: Sequence[str],
+    arrays: Weights = NOTHING,
+    *,
+    counted: bool = True,
+) -> Replies:
+    return Replies({name: answer_question(own[name], question, arrays) for name in clients}, {})
+
+
+def _ask_there(
+    grid: Grid,
+    names: Mapping[int, str],
+    question: str,
+    clients: Sequence[str],
+    arrays: Weights = NOTHING,
+    *,
+    counted: bool = True,
+) -> Replies:
+    nodes, records = {name: node for node, name in names.items()}, {ASK: ConfigRecord({ASK: question})}
+    content = RecordDict({**records, **({ARRAYS: to_arrays(arrays)} if arrays else {})})
+    if counted:
+        content[GRANT] = ConfigRecord()  # filled in as it leaves
+    messages = [Message(content, nodes[name], f"{MessageType.QUERY}.{ASK}") for name in clients]
+    answers, missing = dict[str, Weights](), dict[str, str]()
+    for event in list_events(clients, grid.send_and_receive(messages, timeout=ANSWER_S), names):
+        if isinstance(event, Arrived):
+            try:
+                answers[event.client] = read_arrays(event.content, ARRAYS)
+            except (KeyError, TypeError, ValueError) as error:
+                missing[event.client] = f"an answer that cannot be read: {error}"
+        else:
+            missing[event.client] = event.reason if isinstance(event, Lost) else "no answer in time"
+    return Replies(answers, missing)
 
 
 @contextlib.contextmanager
@@ -126,12 +207,21 @@ def open_runtime(
 
             yield RaySimulation(count)
         case "flower":
-            from flcav.federation.runtimes.deployed import RegionalDeployment, region_of, start_fleet
-
-            if fleet is not None:
-                yield RegionalDeployment(fleet, vehicles)
-            else:
-                with start_fleet(len(clients)) as deployment:
-                    yield RegionalDeployment(deployment.folder, Counter(map(region_of, clients)))
+            with open_fleet(clients, fleet, vehicles) as deployed:
+                yield deployed
         case _:
             raise InputError(f"runtime '{name}': choose one of {', '.join(RUNTIMES)}{suggest(name, RUNTIMES)}")
+
+
+@contextlib.contextmanager
+def open_fleet(
+    clients: Collection[str], fleet: Path | None, vehicles: Mapping[str, int]
+) -> Iterator["RegionalDeployment"]:
+    """Yield the vehicles of a deployed `fleet` for clients, or of one that is brought up, see `open_runtime`."""
+    from flcav.federation.runtimes.deployed import RegionalDeployment, region_of, start_fleet
+
+    if fleet is not None:
+        yield RegionalDeployment(fleet, vehicles)
+    else:
+        with start_fleet(len(clients)) as deployment:
+            yield RegionalDeployment(deployment.folder, Counter(map(region_of, clients)))

@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from flcav.interface.wording import plural
-from flcav.storage.records import Record
+from flcav.storage.records import LEFT_OUT, Record
 
 
 @dataclass(frozen=True)
@@ -14,7 +15,13 @@ class Checked(Record):
     held_back: int  # frames
     before: float  # loss of the network that drives
     after: float | None = None  # of the group's network; None: it is in no group
-    asks: bool = False  # whether `before` is above the limit, so that it sends a request
+    asks: bool = False  # whether `before` is above the limit, so that it sends a request, or it had asked its fleet
+    told: Annotated[float | None, LEFT_OUT] = None  # loss in the FL request by which it had asked its fleet
+
+    @property
+    def error(self) -> float:
+        """Return the loss by which it asks."""
+        return self.before if self.told is None else max(self.before, self.told)
 
 
 @dataclass(frozen=True)
@@ -62,8 +69,11 @@ class Group(Record):
         if not self.asked:
             worst = max((each.before for each in self.vehicles.values()), default=0.0)
             return f"nobody asked: the largest loss on held-back frames is {worst:.3f}, and {self.limit:.3f} the limit"
-        told = [
-            f"{', '.join(self.asked)} asked, with a loss above {self.limit:.3f} on frames held back",
+        own = [name for name in self.asked if self.vehicles[name].told is None]
+        told = [f"{', '.join(own)} asked, with a loss above {self.limit:.3f} on frames held back"] if own else []
+        for name, each in self.vehicles.items():
+            told += [] if each.told is None else [f"{name} had asked its fleet, with a loss of {each.told:.3f}"]
+        told += [
             f"{self.lead} led {plural(len(self.members), 'vehicle')}{self._describe_units()} for "
             f"{max(len(self.losses) - 1, 0)} of {plural(self.most_rounds, 'round')}",
             f"{self.request_bytes} bytes of requests and offers",

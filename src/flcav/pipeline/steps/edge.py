@@ -1,31 +1,16 @@
 """Stage II of a task in a region, and its further edge rounds: the vehicles federate with their edge server."""
 
-import contextlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from safetensors.numpy import load_file
-
-from flcav.federation.buffered_rounds import Buffers, afford_buffers
-from flcav.federation.privacy import count_affordable
-from flcav.federation.rounds import BeforeRound, OnRound, Schedule, federate
-from flcav.federation.rules import Rules
-from flcav.federation.runtimes.link import Runtime, open_runtime
-from flcav.federation.runtimes.metered import Account, Outage
-from flcav.federation.runtimes.processes import ClientProcesses
-from flcav.federation.state import FederationState
-from flcav.federation.strategies import Strategy
+from flcav.federation.runtimes.link import open_fleet, open_questions
+from flcav.federation.runtimes.metered import Account
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.trainable import LocalUpdate, Trainable, Weights
-from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
-from flcav.perception.client import TaskClient
 from flcav.perception.distillation import SharedSamples
-from flcav.perception.outcomes import score_network
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import Setting, find_strategies
 from flcav.pipeline.engine import Step, Work
@@ -35,7 +20,6 @@ from flcav.pipeline.plan.updates import follow_plan
 from flcav.pipeline.radio.buffered import drive_buffers
 from flcav.pipeline.radio.driving import DrivenRounds
 from flcav.pipeline.recipe import EDGE, MORE_EDGE, Federation
-from flcav.pipeline.results.groups import Term
 from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult
 from flcav.pipeline.steps.groups import call_group
@@ -58,156 +42,12 @@ from flcav.pipeline.steps.settings import (
     read_entries,
     share_plan_budget,
 )
-from flcav.pipeline.training.checkpoints import FederationCheckpoints, load_round_network, round_path
-from flcav.pipeline.training.groups import GroupWatch, Levelled
-from flcav.pipeline.training.leads import federate_led, follow_leads
-from flcav.pipeline.training.learning import (
-    Learning,
-    describe_federation,
-    give_outputs,
-    load_stage_network,
-    make_clients,
-)
+from flcav.pipeline.training.edge_rounds import EdgeFederation, federate_edge
+from flcav.pipeline.training.leads import follow_leads
+from flcav.pipeline.training.learning import load_stage_network, make_clients
 from flcav.pipeline.training.messages import send_region_network, share_frames
 from flcav.pipeline.training.private_rounds import PrivateRounds, find_budget_noise, plan_private_rounds, take_noise
 from flcav.pipeline.training.records import read_rounds
-from flcav.pipeline.training.timing import time_clients
-
-
-@dataclass(frozen=True)
-class EdgeFederation:
-    """A region's federation: what its rounds begin with, and where they are kept."""
-
-    learning: Learning
-    network: Any  # that the rounds begin with
-    clients: Mapping[str, TaskClient]  # vehicles, by name
-    schedule: Schedule
-    strategy: Strategy
-    earlier: int  # rounds with the same vehicles before, which a privacy budget counts
-    book: Ledger
-    folder: Path  # of checkpoints, weights and ledger
-    report: Report
-    validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
-    shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
-    relabel: BeforeRound | None = None  # changes the clients' labels before each round
-    watch: GroupWatch | None = None  # over a group, which dissolves when its loss has levelled off
-    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group; none: an edge server leads
-    roadside: frozenset[str] = frozenset()  # clients at the edge server itself, whose messages cross no radio
-
-    @property
-    def start_share(self) -> float:
-        """Return the share of the network's own weights in the result: none in further rounds."""
-        return 0.0 if self.earlier else self.learning.training.start_share
-
-    def score(self, round_: int) -> Mapping[str, float]:
-        """Return the scores, by region, of the network that a federation of so many rounds ends with."""
-        task, averaged = self.learning.task, self.learning.training.average_rounds
-        reached = load_round_network(task, self.network, self.folder, round_, averaged, self.start_share)
-        return {name: score_network(task, reached, own.data, own.vehicles) for name, own in self.validation.items()}
-
-    def afford(self, rules: Rules, rounds: int, buffers: Buffers | None = None) -> int:
-        """Return as many of `rounds` as the privacy budget affords; without one all."""
-        if rules.privacy is None:
-            return rounds
-        if buffers is not None:
-            return min(rounds, afford_buffers(buffers, rules.privacy))
-        return count_affordable(rules.privacy, rules.selection, [*self.clients], rounds, self.earlier)
-
-    def prepare(self, clients: Mapping[str, Trainable], where: Runtime | None, number: int, weights: Weights) -> None:
-        """Have the clients' samples labelled again before a round, where labels change, and hand them on to `where`."""
-        if self.relabel is not None:
-            self.relabel(number, weights)
-            if isinstance(where, ClientProcesses):
-                where.renew(clients)
-
-
-def federate_edge(
-    federation: EdgeFederation,
-    rules: Rules,
-    outages: Mapping[tuple[int, str], Outage] = {},
-    *,
-    buffers: Buffers | None = None,
-    processes: int = 1,
-    runtime: str = "embedded",
-    timed: bool = False,
-    fleet: Path | None = None,
-    vehicles: Mapping[str, int] = {},
-) -> tuple[float | None, ...]:
-    """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
-
-    A privacy budget may end it before the schedule's end, and of asynchronous rounds, `buffers`, each budget. Vehicles
-    train in so many `processes` of a `runtime` of `RUNTIMES`, to the same weights; where that is `timed`, their times
-    are kept, see `read_times`, unless nobody is to know who was drawn. The vehicles that `outages` name by round are
-    lost in it. `fleet` and `vehicles` are those of `open_runtime`.
-    """
-    own, learning, state = federation, federation.learning, FederationState()
-    checkpoints = FederationCheckpoints(
-        learning.task,
-        own.folder,
-        own.book,
-        own.report,
-        {EDGE: state},
-        describe_federation(own.strategy, rules),
-        own.schedule.rounds,
-        rules.privacy,
-        own.score if own.validation else None,
-    )
-    start, done = checkpoints.resume(to_arrays(own.network))
-    checkpoints.keep_secrets({EDGE: rules.secret_parties([*own.clients])})
-    clients: Mapping[str, Trainable] = own.clients
-    if own.shared is not None:
-        clients = give_outputs(own.clients, own.shared, to_arrays(own.network))
-    if timed and not rules.hides_draws:
-        clients = time_clients(clients, own.folder)
-    if own.watch is not None:
-        for number in range(1, done + 1):
-            own.watch.note(load_file(round_path(own.folder, number)))
-    with (
-        checkpoints.refusals(),
-        open_runtime(runtime, clients, processes, fleet, vehicles) as where,
-        contextlib.suppress(Levelled),
-    ):
-        if own.watch is not None and own.watch.over:
-            raise Levelled
-        if done < own.afford(rules, own.schedule.rounds, buffers):
-            account = Account(own.book, EDGE, learning.task.name, "wireless", outages, own.roadside)
-            keep = partial(_keep_round, own.watch, checkpoints)
-
-            def run(weights: Weights, account: Account, done: int, on_round: OnRound) -> LocalUpdate:
-                return federate(
-                    clients,
-                    weights,
-                    own.schedule,
-                    account,
-                    strategy=own.strategy,
-                    rules=rules,
-                    state=state,
-                    done=done,
-                    earlier=own.earlier,
-                    before_round=partial(own.prepare, clients, where),
-                    on_round=on_round,
-                    runtime=where,
-                    distiller=own.shared,
-                    buffers=buffers,
-                )
-
-            if own.terms:
-                federate_led(run, start, account, own.terms, keep, state=state, done=done)
-            else:
-                run(start, account, done, keep)
-    return checkpoints.finish(own.network, learning.training.average_rounds, own.start_share)
-
-
-def _keep_round(
-    watch: GroupWatch | None, checkpoints: FederationCheckpoints, number: int, weights: Weights, loss: float | None
-) -> None:
-    """Keep a round; raises `Levelled` where the group is to dissolve."""
-    if watch is not None:
-        watch.note(weights)
-        watch.tell(checkpoints.book, number)
-    checkpoints.save(number, weights, loss)
-    if watch is not None and watch.over:
-        raise Levelled
 
 
 class EdgeSettings(FederationSettings):
@@ -244,14 +84,37 @@ def edge_step(
 
     Vehicles train in so many `processes` of a `runtime`; other than 0, `timed` keeps their times.
     """
-    inputs, stage, plan = settings.inputs, settings.stage, Plan.load(work.inputs[settings.inputs.plan])
+    inputs, plan = settings.inputs, Plan.load(work.inputs[settings.inputs.plan])
     book = _open_book(work, settings, plan)
     before, labelled = len(book.entries), label_samples(work, settings, inputs, book, EDGE)
-    called, whole = None, labelled.samples
+    clients = [name for name in labelled.samples if len(labelled.samples[name])]
+    where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed)}
+    if runtime != "flower":
+        _federate_region(work, settings, plan, book, before, labelled, where)
+    else:
+        with open_fleet(clients, Path(fleet) if fleet else None, settings.vehicles) as deployed:
+            _federate_region(work, settings, plan, book, before, labelled, {**where, "deployed": deployed})
+
+
+def _federate_region(
+    work: Work,
+    settings: EdgeSettings,
+    plan: Plan,
+    book: Ledger,
+    before: int,
+    labelled: LabelledSamples,
+    where: Mapping[str, Any],
+) -> None:
+    """Run the rounds of a region's vehicles, by arguments of `federate_edge`; save weights and result.
+
+    before: number of entries in `book` of what was sent earlier.
+    """
+    inputs, stage, called, whole = settings.inputs, settings.stage, None, labelled.samples
+    deployed = where.get("deployed")
     if stage == EDGE and settings.federation.requests is not None:
         most = plan.tasks[settings.learning.task].called
         called = call_group(
-            work, settings, inputs, settings.federation.requests, labelled.samples, book, most, labelled.poles
+            work, settings, inputs, settings.federation.requests, whole, book, most, labelled.poles, deployed
         )
         labelled = replace(labelled, samples=called.samples)
     if settings.memory is not None:
@@ -272,11 +135,14 @@ def edge_step(
     if called is not None and called.group.lead in called.vehicles:  # ad hoc
         terms = follow_leads(called.vehicles, called.group.lead, driven.records, inputs.region)
         federation, called = replace(federation, terms=terms), replace(called, terms=terms)
-    where: Any = {"processes": processes, "runtime": runtime, "timed": bool(timed), "vehicles": settings.vehicles}
-    where["fleet"] = Path(fleet) if fleet else None
     losses = federate_edge(federation, driven.rules, driven.outages, buffers=driven.buffers, **where)
     clients, labels = federation.clients, None
-    shown = Frames.open(work.inputs[settings.shown]) if settings.shown else None
+    group = None
+    if called is not None:
+        shown = Frames.open(work.inputs[settings.shown]) if settings.shown else None
+        account = Account(book, EDGE, settings.learning.task, "wireless")
+        with open_questions(called.watch.members, deployed, account) as ask:
+            group = called.dissolve(work.folder, work.inputs[inputs.pretrain], shown, rounds, ask)
     if settings.scored and stage == EDGE and clients:
         labels = score_labels(work, inputs, federation.network.config, whole)
     StageResult(
@@ -291,7 +157,7 @@ def edge_step(
         records=read_rounds(work.folder, inputs.region, before, {inputs.region: driven.seconds}),
         labels=labels,
         noise=noise,
-        group=None if called is None else called.dissolve(work.folder, work.inputs[inputs.pretrain], shown, rounds),
+        group=group,
     ).save(work.folder)
 
 

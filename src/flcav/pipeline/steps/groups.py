@@ -1,20 +1,23 @@
 """Calling a group in stage II: vehicles check the network that drives, ask, are called, and train on copies of it."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.runtimes.link import NOTHING, Ask, open_questions
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.trainable import Weights
 from flcav.network.ledger import Ledger
-from flcav.network.messages import pack, send
-from flcav.perception.client import TaskClient
+from flcav.network.messages import send
 from flcav.perception.objects.samples import Sample
 from flcav.perception.outcomes import score_network
+from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames
@@ -26,27 +29,44 @@ from flcav.pipeline.results.groups import Checked, Group, Term
 from flcav.pipeline.results.plans import Placed
 from flcav.pipeline.results.training import Pretrained
 from flcav.pipeline.steps.settings import FederationSettings, RegionInputs
+from flcav.pipeline.training.fl_requests import answer_requests, take_requests
 from flcav.pipeline.training.groups import (
     ABSENT,
     NO_LINK,
     SERVER_RANGE,
     GroupWatch,
-    Offer,
-    Picked,
     choose_members,
-    count_labels,
-    find_gradient,
     find_in_range,
     find_lead,
-    hold_back,
-    measure_loss,
-    sketch_gradient,
+    read_losses,
     weigh_offers,
 )
 from flcav.pipeline.training.learning import Learning, load_stage_network
+from flcav.pipeline.training.members import (
+    ASKS,
+    CHECK,
+    HELD,
+    LOSS,
+    MESSAGE,
+    OFFER,
+    REQUEST,
+    SCENE,
+    Member,
+    Offer,
+    Picked,
+    Unreadable,
+    hold_back,
+    read_position,
+)
 from flcav.statistics.streams import derive_seed
 
+if TYPE_CHECKING:
+    from flcav.federation.runtimes.deployed import RegionalDeployment
+
 EVERY_SCENE = 10**6  # more than there are
+UNREADABLE = "an answer that cannot be read"
+AnswerT = TypeVar("AnswerT")
+Places = Mapping[str, NDArray[np.float64]]  # (scenes, 3) [m] by client, see `find_places`
 
 
 @dataclass(frozen=True)
@@ -56,6 +76,7 @@ class Called:
     group: Group
     samples: Mapping[str, Sequence[Any]]  # that its members train on, by client
     watch: GroupWatch
+    task: Task
     terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group
 
     @property
@@ -63,18 +84,18 @@ class Called:
         """Return the members that are vehicles."""
         return [*self.group.members]
 
-    def dissolve(self, folder: Path, before: Path, shown: Frames | None, most_rounds: int) -> Group:
-        """Return the group after its rounds, with what the network in `folder` does on what members held back.
+    def dissolve(self, folder: Path, before: Path, shown: Frames | None, most_rounds: int, ask: Ask) -> Group:
+        """Return the group after its rounds; members tell what the network in `folder` does on what they held back.
 
         Of the frames `shown` its score is told beside that of the network in the folder `before`.
         """
         if not self.group.members:
             return self.group
-        task, ended = self.watch.task, load_stage_network(self.watch.task, folder)
-        reached, scores = self.watch.measure(to_arrays(ended)), tuple[float, ...]()
+        ended, scores = load_stage_network(self.task, folder), tuple[float, ...]()
+        reached = read_losses(self.watch.hear(ask, to_arrays(ended), counted=False))
         if shown is not None:
-            networks = (load_stage_network(task, before), ended)
-            scores = tuple(score_network(task, each, shown.data, shown.vehicles) for each in networks)
+            networks = (load_stage_network(self.task, before), ended)
+            scores = tuple(score_network(self.task, each, shown.data, shown.vehicles) for each in networks)
         vehicles = {name: replace(each, after=reached.get(name)) for name, each in self.group.vehicles.items()}
         over = "the loss has levelled off" if self.watch.over else "the plan's rounds are over"
         losses = tuple(self.watch.losses)
@@ -92,69 +113,120 @@ def call_group(
     book: Ledger,
     most: int | None = None,
     poles: Sequence[int] = (),
+    deployed: "RegionalDeployment | None" = None,
 ) -> Called:
     """Return the group that a region's vehicles form, `most` of them by the plan; requests and offers enter `book`.
 
     Units on the `poles` join, if `how` says so, that are in range of one that asked; what they send crosses no radio.
+    Vehicles that are `deployed` answer there, and those whose FL requests wait in their fleet have asked.
 
     Who asks is there when the vehicle that errs most is first there. Raises `InputError` where pretraining has no loss,
     and `BudgetExceeded`.
     """
     learning = settings.learning.resolve()
     task, frozen = learning.task, load_stage_network(learning.task, work.inputs[inputs.pretrain])
-    weights, validated = to_arrays(frozen), Pretrained.load(work.inputs[inputs.pretrain]).validated
+    validated = Pretrained.load(work.inputs[inputs.pretrain]).validated
     if not validated:
         raise InputError("requests: vehicles ask by the loss at the end of pretraining, and there is no pretraining")
-    limit = how.excess * validated[-1].loss
-    clients = [name for name in sorted(samples) if len(samples[name])]
-    parts = {name: hold_back(len(samples[name]), how.held_back) for name in clients}
-    held = {name: Picked(samples[name], own) for name, (_, own) in parts.items()}
-    vehicles: dict[str, Checked] = {}
-    for name, own in held.items():
-        loss = measure_loss(task, frozen.config, weights, own, learning.batch) if len(own) else 0.0
-        vehicles[name] = Checked(len(own), loss, asks=loss > limit)
-    watch = GroupWatch(task, frozen.config, learning.batch, how, {})
-    asked = [name for name, own in vehicles.items() if own.asks]
-    if not asked:
-        return Called(Group(limit, vehicles, ""), {}, watch)
-    split, before = Frames.open(work.inputs[inputs.frames]), len(book.entries)
-    worst = max(asked, key=lambda name: vehicles[name].before)
-    scene, positions = find_positions(split, inputs.region, worst, clients)
-    placed = Placed.load(work.inputs[inputs.place])
-    present = [name for name in asked if name in positions]
-    lead = find_lead(positions, present, find_servers(split, placed, inputs), how.range_m)
-    where: Any = {"stage": EDGE, "task": task.name, "link": "wireless", "direction": "up"}
-    for name in present:
-        about = {"position": positions[name].astype(np.float32), "loss": np.array([vehicles[name].before], np.float32)}
-        send(book, pack(about), client=name, **where)
-    near = find_in_range(positions, present, how.range_m)
-    linked = find_linked(settings, learning, split, placed, scene, inputs.region, near, how.link_s)
-    stayed = {name: ABSENT for name in clients if name not in positions}
+    limit, split = how.excess * validated[-1].loss, Frames.open(work.inputs[inputs.frames])
+    places = find_places(split, inputs.region, [name for name in sorted(samples) if len(samples[name])])
+    members = make_members(learning, frozen, how, limit, samples, places)
+    with open_questions(members, deployed, Account(book, EDGE, task.name, "wireless")) as ask:
+        uplink, entered = Uplink(ask, book, task.name), len(book.entries)
+        vehicles = uplink.check([*members])
+        taken = take_requests(deployed, work.folder, [*members], task.name)
+        before = {name: own for name, own in taken.read().items() if name in vehicles}
+        vehicles |= {name: replace(vehicles[name], asks=True, told=own.loss) for name, own in before.items()}
+        asked = sorted((name for name, own in vehicles.items() if own.asks), key=lambda name: -vehicles[name].error)
+        if not asked:
+            return Called(Group(limit, vehicles, "", stayed=uplink.silent), {}, GroupWatch(how, {}), task)
+        scene = int(np.flatnonzero(np.isfinite(places[asked[0]]).all(axis=1))[0])
+        positions = {name: places[name][scene] for name in vehicles if np.isfinite(places[name][scene]).all()}
+        for name, own in before.items():
+            uplink.enter(name, *(message.encode() for message in taken.messages[name]))
+            positions[name] = np.array([own.x, own.y, positions[name][2] if name in positions else 0.0])
+        asking = [name for name in vehicles if name in asked and name in positions and name not in before]
+        positions |= uplink.hear(REQUEST, asking, read_position, {SCENE: np.array([scene])})
+        present = [name for name in vehicles if name in asked and name in positions and name not in uplink.silent]
+        if not present:
+            return Called(Group(limit, vehicles, "nobody", stayed=uplink.silent), {}, GroupWatch(how, {}), task)
+        placed = Placed.load(work.inputs[inputs.place])
+        lead = find_lead(positions, present, find_servers(split, placed, inputs), how.range_m)
+        near = find_in_range(positions, present, how.range_m)
+        linked = find_linked(settings, learning, split, placed, scene, inputs.region, near, how.link_s)
+        offers = uplink.hear(OFFER, linked, Offer.read)
+    stayed = {name: ABSENT for name in vehicles if name not in positions}
     stayed |= {name: SERVER_RANGE for name in positions if name not in near}
     stayed |= {name: NO_LINK for name in near if name not in linked}
-    offers = {}
-    for name in linked:
-        own = Picked(samples[name], parts[name][0])
-        client = TaskClient(task, frozen.config, own, batch=learning.batch)
-        seed = derive_seed(learning.seed, "offer")
-        sketch = sketch_gradient(find_gradient(client, weights, seed), seed)
-        offers[name] = Offer(len(own), count_labels(own), sketch)
-        send(book, offers[name].message(), client=name, **where)
+    stayed |= uplink.silent
     if not offers:
-        return Called(Group(limit, vehicles, lead, stayed=stayed), {}, watch)
-    asking = sorted((name for name in present if name in linked), key=lambda name: -vehicles[name].before)
-    chosen = choose_members(how, asking, weigh_offers(offers), stayed, most)
-    watch.held = {name: held[name] for name in chosen.members}
-    watch.note(weights)
-    sent = sum(entry.bytes for entry in book.entries[before:] if entry.direction == "up")
-    trained: dict[str, Sequence[Any]] = {name: Picked(samples[name], parts[name][0]) for name in chosen.members}
+        return Called(Group(limit, vehicles, lead, stayed=stayed), {}, GroupWatch(how, {}), task)
+    chosen = choose_members(how, [name for name in asked if name in offers], weigh_offers(offers), stayed, most)
+    answer_requests(deployed, taken, chosen.members)
+    held = {name: members[name] for name in chosen.members if len(members[name].held)}
+    watch = GroupWatch(how, held, [float(np.mean([vehicles[name].before for name in held])) if held else 0.0])
+    sent = sum(entry.bytes for entry in book.entries[entered:] if entry.direction == "up")
     units: dict[str, list[Sample]] = {}
     if how.roadside:
         there = find_units(split, inputs, poles, positions, present, how.range_m)
         spins = {(split.data.keys[i].scene, split.data.keys[i].index) for i in split.vehicles}
         units = label_roadside(split, there, spins, frozen.config, inputs.region)
     group = Group(limit, vehicles, lead, chosen.members, chosen.quality, chosen.stayed, sent, roadside=tuple(units))
-    return Called(group, trained | units, watch)
+    return Called(group, {name: members[name].data for name in chosen.members} | units, watch, task)
+
+
+def make_members(
+    learning: Learning, network: Any, how: Requests, limit: float, samples: Mapping[str, Sequence[Any]], places: Places
+) -> dict[str, Member]:
+    """Return the vehicles' parts in a group: each holds some of its samples back, and trains on the others."""
+    weights, seed, members = to_arrays(network), derive_seed(learning.seed, "offer"), dict[str, Member]()
+    for name, at in places.items():
+        trained, held = (Picked(samples[name], own) for own in hold_back(len(samples[name]), how.held_back))
+        about = learning.task, network.config, learning.batch, trained, held, weights
+        members[name] = Member(*about, limit, seed, at)
+    return members
+
+
+@dataclass(frozen=True)
+class Uplink:
+    """Uplink of a region's vehicles before a group: what they are asked, and the messages that they send."""
+
+    ask: Ask
+    book: Ledger
+    task: str
+    silent: dict[str, str] = field(default_factory=dict)  # by client why nothing is heard of it
+
+    def check(self, clients: Sequence[str]) -> dict[str, Checked]:
+        """Return the checks of clients: they are for the record, and no messages on the radio."""
+        replies, found = self.ask(CHECK, clients, counted=False), dict[str, Checked]()
+        for name, answer in replies.answers.items():
+            told: Any = answer
+            try:
+                found[name] = Checked(int(told[HELD][0]), float(told[LOSS][0]), asks=bool(told[ASKS][0]))
+            except (KeyError, IndexError, TypeError, ValueError) as error:
+                self.silent[name] = f"{UNREADABLE}: {error}"
+        self.silent.update(replies.missing)
+        return found
+
+    def hear(
+        self, question: str, clients: Sequence[str], read: Callable[[bytes], AnswerT], arrays: Weights = NOTHING
+    ) -> dict[str, AnswerT]:
+        """Return what `read` makes of the clients' messages, which enter the ledger."""
+        replies, found = self.ask(question, clients, arrays), dict[str, AnswerT]()
+        for name, answer in replies.answers.items():
+            message = answer.get(MESSAGE, np.zeros(0, np.uint8)).tobytes()
+            self.enter(name, message)
+            try:
+                found[name] = read(message)
+            except Unreadable as error:
+                self.silent[name] = f"{UNREADABLE}: {error}"
+        self.silent.update(replies.missing)
+        return found
+
+    def enter(self, client: str, *messages: bytes) -> None:
+        """Enter a client's messages; raises `BudgetExceeded`."""
+        for message in messages:
+            send(self.book, message, stage=EDGE, task=self.task, link="wireless", direction="up", client=client)
 
 
 def find_units(
@@ -172,18 +244,16 @@ def find_units(
     return [pole for pole in poles if f"pole{pole}" in near]
 
 
-def find_positions(
-    split: Frames, region: str, worst: str, clients: Sequence[str]
-) -> tuple[str, dict[str, NDArray[np.float64]]]:
-    """Return the first scene with the vehicle `worst`, and where (3,) [m] clients are when they are first in it."""
+def find_places(split: Frames, region: str, clients: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Return where (scenes, 3) [m] each client is when it is first in each scene of a split; NaN where it is not."""
     keys = split.data.keys
-    scene = next(keys[i].scene for i in split.vehicles if f"{region}/{keys[i].agent}" == worst)
-    found: dict[str, NDArray[np.float64]] = {}
+    scenes = {scene: number for number, scene in enumerate(dict.fromkeys(keys[i].scene for i in split.vehicles))}
+    found = {name: np.full((len(scenes), 3), np.nan) for name in clients}
     for i in split.vehicles:
-        name = f"{region}/{keys[i].agent}"
-        if keys[i].scene == scene and name in clients and name not in found:
-            found[name] = np.asarray(split.data.frame(i).world_from_agent[:3, 3], np.float64)
-    return scene, found
+        name, scene = f"{region}/{keys[i].agent}", scenes[keys[i].scene]
+        if name in found and np.isnan(found[name][scene, 0]):
+            found[name][scene] = split.data.world_from_agent(i)[:3, 3]
+    return found
 
 
 def find_servers(split: Frames, placed: Placed, inputs: RegionInputs) -> dict[str, NDArray[np.float64]]:
@@ -200,7 +270,7 @@ def find_linked(
     learning: Learning,
     split: Frames,
     placed: Placed,
-    scene: str,
+    scene: int,
     region: str,
     clients: Sequence[str],
     most_s: float,
@@ -209,8 +279,7 @@ def find_linked(
     network = settings.federation.network
     if network is None:
         return [*clients]
-    scenes = list(dict.fromkeys(split.data.keys[i].scene for i in split.vehicles))
-    links = link_scenes(split, placed, network, EVERY_SCENE, learning.seed)[scenes.index(scene)]
+    links = link_scenes(split, placed, network, EVERY_SCENE, learning.seed)[scene]
     bits = 8 * update_bytes(to_arrays(learning.build_network()), settings.federation.upload)
     rates = dict(zip(links.vehicle, links.rate_bps[0].max(axis=1).tolist(), strict=True))
     return [name for name in clients if bits <= most_s * rates.get(name.removeprefix(f"{region}/"), 0.0)]

@@ -8,7 +8,7 @@ from flcav.pipeline.engine import Work
 from flcav.pipeline.recipe import EDGE
 from flcav.pipeline.steps.regions import label_samples
 from flcav.pipeline.steps.settings import FederationSettings, RegionInputs, StepSettings
-from flcav.pipeline.training.groups import Picked
+from flcav.pipeline.training.members import Picked
 from flcav.pipeline.training.memory import Joined, divide_memory, spread_evenly
 
 NO_LIMIT = LinkMegabytes(1e9, 1e9)  # of messages that were sent, and counted, when their condition was there

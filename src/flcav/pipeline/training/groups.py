@@ -5,54 +5,29 @@ that it holds back from training. Where it errs, it sends a request. Whoever is 
 of its labels and a sketch of its gradient, by which the lead measures what the data add.
 """
 
-from collections import Counter
+import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from flcav.federation.trainable import Weights
+from flcav.federation.runtimes.link import Ask
+from flcav.federation.trainable import Trainable, Weights
 from flcav.network.ledger import Ledger
-from flcav.network.messages import from_names, pack, send
+from flcav.network.messages import send
 from flcav.optimization.quality import data_quality, gradient_novelty, label_distribution_distance, visible_objects
-from flcav.perception.client import TaskClient
-from flcav.perception.task import Task
-from flcav.perception.weights import from_arrays
 from flcav.pipeline.recipe import EDGE, Requests
-from flcav.statistics.streams import stream
+from flcav.pipeline.training.members import MESSAGE, SCORE, Member, Offer, Unreadable, read_loss
 
 Array = NDArray[np.float64]
 
-SKETCH = 64  # numbers
 SERVER_RANGE = "out of V2X range of whoever asked"
 ABSENT = "not in the town"
 NO_LINK = "no link to spare"
 NOT_NEEDED = "its data add less"
 FULL = "the group is full"
-
-
-@dataclass(frozen=True)
-class Offer:
-    """A vehicle's offer to a group."""
-
-    samples: int
-    labels: Mapping[str, int]  # their number by class
-    sketch: Array  # (SKETCH,) random projection of the gradient of its loss
-
-    def message(self) -> bytes:
-        """Return the offer as its bytes on the radio."""
-        counts = np.array([*self.labels.values()], np.int64)
-        return pack(
-            {
-                "samples": np.array([self.samples], np.int64),
-                "labels": from_names(self.labels),
-                "counts": counts,
-                "sketch": self.sketch.astype(np.float32),
-            }
-        )
 
 
 @dataclass(frozen=True)
@@ -62,59 +37,6 @@ class Chosen:
     members: tuple[str, ...]  # those that asked first
     quality: Mapping[str, float]
     stayed: Mapping[str, str]
-
-
-def hold_back(count: int, share: float) -> tuple[list[int], list[int]]:
-    """Return the places of `count` samples to train on, and of those held back: evenly spread, one of each at least.
-
-    Of a single sample nothing is held back.
-    """
-    held = min(max(round(share * count), 1), count - 1) if count > 1 else 0
-    places = {int((number + 0.5) * count / held) for number in range(held)}
-    return [i for i in range(count) if i not in places], sorted(places)
-
-
-def measure_loss(task: Task, config: Any, weights: Weights, samples: Sequence[Any], batch: int) -> float:
-    """Return the mean loss of a network on samples, which does not change it."""
-    network = task.build(config)
-    from_arrays(network, weights)
-    network.eval()
-    total = 0.0
-    with torch.no_grad():
-        for first in range(0, len(samples), batch):
-            part = [samples[place] for place in range(first, min(first + batch, len(samples)))]
-            total += float(task.loss(network, part)) * len(part)
-    return total / len(samples)
-
-
-def count_labels(samples: Sequence[Any]) -> dict[str, int]:
-    """Return the number of labels by class, where the task's samples have classes."""
-    counts: Counter[str] = Counter()
-    for number in range(len(samples)):
-        sample = samples[number]
-        label = getattr(sample, "label", None)
-        label = getattr(getattr(sample, "boxes", None), "label", ()) if label is None else label
-        counts.update(map(str, np.atleast_1d(np.asarray(label)).tolist()))
-    return dict(sorted(counts.items()))
-
-
-def find_gradient(client: TaskClient, weights: Weights, seed: int) -> Weights:
-    """Return the gradient of a client's loss on one batch, at `weights`."""
-    return client.train(weights, steps=1, learning_rate=1e-9, seed=seed, shift={}).gradient
-
-
-def sketch_gradient(gradient: Weights, seed: int) -> Array:
-    """Return a random projection (SKETCH,) of a gradient.
-
-    Projections of all clients by one seed keep the angles between their gradients up to some 1 / sqrt(SKETCH).
-    """
-    sketch = np.zeros(SKETCH)
-    for name, array in gradient.items():
-        flat = np.asarray(array, np.float64).ravel()
-        draws = stream(seed, "sketch", name)
-        for row in range(SKETCH):
-            sketch[row] += float(flat @ draws.standard_normal(flat.size))
-    return sketch
 
 
 def weigh_offers(offers: Mapping[str, Offer]) -> dict[str, float]:
@@ -186,21 +108,6 @@ def has_levelled(losses: Sequence[float], how: Requests) -> bool:
     return min(losses[-how.patience :]) > best - how.least_gain * abs(best)
 
 
-class Picked(Sequence[Any]):
-    """Some of a vehicle's samples, by their places."""
-
-    def __init__(self, samples: Sequence[Any], places: Sequence[int]) -> None:
-        self._samples, self._places = samples, tuple(places)
-
-    def __len__(self) -> int:
-        return len(self._places)
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self._samples[place] for place in self._places[index]]
-        return self._samples[self._places[index]]
-
-
 class Levelled(Exception):
     """The loss of a group has levelled off: it dissolves."""
 
@@ -209,35 +116,43 @@ class Levelled(Exception):
 class GroupWatch:
     """Watch over a group's loss on what its members hold back, round by round."""
 
-    task: Task
-    config: Any
-    batch: int
     how: Requests
-    held: Mapping[str, Sequence[Any]]  # of the members, by client
+    members: Mapping[str, Member]  # that hold something back, by client
     losses: list[float] = field(default_factory=list)  # before the first round, and after each
 
-    def measure(self, weights: Weights) -> dict[str, float]:
-        """Return the loss of each member that holds samples back."""
-        return {
-            name: measure_loss(self.task, self.config, weights, own, self.batch)
-            for name, own in self.held.items()
-            if len(own)
-        }
+    def enlist(self, clients: Mapping[str, Trainable]) -> dict[str, Trainable]:
+        """Return the clients of a group's rounds, whose members answer questions as well."""
+        members = {name: replace(own, client=clients[name]) for name, own in self.members.items()}
+        return {name: members.get(name, own) for name, own in clients.items()}
 
-    def note(self, weights: Weights) -> None:
-        """Note the mean loss of the members."""
-        found = self.measure(weights)
-        self.losses.append(float(np.mean([*found.values()])) if found else 0.0)
+    def hear(self, ask: Ask, weights: Weights, *, counted: bool = True) -> dict[str, bytes]:
+        """Return the messages by which members tell the loss of a network."""
+        replies = ask(SCORE, [*self.members], weights, counted=counted)
+        return {name: answer[MESSAGE].tobytes() for name, answer in replies.answers.items() if MESSAGE in answer}
 
-    def tell(self, book: Ledger, round_: int) -> None:
-        """Enter the members' messages of their losses after a round; raises `BudgetExceeded`."""
-        message = pack({"loss": np.zeros(1, np.float32)})
-        for name, own in self.held.items():
-            if len(own):
-                about: Any = {"stage": EDGE, "task": self.task.name, "link": "wireless", "direction": "up"}
-                send(book, message, client=name, round_=round_, **about)
+    def note(self, messages: Mapping[str, bytes]) -> None:
+        """Note the mean loss that members tell; where nobody does, that of the round before."""
+        told = [*read_losses(messages).values()]
+        self.losses.append(float(np.mean(told)) if told else self.losses[-1])
+
+    def follow(self, book: Ledger, number: int, weights: Weights, ask: Ask) -> None:
+        """Note the loss after a round; the members' messages enter `book`. Raises `BudgetExceeded`."""
+        messages = self.hear(ask, weights)
+        self.note(messages)
+        for name, message in messages.items():
+            about: Any = {"stage": EDGE, "task": self.members[name].task.name, "link": "wireless", "direction": "up"}
+            send(book, message, client=name, round_=number, **about)
 
     @property
     def over(self) -> bool:
         """Return whether the loss has levelled off; that of members who hold nothing back never does."""
-        return any(len(own) for own in self.held.values()) and has_levelled(self.losses, self.how)
+        return bool(self.members) and has_levelled(self.losses, self.how)
+
+
+def read_losses(messages: Mapping[str, bytes]) -> dict[str, float]:
+    """Return the losses in messages, by client; those that cannot be read are left out."""
+    found: dict[str, float] = {}
+    for name, message in messages.items():
+        with contextlib.suppress(Unreadable):
+            found[name] = read_loss(message)
+    return found
