@@ -52,6 +52,7 @@ class Target(StrEnum):
     lifelong = "lifelong"
     networks = "networks"
     placement = "placement"
+    redundant_tasks = "redundant-tasks"
     road_average = "road-average"
     road_detector = "road-detector"
     safety_distance = "safety-distance"
@@ -98,7 +99,11 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
 }
 SEEDS: Mapping[str, int] = {
     **dict.fromkeys(
-        (Target.corner_cases, Target.demo_arms, Target.failure_search, Target.lifelong, *EXCHANGES, *DRIVES), 5
+        (
+            *(Target.corner_cases, Target.demo_arms, Target.failure_search, Target.lifelong, Target.redundant_tasks),
+            *(*EXCHANGES, *DRIVES),
+        ),
+        5,
     ),
     **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
     Target.federation_groups: 10,
@@ -128,7 +133,8 @@ def reproduce(
         "--seeds",
         min=1,
         help="Number of seeds, from 1: 10 of federation-groups, 8 of federation-exchange and placement, 5 of "
-        "corner-cases, demo-arms, failure-search, lifelong and the other federation-*, 3 of the others if not given.",
+        "corner-cases, demo-arms, failure-search, lifelong, redundant-tasks and the other federation-*, 3 of the "
+        "others if not given.",
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."
@@ -316,6 +322,17 @@ def _networks(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, 
     _write_figures(out, results.as_json(), {"networks.png": draw_networks(results)}, results.sentences())
 
 
+@when_interrupted()
+def _redundant_tasks(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
+    from flcav.cli.steps import live_steps
+    from flcav.experiments.redundant_tasks.run import compare_splits
+
+    with live_steps(Target.redundant_tasks.value) as notify:
+        how: Any = {"jobs": jobs, "notify": notify, "stale": stale, "engine": engine}
+        results = compare_splits(out, seeds=range(1, seeds + 1), quick=scale != "paper", **how)
+    _write_figures(out, results.as_json(), {"splits.png": results.picture()}, results.sentences())
+
+
 def _federation_exchange(
     target: Target, out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale
 ) -> None:
@@ -400,6 +417,7 @@ COMPARISONS: Mapping[str, Callable[[Path, int, str, int, EngineName, Stale], Non
     Target.lifelong: _lifelong,
     Target.networks: _networks,
     Target.placement: _placement,
+    Target.redundant_tasks: _redundant_tasks,
     Target.safety_distance: _safety_distance,
 }
 
