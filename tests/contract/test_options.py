@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from flcav.cli.main import app, run
-from flcav.cli.reproduce import DRIVES, RECORDED, TARGETS
+from flcav.cli.reproductions.targets import DRIVES, RECORDED, TARGETS
 from flcav.config import InputError
 from flcav.dataset.formats.formats import EXPORTS, IMPORTS
 from flcav.perception.errors import RegistersErrors
