@@ -1,6 +1,7 @@
 """Kept drives, who is hidden, messages of poles, weights in problems and recipes: driving without a loop."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from flcav.cli.importance import set_weights
+from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.driving import jobs as driven
 from flcav.driving.errors import CLASSES, load_errors
@@ -18,6 +20,7 @@ from flcav.driving.networks import load_roads
 from flcav.driving.road import fuse, pack_tracks
 from flcav.driving.scenarios import list_scenarios
 from flcav.driving.seen import TIMES_S
+from flcav.driving.studies import importance
 from flcav.driving.studies.error_measurement import Tally, summarise
 from flcav.driving.studies.hidden import Hidden, find_hidden, summarise_hidden
 from flcav.driving.studies.pole_gain import FusionTally, PoleGain, Precision, measure_precision
@@ -56,6 +59,26 @@ def test_kept_drives_are_not_driven_again(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(pytest.fail.Exception):
         run_jobs([first, second], sensed, kept=kept)
     assert first.key(sensed) != first.key(Sensed("networks")) != replace(first, task="signs").key(sensed)
+
+
+@pytest.mark.parametrize(
+    "command", [["drive", "--scenario", "grid-none-clear"], ["odd", "importance", "--scenarios", "1"]]
+)
+def test_seeds_begin_with_the_first(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[int] = []
+
+    def drive_none(jobs: Sequence[Job], *_: object) -> list[Drive]:
+        asked.extend(job.seed for job in jobs)
+        return [replace(DRIVE, seed=job.seed) for job in jobs]
+
+    for module in (driven, importance):
+        monkeypatch.setattr(module, "run_jobs", drive_none)
+    with pytest.raises(SystemExit) as ended:
+        run([*command, "--seeds", "2", "--first-seed", "5"])
+    assert ended.value.code == 0, capsys.readouterr().err
+    assert list(dict.fromkeys(asked)) == [5, 6]
 
 
 def test_weights_go_into_problems_and_recipes() -> None:
