@@ -44,6 +44,8 @@ from flcav.experiments.networks.run import NetworksResult
 from flcav.experiments.networks.tables import networks_tables
 from flcav.experiments.placement import tables as placement_tables
 from flcav.experiments.placement.run import PlacementProof
+from flcav.experiments.redundant_tasks.run import RedundantTasksResult
+from flcav.experiments.redundant_tasks.tables import redundant_tasks_tables
 from flcav.experiments.roadside import tables as roadside_tables
 from flcav.experiments.roadside.average import RoadAverageResult
 from flcav.experiments.roadside.detector import RoadDetectorResult
@@ -97,6 +99,7 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "leakage": _told(LeakageResult, attack_tables.leakage_tables),
     "networks": _told(NetworksResult, networks_tables),
     "placement": _told(PlacementProof, placement_tables.tables),
+    "redundant-tasks": _told(RedundantTasksResult, redundant_tasks_tables),
     "road-average": _told(RoadAverageResult, roadside_tables.average_tables),
     "road-detector": _told(RoadDetectorResult, roadside_tables.detector_tables),
     "safety-distance": _told(SafetyDistance, safety_tables),

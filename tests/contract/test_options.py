@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from flcav.cli.main import app, run
-from flcav.cli.reproduce import DRIVES, RECORDED, TARGETS
+from flcav.cli.reproductions.targets import DRIVES, RECORDED, TARGETS
 from flcav.config import InputError
 from flcav.dataset.formats.formats import EXPORTS, IMPORTS
 from flcav.perception.errors import RegistersErrors
@@ -165,14 +165,14 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     ),
     "drive": dict.fromkeys(
         (
-            *("--scenario", "--seeds", "--perception", "--errors", "--lasts", "--margin", "--sigmas"),
+            *("--scenario", "--seeds", "--first-seed", "--perception", "--errors", "--lasts", "--margin", "--sigmas"),
             *("--pole", "--measure", "--jobs"),
         ),
         ALWAYS,
     ),
     "odd importance": dict.fromkeys(
         (
-            *("--scenarios", "--seeds", "--perception", "--errors", "--lasts", "--coupling", "--weigh"),
+            *("--scenarios", "--seeds", "--first-seed", "--perception", "--errors", "--lasts", "--coupling", "--weigh"),
             *("--keep", "--jobs"),
         ),
         ALWAYS,

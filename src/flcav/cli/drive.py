@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.importance import ERRORS, Perceives, read_model
+from flcav.cli.importance import ERRORS, FIRST_SEED, Perceives, read_model
 from flcav.cli.options import JOBS, check_finite, refuse_unused
 from flcav.cli.terminal import print_json
 from flcav.interface.wording import plural
@@ -19,7 +19,8 @@ def drive(
     scenario: list[str] = typer.Option(
         [], "--scenario", help="Name of a scenario; may be given several times. By default all of the package."
     ),
-    seeds: int = typer.Option(1, "--seeds", min=1, max=100, help="Seeds of each, from 1."),
+    seeds: int = typer.Option(1, "--seeds", min=1, max=100, help="Seeds of each."),
+    first_seed: int = FIRST_SEED,
     perception: Perceives = typer.Option(
         Perceives.truth, "--perception", help="truth: ground truth; model: the networks' errors; networks: themselves."
     ),
@@ -58,7 +59,7 @@ def drive(
     from flcav.interface.progress import show_progress
     from flcav.storage.files import check_writable, write_json
 
-    chosen, numbers = find_scenarios(scenario), range(1, seeds + 1)
+    chosen, numbers = find_scenarios(scenario), range(first_seed, first_seed + seeds)
     for option, given in (("--pole", bool(pole)), ("--measure", measure is not None)):
         if given and perception != Perceives.networks:
             raise InputError(f"{option}: needs --perception networks, since sensors are simulated")

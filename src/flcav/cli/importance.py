@@ -40,6 +40,7 @@ PERCEPTION = typer.Option(
 ERRORS = typer.Option(
     None, "--errors", help="JSON of the errors of networks, of `flcav drive --measure`; by default the package's."
 )
+FIRST_SEED = typer.Option(1, "--first-seed", min=0, help="The first seed.")
 LASTS = typer.Option(12.0, "--lasts", min=1.0, max=600.0, callback=check_finite, help="Length of a drive [s].")
 
 
@@ -50,7 +51,8 @@ def register(group: typer.Typer) -> None:
 
 def importance(
     scenarios: int = typer.Option(20, "--scenarios", min=1, max=32, help="How many scenarios, of all towns in turn."),
-    seeds: int = typer.Option(3, "--seeds", min=1, max=100, help="Seeds of each, from 1."),
+    seeds: int = typer.Option(3, "--seeds", min=1, max=100, help="Seeds of each."),
+    first_seed: int = FIRST_SEED,
     perception: Perceives = PERCEPTION,
     errors: Path | None = ERRORS,
     lasts: float = LASTS,
@@ -89,7 +91,7 @@ def importance(
         check_writable(out.parent)
     sensed = Sensed(perception.value, read_model(perception, errors))
     with show_progress("importance") as report:
-        chosen, numbers = spread_scenarios(scenarios), range(1, seeds + 1)
+        chosen, numbers = spread_scenarios(scenarios), range(first_seed, first_seed + seeds)
         found = measure_importance(
             chosen, numbers, sensed, read_reached(), lasts_s=lasts, processes=jobs, progress=report, kept=keep
         )

@@ -1,6 +1,7 @@
 """Kept drives, who is hidden, messages of poles, weights in problems and recipes: driving without a loop."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from flcav.cli.importance import set_weights
+from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.driving import jobs as driven
 from flcav.driving.errors import CLASSES, load_errors
@@ -18,15 +20,17 @@ from flcav.driving.networks import load_roads
 from flcav.driving.road import fuse, pack_tracks
 from flcav.driving.scenarios import list_scenarios
 from flcav.driving.seen import TIMES_S
+from flcav.driving.studies import importance
 from flcav.driving.studies.error_measurement import Tally, summarise
 from flcav.driving.studies.hidden import Hidden, find_hidden, summarise_hidden
-from flcav.driving.studies.pole_gain import PoleGain
+from flcav.driving.studies.pole_gain import FusionTally, PoleGain, Precision, measure_precision
 from flcav.geometry import Boxes, left_vectors
 from flcav.network.messages import unpack
 from flcav.optimization.problem import Problem
 from flcav.perception.networks import resolve_network
 from flcav.perception.tracking.tracker import Tracker
 from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.statistics.estimates import Estimate
 from flcav.world.map.roads import read_net
 from flcav.world.map.routes import draw_route
 from flcav.world.map.town import load_town
@@ -55,6 +59,26 @@ def test_kept_drives_are_not_driven_again(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(pytest.fail.Exception):
         run_jobs([first, second], sensed, kept=kept)
     assert first.key(sensed) != first.key(Sensed("networks")) != replace(first, task="signs").key(sensed)
+
+
+@pytest.mark.parametrize(
+    "command", [["drive", "--scenario", "grid-none-clear"], ["odd", "importance", "--scenarios", "1"]]
+)
+def test_seeds_begin_with_the_first(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[int] = []
+
+    def drive_none(jobs: Sequence[Job], *_: object) -> list[Drive]:
+        asked.extend(job.seed for job in jobs)
+        return [replace(DRIVE, seed=job.seed) for job in jobs]
+
+    for module in (driven, importance):
+        monkeypatch.setattr(module, "run_jobs", drive_none)
+    with pytest.raises(SystemExit) as ended:
+        run([*command, "--seeds", "2", "--first-seed", "5"])
+    assert ended.value.code == 0, capsys.readouterr().err
+    assert list(dict.fromkeys(asked)) == [5, 6]
 
 
 def test_weights_go_into_problems_and_recipes() -> None:
@@ -150,13 +174,35 @@ def test_the_gain_of_poles_is_told_with_paired_differences() -> None:
         return Drive(name, 1, 10.0, 0.5, 5.0, ttc, 0.0, 0, 0, (hit,) * hits, 0.5)
 
     without, with_poles = [driven("a", 1.0, 1), driven("b", 2.0)], [driven("a", 1.5), driven("b", 2.5)]
-    gain = PoleGain((1, 3), Hidden(0, None, None, None), 0.5, 0.75, 0.1, tuple(without), tuple(with_poles))
+    precision = Precision(Estimate(0.5, None, None), Estimate(0.75, None, None), Estimate(0.25, 0.1, 0.4))
+    gain = PoleGain((1, 3), Hidden(0, None, None, None), precision, 0.1, tuple(without), tuple(with_poles))
     told = gain.lines()
-    assert told[1] == "AP of the vehicle alone 0.500, with the poles 0.750"
+    assert told[1].endswith(" 0.500, with the poles 0.750, with less without +0.250 (+0.100 to +0.400)")
     assert "without poles: least time to collision 1.50 s" in told[2]
     assert "1 collisions at fault" in told[2]
     assert "least time to collision [s] +0.500 (+0.500 to +0.500)" in told[4]
+    assert "collisions at fault -0.500 (-1.000 to +0.000)" in told[4]
     assert len(replace(gain, without=tuple(without[:1]), with_poles=tuple(with_poles[:1])).lines()) == len(told) - 1
+
+
+def test_precision_with_poles_is_of_the_same_looks_with_intervals_over_scenarios() -> None:
+    """In `a` poles add a car that the vehicle misses; in `b`, which has twice the looks, they add nothing."""
+    both, one = scored(cars((10, 0), (20, 0))), scored(cars((10, 0)))
+    tally = FusionTally(["a", "b", "b"], [one, both, both], [both, both, both], [cars((10, 0), (20, 0))] * 3)
+    found = measure_precision(tally)
+    assert found is not None
+    recalls = np.floor(40 * 5 / 6) / 40  # AP|R40 of detections without a false positive: the recalls that are reached
+    assert found.vehicle.mean == pytest.approx(recalls)
+    assert (found.fused.mean, found.gain.mean) == pytest.approx((1.0, 1.0 - recalls))
+    assert (found.gain.low, found.gain.high) == pytest.approx((0.0, 0.5))  # of b alone, and of a alone
+    alone = measure_precision(FusionTally(["a"], [one], [both], [cars((10, 0), (20, 0))]))
+    assert alone is not None
+    assert (alone.gain.mean, alone.gain.low) == (pytest.approx(0.5), None)
+    assert measure_precision(FusionTally(["a"], [one], [one], [Boxes.empty()])) is None
+
+
+def scored(boxes: Boxes) -> Boxes:
+    return replace(boxes, score=np.full(len(boxes), 0.8))
 
 
 def standing(places: list[tuple[float, float, float]]) -> Trace:

@@ -1,6 +1,6 @@
 """The gain of poles while driving: who is hidden, AP of vehicle and road together, and drives with and without them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,15 +17,24 @@ from flcav.driving.studies.importance import paired_difference
 from flcav.driving.visibility import FIELD_M
 from flcav.geometry import Boxes, rotate
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.metrics.average_precision import average_precision
+from flcav.perception.metrics.average_precision import weighted_precision
 from flcav.perception.metrics.matching import match
+from flcav.statistics.bootstrap import bootstrap_over_scenes
+from flcav.statistics.estimates import Estimate
+from flcav.statistics.streams import stream
 from flcav.storage.records import Record
 from flcav.world.snapshot import Snapshot
 
 Array = NDArray[np.float64]
 
 RANGE_M = 40.0  # of a pole's sensor
-GAINS = {"least_ttc_s": "least time to collision [s]", "score": "driving score"}
+GAINS = {
+    "least_ttc_s": "least time to collision [s]",
+    "near_share": "share of time below 1.5 s to collision",
+    "faults": "collisions at fault",
+    "hard_brakes": "hard brakes",
+    "score": "driving score",
+}
 OVERLAP = 0.3  # bird's-eye IoU of a found car: what braking needs, when boxes are half a second old
 
 
@@ -33,6 +42,7 @@ OVERLAP = 0.3  # bird's-eye IoU of a found car: what braking needs, when boxes a
 class FusionTally:
     """What vehicle and poles find of the cars around, look by look."""
 
+    scenario: list[str] = field(default_factory=list)
     own: list[Boxes] = field(default_factory=list)
     fused: list[Boxes] = field(default_factory=list)
     targets: list[Boxes] = field(default_factory=list)
@@ -46,7 +56,7 @@ class Cooperative:
     def __init__(self, staged: Staged, seed: int, poles: Sequence[int], tally: FusionTally) -> None:
         self._units = RoadUnits(staged.town, poles, seed)
         self._networks = NetworkPerception(staged, seed, road=self._units)
-        self._tally, self._looked_s = tally, -SPIN_S
+        self._scenario, self._tally, self._looked_s = staged.scenario.name, tally, -SPIN_S
 
     def look(self, snapshot: Snapshot) -> Seen:
         """Return what is found at this instant."""
@@ -57,6 +67,7 @@ class Cooperative:
             sites = list(self._units.sites.values())
             targets, hidden = find_hidden(self._networks.scene, own, sites, RANGE_M)
             place = (*snapshot.trace.position[0, own, :2].tolist(), float(snapshot.trace.yaw[0, own]))
+            self._tally.scenario.append(self._scenario)
             self._tally.own.append(keep_in_field(self._networks.own, place))
             self._tally.fused.append(keep_in_field(self._networks.found, place))
             self._tally.targets.append(targets)
@@ -73,13 +84,46 @@ def keep_in_field(boxes: Boxes, place: tuple[float, float, float]) -> Boxes:
 
 
 @dataclass(frozen=True)
+class Precision(Record):
+    """AP of the cars in the vehicle's field, hidden ones too, with intervals over scenarios."""
+
+    vehicle: Estimate  # alone
+    fused: Estimate  # with what poles send
+    gain: Estimate  # of the second over the first, of the same looks
+
+    def line(self) -> str:
+        """Return it in words."""
+        both = f"{self.vehicle.describe()}, with the poles {self.fused.describe()}"
+        return f"AP of the vehicle alone {both}, with less without {self.gain.describe(sign=True)}"
+
+
+def measure_precision(tally: FusionTally) -> Precision | None:
+    """Return AP of the vehicle alone and with poles by the looks of a tally; None where there are no cars."""
+    if not sum(map(len, tally.targets)):
+        return None
+    none = [Boxes.empty()] * len(tally.targets)
+    own, fused = (match(each, tally.targets, none, OVERLAP, "bev") for each in (tally.own, tally.fused))
+
+    def estimate(measure: Callable[[NDArray[np.int64]], Array]) -> Estimate:
+        value = float(measure(np.ones((1, len(none)), np.int64))[0])
+        if len(set(tally.scenario)) < 2:
+            return Estimate(value, None, None)
+        return Estimate(value, *bootstrap_over_scenes(measure, tally.scenario, rng=stream(0, "poles")))
+
+    return Precision(
+        estimate(lambda times: weighted_precision(own, times)),
+        estimate(lambda times: weighted_precision(fused, times)),
+        estimate(lambda times: weighted_precision(fused, times) - weighted_precision(own, times)),
+    )
+
+
+@dataclass(frozen=True)
 class PoleGain(Record):
     """What poles give while driving, over the same drives with and without them."""
 
     poles: tuple[int, ...]
     hidden: Hidden
-    ap_vehicle: float | None  # of all cars in the field, hidden ones too; None where there are none
-    ap_fused: float | None
+    precision: Precision | None  # None where there are no cars
     latency_s: float | None  # mean age of a message on arrival; None where none arrived
     without: tuple[Drive, ...]
     with_poles: tuple[Drive, ...]
@@ -87,8 +131,8 @@ class PoleGain(Record):
     def lines(self) -> list[str]:
         """Return the gain in words."""
         lines = self.hidden.lines()
-        if self.ap_vehicle is not None and self.ap_fused is not None:
-            lines.append(f"AP of the vehicle alone {self.ap_vehicle:.3f}, with the poles {self.ap_fused:.3f}")
+        if self.precision is not None:
+            lines.append(self.precision.line())
         late = "no message arrived" if self.latency_s is None else f"messages are {self.latency_s:.3f} s old on arrival"
         for name, drives in (("without poles", self.without), ("with poles", self.with_poles)):
             ttc, near = (
@@ -121,10 +165,6 @@ def measure_pole_gain(
         without.append(drive(scenario, seed, NetworkPerception, loop))
         with_poles.append(drive(scenario, seed, lambda staged, own: Cooperative(staged, own, poles, tally), loop))
         progress(done, len(pairs), scenario.name)
-    none = [Boxes.empty()] * len(tally.targets)
-    ap = [average_precision(match(each, tally.targets, none, OVERLAP, "bev")) for each in (tally.own, tally.fused)]
-    vehicle, fused = (None if np.isnan(each) else float(each) for each in ap)
     late = float(np.mean(tally.latency_s)) if tally.latency_s else None
-    return PoleGain(
-        tuple(poles), summarise_hidden(tally.hidden), vehicle, fused, late, tuple(without), tuple(with_poles)
-    )
+    hidden, precision = summarise_hidden(tally.hidden), measure_precision(tally)
+    return PoleGain(tuple(poles), hidden, precision, late, tuple(without), tuple(with_poles))

@@ -1,0 +1,1 @@
+"""`flcav reproduce`: its targets, and what it does for each."""

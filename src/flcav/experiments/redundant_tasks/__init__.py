@@ -1,0 +1,1 @@
+"""Redundant tasks: as many as scenarios are complex, against an even split."""

@@ -1,0 +1,172 @@
+"""Redundant tasks: as many as scenarios are complex against an even split, for the same bytes of uplink.
+
+Redundant are the tasks of a scenario beyond its first: other vehicles with the same labels and network. All splits have
+as many tasks, thus as many updates by radio. By complexity they are in proportion to the number that the rule of
+`flcav.odd.tasks` gives each scenario; reversed, the least complex has the most.
+
+Expected, before any run: the most complex scenario gains .01 to .03 AP50 by its further tasks, and the least complex
+loses as much, so that the mean of the scenarios moves by less than .01 and five seeds do not tell it from none.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.experiments.redundant_tasks.scenarios import (
+    EVEN,
+    FULL,
+    REVERSED,
+    RULE,
+    SPLITS,
+    TOY,
+    Size,
+    TriedScenario,
+    list_recordings,
+    outcomes_file,
+    try_splits,
+)
+from flcav.experiments.splits import record_split
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.outcomes import Outcomes, Times, Values
+from flcav.pipeline.engine import Notify, Step, run_steps
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.report import style
+from flcav.report.charts.studies import Bar, precisions
+from flcav.statistics.bootstrap import share_scenes
+from flcav.statistics.seeds import OWN_SCENES, MeanOverSeeds, mean_over_seeds
+from flcav.statistics.streams import stream
+from flcav.statistics.verdicts import describe_means
+from flcav.storage.records import Record, from_json
+
+PRETRAINED_ONLY = "pretrained, no tasks"
+ALL, MOST, LEAST = "mean of the scenarios", "the most complex", "the least complex"
+SCORES = (ALL, MOST, LEAST)
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A test of a scenario's network, and its weight in a score."""
+
+    outcomes: Outcomes
+    weight: float
+    town: str
+
+
+@dataclass(frozen=True)
+class RedundantTasksResult(Record):
+    """Accuracy of each split over seeds, and differences to the even one."""
+
+    seeds: Mapping[str, tuple[TriedScenario, ...]]  # by seed, the most complex first
+    ap50: Mapping[str, Mapping[str, MeanOverSeeds]]  # by score and split
+    differences: Mapping[str, MeanOverSeeds]  # to the even split, in words
+    up_mb: Mapping[str, float]  # uplink of a seed by split, mean over seeds
+    provenance: Provenance
+
+    def sentences(self) -> list[str]:
+        """Return the uplink and the differences in words."""
+        sent = ", ".join(f"{split} {mb:.2f} MB" for split, mb in self.up_mb.items())
+        return [f"uplink: {sent}", *describe_means(self.differences)]
+
+    def picture(self) -> bytes:
+        """Return AP50 of each split by score, a dot per seed, as a PNG."""
+        panels = {
+            score: [Bar(split, mean.mean, self.scores_of(split, score)) for split, mean in of.items()]
+            for score, of in self.ap50.items()
+        }
+        return style.png(precisions(panels, "AP50"))
+
+    def scores_of(self, split: str, score: str) -> tuple[float, ...]:
+        """Return the score of a split by seed."""
+        return tuple(
+            sum(weight * own.ap50[str(count)] for own, count, weight in choose(tried, split, score))
+            for tried in self.seeds.values()
+        )
+
+
+def compare_splits(
+    out: Path, *, seeds: Sequence[int], quick: bool, jobs: int, notify: Notify, stale: str, engine: str
+) -> RedundantTasksResult:
+    """Run or finish the study in the folder `out`; `quick` is a smoke test of few frames and steps."""
+    steps = list_steps(seeds, TOY if quick else FULL)
+    values = run_steps(steps, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
+    tried = {
+        str(seed): from_json(tuple[TriedScenario, ...], values[name_step(seed)], name_step(seed)) for seed in seeds
+    }
+    return summarise(tried, {seed: out / name_step(int(seed)) for seed in tried})
+
+
+def list_steps(seeds: Sequence[int], size: Size) -> list[Step]:
+    """Return the steps: recordings, and the trainings and tests of each seed."""
+    recordings = list_recordings(size)
+    steps = [Step(name, record_split, {"recipe": fields}) for name, fields in recordings.items()]
+    each = [Step(name_step(seed), try_splits, {"seed": seed, "size": size}, (*recordings,)) for seed in seeds]
+    return [*steps, *each]
+
+
+def name_step(seed: int) -> str:
+    """Return the name of the step of a seed."""
+    return f"seed{seed}"
+
+
+def choose(tried: Sequence[TriedScenario], split: str, score: str) -> list[tuple[TriedScenario, int, float]]:
+    """Return the scenarios of a score, the tasks of each by the split, and its weight."""
+    chosen = {ALL: tried, MOST: tried[:1], LEAST: tried[-1:]}[score]
+    return [(own, own.tasks.get(split, 0), 1 / len(chosen)) for own in chosen]
+
+
+def summarise(tried: Mapping[str, tuple[TriedScenario, ...]], folders: Mapping[str, Path]) -> RedundantTasksResult:
+    """Return means over seeds, which share the test's scenes; the folders hold the outcomes of each seed."""
+
+    def tests(seed: str, split: str, score: str, sign: float = 1.0) -> list[Weighed]:
+        return [
+            Weighed(Outcomes.load(outcomes_file(folders[seed], own.town, own.kind, count)), sign * weight, own.town)
+            for own, count, weight in choose(tried[seed], split, score)
+        ]
+
+    def accuracy(split: str, score: str) -> MeanOverSeeds:
+        return mean_score([tests(seed, split, score) for seed in tried], share=True)
+
+    def difference(split: str, score: str) -> MeanOverSeeds:
+        return mean_score([[*tests(seed, split, score), *tests(seed, EVEN, score, -1.0)] for seed in tried])
+
+    return RedundantTasksResult(
+        seeds=tried,
+        ap50={score: {split: accuracy(split, score) for split in (PRETRAINED_ONLY, *SPLITS)} for score in SCORES},
+        differences={
+            f"{split} - {EVEN}, {score}": difference(split, score) for split in (RULE, REVERSED) for score in SCORES
+        },
+        up_mb={
+            split: float(np.mean([sum(own.up_mb[str(own.tasks[split])] for own in each) for each in tried.values()]))
+            for split in SPLITS
+        },
+        provenance=provenance(),
+    )
+
+
+def mean_score(seeds: Sequence[Sequence[Weighed]], *, share: bool = False) -> MeanOverSeeds:
+    """Return the mean over seeds of the weighted sum of the AP50 of tests, with the spread by the scenes they share."""
+    values = [float(weigh_tests(each, np.ones((1, count_frames(each)), np.int64))[0]) for each in seeds]
+    if len(seeds) == 1:
+        return mean_over_seeds(values, shared=OWN_SCENES, share=share)
+    scenes = [[f"{test.town}/{scene}" for test in each for scene in test.outcomes.scene] for each in seeds]
+    spread = share_scenes([partial(weigh_tests, each) for each in seeds], scenes, rng=stream(0, "scenes"))
+    return mean_over_seeds(values, shared=spread, share=share)
+
+
+def weigh_tests(tests: Sequence[Weighed], times: Times) -> Values:
+    """Return (n,) the weighted sum of AP50, for each of n resamples of the frames of all tests, one after another."""
+    ends = np.cumsum([len(test.outcomes.scene) for test in tests])
+    parts: list[NDArray[np.int64]] = np.split(times, ends[:-1], axis=1)
+    return sum(
+        (test.weight * OBJECTS.measure(test.outcomes, part) for test, part in zip(tests, parts, strict=True)),
+        np.zeros(len(times)),
+    )
+
+
+def count_frames(tests: Sequence[Weighed]) -> int:
+    """Return the number of frames of all tests."""
+    return sum(len(test.outcomes.scene) for test in tests)
