@@ -9,6 +9,7 @@ import pytest
 from release_parties import ALL, Parties
 
 from flcav.config import InputError
+from flcav.federation.messages.release_report import ShadowReport
 from flcav.geometry import Boxes
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger, LinkMegabytes
@@ -18,7 +19,7 @@ from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS, read_candida
 from flcav.releases.repositories.directive import Directive, is_assigned
 from flcav.releases.repositories.repository import publish
 from flcav.releases.rollout.delivery import deliver
-from flcav.releases.rollout.shadow import ShadowReport, count_agreed, judge_shadows
+from flcav.releases.rollout.shadow import count_agreed, judge_shadows
 from flcav.releases.rollout.stages import STAGES, change_share, next_share, read_directive, roll_back
 from flcav.storage.files import sha256
 
