@@ -41,6 +41,7 @@ FOLDER, DRIVE, SHADOW = "releases", "drive.json", "shadow.json"
 TASK = "objects"
 POLL_S, LONGEST_S = 2.0, 30.0  # between looks at the customer's timestamp; after one that failed, at most
 CHECK_S = 600.0  # after which everything is checked, whether the timestamp is another one or not
+LARGEST_ANSWER = 1 << 16  # bytes of a timestamp, or of a sentence
 TIMEOUT = httpx.Timeout(30.0, connect=5.0)
 
 
@@ -157,14 +158,23 @@ def _run_shadow(own: Path, vehicle: str, found: Fetched) -> ShadowReport | None:
 def _ask(client: httpx.Client) -> bytes | None:
     """Return the customer's timestamp; nothing where none is on offer, None where the proxy does not answer."""
     try:
-        answer = client.get("director/metadata/timestamp.json")
+        status, content = _call(client, "GET", "director/metadata/timestamp.json")
     except httpx.HTTPError:
         return None
-    return {httpx.codes.OK: answer.content, httpx.codes.NOT_FOUND: b""}.get(answer.status_code)
+    return {httpx.codes.OK: content, httpx.codes.NOT_FOUND: b""}.get(status)
 
 
 def _report(client: httpx.Client, report: ReleaseReport) -> None:
-    client.post(REPORT, content=report.as_bytes()).raise_for_status()
+    """Send a report; raises `httpx.HTTPError` where it is not taken."""
+    status, why = _call(client, "POST", REPORT, report.as_bytes())
+    if status != httpx.codes.OK:
+        raise httpx.HTTPError(f"the report is refused: {status} {why.decode(errors='replace')[:200]}")
+
+
+def _call(client: httpx.Client, method: str, path: str, content: bytes | None = None) -> tuple[int, bytes]:
+    """Return the status and the body of the proxy's answer; of a body that is too long, the beginning."""
+    with client.stream(method, path, content=content) as answer:
+        return answer.status_code, next(answer.iter_raw(LARGEST_ANSWER), b"")
 
 
 def _run_apart(do: Callable[[], None]) -> bool:
