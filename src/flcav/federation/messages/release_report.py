@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from flcav.config import InputError
+from flcav.interface.wording import plural
 from flcav.storage.records import LEFT_OUT, Record
 
 RELEASES = "/v1/flcav/release/"  # at the proxy: of the repositories' files, and of reports
@@ -59,7 +60,7 @@ class ReleaseReport(Record):
         if self.verified > self.release:
             told += f", has verified release {self.verified}"
         if self.shadow is not None:
-            told += f", disagreement {self.shadow.disagreement:.3f} over {self.shadow.frames} frames"
+            told += f", disagreement {self.shadow.disagreement:.3f} over {plural(self.shadow.frames, 'frame')}"
         return f"{told}; refuses what is on offer: {self.refused}" if self.refused else told
 
 
