@@ -83,7 +83,10 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         ("--name", "--image", "--director", "--image-root", "--director-root", "--task"), ALWAYS
     ),
     "release shadow": dict.fromkeys(("--driving", "--data"), ALWAYS),
-    "release rollout": dict.fromkeys(("--key", "--shadows", "--share", "--revoke", "--task"), ALWAYS),
+    "release equip": dict.fromkeys(("--image-root", "--director-root", "--data", "--drive"), ALWAYS),
+    "release rollout": dict.fromkeys(
+        ("--key", "--shadows", "--share", "--revoke", "--task", "--fleet", "--provider", "--data", "--wait"), ALWAYS
+    ),
     "release deliver": dict.fromkeys(("--data", "--pole", "--scene", "--network", "--seed"), ALWAYS),
     "release rehearse": dict.fromkeys(("--earlier", "--data", "--vehicles", "--pole", "--network", "--seed"), ALWAYS),
     "release rollback": dict.fromkeys(("--driving", "--release", "--reason"), ALWAYS),

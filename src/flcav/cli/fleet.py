@@ -1,5 +1,6 @@
 """`flcav fleet`: the authority of a fleet, and the fleet up and running."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -184,6 +185,8 @@ def status(
             f"{own.name}: {own.state}, {there}; {own.socket_up} bytes up and {own.socket_down} down crossed its "
             f"sockets, {own.content_up} and {own.content_down} of them content"
         )
+        if own.release is not None:
+            typer.echo(f"    {own.release.describe()}")
     if found.federation is not None:
         typer.echo(found.federation.describe())
     for asked in found.requests:
@@ -225,7 +228,7 @@ def up(
     from flcav.federation.fleet.up import run_fleet
     from flcav.federation.runtimes.vehicle_app import prepare
 
-    run_fleet(folder, host, port, vehicles, prepare, typer.echo)
+    run_fleet(folder, host, port, vehicles, prepare, typer.echo, _updater())
 
 
 @fleet.command("vehicle")
@@ -234,7 +237,18 @@ def run_vehicle(folder: Path = typer.Argument(help="Folder of the vehicle, on th
     from flcav.federation.fleet.up import run_vehicle as run
     from flcav.federation.runtimes.vehicle_app import prepare
 
-    run(folder, prepare)
+    run(folder, prepare, _updater())
+
+
+def _updater() -> dict[str, Callable[[Path], None]]:
+    """Return the process of a vehicle that follows releases; nothing without the extra that it needs."""
+    from importlib.util import find_spec
+
+    if find_spec("tuf") is None:
+        return {}
+    from flcav.releases.rollout.updater import run_updater
+
+    return {"updater": run_updater}
 
 
 def _describe_new(registry: "Registry", certificate: bytes) -> str:

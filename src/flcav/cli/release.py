@@ -18,6 +18,7 @@ for command in (
     repositories.sign,
     repositories.publish,
     repositories.install,
+    repositories.equip,
     rollouts.shadow,
     rollouts.rollout,
     rollouts.deliver,

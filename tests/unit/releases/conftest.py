@@ -1,16 +1,15 @@
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
+from release_drives import make_frame
 from release_parties import Parties, write_weights
 
-from flcav.geometry import Boxes, pose
 from flcav.releases.candidates.proposal import propose
 from flcav.releases.repositories.creation import create_repository
 from flcav.releases.repositories.metadata import read_root
 from flcav.releases.vehicles.checking import trust_roots
-from flcav.sensors.frame import Annotations, Calibration, Frame
+from flcav.sensors.frame import Frame
 
 
 @pytest.fixture(scope="session")
@@ -42,16 +41,4 @@ def parties(first_release: Path, tmp_path: Path) -> Parties:
 @pytest.fixture(scope="session")
 def recorded_frame() -> Frame:
     """A frame of a LiDAR with a car that drives east at 10 m/s."""
-    rng = np.random.default_rng(0)
-    mounts = Calibration({"lidar": pose(0, 0, 1.8)}, {})
-    known = Annotations(
-        track=np.array(["car1"]),
-        boxes=Boxes(np.array([[10.0, 0, 0.8]]), np.array([[4.4, 1.8, 1.6]]), np.zeros(1), np.array(["car"])),
-        velocity=np.array([[10.0, 0, 0]]),
-        acceleration=np.zeros((1, 3)),
-        returns=np.array([20]),
-        occlusion=np.zeros(1),
-    )
-    points = rng.uniform(-20, 20, (500, 4)).astype(np.float32)
-    points[:, 3] = 0.5
-    return Frame("s", 0, 0.0, "cav0", np.eye(4), mounts, mounts, {"lidar": points}, known)
+    return make_frame()

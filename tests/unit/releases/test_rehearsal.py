@@ -1,15 +1,12 @@
 """A rehearsal: canaries first, downloads by radio, a stop by shadow runs, a roll-back that every vehicle takes."""
 
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from release_parties import Parties
+from release_drives import Drives
+from release_parties import Parties, write_noisy
 
 from flcav.cli.main import run
 from flcav.config import InputError, read_json
@@ -17,43 +14,20 @@ from flcav.dataset.recording.recorder import record
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import RadioLinks
-from flcav.perception.objects.task import OBJECTS
-from flcav.perception.weights import load_network, read_card, save_network
 from flcav.releases.candidates.candidate import WEIGHTS, read_candidate
 from flcav.releases.candidates.proposal import propose
 from flcav.releases.rollout import fleet
-from flcav.releases.rollout.rehearsal import Rehearsal, rehearse
+from flcav.releases.rollout.rehearsal import rehearse
+from flcav.releases.rollout.turns import Rollout
 from flcav.sensors.frame import Frame
 
 VEHICLES, SCENES = 20, 4
 
 
-class Drives:
-    """A source of scenes in which one vehicle sees one frame."""
-
-    def __init__(self, seen: Frame) -> None:
-        self.seen = seen
-
-    def describe(self) -> dict[str, Any]:
-        return {"town": "none", "split": "test", "seed": 0}
-
-    def scenes(self) -> list[str]:
-        return [f"s{number}" for number in range(SCENES)]
-
-    def frame_count(self, scene: str) -> int:
-        return 1
-
-    def frames(self, scene: str) -> Iterator[Frame]:
-        yield replace(self.seen, scene=scene)
-
-    def trace(self, scene: str) -> None:
-        return None
-
-
 @pytest.fixture
 def drive(recorded_frame: Frame, tmp_path: Path) -> Path:
     """A recording of several drives."""
-    record(Drives(recorded_frame), tmp_path / "drive")
+    record(Drives(recorded_frame, SCENES), tmp_path / "drive")
     return tmp_path / "drive"
 
 
@@ -77,10 +51,7 @@ def radio(monkeypatch: pytest.MonkeyPatch) -> None:
 def noisy(parties: Parties) -> Path:
     """A candidate after the first release that finds objects everywhere."""
     first = parties.candidate(1) / WEIGHTS
-    network = load_network(OBJECTS, first)
-    with torch.no_grad():
-        network.head.bias[: network.anchors_per_cell] += 9.0
-    save_network(OBJECTS, network, parties.folder / "noisy.safetensors", read_card(first))
+    write_noisy(first, parties.folder / "noisy.safetensors")
     out = parties.folder / "noisy"
     propose(out, parties.folder / "noisy.safetensors", first, 2, "finds more", "all vehicles")
     return out
@@ -106,7 +77,7 @@ def test_a_candidate_that_agrees_reaches_the_whole_fleet(parties: Parties, drive
     assert down["wireless"] == sum(each.bytes for turn in found.turns for each in turn.arrivals)
     assert weights < down["wireline"] < 2 * weights  # one unit fetches the files once, for the whole roll-out
     assert not (tmp_path / "out" / "fleet").exists()
-    assert Rehearsal.from_json(found.as_json(), "test") == found
+    assert Rollout.from_json(found.as_json(), "test") == found
 
 
 def test_shadow_runs_stop_a_candidate_and_every_vehicle_takes_the_roll_back(
@@ -159,5 +130,5 @@ def test_the_command_writes_ledger_and_rehearsal(
     assert ended.value.code == 1
     said = capsys.readouterr().out
     assert "stopped and rolled back; in the end release 3: 3 vehicles" in said
-    assert Rehearsal.from_json(read_json(out / "rehearsal.json"), "test").stopped
+    assert Rollout.from_json(read_json(out / "rehearsal.json"), "test").stopped
     assert Ledger.load(out / "ledger.parquet").used_bytes("wireless", direction="down") > 0

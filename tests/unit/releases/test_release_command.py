@@ -137,6 +137,17 @@ def test_wrong_inputs_get_one_sentence(parties: Parties, call: Call, tmp_path: P
     assert (code, "no vehicle's folder" in said) == (2, True)
     code, said = call("rollout", parties.director, "--key", parties.director / "keys" / "1.pem")
     assert (code, "either --shadows or --share" in said) == (2, True)
+    rollout = ("rollout", parties.director, "--key", parties.director / "keys" / "1.pem")
+    code, said = call(*rollout, "--share", 1, "--wait", 9)
+    assert (code, "--wait: is for a roll-out to a fleet" in said) == (2, True)
+    code, said = call(*rollout, "--fleet", tmp_path)
+    assert (code, "--fleet: takes --provider" in said) == (2, True)
+    code, said = call(*rollout, "--fleet", tmp_path, "--provider", image)
+    assert (code, "the fleet is not up" in said) == (2, True)
+    code, said = call("equip", tmp_path, "--drive", "s/cav0")
+    assert (code, "--data is missing" in said) == (2, True)
+    code, said = call("equip", tmp_path)
+    assert (code, "is no vehicle's folder" in said) == (2, True)
     assert call("status", tmp_path)[0] == 2
     assert call("init", "provider", "--out", tmp_path / "two", "--keys", 1)[0] == 2
     assert not (tmp_path / "two").exists()

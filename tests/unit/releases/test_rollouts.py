@@ -9,6 +9,7 @@ import pytest
 from release_parties import ALL, Parties
 
 from flcav.config import InputError
+from flcav.federation.messages.release_report import ShadowReport
 from flcav.geometry import Boxes
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger, LinkMegabytes
@@ -18,7 +19,8 @@ from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS, read_candida
 from flcav.releases.repositories.directive import Directive, is_assigned
 from flcav.releases.repositories.repository import publish
 from flcav.releases.rollout.delivery import deliver
-from flcav.releases.rollout.shadow import ShadowReport, count_agreed, judge_shadows
+from flcav.releases.rollout.deployed import share_of
+from flcav.releases.rollout.shadow import count_agreed, judge_shadows
 from flcav.releases.rollout.stages import STAGES, change_share, next_share, read_directive, roll_back
 from flcav.storage.files import sha256
 
@@ -37,6 +39,25 @@ def test_a_larger_share_includes_the_vehicles_of_a_smaller_one():
     assert [len(each) / len(fleet) for each in chosen] == pytest.approx(STAGES, abs=0.02)
     other = {name for name in fleet if is_assigned(name, "objects", Directive(release=4, share_ppm=50_000))}
     assert other != chosen[1]  # other canaries for every release
+
+
+@pytest.mark.parametrize(("count", "reached"), [(1, (1, 1, 1)), (3, (2, 2, 2)), (30, (2, 2, 6)), (300, (3, 15, 60))])
+def test_shares_of_a_fleet_are_rounded_up_and_two_at_least(count: int, reached: tuple[int, ...], parties: Parties):
+    names, candidate = [f"car{number}" for number in range(count)], read_candidate(parties.candidate(2))
+    for stage, wanted in zip(STAGES, (*reached, count), strict=True):
+        share = share_of(stage, names, candidate)
+        directive = Directive(release=2, share_ppm=round(share * ALL))
+        assert sum(is_assigned(name, "objects", directive) for name in names) == wanted
+
+
+def test_a_stop_is_one_for_vehicles_that_were_named_too(parties: Parties):
+    parties.release("image", 2)
+    parties.release("director", 2, Directive(release=2, share_ppm=0, vehicles=("cav0",)))
+    change_share(parties.director, "objects", 0.0, parties.keys("director", 1, 2))
+    publish(parties.director)
+    installed = parties.update()
+    assert installed is not None
+    assert installed.release == 1
 
 
 def test_shadow_runs_decide():

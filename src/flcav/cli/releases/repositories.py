@@ -124,6 +124,40 @@ def install(
     )
 
 
+def equip(
+    folder: Path = typer.Argument(metavar="VEHICLE", help="Folder of the vehicle, on the vehicle."),
+    image_root: Path | None = typer.Option(None, "--image-root", help="1.root.json of the provider."),
+    director_root: Path | None = typer.Option(None, "--director-root", help="1.root.json of the customer."),
+    data: Path | None = typer.Option(None, "--data", help="Dataset of what it meets, for shadow runs."),
+    drive: str | None = typer.Option(
+        None, "--drive", metavar="SCENE/AGENT", help="--data: whose frames; by default the first vehicle's."
+    ),
+) -> None:
+    """On a vehicle of a fleet: trust both parties, and follow the releases that the fleet offers."""
+    from flcav.config import check_is_file
+    from flcav.dataset.store import Dataset
+    from flcav.releases.rollout.fleet import list_drives
+    from flcav.releases.rollout.updater import RecordedDrive, equip_vehicle
+
+    if (image_root is None) != (director_root is None):
+        raise InputError("--image-root and --director-root: a vehicle is delivered with both")
+    if drive is not None and data is None:
+        raise InputError("--drive: is one of a dataset's, and --data is missing")
+    roots = recorded = None
+    if image_root is not None and director_root is not None:
+        for path in (image_root, director_root):
+            check_is_file(path)
+        roots = image_root.read_bytes(), director_root.read_bytes()
+    if data is not None:
+        known = {each.name: each for each in list_drives(Dataset.open(data))}
+        own = known.get(next(iter(known)) if drive is None else drive)
+        if own is None:
+            raise InputError(f"--drive {drive}: is not in {data}, which has {', '.join([*known][:5])}")
+        recorded = RecordedDrive(str(data.resolve()), own.scene, own.agent)
+    equip_vehicle(folder, roots, recorded)
+    typer.echo(f"{folder}: follows the releases of its fleet")
+
+
 def status(
     repository: list[Path] = typer.Argument(help="Folders of parties."),
     candidate: Path | None = typer.Option(

@@ -57,6 +57,7 @@ def shadow(
             typer.echo(f"{name}: disagreement {found.disagreement:.3f} over {plural(found.frames, 'frame')}")
 
 
+@when_interrupted()
 @only_writer_of("repository")
 def rollout(
     repository: Path = typer.Argument(help="The customer's folder."),
@@ -65,14 +66,67 @@ def rollout(
         None, "--shadows", help="Folder of shadow reports: they decide on the next share, 1, 5, 20 and 100 %, or stop."
     ),
     share: float | None = typer.Option(
-        None, "--share", min=0, max=1, callback=check_finite, help="Share of the fleet, without shadow reports."
+        None,
+        "--share",
+        min=0,
+        max=1,
+        callback=check_finite,
+        help="Share of the fleet, without shadow reports; with --fleet, to begin with.",
     ),
     revoke: list[str] = REVOKE,
+    fleet: Path | None = typer.Option(
+        None, "--fleet", help="Folder of a fleet that is up: its vehicles update and report, and decide on each share."
+    ),
+    provider: Path | None = typer.Option(None, "--provider", help="--fleet: the provider's folder."),
+    data: Path | None = typer.Option(
+        None, "--data", help="--fleet: dataset whose drives stand for what the vehicles on this machine meet."
+    ),
+    wait: float | None = typer.Option(
+        None,
+        "--wait",
+        min=1,
+        callback=check_finite,
+        help="--fleet: seconds that the vehicles of a share have to report; by default 600.",
+    ),
+    out: Path | None = typer.Option(None, "--out", help="--fleet: ledger of the downlinks (Parquet)."),
     task: str = TASK,
 ) -> None:
-    """Widen a roll-out, or stop it: sign another share of the fleet that installs the release; `publish` follows."""
+    """Widen a roll-out, or stop it: sign another share of the fleet that installs the release; `publish` follows.
+
+    With --fleet, the whole roll-out to a fleet that is up: every share is published, canaries first, until all vehicles
+    drive the release or shadow runs stop it. Exit 1 where it is stopped, or not complete.
+    """
+    if fleet is None:
+        given = {"--provider": provider, "--data": data, "--wait": wait, "--out": out}
+        if odd := [name for name, value in given.items() if value is not None]:
+            raise InputError(f"{odd[0]}: is for a roll-out to a fleet, and --fleet is missing")
+        _widen(repository, key, shadows, share, revoke, task)
+        return
+    from flcav.interface.progress import show_progress
+    from flcav.network.ledger import Ledger, LinkMegabytes
+    from flcav.releases.rollout.deployed import TASK as ROLLED_OUT
+    from flcav.releases.rollout.deployed import roll_out
+
+    if provider is None or shadows is not None or revoke or task != ROLLED_OUT:
+        raise InputError(f"--fleet: takes --provider, no --shadows, no --revoke, and the task {ROLLED_OUT}")
+    ledger = Ledger(LinkMegabytes(0, 0))
+    with show_progress("rollout") as report:
+        found = roll_out(
+            fleet, provider, repository, key, ledger, share=share, data=data, patience_s=wait or 600.0, progress=report
+        )
+    if out is not None:
+        ledger.save(out)
+    typer.echo("\n".join(found.lines()))
+    if found.stopped or not found.complete:
+        raise typer.Exit(1)
+
+
+def _widen(
+    repository: Path, key: list[Path], shadows: Path | None, share: float | None, revoke: list[str], task: str
+) -> None:
     from flcav.config import read_json
-    from flcav.releases.rollout.shadow import ShadowReport, judge_shadows
+    from flcav.federation.messages.release_report import ShadowReport
+    from flcav.releases.rollout.shadow import judge_shadows
     from flcav.releases.rollout.stages import change_share, next_share, read_directive
 
     if (shadows is None) == (share is None):

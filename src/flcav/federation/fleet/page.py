@@ -54,10 +54,11 @@ async function follow() {
     fill(at("rounds"), ["round", "clients", "loss", "epsilon", "failed"], (f ? f.rounds : []).map(r => [
       cell(r.round, "n"), cell(r.clients, "n"), cell(number(r.loss), "n"), cell(number(r.epsilon), "n"),
       cell(Object.entries(r.failed).map(([who, why]) => `${who}: ${why}`).join("; "), "bad")]));
-    fill(at("vehicles"), ["vehicle", "certificate", "node", "socket up", "socket down", "content up", "content down"],
+    fill(at("vehicles"), ["vehicle", "certificate", "node", "socket up", "socket down", "content up", "content down",
+      "network"],
       s.vehicles.map(v => [cell(v.name), cell(v.state, v.state == "registered" ? "" : "bad"),
         cell(v.online ? "online" : "offline", v.online ? "" : "off"), cell(v.socket_up, "n"), cell(v.socket_down, "n"),
-        cell(v.content_up, "n"), cell(v.content_down, "n")]));
+        cell(v.content_up, "n"), cell(v.content_down, "n"), cell(s.networks[v.name] || "")]));
     list(at("asked"), s.asked);
     list(at("refused"), s.refused);
   } catch (error) { at("state").textContent = `no answer: ${error}`; }
@@ -79,7 +80,9 @@ def make_page(folder: Path) -> Starlette:
         found = await asyncio.to_thread(read_status, folder)
         told = "" if found.federation is None else found.federation.describe()
         asked = [each.describe() for each in found.requests]
-        return Response(json.dumps({**found.as_json(), "told": told, "asked": asked}), media_type="application/json")
+        networks = {own.name: own.release.describe() for own in found.vehicles if own.release is not None}
+        values = {**found.as_json(), "told": told, "asked": asked, "networks": networks}
+        return Response(json.dumps(values), media_type="application/json")
 
     routes = [Route("/", page), Route("/status.json", status)]
     local = Middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost"])  # no page elsewhere reads it

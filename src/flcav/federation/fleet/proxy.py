@@ -2,8 +2,8 @@
 
 A call passes where its path is one of a node's under `/v1/fleet/`, its TLS connection has the certificate of a vehicle
 that is in the registry, neither revoked nor replaced nor expired at that moment, and Flower's node key is that
-vehicle's. FL requests, which need the certificate alone, are for the proxy itself. The control side of the SuperLink
-listens on the operator's host alone.
+vehicle's. FL requests and releases, which need the certificate alone, are for the proxy itself. The control side of the
+SuperLink listens on the operator's host alone.
 """
 
 import asyncio
@@ -26,9 +26,11 @@ from flcav.federation.fleet.keys import AUTHORITY, public_der
 from flcav.federation.fleet.mutual_tls import CERTIFICATE, CONNECTION, Connection, serve_https
 from flcav.federation.fleet.registry import Registry, Vehicle
 from flcav.federation.fleet.relay import TIMEOUT, answer, keep_alive, read_body, relay
+from flcav.federation.fleet.releases.service import answer_release
 from flcav.federation.fleet.traffic import Traffic, read_traffic
 from flcav.federation.messages.fl_request import LARGEST, check_age, parse_request
 from flcav.federation.messages.fl_request import PATH as REQUEST_PATH
+from flcav.federation.messages.release_report import RELEASES
 
 FLEET = "/v1/fleet/"
 CALLS = frozenset(
@@ -75,6 +77,9 @@ class FleetProxy:
         if path == REQUEST_PATH and scope["method"] == "POST":
             await self._take_request(vehicle.name, receive, send)
             return
+        if path.startswith(RELEASES):
+            await self._answer_release(vehicle.name, scope, receive, send)
+            return
         call = path.removeprefix(FLEET)
         if scope["method"] != "POST" or path != FLEET + call or call not in CALLS:
             await self._refuse(send, 403, vehicle.name, f"{scope['method']} {path[:100]} is no call of a vehicle's")
@@ -116,6 +121,19 @@ class FleetProxy:
             return registry.take_request(*about)
         finally:
             registry.close()
+
+    async def _answer_release(self, vehicle: str, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send a file of the repositories on offer, keep a vehicle's report, or refuse its call."""
+        connection: Connection = scope["state"][CONNECTION]
+
+        def count() -> int:
+            self._changed = True
+            return self._traffic.count_release(vehicle, connection.count_bytes())
+
+        refused = await answer_release(self._folder, vehicle, scope, receive, send, count)
+        if refused is not None:
+            await self._refuse(send, refused[0], vehicle, refused[1])
+        count()
 
     async def _refuse(self, send: Send, status: int, who: str | bytes | None, why: str) -> None:
         told = who if isinstance(who, str) else "nobody" if who is None else hashlib.sha256(who).hexdigest()[:16]

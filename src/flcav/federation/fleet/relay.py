@@ -1,13 +1,17 @@
-"""Passing an HTTP request on to another server, and its response back, as they come (ASGI)."""
+"""HTTP requests that are passed on to another server, and answers: of that, of one sentence, or a file (ASGI)."""
 
-from collections.abc import AsyncIterator
+import asyncio
+import os
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import httpx
 from starlette.types import Message, Receive, Scope, Send
 
 HOP_BY_HOP = {b"connection", b"keep-alive", b"transfer-encoding", b"te", b"trailer", b"upgrade", b"host"}  # RFC 9110
 LARGEST_BODY = 64_000_000  # bytes; Flower's objects have 5 MiB at most
+PIECE_BYTES = 1 << 18  # of a file
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 
 
@@ -26,6 +30,21 @@ async def answer(send: Send, status: int, text: str) -> None:
     headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"content-length", str(len(body)).encode())]
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": body})
+
+
+async def send_file(send: Send, path: Path, sent: Callable[[], object]) -> None:
+    """Send a file as a response, with its size at the beginning; `sent` is called after each piece."""
+    with path.open("rb") as file:
+        left = os.fstat(file.fileno()).st_size
+        headers = [(b"content-type", b"application/octet-stream"), (b"content-length", str(left).encode())]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        more = True
+        while more:
+            piece = await asyncio.to_thread(file.read, min(left, PIECE_BYTES))
+            left -= len(piece)
+            more = left > 0 and bool(piece)  # of a file that was cut, less than its size is sent, which breaks the call
+            await send({"type": "http.response.body", "body": piece, "more_body": more})
+            sent()
 
 
 async def read_body(receive: Receive, most: int) -> bytes:

@@ -7,17 +7,20 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from flcav.config import InputError
 from flcav.federation.fleet.authority import open_registry
+from flcav.federation.fleet.releases.offer import read_reports
 from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
 from flcav.federation.fleet.supervisor import read_processes
 from flcav.federation.fleet.traffic import Crossed, read_traffic
 from flcav.federation.fleet.up import read_ready
 from flcav.federation.messages.fl_request import FLRequest, parse_request
+from flcav.federation.messages.release_report import ReleaseReport
 from flcav.interface.wording import plural
 from flcav.storage.files import write_bytes
-from flcav.storage.records import Record
+from flcav.storage.records import LEFT_OUT, Record
 
 SHOWN = 20  # of requests and refusals, the latest
 LEAST_ROOM = 1_000_000  # bytes on the fleet's disk below which is said so
@@ -76,6 +79,7 @@ class VehicleStatus(Record):
     socket_down: int
     content_up: int  # [bytes] of what its app sent and got, in Flower's serialisation
     content_down: int
+    release: Annotated[ReleaseReport | None, LEFT_OUT] = None  # its latest report of the network that drives
 
 
 @dataclass(frozen=True)
@@ -124,11 +128,13 @@ def read_status(folder: Path) -> FleetStatus:
     if ready is not None:
         with contextlib.suppress(*SuperLinkLost):
             online = SuperLink(folder, ready.superlink).list_online()
-    vehicles = []
+    vehicles, reports = [], read_reports(folder)
     for own in registered:
         crossed = traffic.vehicles.get(own.name, Crossed())
         counted = crossed.socket_up, crossed.socket_down, crossed.content_up, crossed.content_down
-        vehicles.append(VehicleStatus(own.name, own.describe_state(), own.expires, own.node in online, *counted))
+        release = reports[own.name].report if own.name in reports else None
+        told = own.name, own.describe_state(), own.expires, own.node in online
+        vehicles.append(VehicleStatus(*told, *counted, release))
     try:
         federation = Followed.from_json(json.loads((folder / PROGRESS).read_bytes()), str(folder / PROGRESS))
     except FileNotFoundError:
@@ -137,5 +143,5 @@ def read_status(folder: Path) -> FleetStatus:
     made = [(vehicle, parse_request(content)) for vehicle, _, content in asked]
     requests = tuple(Asked(vehicle, own, own.nonce in answered) for vehicle, own in made)
     refused, free = tuple(traffic.refused[-SHOWN:]), shutil.disk_usage(folder).free
-    told = tuple(vehicles), requests, refused, free, federation, time.time()
-    return FleetStatus(proxy, read_processes(folder), *told)
+    rest = refused, free, federation, time.time()
+    return FleetStatus(proxy, read_processes(folder), tuple(vehicles), requests, *rest)

@@ -25,6 +25,8 @@ class Crossed:
     other_down: int = 0
     calls: int = 0
     activations: int = 0  # of its SuperNode: how often it has come in
+    release_up: int = 0  # of those that crossed the socket, the ones for releases and their reports
+    release_down: int = 0
     lost: int = 0  # calls that the SuperLink failed, with which a message may be lost
 
 
@@ -52,6 +54,15 @@ class Traffic:
         else:
             own.other_up += up
             own.other_down += down
+
+    def count_release(self, vehicle: str, socket: tuple[int, int]) -> int:
+        """Count bytes that crossed the socket for releases; return those down to the vehicle so far."""
+        own = self.vehicles.setdefault(vehicle, Crossed())
+        own.socket_up += socket[0]
+        own.socket_down += socket[1]
+        own.release_up += socket[0]
+        own.release_down += socket[1]
+        return own.release_down
 
     def refuse(self, who: str, why: str) -> None:
         """Note a refusal."""

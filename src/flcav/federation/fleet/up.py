@@ -8,7 +8,7 @@ import os
 import socket
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -106,10 +106,12 @@ def run_fleet(
     vehicles: int,
     prepare: Prepare,
     report: Callable[[str], None],
+    others: Mapping[str, Callable[[Path], None]] = {},
 ) -> None:
     """Run a fleet until this process is told to end; see `prepare_fleet`.
 
-    prepare: of the vehicles' executors. report: called with a sentence when the fleet is up.
+    prepare: of the vehicles' executors. report: called with a sentence when the fleet is up. others: further processes
+    of each vehicle, by name.
     """
     with _alone(folder):
         _, proxy, superlink = prepare_fleet(folder, host, port, vehicles)
@@ -120,7 +122,7 @@ def run_fleet(
         }
         later: dict[str, Callable[[], None]] = {}
         for name in name_vehicles(vehicles):
-            own = vehicle_processes(folder / VEHICLES / name, prepare)
+            own = vehicle_processes(folder / VEHICLES / name, prepare, others)
             later |= {f"{name}-{kind}": do for kind, do in own.items()}
 
         begun, silent = time.monotonic(), True
@@ -144,13 +146,13 @@ def run_fleet(
             (folder / READY).unlink(missing_ok=True)
 
 
-def run_vehicle(folder: Path, prepare: Prepare) -> None:
-    """Run the vehicle in `folder` until this process is told to end."""
+def run_vehicle(folder: Path, prepare: Prepare, others: Mapping[str, Callable[[Path], None]] = {}) -> None:
+    """Run the vehicle in `folder`, with `others` of its processes, until this process is told to end."""
     if not (folder / SETTINGS).exists():
         raise InputError(f"{folder}: is no vehicle's folder, without {SETTINGS}")
     with _alone(folder):
         import_flower()
-        supervise(folder, vehicle_processes(folder, prepare))
+        supervise(folder, vehicle_processes(folder, prepare, others))
 
 
 def run_superlink(folder: Path, address: str) -> None:

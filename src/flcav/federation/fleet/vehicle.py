@@ -8,8 +8,9 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from flcav.config import InputError
@@ -54,8 +55,10 @@ def load_settings(folder: Path) -> VehicleSettings:
 Prepare = Callable[[Path], None]  # called with the vehicle's folder before each message, to have imported what it needs
 
 
-def vehicle_processes(folder: Path, prepare: Prepare) -> dict[str, Callable[[], None]]:
-    """Return what the processes of the vehicle in `folder` run, by name."""
+def vehicle_processes(
+    folder: Path, prepare: Prepare, others: Mapping[str, Callable[[Path], None]] = {}
+) -> dict[str, Callable[[], None]]:
+    """Return what the processes of the vehicle in `folder` run, by name; `others` are called with the folder."""
     own = load_settings(folder)
 
     def forward() -> None:
@@ -67,6 +70,7 @@ def vehicle_processes(folder: Path, prepare: Prepare) -> dict[str, Callable[[], 
         "forwarder": forward,
         "supernode": lambda: run_supernode(folder, own),
         "executor": lambda: run_executor(folder, f"127.0.0.1:{own.node_port}", prepare),
+        **{name: partial(do, folder) for name, do in others.items()},
     }
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from flcav.config import InputError, check_is_file
-from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS
+from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS, Candidate, parse_candidate
 from flcav.releases.keys import PrivateKey, PublicKey
 from flcav.releases.repositories.directive import Directive
 from flcav.storage.files import write_bytes
@@ -64,6 +64,17 @@ def load_targets(out: Path) -> "Metadata[Targets]":
     timestamp = load_metadata(metadata / "timestamp.json")
     snapshot = load_metadata(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")
     return load_metadata(metadata / f"{snapshot.signed.meta['targets.json'].version}.targets.json")
+
+
+def read_released(out: Path, task: str, release: int) -> Candidate:
+    """Return the description of a release in the provider's repository; raises `InputError` where it is not there."""
+    name = target_names(task, release)[1]
+    target = load_targets(out).signed.targets.get(name)
+    path = Path(name) if target is None else Path(name).with_name(f"{target.hashes['sha256']}.{CANDIDATE}")
+    path = out / "repository" / "targets" / path
+    if target is None or not path.is_file():
+        raise InputError(f"{out}: has no release {release} of {task}, or is not the provider's")
+    return parse_candidate(path.read_bytes(), str(path))
 
 
 def load_metadata(path: Path) -> "Metadata":

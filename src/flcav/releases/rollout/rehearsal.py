@@ -6,16 +6,14 @@ drove before beside the new one on what they meet; the next share follows, or th
 
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
+from flcav.federation.messages.release_report import ShadowReport
 from flcav.interface.progress import Report, ignore_progress
-from flcav.interface.wording import plural
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.objects.task import OBJECTS
@@ -34,56 +32,13 @@ from flcav.releases.rollout.fleet import (
     list_drives,
     update_over_radio,
 )
-from flcav.releases.rollout.shadow import ShadowDecision, ShadowReport, judge_shadows, run_shadow
+from flcav.releases.rollout.shadow import ShadowDecision, judge_shadows, run_shadow
 from flcav.releases.rollout.stages import STAGES, change_share, next_share, roll_back
+from flcav.releases.rollout.turns import Rollout, Turn
 from flcav.releases.vehicles.checking import Sources, open_sources
-from flcav.storage.records import Record
 
 MOST_TURNS = 12  # of the whole rehearsal; a vehicle drives once a turn
 KEYS = (1, 2)  # of each party, that sign
-
-
-@dataclass(frozen=True)
-class Turn:
-    """One turn: a share of the fleet, what was delivered in it, and what the shadow runs said."""
-
-    release: int
-    share: float
-    assigned: int  # vehicles of the share
-    reached: int  # of these, have the release by the end of the turn
-    arrivals: tuple[Delivered, ...]  # seconds from the beginning of each vehicle's drive
-    wireless_mb: float
-    wireline_mb: float
-    decision: ShadowDecision | None  # None without shadow runs
-
-    def describe(self) -> str:
-        """Return the turn in words."""
-        times = sorted(each.at_s for each in self.arrivals if each.at_s is not None)
-        after = (
-            f", {len(times)} now, half of these by {np.median(times):.2f} s, all by {times[-1]:.2f} s" if times else ""
-        )
-        said = f"; {self.decision.describe()}" if self.decision is not None else ""
-        return (
-            f"release {self.release}, {self.share:.0%} of the fleet: reaches {self.reached} of "
-            f"{plural(self.assigned, 'vehicle')}{after}; {self.wireless_mb:.2f} MB wireless, "
-            f"{self.wireline_mb:.2f} MB wireline{said}"
-        )
-
-
-@dataclass(frozen=True)
-class Rehearsal(Record):
-    """What became of a roll-out: stopped or not, its turns, and how many vehicles drive which release in the end."""
-
-    stopped: bool
-    complete: bool  # every vehicle drives the new release, or after a stop the earlier weights
-    turns: tuple[Turn, ...]
-    drive: Mapping[int, int]  # release -> vehicles
-
-    def lines(self) -> list[str]:
-        """Return the rehearsal in words."""
-        held = ", ".join(f"release {release}: {plural(count, 'vehicle')}" for release, count in self.drive.items())
-        end = "stopped and rolled back" if self.stopped else "complete" if self.complete else "not complete"
-        return [*(turn.describe() for turn in self.turns), f"{end}; in the end {held}"]
 
 
 @dataclass(frozen=True)
@@ -124,7 +79,7 @@ def rehearse(
     settings: NetworkSettings | None = None,
     seed: int = 0,
     progress: Report = ignore_progress,
-) -> Rehearsal:
+) -> Rollout:
     """Return what became of the roll-out of a candidate to a simulated fleet that drives an earlier release.
 
     Args:
@@ -168,7 +123,7 @@ def rehearse(
             turns += _spread(new.release + 1, parties, fleet, radio, spent, len(turns))
         drive = Counter(fleet.installed(name).release for name in fleet.names)
         wanted = new.release + 1 if stopped else new.release
-        return Rehearsal(stopped, drive[wanted] == vehicles, tuple(turns), dict(sorted(drive.items())))
+        return Rollout(stopped, drive[wanted] == vehicles, tuple(turns), dict(sorted(drive.items())))
     finally:
         shutil.rmtree(out / "fleet", ignore_errors=True)
 

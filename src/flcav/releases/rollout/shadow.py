@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from flcav.config import InputError
+from flcav.federation.messages.release_report import ShadowReport
 from flcav.geometry import Boxes
 from flcav.interface.wording import plural
 from flcav.perception.errors import THRESHOLD
@@ -21,32 +22,11 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import select_class
 from flcav.sensors.frame import Frame
-from flcav.storage.records import Record
 
 OVERLAP = 0.5
 LIMIT = 0.4  # of the mean disagreement over vehicles
 LEVEL = 0.05  # one-sided
 Judgement = Literal["go on", "wait", "stop"]
-
-
-@dataclass(frozen=True)
-class ShadowReport(Record):
-    """The shadow run of one vehicle: numbers of detections from the score of use on."""
-
-    vehicle: str
-    task: str
-    driving: str  # SHA-256 of the weights
-    candidate: str
-    frames: int
-    driving_found: int
-    candidate_found: int
-    agreed: int
-
-    @property
-    def disagreement(self) -> float:
-        """Return 1 minus the Dice coefficient, in [0, 1]; 0 where neither found anything."""
-        found = self.driving_found + self.candidate_found
-        return 1 - 2 * self.agreed / found if found else 0.0
 
 
 @dataclass(frozen=True)

@@ -49,10 +49,13 @@ def next_share(share: float, decision: ShadowDecision) -> float:
 def change_share(
     out: Path, task: str, share: float, keys: Sequence[Path], revoke: Sequence[str] = ()
 ) -> tuple[Directive, Staged]:
-    """Stage a directive with another share of the fleet, and more revoked vehicles; return it and its signatures."""
+    """Stage a directive with another share of the fleet, and more revoked vehicles; return it and its signatures.
+
+    A share of 0 stops the roll-out for vehicles that were named, too.
+    """
     now = read_directive(out, task)
-    revoked = tuple(sorted({*now.revoked, *revoke}))
-    changed = now.model_copy(update={"share_ppm": round(share * MILLION), "revoked": revoked})
+    revoked, named = tuple(sorted({*now.revoked, *revoke})), now.vehicles if share else ()
+    changed = now.model_copy(update={"share_ppm": round(share * MILLION), "revoked": revoked, "vehicles": named})
     return changed, stage_directive(out, task, changed, keys)
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from tuf.ngclient import Updater
 
 REPOSITORIES = {"director": "customer", "image": "provider"}
+FIRST_ROOT = "first.root.json"  # that the vehicle was delivered with
 CLOCK_SLACK = timedelta(hours=1)
 MOST_METADATA_BYTES = 5_000_000
 
@@ -89,7 +90,12 @@ def trust_roots(folder: Path, image_root: bytes, director_root: bytes) -> None:
     check_distinct(keys, "the keys of provider and customer together")
     for name, data in (("image", image_root), ("director", director_root)):
         (folder / "metadata" / name).mkdir(parents=True, exist_ok=True)
-        (folder / "metadata" / name / "first.root.json").write_bytes(data)
+        (folder / "metadata" / name / FIRST_ROOT).write_bytes(data)
+
+
+def trusts_roots(folder: Path) -> bool:
+    """Return whether a vehicle's folder has the roots of both parties."""
+    return all((folder / "metadata" / name / FIRST_ROOT).is_file() for name in REPOSITORIES)
 
 
 def check_release(
@@ -124,7 +130,7 @@ def _refresh(folder: Path, name: str, sources: Sources, at: datetime) -> "Update
     from tuf.ngclient import Updater, UpdaterConfig
 
     kept = folder / "metadata" / name
-    root = kept / "first.root.json"
+    root = kept / FIRST_ROOT
     if not root.is_file():
         raise InputError(f"{folder}: no vehicle's folder, since it has no root of the {REPOSITORIES[name]}")
     address = getattr(sources, name)

@@ -6,6 +6,7 @@ The size is bounded by The Update Framework's client, which stops at the length 
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
@@ -13,6 +14,9 @@ from tuf.api.exceptions import DownloadError, DownloadHTTPError
 from tuf.ngclient.fetcher import FetcherInterface
 
 from flcav.config import InputError
+
+if TYPE_CHECKING:
+    import httpx
 
 PIECE_BYTES = 1 << 16
 LONGEST_S = 120.0  # of one file
@@ -41,6 +45,26 @@ class RepositoryFetcher(FetcherInterface):
         from tuf.ngclient.urllib3_fetcher import Urllib3Fetcher
 
         return Urllib3Fetcher(socket_timeout=10).fetch(url)
+
+
+class CertifiedFetcher(RepositoryFetcher):
+    """A fetcher of files by a client that has a vehicle's certificate."""
+
+    def __init__(self, client: "httpx.Client", longest_s: float = LONGEST_S) -> None:
+        super().__init__(longest_s)
+        self._client = client
+
+    def _open(self, url: str) -> Iterator[bytes]:
+        import httpx
+
+        try:
+            with self._client.stream("GET", url) as answer:
+                if answer.status_code != httpx.codes.OK:
+                    why = next(answer.iter_raw(200), b"").decode(errors="replace")
+                    raise DownloadHTTPError(f"{answer.status_code}: {why}", answer.status_code)
+                yield from answer.iter_raw(PIECE_BYTES)
+        except httpx.HTTPError as error:
+            raise DownloadError(f"{url}: {error}") from None
 
 
 def _read(path: Path) -> Iterator[bytes]:

@@ -48,39 +48,64 @@ def weights_path(folder: Path, installed: Installed) -> Path:
     return folder / "networks" / f"{installed.weights}.safetensors"
 
 
+@dataclass(frozen=True)
+class Fetched:
+    """What a vehicle has fetched beside the network that drives."""
+
+    driving: Installed | None
+    newer: Approved | None  # that is to drive instead; its weights are in the vehicle's folder, as approved
+
+
 def update_vehicle(
     folder: Path, vehicle: str, sources: Sources, task: str = "objects", now: datetime | None = None
 ) -> Installed | None:
     """Install the release of a task that both parties name for `vehicle`; return the network that drives then.
 
-    Without one that is newer than the installed, that one goes on. Raises `Refused` for anything that both parties did
-    not sign, a number below the installed, and where the clock is off; the network that drives is left as it is.
+    Without one that is newer than the installed, that one goes on. Raises `Refused` as `fetch_release`.
+    """
+    found = fetch_release(folder, vehicle, sources, task, now)
+    return found.driving if found.newer is None else install(folder, found.newer)
+
+
+def fetch_release(
+    folder: Path, vehicle: str, sources: Sources, task: str = "objects", now: datetime | None = None
+) -> Fetched:
+    """Fetch and verify the release of a task that both parties name for `vehicle`; what drives is left as it is.
+
+    Raises `Refused` for anything that both parties did not sign, a number below the installed, and where the clock is
+    off.
     """
     driving = read_installed(folder)
     checked = check_release(folder, vehicle, sources, task, now)
     approved = checked.approved
     if approved is None or driving == Installed(task, approved.release, approved.weights):
-        return driving
+        return Fetched(driving, None)
     if driving is not None and driving.task == task and approved.release <= driving.release:
         raise Refused(f"release {approved.release} of {task}: does not rise above {driving.release}, which drives")
-    return install(folder, checked, approved)
+    download(folder, checked, approved)
+    return Fetched(driving, approved)
 
 
-def install(folder: Path, checked: Checked, approved: Approved) -> Installed:
-    """Download the weights of an approved release and make them the network that drives.
+def download(folder: Path, checked: Checked, approved: Approved) -> None:
+    """Download the weights of an approved release, unless the vehicle keeps them.
 
     Raises `Refused` where the file is another than was approved, or its card another than its description's.
     """
+    kept = weights_path(folder, Installed(approved.task, approved.release, approved.weights))
+    if kept.is_file() and sha256(kept) == approved.weights:
+        return
+    assert checked.target is not None
+    with atomic_path(kept) as temporary:
+        with refuse(f"weights of release {approved.release}"):
+            checked.updater.download_target(checked.target, str(temporary))
+        if sha256(temporary) != approved.weights:
+            raise Refused(f"weights of release {approved.release}: have another SHA-256 than was approved")
+        check_card(temporary, approved)
+
+
+def install(folder: Path, approved: Approved) -> Installed:
+    """Make an approved release, whose weights are in a vehicle's folder, the network that drives."""
     installed = Installed(approved.task, approved.release, approved.weights)
-    kept = weights_path(folder, installed)
-    if not kept.is_file() or sha256(kept) != approved.weights:
-        assert checked.target is not None
-        with atomic_path(kept) as temporary:
-            with refuse(f"weights of release {approved.release}"):
-                checked.updater.download_target(checked.target, str(temporary))
-            if sha256(temporary) != approved.weights:
-                raise Refused(f"weights of release {approved.release}: have another SHA-256 than was approved")
-            check_card(temporary, approved)
     write_json(folder / CURRENT, installed.as_json())
     return installed
 

@@ -1,0 +1,53 @@
+"""The proxy's answers about releases: files of the repositories on offer to a vehicle, and its reports back (ASGI)."""
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from starlette.types import Receive, Scope, Send
+
+from flcav.federation.fleet.relay import answer, read_body, send_file
+from flcav.federation.fleet.releases.offer import KeptReport, find_offered
+from flcav.federation.messages.release_report import LARGEST, RELEASES, REPORT, parse_report
+
+
+async def answer_release(
+    fleet: Path, vehicle: str, scope: Scope, receive: Receive, send: Send, count: Callable[[], int]
+) -> tuple[int, str] | None:
+    """Answer a registered vehicle's call; or return, unanswered, the status and the reason of a refusal.
+
+    count: called for each piece that was sent; returns the bytes that this vehicle's releases took so far.
+    """
+    asked, method = scope["path"].removeprefix(RELEASES), scope["method"]
+    if method == "POST" and asked == REPORT:
+        return await _take_report(fleet, vehicle, receive, send, count)
+    if method != "GET":
+        return 403, f"{method} {scope['path'][:100]} is no call of a vehicle's"
+    try:
+        path = await asyncio.to_thread(find_offered, fleet, asked)
+    except ValueError as error:
+        return 403, f"{scope['path'][:100]} {error}"
+    if path is None:
+        await answer(send, 404, "no such file is on offer")
+    else:
+        await send_file(send, path, count)
+    return None
+
+
+async def _take_report(
+    fleet: Path, vehicle: str, receive: Receive, send: Send, count: Callable[[], int]
+) -> tuple[int, str] | None:
+    try:
+        report = parse_report(await read_body(receive, LARGEST))
+    except ValueError as error:
+        return 400, str(error)
+    if report.shadow is not None:  # the certificate says whose it is
+        report = replace(report, shadow=replace(report.shadow, vehicle=vehicle))
+    try:
+        await asyncio.to_thread(KeptReport(vehicle, time.time(), count(), report).save, fleet)
+    except OSError as error:
+        return 503, f"the report cannot be kept: {error}"
+    await answer(send, 200, "the report is taken")
+    return None

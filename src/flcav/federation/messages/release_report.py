@@ -1,0 +1,83 @@
+"""Release report: the message by which a vehicle tells its fleet what drives it, and what its shadow run says.
+
+It goes to the proxy of a fleet with the vehicle's certificate, which says whose it is (a vehicle version manifest,
+Uptane Standard for Design and Implementation 2.1.0, section 5.4.2.1.1, without ECUs of their own).
+"""
+
+import json
+import re
+from dataclasses import dataclass
+from typing import Annotated
+
+from flcav.config import InputError
+from flcav.interface.wording import plural
+from flcav.storage.records import LEFT_OUT, Record
+
+RELEASES = "/v1/flcav/release/"  # at the proxy: of the repositories' files, and of reports
+REPORT = "report"
+LARGEST = 4096  # bytes of a report
+MOST = 10**9  # of any number in it
+TASK, SHA256 = re.compile("[a-z][a-z0-9_]{0,31}"), re.compile("[0-9a-f]{64}")
+
+
+@dataclass(frozen=True)
+class ShadowReport(Record):
+    """The shadow run of one vehicle: numbers of detections from the score of use on."""
+
+    vehicle: str
+    task: str
+    driving: str  # SHA-256 of the weights
+    candidate: str
+    frames: int
+    driving_found: int
+    candidate_found: int
+    agreed: int
+
+    @property
+    def disagreement(self) -> float:
+        """Return 1 minus the Dice coefficient, in [0, 1]; 0 where neither found anything."""
+        found = self.driving_found + self.candidate_found
+        return 1 - 2 * self.agreed / found if found else 0.0
+
+
+@dataclass(frozen=True)
+class ReleaseReport(Record):
+    """State of a vehicle's network: what drives, what it has verified, and how that disagrees with what drove."""
+
+    task: str
+    release: int  # that drives; 0: none
+    verified: int  # whose signatures and weights were verified, and which drives or is to drive; 0: none
+    refused: str = ""  # why what is on offer was not taken
+    shadow: Annotated[ShadowReport | None, LEFT_OUT] = None  # of the verified release; None: there was no run
+
+    def as_bytes(self) -> bytes:
+        """Return it as it is sent: JSON."""
+        return json.dumps(self.as_json()).encode()
+
+    def describe(self) -> str:
+        """Return it in words."""
+        told = f"drives release {self.release} of {self.task}" if self.release else f"drives no {self.task}"
+        if self.verified > self.release:
+            told += f", has verified release {self.verified}"
+        if self.shadow is not None:
+            told += f", disagreement {self.shadow.disagreement:.3f} over {plural(self.shadow.frames, 'frame')}"
+        return f"{told}; refuses what is on offer: {self.refused}" if self.refused else told
+
+
+def parse_report(data: bytes) -> ReleaseReport:
+    """Return the report in a message; raises ValueError for another message, in words."""
+    try:
+        found = ReleaseReport.from_json(json.loads(data), "report")
+    except (InputError, ValueError, RecursionError):
+        raise ValueError("the message is no release report") from None
+    shadow = found.shadow
+    numbers = [found.release, found.verified]
+    if shadow is not None:
+        numbers += [shadow.frames, shadow.driving_found, shadow.candidate_found, shadow.agreed]
+        if shadow.agreed > min(shadow.driving_found, shadow.candidate_found):
+            raise ValueError("more detections agree than there are")
+        if not all(SHA256.fullmatch(each) for each in (shadow.driving, shadow.candidate)):
+            raise ValueError("SHA-256 of both networks is wanted")
+    if not all(0 <= each < MOST for each in numbers) or not TASK.fullmatch(found.task):
+        raise ValueError("the message is no release report")
+    return found
