@@ -51,9 +51,9 @@ def reproduce(
         None,
         "--seeds",
         min=1,
-        help="Number of seeds, from 1: 10 of federation-groups, 8 of federation-exchange and placement, 5 of "
-        "corner-cases, demo-arms, failure-search, lifelong, redundant-tasks and the other federation-*, 3 of the "
-        "others if not given.",
+        help="Number of seeds, from 1: 10 of federation-groups, 8 of corner-cases, federation-exchange and placement, "
+        "5 of demo-arms, failure-search, lifelong, redundant-tasks and the other federation-*, 3 of the others if not "
+        "given.",
     ),
     scale: Scale | None = typer.Option(
         None, "--scale", help="full (or paper, the default): as committed; quick: in minutes."

@@ -82,12 +82,12 @@ TAKEN: Mapping[str, tuple[str, ...]] = dict.fromkeys(TARGETS, STUDY) | {
 SEEDS: Mapping[str, int] = {
     **dict.fromkeys(
         (
-            *(Target.corner_cases, Target.demo_arms, Target.failure_search, Target.lifelong, Target.redundant_tasks),
+            *(Target.demo_arms, Target.failure_search, Target.lifelong, Target.redundant_tasks),
             *(*EXCHANGES, *DRIVES),
         ),
         5,
     ),
-    **dict.fromkeys((Target.federation_exchange, Target.placement), 8),
+    **dict.fromkeys((Target.corner_cases, Target.federation_exchange, Target.placement), 8),
     Target.federation_groups: 10,
     Target.safety_distance: 1,
 }
