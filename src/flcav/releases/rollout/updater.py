@@ -161,7 +161,7 @@ def _ask(client: httpx.Client) -> bytes | None:
         status, content = _call(client, "GET", "director/metadata/timestamp.json")
     except httpx.HTTPError:
         return None
-    return {httpx.codes.OK: content, httpx.codes.NOT_FOUND: b""}.get(status)
+    return content if status == httpx.codes.OK else b"" if status == httpx.codes.NOT_FOUND else None
 
 
 def _report(client: httpx.Client, report: ReleaseReport) -> None:
