@@ -35,7 +35,7 @@ LEAD = "lead"
 
 @dataclass(frozen=True)
 class Scenario:
-    """What is driven through, but for the seed."""
+    """Driving scenario: town, event and weather; a seed makes a drive of it."""
 
     name: str
     town: str

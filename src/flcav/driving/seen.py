@@ -1,4 +1,4 @@
-"""What a driver is told about the world around: road users with predicted paths, lights, and the weather's factor.
+"""Perceived surroundings of the vehicle: road users with predicted paths, lights, and the factor of the weather.
 
 All tasks of perception end here: `objects` in the boxes, `trajectory` in the paths, `signs` in the lights, `weather` in
 the speed. World frame: ENU, metres, radians, seconds.
@@ -45,7 +45,7 @@ class Seen:
 
 
 class Perception(Protocol):
-    """What tells a driver about the world."""
+    """Perception of a driver: it turns the world into what is seen of it."""
 
     def look(self, snapshot: Snapshot) -> Seen:
         """Return what is known at this instant; called once for every decision, in order of time."""

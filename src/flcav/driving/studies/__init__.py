@@ -1,1 +1,1 @@
-"""What is measured over many drives: errors of the networks, tasks left out, what poles give."""
+"""Studies over many drives: errors of the networks, tasks left out, what poles give."""

@@ -1,4 +1,4 @@
-"""Who is hidden from a vehicle, from poles, and from both: the argument for road sensors.
+"""Occlusion of road users from a vehicle, from poles, and from both: the argument for road sensors.
 
 The article argues for them with what a vehicle cannot see (Wang et al., IEEE Network 37(3), 2023). Counted are cars and
 vans in the field of the vehicle's detector, and hidden is who no ray reaches: `visibility.share_seen`.

@@ -119,7 +119,7 @@ def measure_precision(tally: FusionTally) -> Precision | None:
 
 @dataclass(frozen=True)
 class PoleGain(Record):
-    """What poles give while driving, over the same drives with and without them."""
+    """Gain of roadside sensors in closed loop, over the same drives with and without them."""
 
     poles: tuple[int, ...]
     hidden: Hidden

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 RUNTIMES = "embedded", "ray", "flower"
 NOTHING: Weights = {}  # comes with a question
+UNREADABLE = "an answer that cannot be read"  # why one is missing
 ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere
 # where clients train, and how messages reach them
 Runtime = Union[ClientProcesses, "RaySimulation", "Deployment", "RegionalDeployment", "RosTopics"]
@@ -166,7 +167,7 @@ def _ask_there(
             try:
                 answers[event.client] = read_arrays(event.content, ARRAYS)
             except (KeyError, TypeError, ValueError) as error:
-                missing[event.client] = f"an answer that cannot be read: {error}"
+                missing[event.client] = f"{UNREADABLE}: {error}"
         else:
             missing[event.client] = event.reason if isinstance(event, Lost) else "no answer in time"
     return Replies(answers, missing)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.runtimes.link import NOTHING, Ask, open_questions
+from flcav.federation.runtimes.link import NOTHING, UNREADABLE, Ask, open_questions
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import Ledger
@@ -64,7 +64,6 @@ if TYPE_CHECKING:
     from flcav.federation.runtimes.deployed import RegionalDeployment
 
 EVERY_SCENE = 10**6  # more than there are
-UNREADABLE = "an answer that cannot be read"
 AnswerT = TypeVar("AnswerT")
 Places = Mapping[str, NDArray[np.float64]]  # (scenes, 3) [m] by client, see `find_places`
 
