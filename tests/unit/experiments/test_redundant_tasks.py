@@ -75,6 +75,7 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[TriedSc
     return out / name_step(1), from_json(tuple[TriedScenario, ...], values[name_step(1)], "step")
 
 
+@pytest.mark.slow
 def test_bytes_are_the_same_by_every_split(tried: tuple[Path, tuple[TriedScenario, ...]]) -> None:
     _, own = tried
     assert {(each.town, each.kind) for each in own} == set(SCENARIOS)
@@ -87,6 +88,7 @@ def test_bytes_are_the_same_by_every_split(tried: tuple[Path, tuple[TriedScenari
     assert all(each.up_mb["0"] == 0 for each in own)
 
 
+@pytest.mark.slow
 def test_scores_are_means_of_the_tests_of_each_scenario(tried: tuple[Path, tuple[TriedScenario, ...]]) -> None:
     folder, own = tried
     results = summarise({"1": own, "2": own}, {"1": folder, "2": folder})
@@ -145,6 +147,7 @@ def test_a_scenario_needs_the_frames_of_its_tasks() -> None:
         draw_sweeps(frames, 30, (1, "ring, roundabout"))
 
 
+@pytest.mark.slow
 def test_outcomes_have_a_file_for_each_number_of_tasks(tried: tuple[Path, tuple[TriedScenario, ...]]) -> None:
     folder, own = tried
     for each in own:
