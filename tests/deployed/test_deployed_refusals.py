@@ -143,6 +143,7 @@ def test_fl_request_sent_twice(deployment):
     server = read_ready(deployment.folder).proxy
     one, another = (deployment.folder / VEHICLES / name for name in ("vehicle-001", "vehicle-002"))
     asked = make_request("weather", 2.5, 12, (10.0, -3.0))
+    earlier = read_status(deployment.folder).requests
     send_request(one, server, asked)
     with pytest.raises(InputError, match="a request with this nonce came before"):
         send_request(one, server, asked)
@@ -158,7 +159,8 @@ def test_fl_request_sent_twice(deployment):
             assert time.monotonic() < end
             time.sleep(0.2)
     assert read_processes(deployment.folder)["proxy"] != before
-    assert [(each.vehicle, each.request) for each in read_status(deployment.folder).requests] == [(one.name, asked)]
+    came = [each for each in read_status(deployment.folder).requests if each not in earlier]
+    assert [(each.vehicle, each.request) for each in came] == [(one.name, asked)]
 
 
 def test_fl_request_that_is_old_or_none(deployment):
