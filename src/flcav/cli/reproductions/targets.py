@@ -89,5 +89,4 @@ SEEDS: Mapping[str, int] = {
     ),
     **dict.fromkeys((Target.corner_cases, Target.federation_exchange, Target.placement), 8),
     Target.federation_groups: 10,
-    Target.safety_distance: 1,
 }
