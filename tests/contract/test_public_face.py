@@ -38,7 +38,9 @@ def told(name: str) -> str:
     return (found.__doc__ if callable(found) else import_module(f"flcav.perception.{name.lower()}").__doc__) or ""
 
 
-@pytest.mark.parametrize("name", flcav.__all__)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "run" else []) for name in flcav.__all__]
+)
 def test_the_example_of_each_name_runs(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch):
     text = told(name)
     example = doctest.DocTestParser().get_doctest(text, {}, name, None, None)

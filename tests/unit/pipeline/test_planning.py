@@ -302,6 +302,7 @@ def test_plans_of_the_comparison_of_plans_stay_within_what_the_history_covers() 
         assert (np.array(counts) <= covered).all()
 
 
+@pytest.mark.slow  # a curve for each run and each seed
 @pytest.mark.parametrize(  # docs/runs.md, "Histories of the package"
     ("task", "runs", "points", "agreement", "noise", "attainable", "before", "pretrained"),
     [
