@@ -1,11 +1,15 @@
 """A deployed federation ends with the weights of the embedded one, bit by bit, by every strategy and every rule."""
 
+import os
+
 import numpy as np
 import pytest
+from fleet_clients import Walker
 
 from flcav.federation.privacy import Privacy
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules, SecureAggregation
+from flcav.federation.runtimes.deployed import RegionalDeployment
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import STRATEGIES, strategy_named
@@ -51,6 +55,16 @@ def test_strategies(name, clients, weights, deployment):
 )
 def test_rules(rules, clients, weights, deployment):
     check_same(*both(clients, weights, deployment, rules=rules))
+
+
+def test_the_edge_server_s_own_client_trains_here(clients, weights, deployment, tmp_path):
+    """A roadside unit beside two deployed vehicles."""
+    log = tmp_path / "log"
+    clients = {**clients, "town/cav2": Walker(3, log)}
+    partly = RegionalDeployment(deployment.folder, {"town": 2}).beside({"town/cav2"})
+    check_same(*both(clients, weights, partly, strategy=strategy_named("scaffold")))
+    assert {line.split()[1] for line in log.read_text().splitlines()} == {str(os.getpid())}
+    assert len(log.read_text().splitlines()) == 2 * SCHEDULE.rounds
 
 
 def test_masks(clients, weights, deployment):

@@ -15,11 +15,8 @@ FEDERATING = (edge_step, cloud_step)
 
 
 def check_clients(graph: Graph, arms: Iterable[str], runtime: str) -> None:
-    """Raise `InputError` where an arm's labels cannot be had by clients of a `runtime` elsewhere, or its units join."""
+    """Raise `InputError` where an arm's labels cannot be had by clients of a `runtime` elsewhere."""
     for arm in arms if runtime != "embedded" else ():
-        requests = graph.settings[arm].federation.requests
-        if runtime == "flower" and requests is not None and requests.roadside:
-            raise InputError("requests.roadside: units train at the edge server, and on 'flower' all train on vehicles")
         if any(LABEL_SOURCES[kind].averaged for kind in graph.settings[arm].labels.values()):
             raise InputError(
                 "labels 'road-average' are renewed between rounds, and clients elsewhere get them once; "

@@ -47,12 +47,6 @@ def test_what_federates_is_deployed_and_nothing_else_changes():
             {"arms": {"averaged": {"labels": {"objects": "road-average"}, "stages": ["edge"]}}},
             "'road-average' are renewed between rounds",
         ),
-        (
-            "flower",
-            "processes",
-            {"federation": {"requests": {"roadside": True}}},
-            "units train at the edge server, and on 'flower' all train on vehicles",
-        ),
     ],
 )
 def test_what_cannot_be_deployed(runtime, engine, changes, told):

@@ -7,13 +7,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from flwr.app import Message
+
 from flcav.config import InputError
+from flcav.federation.client import client_app
 from flcav.federation.fleet.authority import found_authority, open_registry
 from flcav.federation.fleet.keys import AUTHORITY
 from flcav.federation.fleet.registry import Vehicle
@@ -24,9 +27,10 @@ from flcav.federation.messages.fl_request import parse_request
 from flcav.federation.noise import Secret
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.deployed_grid import POLL_S, STARTING_S, DeployedGrid
-from flcav.federation.runtimes.embedded import keep_identity
+from flcav.federation.runtimes.embedded import EmbeddedGrid, keep_identity
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.vehicle_app import Assignment
+from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.federation.state import ClientStates
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable
@@ -176,6 +180,61 @@ class RegionalDeployment:
     def fleet_of(self, client: str) -> Deployment:
         """Return the fleet that a client, REGION/VEHICLE, is in."""
         return self._fleets[region_of(client)]
+
+    def beside(self, clients: Collection[str]) -> "RegionalDeployment | PartlyDeployed":
+        """Return the deployment where these `clients`, the edge server's own, train in this process."""
+        return PartlyDeployed(self, frozenset(clients)) if clients else self
+
+
+@dataclass(frozen=True)
+class PartlyDeployed:
+    """A deployment beside the edge server's own clients, such as roadside units, which train in this process."""
+
+    fleet: RegionalDeployment
+    own: frozenset[str]  # names of those clients
+    deployed: Literal[True] = True
+
+    @contextlib.contextmanager
+    def open(
+        self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
+    ) -> Iterator["JoinedGrid"]:
+        """Yield the grid of `clients`, of which the vehicles are deployed, see `Deployment.open`."""
+        here = {name: client for name, client in clients.items() if name in self.own}
+        there = {name: client for name, client in clients.items() if name not in self.own}
+        app = client_app(here, agreed.strategy, agreed.rules, agreed.secrets, agreed.spent)
+        with self.fleet.open(there, agreed, states, account) as far:
+            yield JoinedGrid(far, EmbeddedGrid(app, [*here], states), [*clients])
+
+
+class JoinedGrid(WrappedGrid):
+    """Grid of deployed nodes, and of others in this process."""
+
+    def __init__(self, far: "DeployedGrid", near: EmbeddedGrid, clients: Sequence[str]) -> None:
+        """Join two grids, whose nodes stand for `clients`, in their order."""
+        self._grid, self._near, self.follow = far, near, far.follow
+        nodes = {name: node for node, name in (far.names | near.names).items()}
+        self.names = {nodes[name]: name for name in clients}
+
+    def get_node_ids(self) -> list[int]:
+        """Return the ids of the nodes, in the order of the clients."""
+        return [*self.names]
+
+    def read_states(self, keys: Iterable[str]) -> ClientStates:
+        """Return the arrays that clients keep between rounds under these records, by client and record."""
+        wanted = tuple(keys)
+        found = self._grid.read_states(wanted) | self._near.read_states(wanted)
+        return {name: found[name] for name in self.names.values() if name in found}
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
+        """Yield the replies, those of this process once the deployed nodes asked before them have answered."""
+        asked = [*messages]
+        far = [message for message in asked if message.metadata.dst_node_id not in self._near.names]
+        answers = iter(self._grid.send_and_receive(far, timeout=timeout))
+        for message in asked:
+            if message.metadata.dst_node_id in self._near.names:
+                yield from self._near.send_and_receive([message])
+            elif (answer := next(answers, None)) is not None:
+                yield answer
 
 
 def region_of(client: str) -> str:

@@ -32,7 +32,7 @@ from flcav.federation.trainable import Trainable, Weights, answer_question
 from flcav.interface.wording import suggest
 
 if TYPE_CHECKING:
-    from flcav.federation.runtimes.deployed import Deployment, RegionalDeployment
+    from flcav.federation.runtimes.deployed import Deployment, PartlyDeployed, RegionalDeployment
     from flcav.federation.runtimes.simulation import RaySimulation
     from flcav.federation.runtimes.topics import RosTopics
 
@@ -41,7 +41,7 @@ NOTHING: Weights = {}  # comes with a question
 UNREADABLE = "an answer that cannot be read"  # why one is missing
 ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere
 # where clients train, and how messages reach them
-Runtime = Union[ClientProcesses, "RaySimulation", "Deployment", "RegionalDeployment", "RosTopics"]
+Runtime = Union[ClientProcesses, "RaySimulation", "Deployment", "RegionalDeployment", "PartlyDeployed", "RosTopics"]
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def open_link(
 
 @contextlib.contextmanager
 def open_questions(
-    clients: Mapping[str, Trainable], deployed: "RegionalDeployment | None", account: Account
+    clients: Mapping[str, Trainable], deployed: "RegionalDeployment | PartlyDeployed | None", account: Account
 ) -> Iterator[Ask]:
     """Yield a way to ask clients outside the rounds of a federation: in this process, or `deployed`.
 

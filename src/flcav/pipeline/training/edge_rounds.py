@@ -99,11 +99,12 @@ def federate_edge(
     """Run the rounds of stage II of a region; write weights and ledger, return each round's loss.
 
     A privacy budget may end it before the schedule's end, and of asynchronous rounds, `buffers`, each budget. Vehicles
-    train in so many `processes` of a `runtime` of `RUNTIMES`, or where they are `deployed`, to the same weights; where
-    that is `timed`, their times are kept, see `read_times`, unless nobody is to know who was drawn. The vehicles that
-    `outages` name by round are lost in it.
+    train in so many `processes` of a `runtime` of `RUNTIMES`, or where they are `deployed`, to the same weights; units
+    of the edge server itself then train in this process. Where that is `timed`, their times are kept, see `read_times`,
+    unless nobody is to know who was drawn. The vehicles that `outages` name by round are lost in it.
     """
     own, learning, state = federation, federation.learning, FederationState()
+    far = None if deployed is None else deployed.beside(own.roadside)
     checkpoints = FederationCheckpoints(
         learning.task,
         own.folder,
@@ -125,12 +126,12 @@ def federate_edge(
     account = Account(own.book, EDGE, learning.task.name, "wireless", outages, own.roadside)
     if own.watch is not None:
         clients = own.watch.enlist(clients)
-        with open_questions(clients, deployed if done else None, account) as ask:
+        with open_questions(clients, far if done else None, account) as ask:
             for number in range(1, done + 1):
                 reached = load_file(round_path(own.folder, number))
                 own.watch.note(own.watch.hear(ask, reached, counted=False))
     asking: Any = {} if own.watch is None else {"ask_after": partial(own.watch.follow, own.book)}
-    opened = contextlib.nullcontext(deployed) if deployed else open_runtime(runtime, clients, processes)
+    opened = contextlib.nullcontext(far) if far else open_runtime(runtime, clients, processes)
     with checkpoints.refusals(), opened as where, contextlib.suppress(Levelled):
         if own.watch is not None and own.watch.over:
             raise Levelled
