@@ -211,8 +211,8 @@ class JoinedGrid(WrappedGrid):
 
     def __init__(self, far: "DeployedGrid", near: EmbeddedGrid, clients: Sequence[str]) -> None:
         """Join two grids, whose nodes stand for `clients`, in their order."""
-        self._grid, self._near, self.follow = far, near, far.follow
-        nodes = {name: node for node, name in (far.names | near.names).items()}
+        self._grid, self._far, self._near, self.follow = far, far, near, far.follow
+        nodes = {name: node for grid in (far, near) for node, name in grid.names.items()}
         self.names = {nodes[name]: name for name in clients}
 
     def get_node_ids(self) -> list[int]:
@@ -222,7 +222,7 @@ class JoinedGrid(WrappedGrid):
     def read_states(self, keys: Iterable[str]) -> ClientStates:
         """Return the arrays that clients keep between rounds under these records, by client and record."""
         wanted = tuple(keys)
-        found = self._grid.read_states(wanted) | self._near.read_states(wanted)
+        found = self._far.read_states(wanted) | self._near.read_states(wanted)
         return {name: found[name] for name in self.names.values() if name in found}
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
