@@ -1,4 +1,4 @@
-"""Couplings of perception and driving: what a driver does without a task.
+"""Couplings of perception tasks to driving: the driver's input when a task is left out.
 
 Without `objects` nobody is seen, without `trajectory` everybody is taken to stand where they are, without `signs` no
 light is known, and without `weather` the driver keeps to the limit in any: that is the *bare* coupling. In the
@@ -34,7 +34,7 @@ FEEDS: Mapping[str, str] = {
 
 
 def leave_out(seen: Seen, task: str, coupling: Coupling) -> Seen:
-    """Return what is left of `seen` without the output of a task."""
+    """Return the perceived surroundings without the output of a task."""
     if task == "objects":
         none = np.zeros((0, len(TIMES_S)))
         seen = replace(
@@ -67,5 +67,5 @@ class Without:
     coupling: Coupling
 
     def look(self, snapshot: Snapshot) -> Seen:
-        """Return what is left of the whole perception's view."""
+        """Return the surroundings as the complete perception has them, less the output of the task."""
         return leave_out(self.whole.look(snapshot), self.task, self.coupling)

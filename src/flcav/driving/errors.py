@@ -1,4 +1,4 @@
-"""A model of the networks' errors: perception of the same quality at a small part of the time.
+"""A statistical error model of the networks: perception of the same quality at a fraction of the computing time.
 
 A perception error model (Piazzoni et al., "Modeling perception errors towards robust decision making in autonomous
 vehicles", IJCAI 2020): road users in sight are detected with the measured probability for their class and distance,
@@ -104,7 +104,7 @@ class ModelledPerception:
         self._share = WEATHER_SPEED[str(drawn)]
 
     def look(self, snapshot: Snapshot) -> Seen:
-        """Return what networks with these errors might find at this instant."""
+        """Return a random draw of the networks' output at this instant."""
         self._scene.follow(snapshot.trace)
         self._read_lights(snapshot)
         closed = frozenset(n for n, (_, letter) in self._read.items() if letter != "G")
@@ -160,7 +160,7 @@ class ModelledPerception:
 
 
 def sense_model(model: ErrorModel) -> Sensing:
-    """Return what makes perception with the errors of a model, for `loop.drive`."""
+    """Return the constructor of a perception with the errors of a model, for `loop.drive`."""
 
     def sense(staged: Staged, seed: int) -> Perception:
         return ModelledPerception(model, staged, seed)

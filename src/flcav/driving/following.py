@@ -1,4 +1,4 @@
-"""From detections to what a driver is told: tracks, forecasts of their paths, and how far off these may be.
+"""Tracking and motion forecasts of detected road users, with calibrated uncertainty, as the input of the driver.
 
 Tracks come from the tracker of the package, and are kept for `KEPT_S` without a detection. Vehicles that are known for
 two seconds get the single path of the trajectory network, every half second; all others keep their velocity. Who moves
@@ -50,7 +50,7 @@ def head_forward(yaw: Array, velocity: Array) -> Array:
 
 @dataclass(frozen=True)
 class Spread:
-    """Calibrated uncertainty: what the variances of boxes are multiplied by, and how predicted paths come apart."""
+    """Calibrated uncertainty: factors of the variances of boxes, and the growth of the error of predicted paths."""
 
     factor: float = 1.0  # of the variances of tracked positions
     growth: Mapping[str, tuple[float, ...]] = field(

@@ -1,4 +1,4 @@
-"""Many drives: jobs on several processes, each kept in a file when it is done, so that stopped work goes on."""
+"""Parallel execution of many drives: each result is a file of its own, so that interrupted work can be resumed."""
 
 import hashlib
 import json
@@ -28,7 +28,7 @@ class Sensed(Record):
     model: ErrorModel | None = None
 
     def make(self) -> Sensing:
-        """Return what makes it; raises `ValueError` for a modelled perception without its model."""
+        """Return the constructor of the perception; raises `ValueError` for a modelled perception without its model."""
         if self.kind == "model":
             if self.model is None:
                 raise ValueError("a modelled perception needs its model")
@@ -74,7 +74,7 @@ def run_jobs(
     progress: Report = ignore_progress,
     kept: Path | None = None,
 ) -> list[Drive]:
-    """Return the measures of drives in the order of the jobs, on so many processes.
+    """Return the measures of drives in the order of the jobs, computed by parallel processes.
 
     With `kept`, a file of JSON lines, drives that are in it are not driven again, and others are added to it.
     """

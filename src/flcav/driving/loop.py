@@ -1,4 +1,4 @@
-"""The closed loop: ten times a second the driver is told what is seen, and the world goes on by what it does."""
+"""The closed loop of perception, driver and world, at ten steps a second."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ def sense_truth(staged: Staged, seed: int) -> Perception:
 
 
 def drive(scenario: Scenario, seed: int, sense: Sensing = sense_truth, loop: Loop = LOOP) -> Drive:
-    """Return the measures of a drive: a scenario with a seed, with what `sense` makes of it.
+    """Return the measures of a closed-loop drive through a scenario with a seed, on the perception that `sense` makes.
 
     It ends with a collision at fault, near the end of the route, or after its time. Raises `InputError` where the town
     has no room for the ego vehicle, and what the perception raises.

@@ -30,7 +30,7 @@ PENALTY: Mapping[str, float] = {"pedestrian": 0.0, "vehicle": 0.0, "obstacle": 0
 
 @dataclass(frozen=True)
 class Hit(Record):
-    """A collision of the ego vehicle: with what, when, and whether by its own fault."""
+    """A collision of the ego vehicle: its time, the other body, and whether the ego vehicle is at fault."""
 
     time_s: float
     other: str
@@ -76,7 +76,7 @@ def score_drive(progress: float, hits: Sequence[Hit], red_lights: int) -> float:
 
 
 def measure_ttc(route: Route, own: Motion, truth: Seen, size: tuple[float, float]) -> float:
-    """Return the time to collision [s] when all go on as they do, by true states; the horizon where there is none.
+    """Return the time to collision [s] by true states, if all keep their motion; the horizon if there is no collision.
 
     The ego vehicle, `size` its length and width [m], keeps its speed along the route.
     """

@@ -130,7 +130,7 @@ class NetworkPerception:
         self.followed: Followed | None = None
 
     def look(self, snapshot: Snapshot) -> Seen:
-        """Return what the networks find at this instant."""
+        """Return the networks' perception at this instant."""
         self.scene.follow(snapshot.trace)
         pictured = self._step % CAMERA_STEPS == 0
         rig = Rig(lidars=lidar32().lidars, cameras=car().cameras if pictured else {})

@@ -1,4 +1,4 @@
-"""Roadside perception while driving: detections of poles that reach the ego vehicle with the road's latency.
+"""Roadside perception while driving: detections by roadside units, which reach the ego vehicle after a latency.
 
 A pole spins its LiDAR every `SPIN_S`; the road detector of the package finds cars in the returns before the pole's
 static background, which a sweep of the town without actors shows. The message is as old on arrival as the detector
@@ -49,7 +49,7 @@ class RoadMessage:
 
 
 class RoadUnits:
-    """The poles of a drive that send what they find."""
+    """The roadside units of a drive, which send their detections."""
 
     def __init__(self, town: Town, poles: Sequence[int], seed: int, *, radio: Radio | None = None) -> None:
         """Take the numbers of the town's poles; raises `InputError` for one that the town does not have."""
@@ -78,7 +78,7 @@ class RoadUnits:
         return concatenate(parts) if parts else Boxes.empty()
 
     def _spin(self, scene: Scene, snapshot: Snapshot) -> None:
-        """Let every pole look, and send what it finds."""
+        """Detect with every roadside unit, and send the detections."""
         links = link_vehicles(self._town, snapshot.trace, [EGO], self.sites, self._radio, self._seed)
         for number, (name, messages) in enumerate(self._last.items()):
             boxes = self._detect(scene, snapshot, name)
@@ -108,7 +108,7 @@ def pack_tracks(tracked: Tracked) -> bytes:
 
 
 def learn_pole_background(town: Town, pole: str, seed: int) -> Background:
-    """Return the static background of a pole's LiDAR: what it sees of the town without actors."""
+    """Return the static background of a pole's LiDAR: its sweeps of the town without actors."""
     scene = Scene(town, empty_trace(town.name))
     sweeps = [
         observe(scene, lidar_pole(), pole, 0, scene_name="empty", seed=seed, number=number).lidar[LIDAR]

@@ -1,4 +1,4 @@
-"""Scenarios of closed-loop drives: a route in a town, its traffic and weather, and an event that asks for brakes.
+"""Scenarios of closed-loop drives: a route in a town, its traffic and weather, and an event that requires braking.
 
 A scenario with a seed is one drive: the route is of the scenario, traffic and the moment of the event are of the seed.
 """
@@ -65,7 +65,7 @@ def find_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
 
 
 def spread_scenarios(count: int) -> tuple[Scenario, ...]:
-    """Return so many scenarios, of towns, events and weathers in turn."""
+    """Return a number of scenarios that cycle through towns, events and weathers."""
     known = list_scenarios()
     step = 7  # coprime to their number: it goes through all
     return tuple(known[(step * i) % len(known)] for i in range(count))

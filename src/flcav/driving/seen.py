@@ -45,10 +45,10 @@ class Seen:
 
 
 class Perception(Protocol):
-    """Perception of a driver: it turns the world into what is seen of it."""
+    """The interface of a driver's perception: from the world to its perceived surroundings."""
 
     def look(self, snapshot: Snapshot) -> Seen:
-        """Return what is known at this instant; called once for every decision, in order of time."""
+        """Return the perceived surroundings at this instant; called once for every decision, in order of time."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Ground-truth perception: all road users around, where and how fast they are; paths keep speed and turn rate.
+"""Ground-truth perception: true positions and velocities of all road users; paths of constant speed and turn rate.
 
 What they are going to do is not known to anybody in a live world, so that paths are predicted here, too.
 """

@@ -1,4 +1,4 @@
-"""Which road users a place sees past the town and the traffic, by rays through the scene."""
+"""Visibility of road users from a place among buildings and traffic, by ray casting."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Attendance of a federated round: who is asked, who fails, how many are enough; and the updates that arrived."""
+"""Attendance of a federated round: clients asked, failures, the number of updates required, and those that arrived."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Rounds of buffered asynchronous aggregation: a round is a buffer that fills, as a clock says when and by whom.
+"""Rounds of buffered asynchronous aggregation: a round is a buffer, filled by clients in the order of a clock.
 
 Who is how fast does not depend on what is learned. So a clock comes first (`flcav.network.clock.buffers`), and its
 buffers say which version of the weights each update began with; here clients train on those versions. The same

@@ -1,4 +1,4 @@
-"""A server that reads: the updates of a round as they arrive, for experiments on what they give away."""
+"""A curious server: it reads the updates of a round as they arrive, for experiments on leakage."""
 
 from collections.abc import Callable, Iterable, Mapping
 

@@ -107,7 +107,7 @@ class Trainable(Protocol):
 
 @runtime_checkable
 class Counts(Protocol):
-    """A client that says before it trains how many samples it will train on."""
+    """A client that reports its number of samples before it trains."""
 
     def count_samples(self, steps: int) -> int:
         """Return the number of distinct samples that `steps` local steps train on: the update's `samples`."""
@@ -115,7 +115,7 @@ class Counts(Protocol):
 
 
 def count_samples(client: Trainable, steps: int) -> int:
-    """Return what a client that `Counts` says; raises TypeError of any other."""
+    """Return the number of samples of a client that `Counts`; raises TypeError for any other client."""
     if not isinstance(client, Counts):
         raise TypeError(f"{type(client).__name__} does not say how many samples it has: no count_samples")
     return client.count_samples(steps)
@@ -131,7 +131,7 @@ class Answers(Protocol):
 
 
 def answer_question(client: Trainable, question: str, arrays: Weights) -> Weights:
-    """Return what a client that `Answers` says; raises TypeError of any other."""
+    """Return the answer of a client that `Answers`; raises TypeError for any other client."""
     if not isinstance(client, Answers):
         raise TypeError(f"{type(client).__name__} answers no questions, such as '{question}'")
     return client.answer(question, arrays)

@@ -134,7 +134,7 @@ def locate_failure(world_from_agent: Array, error: PerceptionError) -> float | N
 
 
 def measure_cells(measure: Measure, outcomes: Outcomes, tested: Sequence[Trial], range_m: float) -> list[CellErrors]:
-    """Return what a detector does in each cell of several recordings, the one with most errors per frame first.
+    """Return a detector's measures in each cell of several recordings, the one with most errors per frame first.
 
     The units of `outcomes` are the frames of `tested`, in their order. range_m: of a pole's sensor.
     """

@@ -39,7 +39,7 @@ Cell = tuple[str, ...]  # kind of place, class, and the bucket of each number of
 
 @dataclass(frozen=True)
 class Candidate:
-    """A frame that may be tested: its vehicle at a spin, and whom it has in its path."""
+    """A candidate frame of the search: a vehicle at a spin, and the road users in its path."""
 
     spin: int
     vehicle: int  # number of "cav0", ...

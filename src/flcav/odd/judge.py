@@ -50,7 +50,7 @@ class Verdicts:
 
 @dataclass(frozen=True)
 class Rates(Record):
-    """Precision and recall of one verdict, with Wilson's intervals; None where it was never said, or never true."""
+    """Precision and recall of one verdict, with Wilson's intervals; None if it was never given, or never true."""
 
     precision: Estimate | None
     recall: Estimate | None

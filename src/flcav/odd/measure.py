@@ -62,7 +62,7 @@ class Span(Record):
 
 
 def summarise(measured: Measurements) -> tuple[Span, ...]:
-    """Return what the frames cover of each attribute, in the order of the columns."""
+    """Return the range or the values of each attribute in the frames, in the order of the columns."""
     spans = []
     for name, column in measured.columns.items():
         if column.dtype.kind == "U":
@@ -85,7 +85,7 @@ def select_vehicles(data: Dataset) -> tuple[int, ...]:
 
 
 def measure(data: Dataset, frames: Sequence[int] | None = None, scenery: Scenery | None = None) -> Measurements:
-    """Return what the ground truth of `frames` (None: all of vehicles) says of each attribute.
+    """Return the value of each attribute in `frames` (None: all of vehicles), by ground truth.
 
     scenery: that of the recording's town, where it has been read before. What a recording does not say is missing.
     """

@@ -1,4 +1,4 @@
-"""Scenarios as ASAM OpenSCENARIO XML 1.2: entities, where they start, the weather, and what the corner case does.
+"""Scenarios as ASAM OpenSCENARIO XML 1.2: entities, their initial states, the weather, and the storyboard.
 
 The file says what happens to the vehicle under test, `ego`, on one street of the town, whose OpenDRIVE map it names.
 When a recipe is recorded, its actors are cast from the traffic; here each has a place of its own. docs/odd.md says what
@@ -48,7 +48,7 @@ class Speed:
 
 @dataclass(frozen=True)
 class Aside:
-    """An actor moves sideways to a lane, by so many lanes to the left, within so many seconds."""
+    """A lane change of an actor: the number of lanes to the left, and the duration."""
 
     actor: str
     lanes: int

@@ -42,7 +42,7 @@ def perceive(
     objects: Second | None,
     progress: Report = ignore_progress,
 ) -> Measurements:
-    """Return what a vehicle perceives of each attribute in its `frames`; what a network of None would say is missing.
+    """Return the attributes as a vehicle perceives them in its `frames`; those of a network that is None are missing.
 
     Raises `InputError` where a frame lacks the camera of the weather network, or the LiDAR of the detector.
     """

@@ -1,4 +1,4 @@
-"""Which parts of a domain a town or a recording realises: attribute by attribute, with the rest left open."""
+"""Feasibility of a domain by attribute: whether a town or a recording has values inside it, or unknown ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

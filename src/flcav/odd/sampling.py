@@ -136,7 +136,7 @@ class Space:
         return Axis(name, tuple(labels), tuple(spans), self.domain.bound[name] == "visibility")
 
     def _is_inside(self, name: str, value: float) -> bool:
-        """Return whether the domain can hold with a value and what it implies: the sun the light, rain the surface."""
+        """Return whether a value can be inside the domain, with its implications: light by sun, surface by rain."""
         column = self.domain.bound[name]
         weather = {field: np.full(1, np.nan) for field in Weather.model_fields}
         if column == "sun_elevation":

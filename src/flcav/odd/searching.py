@@ -1,4 +1,4 @@
-"""Adaptive search for failures: scenarios and their frames are chosen by what earlier ones have shown.
+"""Adaptive search for failures by Thompson sampling: earlier results determine which scenarios and frames to test.
 
 A naive Bayes model has the rate of failures in each bucket of each axis of a frame's cell, of the corner case and of
 the town; a rate is drawn from its Beta posterior (Thompson sampling: Russo et al., "A tutorial on Thompson sampling",
@@ -69,7 +69,7 @@ class Searched(Record):
 
 @dataclass
 class FailureModel:
-    """Rates of failures by bucket, and the cells in which there is one."""
+    """A naive Bayes model of failures: their rates by bucket, and the cells in which one has been found."""
 
     tests: Counter[str] = field(default_factory=Counter)  # by bucket
     hits: Counter[str] = field(default_factory=Counter)
@@ -93,7 +93,7 @@ class FailureModel:
         }
 
     def promise(self, names: Sequence[str], cell: Cell, ratios: Mapping[str, float]) -> float:
-        """Return what a frame in a cell promises: the product of its ratios, less where there are failures already."""
+        """Return the expected yield of a frame in a cell: the product of its ratios, less in a cell with a failure."""
         rate = float(np.prod([ratios.get(name, 1.0) for name in (*names, *cell)]))
         return rate / (1 + self.failed[cell]) ** 2
 
@@ -108,7 +108,7 @@ def search_failures(
     kept: Path | None = None,
     progress: Report = ignore_progress,
 ) -> list[Searched]:
-    """Return so many scenarios of a space with the failures of a detector in `FRAMES` frames of each.
+    """Return a number of scenarios of a space, with the failures of a detector in `FRAMES` frames of each.
 
     rule: "failures" searches; "sobol" takes Sobol points as they come, and the frames nearest to the place while the
     corner case plays; "path" takes frames of them at random, but with somebody in the path. Scenario n has seed + n.
@@ -138,7 +138,7 @@ def search_failures(
 
 
 def distinct(searched: Sequence[Searched]) -> set[Cell]:
-    """Return the cells in which there is a failure: distinct failures."""
+    """Return the cells with a failure: the distinct failures."""
     return {failure.cell for each in searched for failure in each.failures}
 
 
@@ -175,7 +175,7 @@ def choose_frames(
 
 
 def _context(sample: Sample) -> tuple[str, ...]:
-    """Return what else a rate depends on, which is not part of a cell."""
+    """Return the further features that a rate depends on, beside those of the cell."""
     return f"case {sample.case}", f"town {sample.place.town}"
 
 

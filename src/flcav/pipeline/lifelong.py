@@ -1,4 +1,4 @@
-"""Settings of lifelong learning: conditions that come one after another, what vehicles remember, and what is mended."""
+"""Settings of lifelong learning: the sequence of conditions, the replay memory, and the margin of mending."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any

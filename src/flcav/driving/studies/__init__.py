@@ -1,1 +1,1 @@
-"""Studies over many drives: errors of the networks, tasks left out, what poles give."""
+"""Studies over many drives: errors of the networks, importance of tasks, benefit of roadside units."""

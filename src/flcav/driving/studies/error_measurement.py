@@ -1,4 +1,4 @@
-"""Measurement of the networks' errors on drives: how often they find whom, how far off, and in four seconds.
+"""Measurement of the networks' errors on drives: recall, errors of position, and of forecasts over four seconds.
 
 The vehicle is driven by the truth, and the networks are compared with it; `errors.ErrorModel` is what is found.
 """
@@ -68,7 +68,7 @@ class Comparing:
         self._places: dict[tuple[str, int], Array] = {}
 
     def look(self, snapshot: Snapshot) -> Seen:
-        """Return the truth; note what the networks make of it."""
+        """Return the truth, and count the networks' errors against it."""
         told = self._networks.look(snapshot)
         self._compare(snapshot)
         self._remember(snapshot)
@@ -148,14 +148,14 @@ def measure_errors(
 
 
 def tally_drive(scenario: Scenario, seed: int, loop: Loop) -> Tally:
-    """Return what the networks get wrong in one drive."""
+    """Return the counts of the networks' errors in one drive."""
     tally = Tally()
     drive(scenario, seed, lambda staged, own: Comparing(staged, own, tally), loop)
     return tally
 
 
 def summarise(tally: Tally) -> ErrorModel:
-    """Return the model of what was counted; shares have half a success and half a failure added (Jeffreys)."""
+    """Return the error model of the counts; shares have half a success and half a failure added (Jeffreys prior)."""
     detected: dict[str, tuple[float, ...]] = {}
     sd: dict[str, tuple[float, float, float]] = {}
     for name in CLASSES:

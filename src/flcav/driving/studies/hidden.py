@@ -73,7 +73,7 @@ def summarise_hidden(flags: Sequence[NDArray[np.bool_]]) -> Hidden:
 
 
 def count_hidden(town: Town, traces: Sequence[Trace], sites: Array, ranges_m: Sequence[float]) -> Hidden:
-    """Return who is hidden from connected vehicles ("cav0", ...) of recorded traffic, and from sites (P, 3) [m].
+    """Return the road users hidden from connected vehicles ("cav0", ...) in recorded traffic, and from sites (P, 3).
 
     Looked at are about `INSTANTS` instants. Without connected vehicles every car that drives is one.
     """

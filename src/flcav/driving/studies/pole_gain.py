@@ -1,4 +1,4 @@
-"""The gain of poles while driving: who is hidden, AP of vehicle and road together, and drives with and without them."""
+"""The benefit of roadside units for driving: hidden road users, average precision, and drives, with and without."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -51,7 +51,7 @@ class FusionTally:
 
 
 class Cooperative:
-    """Perception by the networks of the vehicle and of poles; what both find is tallied beside the truth."""
+    """Cooperative perception by vehicle and roadside units; the detections of both are compared with the truth."""
 
     def __init__(self, staged: Staged, seed: int, poles: Sequence[int], tally: FusionTally) -> None:
         self._units = RoadUnits(staged.town, poles, seed)
@@ -59,7 +59,7 @@ class Cooperative:
         self._scenario, self._tally, self._looked_s = staged.scenario.name, tally, -SPIN_S
 
     def look(self, snapshot: Snapshot) -> Seen:
-        """Return what is found at this instant."""
+        """Return the cooperative perception at this instant."""
         told = self._networks.look(snapshot)
         if snapshot.time_s - self._looked_s >= SPIN_S - 1e-6:
             self._looked_s = snapshot.time_s
@@ -158,7 +158,7 @@ def measure_pole_gain(
     loop: Loop = LOOP,
     progress: Report = ignore_progress,
 ) -> PoleGain:
-    """Return what poles of the scenarios' town give; raises `InputError` for a pole that it does not have."""
+    """Return the benefit of roadside units on poles of the scenarios' town; raises `InputError` for an unknown pole."""
     tally, without, with_poles = FusionTally(), list[Drive](), list[Drive]()
     pairs = [(scenario, seed) for scenario in scenarios for seed in seeds]
     for done, (scenario, seed) in enumerate(pairs, start=1):

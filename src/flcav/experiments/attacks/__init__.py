@@ -1,1 +1,1 @@
-"""Attacks on a federation of the weather task: clients that lie, and a server that reads."""
+"""Attacks on a federation of the weather task: Byzantine clients, and a curious server."""

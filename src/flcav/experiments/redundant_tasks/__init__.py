@@ -1,1 +1,1 @@
-"""Redundant tasks: as many as scenarios are complex, against an even split."""
+"""Redundant tasks: their number by the complexity of a scenario, against an even split."""

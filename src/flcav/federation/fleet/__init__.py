@@ -1,1 +1,1 @@
-"""A deployed fleet: its authority and registry, mutual TLS in front of Flower's SuperLink, and the processes of all."""
+"""A deployed fleet: its authority and registry, mutual TLS in front of Flower's SuperLink, and its processes."""

@@ -54,7 +54,7 @@ def build_bundle(client: str = CLIENT) -> bytes:
 
 
 def make_publisher(folder: Path) -> None:
-    """Make the publisher's key in `folder`, and beside it the file of those whom vehicles trust."""
+    """Make the publisher's key in `folder`, and beside it the file of keys that vehicles trust."""
     key = ed25519.Ed25519PrivateKey.generate()
     openssh = serialization.PrivateFormat.OpenSSH
     write_private(

@@ -1,4 +1,4 @@
-"""A vehicle's forwarder: Flower's SuperNode, which knows no client certificates, reaches the fleet's proxy through it.
+"""A vehicle's forwarder: a local proxy that adds the client certificate, which Flower's SuperNode does not support.
 
 It listens on the vehicle's loopback alone, and passes calls on with the vehicle's certificate. FL requests go to the
 proxy directly.
@@ -18,13 +18,13 @@ from flcav.federation.messages.fl_request import PATH, FLRequest
 
 
 class Forwarder:
-    """ASGI app on a vehicle's loopback."""
+    """The forwarder's ASGI app, on the loopback interface of a vehicle."""
 
     def __init__(self, client: httpx.AsyncClient) -> None:
         self._client = client
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a call on."""
+        """Forward a call to the proxy."""
         if scope["type"] == "lifespan":
             while not await keep_alive(receive, send):
                 pass
@@ -33,7 +33,7 @@ class Forwarder:
 
 
 def vehicle_tls(folder: Path) -> ssl.SSLContext:
-    """Return the TLS settings of a vehicle: its certificate, and the authority that it knows servers by."""
+    """Return the TLS settings of a vehicle: its certificate, and the authority whose servers it trusts."""
     context = ssl.create_default_context(cafile=str(folder / AUTHORITY))
     context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
     context.minimum_version = ssl.TLSVersion.TLSv1_3

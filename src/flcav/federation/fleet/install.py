@@ -1,4 +1,4 @@
-"""Putting a vehicle to use, on the vehicle: its certificate, whom it trusts, and where the fleet is reached."""
+"""Installation on a vehicle: its certificate, the keys that it trusts, and the address of the fleet."""
 
 import re
 from pathlib import Path
@@ -17,7 +17,7 @@ from flcav.storage.files import write_bytes
 def install_vehicle(
     folder: Path, certificate: Path, authority: Path, trusted: Path, server: str, client: str = ""
 ) -> None:
-    """Put what came from the authority into a vehicle's folder; raises `InputError` where a part is another thing.
+    """Install the authority's files in a vehicle's folder; raises `InputError` for a file of another kind.
 
     server: host:port of the proxy. client: module:NAME of the vehicle's own part in a federation, an `Assignment`
     of `runtimes.vehicle_app`; "": the one that is put into its folder.

@@ -124,7 +124,7 @@ def requested_name(request: x509.CertificateSigningRequest) -> str:
 
 
 def make_loopback(folder: Path) -> None:
-    """Make the key and the self-signed certificate (127.0.0.1) that a vehicle's SuperNode knows its forwarder by."""
+    """Make the key and the self-signed certificate (127.0.0.1) of a vehicle's forwarder, which its SuperNode trusts."""
     key, name = make_key(), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "forwarder")])
     made = certificate_of(key.public_key(), name, name, timedelta(days=3650), hosts=("127.0.0.1", "localhost"))
     write_private(folder / LOOPBACK_KEY, private_pem(key))

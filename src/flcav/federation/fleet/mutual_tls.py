@@ -1,4 +1,4 @@
-"""HTTPS with certificates on both sides: a uvicorn server that tells its app whose certificate a request came with.
+"""Mutual TLS: a uvicorn server that passes the client certificate of each request to its app.
 
 `scope["state"]` of a request has the client's certificate (DER; None: it has none) and its connection, whose bytes are
 read where they cross: the kernel counts those of a TCP socket (TCP_INFO, Linux), TLS records included.
@@ -26,7 +26,7 @@ class Connection:
         self._counted = (0, 0)
 
     def count_bytes(self) -> tuple[int, int]:
-        """Return the bytes that were received and sent since the last call; zeros where the system does not say."""
+        """Return the bytes received and sent since the last call; zeros where the system does not report them."""
         if not hasattr(socket, "TCP_INFO"):
             return 0, 0
         try:

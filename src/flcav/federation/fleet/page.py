@@ -1,4 +1,4 @@
-"""The live page of a fleet, on the loopback of the operator's host: what `status` reads, again and again."""
+"""The live page of a fleet's status, on the loopback interface of the operator's host."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""The fleet's proxy: the one door of vehicles to Flower's SuperLink, for registered certificates and fleet calls alone.
+"""The fleet's reverse proxy before Flower's SuperLink: it only admits registered certificates and calls of nodes.
 
 A call passes where its path is one of a node's under `/v1/fleet/`, its TLS connection has the certificate of a vehicle
 that is in the registry, neither revoked nor replaced nor expired at that moment, and Flower's node key is that

@@ -1,4 +1,4 @@
-"""The registry of a fleet's vehicles (SQLite): who has which certificate, and an audit trail of every change.
+"""The registry of a fleet's vehicles (SQLite): their certificates, and an audit trail of every change.
 
 A row of `certificates` is one certificate. It is in force, or revoked, or replaced by that of a newer key; it expires
 by itself. Each change and its entry in `audit` are one transaction; entries are never changed.
@@ -187,7 +187,7 @@ class Registry:
         return [*self._select("WHERE node IS NOT NULL")]
 
     def take_request(self, vehicle: str, nonce: str, content: bytes, now: float) -> str | None:
-        """Keep a vehicle's FL request for a day; return in words why it is refused: it came before, or too many did."""
+        """Store a vehicle's FL request for a day; return in words why it is refused: a replay, or the rate limit."""
         with self._change() as cursor:
             cursor.execute("DELETE FROM requests WHERE time < ?", (now - KEPT_S,))
             cursor.execute("DELETE FROM answered WHERE nonce NOT IN (SELECT nonce FROM requests)")

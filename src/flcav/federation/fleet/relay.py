@@ -1,4 +1,4 @@
-"""HTTP requests that are passed on to another server, and answers: of that, of one sentence, or a file (ASGI)."""
+"""Relaying of HTTP requests to another server, and answers with a sentence or a file (ASGI)."""
 
 import asyncio
 import os

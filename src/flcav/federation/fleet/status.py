@@ -1,4 +1,4 @@
-"""What a fleet is doing: who is registered and in, rounds of its federation, bytes against budgets, and refusals."""
+"""The status of a fleet: registered and connected vehicles, rounds of its federation, bytes and budgets, refusals."""
 
 import contextlib
 import json
@@ -29,7 +29,7 @@ PROGRESS = "federation.json"  # in the fleet's folder, written by the server of 
 
 @dataclass(frozen=True)
 class FollowedRound(Record):
-    """One round as its server tells of it while the federation goes on."""
+    """One round as its server reports it during the federation."""
 
     round: int
     time: float  # when it ended [s since 1970]
@@ -113,7 +113,7 @@ class FleetStatus(Record):
 
 
 def read_status(folder: Path) -> FleetStatus:
-    """Return what the fleet of `folder` is doing; raises `InputError` where there is none."""
+    """Return the status of the fleet in `folder`; raises `InputError` where there is none."""
     registry = open_registry(folder)
     try:
         registered = registry.list_vehicles()

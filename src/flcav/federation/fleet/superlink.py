@@ -1,4 +1,4 @@
-"""Flower's SuperLink as its operator uses it: nodes are enrolled, runs begin, this process is the server app of one.
+"""Control of Flower's SuperLink: enrolment of nodes, start of runs, and this process as the server app of a run.
 
 Uses private parts of Flower (pinned to 1.42): the clients of its control and runtime interfaces, and its table of app
 bundles; so do `vehicle`, for its node and executor, and `runtimes.vehicle_app` and `runtimes.embedded`, for messages.
@@ -66,7 +66,7 @@ class SuperLink:
         return asked.status_code == httpx.codes.OK
 
     def wait(self, seconds: float) -> None:
-        """Wait until it answers; raises `OSError` after so many seconds."""
+        """Wait until the SuperLink answers; raises `OSError` after a time-out."""
         end = time.monotonic() + seconds
         while not self.is_up():
             if time.monotonic() > end:

@@ -1,4 +1,4 @@
-"""Supervision of a fleet's processes: forks of one that has imported what they need, started again when they end.
+"""Supervisor of a fleet's processes: forks of a process with all imports done, restarted when they end.
 
 They end with the supervisor. A process that ends at once is started again later and later, up to half a minute: a node
 that was refused, for its clock or its certificate, comes back when that is corrected.
@@ -89,7 +89,7 @@ def read_processes(folder: Path) -> dict[str, int]:
 
 
 def _write(path: Path, data: bytes) -> bool:
-    """Write a file that others follow the fleet by; return whether there was room for it."""
+    """Write a status file that other processes read; return whether the disk had room for it."""
     try:
         write_bytes(path, data)
     except OSError:

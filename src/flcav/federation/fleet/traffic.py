@@ -1,4 +1,4 @@
-"""What crossed the proxy, by vehicle: bytes of the socket beside those of Flower's calls, and who was refused."""
+"""Traffic of the proxy by vehicle: bytes of sockets and of Flower's calls, and refusals."""
 
 import json
 from dataclasses import asdict, dataclass, field
@@ -74,7 +74,7 @@ class Traffic:
 
 
 def read_traffic(folder: Path) -> Traffic:
-    """Return what the proxy of a fleet has counted; nothing where it has not yet."""
+    """Return the counts of a fleet's proxy; empty if there are none yet."""
     try:
         found = json.loads((folder / TRAFFIC).read_bytes())
     except FileNotFoundError:

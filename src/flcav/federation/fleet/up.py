@@ -1,4 +1,4 @@
-"""A fleet up and running: the SuperLink, the proxy in front of it and, for tests, vehicles on this machine."""
+"""Start of a fleet: the SuperLink, the proxy in front of it and, for tests, vehicles on this machine."""
 
 import contextlib
 import fcntl
@@ -55,7 +55,7 @@ def read_ready(folder: Path) -> Ready:
 
 
 def name_vehicles(count: int) -> list[str]:
-    """Return the identifiers of so many vehicles on this machine."""
+    """Return the identifiers of a number of vehicles on this machine."""
     return [f"vehicle-{number:03d}" for number in range(1, count + 1)]
 
 
@@ -198,7 +198,7 @@ class _Enrolment:
         self.wrong = ""  # why it is not so
 
     def update(self, link: SuperLink) -> bool:
-        """Enrol where there is something to; return whether the nodes are the registry's vehicles."""
+        """Bring the enrolled nodes up to date; return whether they are the registry's vehicles."""
         if time.monotonic() < self._next:
             return self._seen >= 0
         self._next = time.monotonic() + (CHECK_S if self._seen >= 0 else 0.1)

@@ -1,4 +1,4 @@
-"""Acceptance of replies: what the server asked for is the measure of what a client sends, before anything is computed.
+"""Acceptance of replies: each is checked against the server's request before anything is computed from it.
 
 Every update of a round is read here, keys and shares of masks in `secure.messages`. A reply has the records that were
 asked for and no others, arrays of the names, shapes and types that the server's own weights give, and numbers within
@@ -37,7 +37,7 @@ from flcav.federation.upload import Arrays
 
 
 class ReplyRefused(ValueError):
-    """A reply that is none to what was asked, or beyond the limits of the rules."""
+    """A reply that does not match its request, or exceeds the limits of the rules."""
 
 
 @dataclass(frozen=True)

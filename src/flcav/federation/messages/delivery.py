@@ -1,4 +1,4 @@
-"""What reaches a server in a round: a reply arrives, a client is lost, or the time for its answer ends."""
+"""Delivery of replies in a round: each arrives, is lost with its client, or misses the deadline."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -20,7 +20,7 @@ class Arrived:
 
 @dataclass(frozen=True)
 class Lost:
-    """A client that failed, or whom the network lost."""
+    """A client that failed, or was lost by the network."""
 
     client: str
     reason: str

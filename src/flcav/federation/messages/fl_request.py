@@ -1,4 +1,4 @@
-"""FL request: the message by which a vehicle that errs asks its edge server for federated learning.
+"""FL request: the message by which a vehicle whose network errs requests federated learning from its edge server.
 
 It goes to the proxy of a fleet with the vehicle's certificate, which says whose it is, and is taken once: its nonce
 stays in the registry for longer than a request may be old, so that a request sent again is refused, also by a proxy

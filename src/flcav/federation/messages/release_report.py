@@ -1,4 +1,4 @@
-"""Release report: the message by which a vehicle tells its fleet what drives it, and what its shadow run says.
+"""Release report: the message with a vehicle's deployed network and the result of its shadow run.
 
 It goes to the proxy of a fleet with the vehicle's certificate, which says whose it is (a vehicle version manifest,
 Uptane Standard for Design and Implementation 2.1.0, section 5.4.2.1.1, without ECUs of their own).

@@ -1,4 +1,4 @@
-"""A Flower grid whose nodes the network loses: who is not there when a round begins, and whose update breaks off."""
+"""A Flower grid with network outages: nodes absent at the begin of a round, and updates lost in transit."""
 
 from collections.abc import Iterable, Iterator, Mapping
 

@@ -1,4 +1,4 @@
-"""Names of ROS 2's topics, for whoever does without DDS."""
+"""Names of ROS 2 topics, importable without DDS."""
 
 import re
 

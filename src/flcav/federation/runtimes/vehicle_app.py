@@ -1,4 +1,4 @@
-"""The app of a deployed vehicle: the client app of `federation.client`, with what its own folder assigns it.
+"""The app of a deployed vehicle: the client app of `federation.client`, with the assignment in the vehicle's folder.
 
 Every message may find another process, and Flower's node forgets all when it is killed. So what the client keeps is in
 the vehicle's folder, with its last answer: where the same request comes again, after a stop of whoever was on the way,
@@ -64,7 +64,7 @@ def _load(path: Path, changed_ns: int, size: int) -> Assignment:
 
 
 def load_assignment(folder: Path) -> Assignment:
-    """Return what the vehicle in `folder` takes part in: its own client, or what lies in its folder.
+    """Return the assignment of the vehicle in `folder`: that of its own module, or the file in its folder.
 
     It is read once a process, unless it has changed. Raises `InputError` where its own client is none.
     """

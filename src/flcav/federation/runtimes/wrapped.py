@@ -1,4 +1,4 @@
-"""A Flower grid around another one: what a grid adds to is overridden, all else is the inner grid's."""
+"""A Flower grid that wraps another one and delegates to it what a subclass does not override."""
 
 from collections.abc import Iterable
 

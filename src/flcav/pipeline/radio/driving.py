@@ -1,4 +1,4 @@
-"""The radio network of a run's vehicles: who ends a round, how long it takes, and what a plan predicts of that.
+"""The radio network of a run's vehicles: clients that complete a round, its duration, and a plan's prediction of both.
 
 Round n of a region is driven in one of the scenes of its training data, in turn, from the scene's first instant. The
 roadside units are on the poles of its sensors; a plan, which is made before these are placed, has one unit, on the pole

@@ -1,4 +1,4 @@
-"""Records of groups: who asked for federated learning and why, who was called and came, what it cost and mended."""
+"""Records of groups: requests and their reasons, members, costs, and vehicles mended."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Records of lifelong learning: what drives after each condition, and an arm's scores, transfer, bytes and seconds."""
+"""Records of lifelong learning: the deployed network after each condition; scores, transfer, bytes and times by arm."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

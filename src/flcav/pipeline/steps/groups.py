@@ -1,4 +1,4 @@
-"""Calling a group in stage II: vehicles check the network that drives, ask, are called, and train on copies of it."""
+"""Formation of a group in stage II: vehicles check the deployed network, send requests and offers, and are selected."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,4 +1,4 @@
-"""Lifelong learning: in each condition vehicles ask, a group learns on copies, and a better copy drives from then on.
+"""Lifelong learning: in each condition a group trains copies on request, and a better copy is deployed.
 
 The rounds of a condition are those of stage II. They go on from the network that drives, in the place of the pretrained
 one, and their group forms on request.

@@ -1,4 +1,4 @@
-"""What vehicles remember of earlier conditions, in the rounds of a later one."""
+"""Replay of the frames that vehicles remember of earlier conditions, in the rounds of a later one."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

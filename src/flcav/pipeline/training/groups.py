@@ -1,4 +1,4 @@
-"""Groups of edge FL: who asks, who is called, and when a group dissolves (Wang et al., IEEE Network 37(3), 2023).
+"""Groups of edge FL on request: requests, selection of members, and early stopping (Wang et al., IEEE Network, 2023).
 
 A vehicle checks the network that drives against its own labels (of its tracks, the map or the road's boxes) on frames
 that it holds back from training. Where it errs, it sends a request. Whoever is in range of it offers its data: counts
@@ -32,7 +32,7 @@ FULL = "the group is full"
 
 @dataclass(frozen=True)
 class Chosen:
-    """The members of a group in a region, by name, and why others stayed."""
+    """The members of a group in a region, by name, and the reasons why others did not join."""
 
     members: tuple[str, ...]  # those that asked first
     quality: Mapping[str, float]
@@ -114,7 +114,7 @@ class Levelled(Exception):
 
 @dataclass
 class GroupWatch:
-    """Watch over a group's loss on what its members hold back, round by round."""
+    """Early stopping of a group by the loss on its members' held-out frames, round by round."""
 
     how: Requests
     members: Mapping[str, Member]  # that hold something back, by client
@@ -126,12 +126,12 @@ class GroupWatch:
         return {name: members.get(name, own) for name, own in clients.items()}
 
     def hear(self, ask: Ask, weights: Weights, *, counted: bool = True) -> dict[str, bytes]:
-        """Return the messages by which members tell the loss of a network."""
+        """Return the messages with the members' losses of a network."""
         replies = ask(SCORE, [*self.members], weights, counted=counted)
         return {name: answer[MESSAGE].tobytes() for name, answer in replies.answers.items() if MESSAGE in answer}
 
     def note(self, messages: Mapping[str, bytes]) -> None:
-        """Note the mean loss that members tell; where nobody does, that of the round before."""
+        """Record the mean of the reported losses; if none is reported, that of the round before."""
         told = [*read_losses(messages).values()]
         self.losses.append(float(np.mean(told)) if told else self.losses[-1])
 

@@ -1,4 +1,4 @@
-"""Rounds of an ad hoc group: one of its vehicles leads, and when it leaves, also in mid-round, the next takes over.
+"""Rounds of an ad hoc group: one of its vehicles leads; if it leaves, even in mid-round, the next one takes over.
 
 The lead is the server of the group's rounds, and its own update crosses no link. A lead that leaves in mid-round takes
 with it what it has received. All that are left have the weights that the round began with, so the next lead begins it

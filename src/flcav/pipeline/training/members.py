@@ -1,4 +1,4 @@
-"""Vehicle's part in a group on request: it checks the network that drives, asks, offers its data, and tells its loss.
+"""A vehicle as a member of a group: its check of the deployed network, request, offer of data, and reported loss.
 
 It answers questions of the lead from data that stay with it, in this process or on the vehicle of a deployed fleet.
 """
@@ -75,7 +75,7 @@ def read_position(message: bytes) -> Array:
 
 
 def read_loss(message: bytes) -> float:
-    """Return the loss that a member tells; raises `Unreadable`."""
+    """Return the loss that a member reports; raises `Unreadable`."""
     return float(_read(message, loss=(1,))["loss"][0])
 
 

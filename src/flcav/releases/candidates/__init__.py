@@ -1,1 +1,1 @@
-"""Release candidates: a folder of weights, card, provenance and evaluation, and the signatures of those who read it."""
+"""Release candidates: a folder of weights, card, provenance and evaluation, and the signatures of its approval."""

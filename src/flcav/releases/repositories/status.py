@@ -1,4 +1,4 @@
-"""The state of a party's repository: what it names, who gets it, what waits for signatures, and when it expires."""
+"""The state of a party's repository: its releases and their vehicles, pending signatures, and times of expiry."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime

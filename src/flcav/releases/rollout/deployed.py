@@ -48,7 +48,7 @@ def roll_out(
     patience_s: float = 600.0,
     progress: Report = ignore_progress,
 ) -> Rollout:
-    """Return what became of the roll-out of the customer's current release to a fleet that is up.
+    """Return the outcome of a roll-out of the customer's current release to a running fleet.
 
     It ends where every registered vehicle drives the release, shadow runs stop it, or do not tell.
 

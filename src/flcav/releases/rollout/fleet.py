@@ -1,4 +1,4 @@
-"""A simulated fleet: vehicles that drive what was recorded, download over its radio, and install as real ones do.
+"""A simulated fleet: vehicles that repeat recorded drives, download over their radio, and install as real ones do.
 
 Every vehicle of every recorded scene is a drive. Vehicle i takes the drive i at first and the next one later, so that
 vehicles beyond the number of drives take the same ones on other days. Folders, metadata, signatures and installation
@@ -63,7 +63,7 @@ class SimulatedFleet:
     task: str
 
     def drive_of(self, vehicle: str, turn: int) -> Drive:
-        """Return what a vehicle drives at a turn."""
+        """Return the recorded drive of a vehicle at a turn."""
         return self.drives[(self.names.index(vehicle) + turn) % len(self.drives)]
 
     def installed(self, vehicle: str) -> Installed:

@@ -80,7 +80,7 @@ def rehearse(
     seed: int = 0,
     progress: Report = ignore_progress,
 ) -> Rollout:
-    """Return what became of the roll-out of a candidate to a simulated fleet that drives an earlier release.
+    """Return the outcome of a roll-out of a candidate to a simulated fleet with an earlier release.
 
     Args:
         candidate: folder of the new release.

@@ -1,4 +1,4 @@
-"""Turns of a roll-out, on a simulated fleet or a deployed one: what was delivered, and what shadow runs said."""
+"""Turns of a roll-out, on a simulated or a deployed fleet: deliveries, and results of shadow runs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from flcav.storage.records import Record
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn: a share of the fleet, what was delivered in it, and what the shadow runs said."""
+    """One turn: a share of the fleet, the deliveries to it, and the results of the shadow runs."""
 
     release: int
     share: float

@@ -47,7 +47,7 @@ TIMEOUT = httpx.Timeout(30.0, connect=5.0)
 
 @dataclass(frozen=True)
 class RecordedDrive(Record):
-    """The frames of a recording that stand for what a vehicle meets."""
+    """The frames of a recording, in place of a vehicle's own sensors."""
 
     data: str  # the dataset's folder
     scene: str

@@ -1,1 +1,1 @@
-"""A vehicle's side of releases: what it fetches, what it checks, and how it installs."""
+"""A vehicle's side of releases: fetching, verification and atomic installation."""

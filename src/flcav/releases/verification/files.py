@@ -1,4 +1,4 @@
-"""What a candidate's files say before any frame is tested: hashes, numbers, architecture, card, and provenance."""
+"""Checks of a candidate's files before any frame is tested: hashes, numbers, architecture, card, and provenance."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields

@@ -1,4 +1,4 @@
-"""Tests of one network on recorded frames: its detections in every condition, and what was to be found."""
+"""Tests of one network on recorded frames: its detections in every condition, and the ground truth."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace

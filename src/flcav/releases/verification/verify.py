@@ -1,4 +1,4 @@
-"""Verification of a candidate: its files, non-inferiority on the whole, and guards against catastrophes."""
+"""Verification of a candidate: its files, overall non-inferiority, and guards against large losses in slices."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,1 +1,1 @@
-"""Releases of networks on a fleet: what its proxy offers vehicles, and what these report."""
+"""Releases of networks on a fleet: the files that its proxy serves to vehicles, and the vehicles' reports."""

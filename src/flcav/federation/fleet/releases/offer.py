@@ -32,7 +32,7 @@ class Offer(Record):
 
 @dataclass(frozen=True)
 class KeptReport(Record):
-    """The latest report of a vehicle, and when it came."""
+    """The latest report of a vehicle, and the time of its arrival."""
 
     vehicle: str  # by its certificate
     time: float  # [s since 1970]

@@ -1,4 +1,4 @@
-"""Blueprints: what can be spawned, and the check of what a client asks for."""
+"""Blueprints: the actors that can be spawned, and the check of a client's description of one."""
 
 from dataclasses import dataclass
 from functools import cache

@@ -1,4 +1,4 @@
-"""The town's things, as clients ask for them: boxes by semantic tag, and where rays meet them."""
+"""The town's static objects for clients: boxes by semantic tag, and ray casts."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,4 +1,4 @@
-"""What collision and obstacle sensors send: records of the two actors."""
+"""Events of collision and obstacle sensors: records of the two actors."""
 
 from collections.abc import Callable, Sequence
 
