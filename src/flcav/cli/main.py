@@ -25,7 +25,7 @@ from flcav.config import InputError
 from flcav.interface.wording import describe_number, suggest
 
 INTERRUPTED = 130
-NO_FOLDER = (errno.ENOTDIR, errno.ELOOP)  # a path leads over a file, or a link to itself
+NO_FOLDER = (errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG)  # a path leads over a file, or a link to itself; no name
 LONGEST = 1000  # characters of a message
 
 atexit.register(gc.freeze)  # searching all modules for garbage would take a second before the process ends

@@ -226,6 +226,8 @@ def _refuse_foreign(path: Path, folder: Path, seen: set[Path]) -> None:
         raise InputError(f"{path}: imports itself")
     if len(seen) >= MOST_FILES:
         raise InputError(f"{path}: more than {MOST_FILES} files are imported")
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise InputError(f"{path}: an ODD is a file, and no pipe or device")
     if path.is_file() and path.stat().st_size > MOST_BYTES:
         raise InputError(f"{path}: an ODD of more than {MOST_BYTES} bytes is not read")
     document = read_yaml(path)

@@ -22,6 +22,7 @@ from flcav.storage.files import write_bytes
 PREFIX = "flcav."
 LARGEST = 1e9  # largest absolute value of a weight; larger ones overflow in a few layers
 SHIPPED = "shipped/weights.safetensors"  # relative to the folder of a task's module
+KINDS = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)  # of numbers in a file
 COUNTER = "num_batches_tracked"  # buffer of batch normalisation, unused with a fixed momentum
 
 
@@ -159,6 +160,8 @@ def _read(task: Task[ConfigT, NetworkT, SampleT], path: Path) -> tuple[ConfigT, 
 
 
 def _fill(network: nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
+    if odd := [name for name, tensor in tensors.items() if tensor.dtype not in KINDS]:
+        raise InputError(f"{path}: weights of numbers that are not used here, in '{odd[0]}': {tensors[odd[0]].dtype}")
     if odd := [name for name, tensor in tensors.items() if not (tensor.abs() <= LARGEST).all()]:
         raise InputError(f"{path}: weights that are not finite numbers, in '{odd[0]}', or above {LARGEST:g}")
     try:

@@ -102,6 +102,13 @@ def test_a_huge_file_is_not_read(odd_file: Write, monkeypatch: pytest.MonkeyPatc
         read_domain(odd_file("MODULES: {m: {INCLUDE_AND: {rainfall: '<= 1 mm/h'}}}"))
 
 
+def test_a_pipe_is_not_waited_for(odd_file: Write):
+    path = odd_file("").with_name("pipe.yaml")
+    os.mkfifo(path)
+    with pytest.raises(InputError, match="no pipe or device"):
+        read_domain(path)
+
+
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"Autoware's ODD files are not at {REAL}; set FLCAV_REAL_DATA")
 @pytest.mark.parametrize("name", ["ODD_Dense_Urban", "Domain_Concepts_Definition_ISO_34503"])
 def test_autowares_files_are_refused_in_one_sentence(name: str, capsys: pytest.CaptureFixture[str]):

@@ -1,5 +1,7 @@
 """The commands of `flcav release`, from a proposal to a vehicle; wrong inputs get one sentence and exit code 2."""
 
+import json
+import os
 import shutil
 import subprocess
 import sys
@@ -48,7 +50,7 @@ def accept(folder: Path, accepted: bool = True) -> None:
         margin=0.03,
         kept_share=0.8,
         frames=0,
-        scenes=0,
+        scenes=20,
         frames_to_decide=None,
         whole=Comparison("whole", "AP50", 50, 20, 0.5, 0.51, 0.4, 0.6, -0.01 if accepted else -0.2, 0.03, "kept"),
         guards=(),
@@ -159,3 +161,116 @@ def test_without_the_extra_the_command_to_install_it_is_named(call: Call, monkey
     assert code == 2
     assert said.startswith("flcav: releases need tuf, which is in: ")
     assert "pip install" in said
+
+
+def change_json(path: Path, **values: object) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"margin": 5.0}, "its own numbers say that it is not"),
+        ({"scenes": 1}, "its own numbers say that it is not"),
+        ({"reasons": ["class Car lost"]}, "its own numbers say that it is not"),
+        ({"kept_share": 0.0}, "its own numbers say that it is not"),
+        ({"driving": "0" * 64}, "beside another network than the candidate replaces"),
+    ],
+)
+def test_a_verification_whose_figures_were_edited_is_not_signed(
+    values: dict[str, object], said: str, parties: Parties, call: Call
+):
+    candidate = parties.candidate(2)
+    accept(candidate)
+    change_json(candidate / VERIFICATION, **values)
+    code, told = call("sign", candidate, "--repository", parties.image, "--key", *parties.keys("image", 1))
+    assert (code, said in told) == (2, True)
+
+
+def add_link(folder: Path) -> None:
+    (folder / "notes").symlink_to("/etc/hostname")
+
+
+def link_acknowledgements(folder: Path) -> None:
+    (folder / ACKNOWLEDGEMENTS).symlink_to(folder.parent)
+
+
+def add_pipe(folder: Path) -> None:
+    os.mkfifo(folder / "pipe")
+
+
+def enlarge(folder: Path) -> None:
+    os.truncate(folder / CANDIDATE, 10**10)  # sparse
+
+
+def repeat_key(folder: Path) -> None:
+    path = folder / CANDIDATE
+    path.write_text(path.read_text().replace('"release": 2', '"release": 1, "release": 2'))
+
+
+def roll_back_to_others(folder: Path) -> None:
+    change_json(folder / CANDIDATE, rolls_back=1)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (add_link, "no links"),
+        (link_acknowledgements, "no links"),
+        (add_pipe, "no links and no others"),
+        (enlarge, "too large"),
+        (repeat_key, "every key once"),
+        (roll_back_to_others, "rolls back to 1, which has not its weights here"),
+    ],
+)
+def test_a_spoilt_bundle_is_not_signed_and_nothing_is_written(
+    spoil: Callable[[Path], None], said: str, parties: Parties, call: Call
+):
+    candidate = parties.candidate(2)
+    accept(candidate)
+    spoil(candidate)
+    before = sorted(parties.folder.rglob("*"))
+    code, told = call("sign", candidate, "--repository", parties.image, "--key", *parties.keys("image", 1))
+    assert (code, said in told, told.count("\n")) == (2, True, 1)
+    assert sorted(parties.folder.rglob("*")) == before
+
+
+def test_wrong_words_and_names_leave_nothing(parties: Parties, call: Call):
+    new, first = parties.folder / "new", parties.folder / "1.safetensors"
+    made = ("--driving", first, "--release", 9, "--out", new)
+    assert call("propose", first, *made, "--changes", "x" * 5000)[0] == 2
+    assert call("rollback", parties.candidate(1), *made, "--reason", "x")[0] == 2  # was not verified
+    accept(parties.candidate(1))
+    assert call("rollback", parties.candidate(1), *made, "--reason", "x" * 5000)[0] == 2
+    assert not new.exists()
+    accept(parties.candidate(2))
+    key = ("--key", *parties.keys("director", 1))
+    assert call("sign", parties.candidate(2), "--repository", parties.director, *key, "--vehicle", "\udcff")[0] == 2
+    where = ("--image", parties.image / "repository", "--director", parties.director / "repository")
+    assert call("install", parties.vehicle, "--name", "\udcff", *where)[0] == 2
+    assert call("install", parties.vehicle, "--name", "cav0", *where[:2], "--director", "http://[::1")[0] == 2
+
+
+def test_shadow_runs_of_other_weights_or_impossible_ones_do_not_decide(parties: Parties, call: Call):
+    rollout = ("rollout", parties.director, "--key", *parties.keys("director", 1), "--shadows", parties.folder / "s")
+    (parties.folder / "s").mkdir()
+    counts = {"frames": 9, "driving_found": 9, "candidate_found": 9, "agreed": 9}
+    known = {"vehicle": "a", "task": "objects", "driving": "0" * 64, "candidate": "1" * 64, **counts}
+    for values, said in (
+        ({}, "of other weights than those of release 1"),
+        ({"agreed": 99}, "more detections agree than there are"),
+        ({"candidate": read_candidate(parties.candidate(1)).weights, "frames": 0}, "no shadow run of any frame"),
+    ):
+        (parties.folder / "s" / "a.json").write_text(json.dumps(known | values))
+        code, told = call(*rollout)
+        assert (code, said in told) == (2, True)
+
+
+def test_metadata_of_another_role_and_another_online_key(parties: Parties, call: Call):
+    shutil.copyfile(parties.image / "keys" / "1.pem", parties.image / "keys" / "online.pem")
+    code, said = call("publish", parties.image)
+    assert (code, "is not the online key" in said) == (2, True)
+    metadata = parties.image / "repository" / "metadata"
+    shutil.copyfile(metadata / "1.root.json", metadata / "timestamp.json")
+    code, said = call("status", parties.image)
+    assert (code, "metadata of the role root, and those of timestamp are wanted" in said) == (2, True)

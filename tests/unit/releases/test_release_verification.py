@@ -6,14 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from release_parties import Parties
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
+from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.perception.metrics import average_precision, match
 from flcav.perception.objects.evaluate import split_parts
+from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import FrameTruth
-from flcav.releases.candidates.candidate import CARD, WEIGHTS, DataHash, read_candidate
+from flcav.perception.weights import load_network
+from flcav.releases.candidates.candidate import CARD, LEDGER, WEIGHTS, DataHash, LedgerSum, read_candidate
 from flcav.releases.verification import verify
 from flcav.releases.verification.comparison import Pair, compare, measure_results, pair_slices
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
@@ -24,6 +30,7 @@ from flcav.releases.verification.verify import decide, read_verification, write_
 from flcav.report.pages.release_page import release_page
 from flcav.sensors.frame import Frame
 from flcav.statistics.power import plan_scenes
+from flcav.storage.files import sha256
 
 SCENES, FRAMES = 24, 1
 SIZE = {"Car": (4.4, 1.8, 1.6), "Pedestrian": (0.8, 0.6, 1.7)}
@@ -346,3 +353,32 @@ def test_conditions_change_points_and_nothing_that_is_to_be_found(recorded_frame
         )
     late = CONDITIONS["latency"](recorded_frame).annotations.boxes.center - recorded_frame.annotations.boxes.center
     assert np.allclose(late, (2.0, 0.0, 0.0))
+
+
+def test_a_description_that_its_files_contradict_is_refused(parties: Parties):
+    folder, driving = parties.candidate(2), parties.folder / "1.safetensors"
+    candidate = read_candidate(folder)
+    hidden = candidate.model_copy(update={"data": (candidate.data[0].model_copy(update={"seed": 6}),)})
+    assert [*find_faults(folder, hidden, driving, [])] == [
+        "its provenance is another than that of the card in its weights"
+    ]
+    ledger = Ledger(LinkMegabytes(9, 9))
+    ledger.enter(LedgerEntry("pretrain", "objects", "wireless", "up", 1, "cav0", 1000))
+    ledger.save(folder / LEDGER)
+    cheaper = LedgerSum(stage="pretrain", link="wireless", direction="up", bytes=1)
+    described = candidate.model_copy(update={"ledger": sha256(folder / LEDGER), "spent": (cheaper,)})
+    assert [*find_faults(folder, described, driving, [])] == ["its description names other megabytes than its ledger"]
+    true = described.model_copy(update={"spent": (cheaper.model_copy(update={"bytes": 1000}),)})
+    assert [*find_faults(folder, true, driving, [])] == []
+    (folder / CARD).write_bytes(b"\xff")
+    assert "a card of other weights" in next(find_faults(folder, true, driving, []))
+
+
+@pytest.mark.parametrize("kind", [torch.bool, torch.float8_e4m3fn, torch.complex64])
+def test_weights_of_unusual_numbers_are_refused(kind: torch.dtype, parties: Parties):
+    path = parties.folder / "2.safetensors"
+    with safe_open(path, "pt") as file:
+        metadata = file.metadata()
+    save_file({name: tensor.to(kind) for name, tensor in load_file(path).items()}, path, metadata)
+    with pytest.raises(InputError, match="weights of numbers that are not used here"):
+        load_network(OBJECTS, path)

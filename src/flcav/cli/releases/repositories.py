@@ -17,7 +17,7 @@ from flcav.cli.releases.options import (
     tell_signatures,
 )
 from flcav.cli.terminal import only_writer_of, print_json
-from flcav.config import InputError
+from flcav.config import InputError, parse_config
 from flcav.interface.wording import plural
 
 IMAGE = typer.Option(..., "--image", help="The provider's repository: folder or http(s) address.")
@@ -76,12 +76,13 @@ def sign(
         raise InputError("--vehicle and --revoke are the customer's: the provider does not choose vehicles")
     directive = None
     if party == "customer":
-        directive = Directive(
-            release=describe_candidate(candidate).release,
-            share_ppm=round(share * MILLION),
-            vehicles=tuple(vehicle),
-            revoked=tuple(revoke),
-        )
+        values = {
+            "release": describe_candidate(candidate).release,
+            "share_ppm": round(share * MILLION),
+            "vehicles": vehicle,
+            "revoked": revoke,
+        }
+        directive = parse_config(Directive, values, "the directive")
     state = stage_release(repository, candidate, key, directive)
     for each in key:
         acknowledge(candidate, each)
@@ -112,6 +113,8 @@ def install(
     from flcav.releases.vehicles.checking import open_sources, trust_roots
     from flcav.releases.vehicles.installation import update_vehicle
 
+    if not name.isprintable() or not name:
+        raise InputError("--name: a vehicle's name has letters, digits and signs")
     if (image_root is None) != (director_root is None):
         raise InputError("--image-root and --director-root: a vehicle is delivered with both")
     if image_root is not None and director_root is not None:
@@ -120,7 +123,8 @@ def install(
         trust_roots(folder, image_root.read_bytes(), director_root.read_bytes())
     driving = update_vehicle(folder, name, open_sources(image, director), task)
     typer.echo(
-        f"{name}: " + ("drives no network" if driving is None else f"drives release {driving.release} of {task}")
+        f"{name}: "
+        + ("drives no network" if driving is None else f"drives release {driving.release} of {driving.task}")
     )
 
 

@@ -124,9 +124,8 @@ def rollout(
 def _widen(
     repository: Path, key: list[Path], shadows: Path | None, share: float | None, revoke: list[str], task: str
 ) -> None:
-    from flcav.config import read_json
-    from flcav.federation.messages.release_report import ShadowReport
-    from flcav.releases.rollout.shadow import judge_shadows
+    from flcav.releases.repositories.metadata import read_weights
+    from flcav.releases.rollout.shadow import judge_shadows, read_shadow
     from flcav.releases.rollout.stages import change_share, next_share, read_directive
 
     if (shadows is None) == (share is None):
@@ -134,9 +133,12 @@ def _widen(
     wanted, stopped = share, False
     if shadows is not None:
         paths = sorted(shadows.glob("*.json"))
-        decision = judge_shadows([ShadowReport.from_json(read_json(path), str(path)) for path in paths])
+        runs, now = [read_shadow(path) for path in paths], read_directive(repository, task)
+        if any(run.candidate != read_weights(repository, task, now.release) for run in runs):
+            raise InputError(f"{shadows}: has shadow runs of other weights than those of release {now.release}")
+        decision = judge_shadows(runs)
         typer.echo(decision.describe())
-        wanted = next_share(read_directive(repository, task).share, decision)
+        wanted = next_share(now.share, decision)
         stopped = decision.judgement == "stop"
     assert wanted is not None
     directive, state = change_share(repository, task, wanted, key, revoke)
@@ -245,9 +247,11 @@ def rollback(
     """Make a candidate of earlier weights under a number that rises; both parties sign it like any other."""
     from flcav.config import check_is_file
     from flcav.releases.rollout.stages import roll_back
+    from flcav.releases.verification.verify import read_verification
     from flcav.storage.files import sha256
 
     check_is_file(driving)
+    read_verification(earlier)
     made = roll_back(earlier, number, reason, out, sha256(driving))
     draw_page(out, [])
     typer.echo(f"{out}: release {made.release} of {made.task}, weights {made.weights[:16]}; sign and publish it")

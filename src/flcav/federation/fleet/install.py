@@ -29,7 +29,7 @@ def install_vehicle(
     keys = trusted.read_bytes()
     try:
         named = yaml.safe_load(keys)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError, RecursionError):
         named = None
     if not isinstance(named, dict) or not named:
         raise InputError(f"{trusted}: names no key that apps are signed by")

@@ -92,7 +92,11 @@ def take_certificate(folder: Path, certificate: bytes, authority: bytes) -> None
     Raises `InputError` where the certificate is for another key.
     """
     at = folder / NEXT if (folder / NEXT / KEY).exists() else folder
-    given = x509.load_pem_x509_certificate(certificate).public_key()
+    try:
+        given = x509.load_pem_x509_certificate(certificate).public_key()
+        x509.load_pem_x509_certificate(authority)
+    except ValueError:
+        raise InputError(f"{folder}: what is given as the certificate, or as the authority's, is none (PEM)") from None
     if given != load_key(at / KEY).public_key():
         raise InputError(f"{folder}: the certificate is for another key than {at / KEY}")
     for name in (KEY, FLOWER_KEY, REQUEST):

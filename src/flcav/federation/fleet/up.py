@@ -52,6 +52,8 @@ def read_ready(folder: Path) -> Ready:
         return Ready(**json.loads((folder / READY).read_bytes()))
     except FileNotFoundError:
         raise InputError(f"{folder}: the fleet is not up; flcav fleet up {folder}") from None
+    except (ValueError, TypeError):
+        raise InputError(f"{folder / READY}: is damaged; flcav fleet up {folder} writes it anew") from None
 
 
 def name_vehicles(count: int) -> list[str]:

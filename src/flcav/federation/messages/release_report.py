@@ -39,6 +39,15 @@ class ShadowReport(Record):
         found = self.driving_found + self.candidate_found
         return 1 - 2 * self.agreed / found if found else 0.0
 
+    def check(self) -> None:
+        """Raise ValueError for numbers that cannot be, in words."""
+        if not all(0 <= each < MOST for each in (self.frames, self.driving_found, self.candidate_found, self.agreed)):
+            raise ValueError("a number below 0, or too large")
+        if self.agreed > min(self.driving_found, self.candidate_found):
+            raise ValueError("more detections agree than there are")
+        if not all(SHA256.fullmatch(each) for each in (self.driving, self.candidate)):
+            raise ValueError("SHA-256 of both networks is wanted")
+
 
 @dataclass(frozen=True)
 class ReleaseReport(Record):
@@ -70,14 +79,8 @@ def parse_report(data: bytes) -> ReleaseReport:
         found = ReleaseReport.from_json(json.loads(data), "report")
     except (InputError, ValueError, RecursionError):
         raise ValueError("the message is no release report") from None
-    shadow = found.shadow
-    numbers = [found.release, found.verified]
-    if shadow is not None:
-        numbers += [shadow.frames, shadow.driving_found, shadow.candidate_found, shadow.agreed]
-        if shadow.agreed > min(shadow.driving_found, shadow.candidate_found):
-            raise ValueError("more detections agree than there are")
-        if not all(SHA256.fullmatch(each) for each in (shadow.driving, shadow.candidate)):
-            raise ValueError("SHA-256 of both networks is wanted")
-    if not all(0 <= each < MOST for each in numbers) or not TASK.fullmatch(found.task):
+    if found.shadow is not None:
+        found.shadow.check()
+    if not all(0 <= each < MOST for each in (found.release, found.verified)) or not TASK.fullmatch(found.task):
         raise ValueError("the message is no release report")
     return found

@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from flcav.config import Config, InputError, check_is_file, parse_config
+from flcav.config import Config, InputError, Json, check_is_file, parse_config
 from flcav.storage.files import sha256, write_bytes
 
 CANDIDATE = "candidate.json"
@@ -26,6 +26,7 @@ LARGEST = 1_000_000_000  # bytes of weights
 FORMAT = "flcav-candidate-1"
 CARD_KEY = "flcav.card"  # as in `flcav.perception.card`, which needs torch
 MOST_HEADER_BYTES = 10_000_000
+MOST_TEXT_BYTES = 10_000_000  # of a description, a card, a verification
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
@@ -72,23 +73,48 @@ class Candidate(Config):
 
 
 def read_candidate(folder: Path) -> Candidate:
-    """Return the description of the candidate in `folder`; raises `InputError` for a bundle of another format."""
+    """Return the description of the candidate in `folder`.
+
+    Raises `InputError` for a bundle of another format, and one with links, special files or texts that are too large.
+    """
     path = folder / CANDIDATE
     if not path.is_file():
         raise InputError(f"{folder}: no release candidate, since it has no {CANDIDATE}")
-    return parse_candidate(path.read_bytes(), str(path))
+    if path.stat().st_size > MOST_TEXT_BYTES:
+        raise InputError(f"{path}: too large for a candidate's file")
+    found = parse_candidate(path.read_bytes(), str(path))
+    _check_bundle(folder)
+    return found
 
 
 def parse_candidate(data: bytes, origin: str) -> Candidate:
     """Return the candidate that the bytes of a `candidate.json` describe; raises `InputError` for another format."""
     try:
-        values = json.loads(data)
+        values = json.loads(data, object_pairs_hook=_unique)
     except (ValueError, RecursionError):
-        raise InputError(f"{origin}: not JSON, so no release candidate") from None
+        raise InputError(f"{origin}: not JSON with every key once, so no release candidate") from None
     found = values.get("format") if isinstance(values, dict) else None
     if found != FORMAT:
         raise InputError(f"{origin}: a bundle of the format {str(found)[:40]!r}, and {FORMAT!r} is wanted")
     return parse_config(Candidate, values, origin)
+
+
+def _unique(pairs: list[tuple[str, Json]]) -> dict[str, Json]:
+    """Return a JSON object; raises ValueError for a key twice, of which readers take the first or the last."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key is given twice")
+    return found
+
+
+def _check_bundle(folder: Path) -> None:
+    """Raise `InputError` where a candidate's folder has links, special files, or files that are too large to read."""
+    for path in folder.rglob("*"):
+        name = str(path.relative_to(folder))
+        if path.is_symlink() or path.is_dir() != (name == ACKNOWLEDGEMENTS) or not (path.is_file() or path.is_dir()):
+            raise InputError(f"{path}: a candidate has files and the folder {ACKNOWLEDGEMENTS}, no links and no others")
+        if path.is_file() and path.stat().st_size > (LARGEST if name in (WEIGHTS, LEDGER) else MOST_TEXT_BYTES):
+            raise InputError(f"{path}: too large for a candidate's file")
 
 
 def check_files(folder: Path, candidate: Candidate) -> None:
@@ -101,8 +127,6 @@ def check_files(folder: Path, candidate: Candidate) -> None:
                 raise InputError(f"{path}: is not in the candidate's description")
             continue
         check_is_file(path)
-        if path.stat().st_size > LARGEST:
-            raise InputError(f"{path}: larger than {LARGEST} bytes")
         if sha256(path) != digest:
             raise InputError(f"{path}: has another SHA-256 than the candidate's description says")
     if hash_card(folder / WEIGHTS) != candidate.card:

@@ -7,7 +7,7 @@ from typing import Literal
 
 from torch import nn
 
-from flcav.config import InputError, check_is_file
+from flcav.config import InputError, check_is_file, parse_config
 from flcav.dataset.store import Dataset
 from flcav.network.ledger import Ledger
 from flcav.perception.agents import choose_frames
@@ -76,20 +76,21 @@ def propose(
                 shutil.copyfile(source, out / name)
         card = _complete_card(learned, network, out / WEIGHTS, entries)
         write_card(card, out / CARD)
-        candidate = Candidate(
-            task=task,
-            release=release,
-            changes=changes,
-            audience=audience,
-            network=card.network,
-            weights=sha256(out / WEIGHTS),
-            driving=sha256(driving),
-            card=hash_card(out / WEIGHTS),
-            data=tuple(trace_data(card)),
-            recipe=None if recipe is None else sha256(recipe),
-            ledger=None if ledger is None else sha256(ledger),
-            spent=spent,
-        )
+        values = {
+            "task": task,
+            "release": release,
+            "changes": changes,
+            "audience": audience,
+            "network": card.network,
+            "weights": sha256(out / WEIGHTS),
+            "driving": sha256(driving),
+            "card": hash_card(out / WEIGHTS),
+            "data": trace_data(card),
+            "recipe": None if recipe is None else sha256(recipe),
+            "ledger": None if ledger is None else sha256(ledger),
+            "spent": spent,
+        }
+        candidate = parse_config(Candidate, values, "the candidate")
         write_json(out / CANDIDATE, candidate.model_dump(mode="json"), sort=False)
     except BaseException:
         shutil.rmtree(out)
@@ -129,22 +130,26 @@ def _complete_card(task: Task, network: nn.Module, path: Path, entries: tuple[Da
     return card
 
 
-def trace_data(card: Card) -> list[DataHash]:
-    """Return the datasets that a card names: of training, and the one by which its best epoch was chosen."""
-    known = [_trace(entry, "training") for entry in card.data]
-    return known if card.validation is None else [*known, _trace(card.validation, "validation")]
+def trace_data(card: Card) -> tuple[DataHash, ...]:
+    """Return the datasets that a card names: of training, and the one by which its best epoch was chosen.
+
+    Raises `InputError` where what the card has for a manifest's SHA-256 is none.
+    """
+    known = tuple(_trace(entry, "training") for entry in card.data)
+    return known if card.validation is None else (*known, _trace(card.validation, "validation"))
 
 
 def _trace(entry: DataEntry, use: Literal["training", "validation"]) -> DataHash:
     town, seed, split = (entry.recipe.get(name) for name in ("town", "seed", "split"))
-    return DataHash(
-        name=entry.name,
-        manifest=entry.manifest,
-        town=town if isinstance(town, str) else None,
-        seed=seed if isinstance(seed, int) else None,
-        split=split if isinstance(split, str) else None,
-        use=use,
-    )
+    values = {
+        "name": entry.name,
+        "manifest": entry.manifest,
+        "town": town if isinstance(town, str) else None,
+        "seed": seed if isinstance(seed, int) else None,
+        "split": split if isinstance(split, str) else None,
+        "use": use,
+    }
+    return parse_config(DataHash, values, f"card's data {entry.name}")
 
 
 def sum_ledger(ledger: Ledger) -> tuple[LedgerSum, ...]:

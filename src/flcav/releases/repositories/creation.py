@@ -17,6 +17,7 @@ from flcav.releases.repositories.metadata import (
     PARTY,
     Party,
     expiry_of,
+    latest_version,
     load_metadata,
     load_root,
     read_party,
@@ -106,7 +107,7 @@ def replace_online_key(out: Path, keys: Sequence[Path], now: datetime | None = N
         < root.roles["root"].threshold
     ):
         raise InputError(f"{out}: fewer signatures of the {party} than its root wants")
-    version = max(int(path.name.partition(".")[0]) for path in metadata.glob("*.targets.json"))
+    version = latest_version(metadata, "targets")
     write_metadata(signed, metadata / f"{root.version}.root.json")
     timestamp: Metadata[Timestamp] = load_metadata(metadata / "timestamp.json")
     snapshot: Metadata[Snapshot] = load_metadata(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")

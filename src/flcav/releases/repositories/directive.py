@@ -1,7 +1,7 @@
 """The customer's directive on a release: which vehicles install it, as Uptane's director says it."""
 
 import hashlib
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -9,6 +9,7 @@ from flcav.config import Config
 
 WHOLE = 2**64
 MILLION = 1_000_000
+Name = Annotated[str, Field(min_length=1, max_length=200)]  # of a vehicle
 
 
 class Directive(Config):
@@ -18,8 +19,8 @@ class Directive(Config):
 
     release: int = Field(ge=1, le=10**9)
     share_ppm: int = Field(ge=0, le=MILLION)  # share of the fleet in millionths: canonical JSON has no fractions
-    vehicles: tuple[str, ...] = Field(default=(), max_length=100_000)  # that install it besides
-    revoked: tuple[str, ...] = Field(default=(), max_length=100_000)  # that install nothing
+    vehicles: tuple[Name, ...] = Field(default=(), max_length=100_000)  # that install it besides
+    revoked: tuple[Name, ...] = Field(default=(), max_length=100_000)  # that install nothing
 
     @property
     def share(self) -> float:

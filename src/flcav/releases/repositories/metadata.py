@@ -49,8 +49,13 @@ def load_root(out: Path) -> "Metadata[Root]":
     """Return the repository's latest root; raises `InputError` where `out` is none of a party."""
     read_root(out)
     metadata = out / "repository" / "metadata"
-    latest = max(int(path.name.partition(".")[0]) for path in metadata.glob("*.root.json"))
-    return load_metadata(metadata / f"{latest}.root.json")
+    return load_metadata(metadata / f"{latest_version(metadata, 'root')}.root.json")
+
+
+def latest_version(metadata: Path, role: str) -> int:
+    """Return the highest version of a role's files in a folder of metadata; 0 without any."""
+    numbers = (path.name.partition(".")[0] for path in metadata.glob(f"*.{role}.json"))
+    return max((int(number) for number in numbers if number.isdecimal()), default=0)
 
 
 def load_timestamp(out: Path) -> "Metadata[Timestamp]":
@@ -58,12 +63,18 @@ def load_timestamp(out: Path) -> "Metadata[Timestamp]":
     return load_metadata(out / "repository" / "metadata" / "timestamp.json")
 
 
+def load_snapshot(out: Path) -> "Metadata[Snapshot]":
+    """Return the repository's current snapshot."""
+    version = load_timestamp(out).signed.snapshot_meta.version
+    return load_metadata(out / "repository" / "metadata" / f"{version}.snapshot.json")
+
+
 def load_targets(out: Path) -> "Metadata[Targets]":
-    """Return the repository's current targets metadata."""
-    metadata = out / "repository" / "metadata"
-    timestamp = load_metadata(metadata / "timestamp.json")
-    snapshot = load_metadata(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")
-    return load_metadata(metadata / f"{snapshot.signed.meta['targets.json'].version}.targets.json")
+    """Return the repository's current targets metadata; raises `InputError` where its snapshot names none."""
+    named = load_snapshot(out).signed.meta.get("targets.json")
+    if named is None:
+        raise InputError(f"{out}: its snapshot names no targets")
+    return load_metadata(out / "repository" / "metadata" / f"{named.version}.targets.json")
 
 
 def read_released(out: Path, task: str, release: int) -> Candidate:
@@ -77,16 +88,25 @@ def read_released(out: Path, task: str, release: int) -> Candidate:
     return parse_candidate(path.read_bytes(), str(path))
 
 
+def read_weights(out: Path, task: str, release: int) -> str | None:
+    """Return the SHA-256 of a release's weights by a party's current targets; None where they name no such release."""
+    target = load_targets(out).signed.targets.get(target_names(task, release)[0])
+    return None if target is None else target.hashes.get("sha256")
+
+
 def load_metadata(path: Path) -> "Metadata":
-    """Return the metadata in a file; raises `InputError` for any other file."""
+    """Return the metadata in a file, of the role that its name says; raises `InputError` for any other file."""
     from tuf.api.exceptions import RepositoryError
     from tuf.api.metadata import Metadata
 
     check_is_file(path)
     try:
-        return Metadata.from_bytes(path.read_bytes())
+        found = Metadata.from_bytes(path.read_bytes())
     except RepositoryError as error:
         raise InputError(f"{path}: no metadata of The Update Framework ({error})") from None
+    if found.signed.type != (role := path.name.split(".")[-2]):
+        raise InputError(f"{path}: metadata of the role {found.signed.type}, and those of {role} are wanted")
+    return found
 
 
 def write_metadata(metadata: "Metadata", path: Path) -> None:
@@ -111,12 +131,12 @@ def read_directives(targets: Mapping[str, "TargetFile"]) -> dict[str, Directive]
 def list_releases(targets: Mapping[str, "TargetFile"], task: str) -> list[int]:
     """Return the numbers of the releases of a task, rising."""
     parts = [name.split("/") for name in targets]
-    return sorted({int(part[1]) for part in parts if len(part) == 3 and part[0] == task and part[1].isdigit()})
+    return sorted({int(part[1]) for part in parts if len(part) == 3 and part[0] == task and part[1].isdecimal()})
 
 
-def root_keys(root: "Root") -> list[PublicKey]:
-    """Return the keys of a root's targets role."""
-    return [PublicKey(root.keys[name].keyval["public"]) for name in root.roles["targets"].keyids]
+def root_keys(root: "Root", role: str = "targets") -> list[PublicKey]:
+    """Return the keys of a role by a root."""
+    return [PublicKey(root.keys[name].keyval["public"]) for name in root.roles[role].keyids]
 
 
 def target_names(task: str, release: int) -> tuple[str, str]:

@@ -18,6 +18,7 @@ from flcav.releases.repositories.directive import Directive
 from flcav.releases.repositories.metadata import (
     DIRECTIVE,
     LIFETIME,
+    Party,
     expiry_of,
     list_releases,
     load_metadata,
@@ -68,13 +69,14 @@ def stage_release(
 
     candidate = read_candidate(folder)
     check_files(folder, candidate)
-    if (directive is None) != (read_party(out) == "provider"):
+    party = read_party(out)
+    if (directive is None) != (party == "provider"):
         raise InputError(f"{out}: the customer's repository has a directive, and the provider's has none")
     names = target_names(candidate.task, candidate.release)
     files = {name: TargetFile.from_file(name, str(folder / name.rpartition("/")[2]), ["sha256"]) for name in names}
     if directive is not None:
         files[names[0]].unrecognized_fields["custom"] = {DIRECTIVE: directive.model_dump(mode="json")}
-    _check_rising(out, candidate, files)
+    _check_rising(out, candidate, files, party)
     for name, file in files.items() if directive is None else ():  # vehicles download from the provider
         kept = out / "repository" / "targets" / name
         kept = kept.with_name(f"{file.hashes['sha256']}.{kept.name}")
@@ -113,6 +115,9 @@ def publish(out: Path, now: datetime | None = None) -> int:
     metadata, staged = out / "repository" / "metadata", _staged_path(out)
     _check_clock(out, at)
     version = load_targets(out).signed.version
+    online = read_private_key(key := out / "keys" / f"{ONLINE}.pem")
+    if online.public not in root_keys(load_root(out).signed, "timestamp"):
+        raise InputError(f"{key}: is not the online key, by the root of {out}")
     if staged.is_file():
         targets = load_metadata(staged)
         state = _count(out, targets)
@@ -120,7 +125,6 @@ def publish(out: Path, now: datetime | None = None) -> int:
             raise InputError(f"{out}: {state.signatures} of {state.threshold} signatures of the {read_party(out)}")
         version = targets.signed.version
         write_metadata(targets, metadata / f"{version}.targets.json")
-    online = read_private_key(out / "keys" / f"{ONLINE}.pem")
     timestamp: Metadata[Timestamp] = load_metadata(metadata / "timestamp.json")
     snapshot: Metadata[Snapshot] = load_metadata(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")
     sign_online(metadata, snapshot, timestamp, online, at, version)
@@ -168,8 +172,11 @@ def _stage(
     return _count(out, staged)
 
 
-def _check_rising(out: Path, candidate: Candidate, files: Mapping[str, "TargetFile"]) -> None:
-    """Raise `InputError` for a number that does not rise, and for earlier weights that are no roll-back to them."""
+def _check_rising(out: Path, candidate: Candidate, files: Mapping[str, "TargetFile"], party: Party) -> None:
+    """Raise `InputError` for a number that does not rise, and for earlier weights that are no roll-back to them.
+
+    Nor is a roll-back to other weights than those of the release that it names; the provider's repository knows them.
+    """
     known = load_targets(out).signed.targets
     if all(name in known and known[name].hashes == file.hashes for name, file in files.items()):
         return
@@ -178,9 +185,14 @@ def _check_rising(out: Path, candidate: Candidate, files: Mapping[str, "TargetFi
         raise InputError(
             f"{out}: release {candidate.release} of {candidate.task} does not rise above {releases[-1]}, which it names"
         )
+    back = candidate.rolls_back
+    if back is not None and releases and party == "provider":
+        earlier = known.get(target_names(candidate.task, back)[0])
+        if earlier is None or earlier.hashes.get("sha256") != candidate.weights:
+            raise InputError(f"{out}: release {candidate.release} rolls back to {back}, which has not its weights here")
     for number in releases:
         weights = known[target_names(candidate.task, number)[0]]
-        if weights.hashes["sha256"] == candidate.weights and candidate.rolls_back is None:
+        if weights.hashes.get("sha256") == candidate.weights and back is None:
             raise InputError(
                 f"{out}: release {candidate.release} has the weights of release {number}; a roll-back says so "
                 "(`flcav release rollback`)"

@@ -10,6 +10,7 @@ from flcav.releases.candidates.acknowledgement import Acknowledgement, find_ackn
 from flcav.releases.repositories.metadata import (
     list_releases,
     load_root,
+    load_snapshot,
     load_targets,
     load_timestamp,
     read_directives,
@@ -30,7 +31,7 @@ class RepositoryStatus(Record):
     version: int  # of the targets metadata
     threshold: int
     keys: tuple[str, ...]
-    fresh_until: datetime  # of the timestamp; vehicles refuse it afterwards
+    fresh_until: datetime  # when the first of its metadata expires; vehicles refuse it afterwards
     staged: Annotated[Staged | None, LEFT_OUT] = None
     share: Annotated[float | None, LEFT_OUT] = None  # of the fleet; None of the provider
     revoked: tuple[str, ...] = ()
@@ -63,7 +64,9 @@ def read_status(out: Path, task: str) -> RepositoryStatus:
         version=targets.version,
         threshold=root.roles["targets"].threshold,
         keys=tuple(key.short for key in root_keys(root)),
-        fresh_until=load_timestamp(out).signed.expires,
+        fresh_until=min(
+            each.expires for each in (root, targets, load_snapshot(out).signed, load_timestamp(out).signed)
+        ),
         staged=read_staged(out),
         share=None if directive is None else directive.share,
         revoked=() if directive is None else directive.revoked,

@@ -188,7 +188,7 @@ class _Rollout:
         runs = [kept.report.shadow for kept in reports.values() if kept.report.shadow is not None]
         wanted = (self.candidate.driving, self.candidate.weights)
         fitting = [run for run in runs if (run.driving, run.candidate) == wanted]
-        return judge_shadows(fitting) if fitting else None
+        return judge_shadows(fitting) if any(run.frames for run in fitting) else None
 
     def count_down(self, reports: Mapping[str, KeptReport]) -> dict[str, int]:
         """Return the bytes that crossed the sockets down to each vehicle for releases, so far."""

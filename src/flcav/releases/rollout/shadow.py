@@ -7,12 +7,13 @@ for nothing else.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from scipy.special import stdtrit
 
-from flcav.config import InputError
+from flcav.config import InputError, read_json
 from flcav.federation.messages.release_report import ShadowReport
 from flcav.geometry import Boxes
 from flcav.interface.wording import plural
@@ -58,6 +59,16 @@ def run_shadow(
     return ShadowReport(vehicle, "objects", driving[1], candidate[1], number, before, after, agreed)
 
 
+def read_shadow(path: Path) -> ShadowReport:
+    """Return the shadow run in a JSON file; raises `InputError` where there is none, or its numbers cannot be."""
+    found = ShadowReport.from_json(read_json(path), str(path))
+    try:
+        found.check()
+    except ValueError as error:
+        raise InputError(f"{path}: no shadow run: {error}") from None
+    return found
+
+
 def count_agreed(first: Boxes, second: Boxes) -> int:
     """Return how many detections of two networks agree, each matched once."""
     labels = set(first.label.tolist()) & set(second.label.tolist())
@@ -72,8 +83,9 @@ def judge_shadows(reports: Sequence[ShadowReport], limit: float = LIMIT) -> Shad
     Student's t over vehicles. Raises `InputError` for no reports, of different networks, and for a vehicle that
     reports twice.
     """
+    reports = [each for each in reports if each.frames]  # who met nothing tells nothing
     if not reports:
-        raise InputError("no shadow run: at least two vehicles' are wanted")
+        raise InputError("no shadow run of any frame: at least two vehicles' are wanted")
     if len({(each.driving, each.candidate) for each in reports}) > 1:
         raise InputError("the shadow runs are of different networks")
     if len({each.vehicle for each in reports}) < len(reports):

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from flcav.config import InputError
+from flcav.config import InputError, parse_config
 from flcav.releases.candidates.candidate import (
     ACKNOWLEDGEMENTS,
     CANDIDATE,
@@ -55,7 +55,8 @@ def change_share(
     """
     now = read_directive(out, task)
     revoked, named = tuple(sorted({*now.revoked, *revoke})), now.vehicles if share else ()
-    changed = now.model_copy(update={"share_ppm": round(share * MILLION), "revoked": revoked, "vehicles": named})
+    updates = {"share_ppm": round(share * MILLION), "revoked": revoked, "vehicles": named}
+    changed = parse_config(Directive, now.model_dump() | updates, "the directive")
     return changed, stage_directive(out, task, changed, keys)
 
 
@@ -82,7 +83,7 @@ def roll_back(earlier: Path, release: int, reason: str, out: Path, driving: str)
         raise InputError(f"{out}: exists already; a candidate is a new folder")
     changes = f"Roll-back to release {candidate.release}. {reason}"
     updates = {"release": release, "changes": changes, "driving": driving, "rolls_back": candidate.release}
-    changed = candidate.model_copy(update=updates)
+    changed = parse_config(Candidate, candidate.model_dump() | updates, f"release {release}")
     shutil.copytree(earlier, out, ignore=shutil.ignore_patterns(ACKNOWLEDGEMENTS, REPORT))
     write_json(out / CANDIDATE, changed.model_dump(mode="json"), sort=False)
     return changed

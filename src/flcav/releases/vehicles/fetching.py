@@ -77,7 +77,10 @@ def _read(path: Path) -> Iterator[bytes]:
 
 def locate(repository: str) -> str:
     """Return the address of a repository that is given as a folder or an address; raises `InputError` for neither."""
-    scheme = urlsplit(repository).scheme
+    try:
+        scheme = urlsplit(repository).scheme
+    except ValueError as error:
+        raise InputError(f"{repository}: no address ({error})") from None
     if scheme in ("http", "https", "file"):
         return repository.rstrip("/")
     if not (Path(repository) / "metadata").is_dir():

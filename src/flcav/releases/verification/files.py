@@ -7,10 +7,12 @@ from pathlib import Path
 from flcav.config import InputError
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
+from flcav.network.ledger import Ledger
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network, read_card
-from flcav.releases.candidates.candidate import CARD, WEIGHTS, Candidate, check_files
+from flcav.releases.candidates.candidate import CARD, LEDGER, WEIGHTS, Candidate, check_files
+from flcav.releases.candidates.proposal import sum_ledger, trace_data
 from flcav.releases.verification.records import VerificationData
 from flcav.storage.files import sha256
 
@@ -41,6 +43,8 @@ def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Seque
         check_files(folder, candidate)
         network, now = load_network(OBJECTS, folder / WEIGHTS), load_network(OBJECTS, driving)
         card = read_card(folder / WEIGHTS)
+        known = trace_data(card)
+        spent = () if candidate.ledger is None else sum_ledger(Ledger.load(folder / LEDGER))
     except InputError as error:
         yield str(error)
         return
@@ -49,12 +53,16 @@ def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Seque
     yield from _compare_interfaces(network, now)
     if below := [name for name, values in network.named_buffers() if "variance" in name and bool((values < 0).any())]:
         yield f"a variance below 0 in '{below[0]}': nothing that the network says is a number"
-    if not (folder / CARD).is_file() or (folder / CARD).read_text() != card.markdown():
+    if not (folder / CARD).is_file() or (folder / CARD).read_bytes() != card.markdown().encode():
         yield f"{CARD} is not the card in the weights: a card of other weights"
     if card.parameters != sum(each.numel() for each in network.parameters()):
         yield "a card of other weights: it names another number of parameters"
     if card.task != candidate.task or card.network != candidate.network or not _fits_name(network, card.network):
         yield "a card of other weights: it names another task or network"
+    if known != candidate.data:
+        yield "its provenance is another than that of the card in its weights"
+    if spent != candidate.spent:
+        yield "its description names other megabytes than its ledger"
     if not candidate.data:
         yield "its provenance names no training data"
     yield from find_overlap(candidate, tested)

@@ -17,6 +17,8 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
 from flcav.releases.verification.comparison import (
+    DOUBTED,
+    FIRST,
     KEPT,
     LEAST_SCENES,
     LEAST_TARGETS,
@@ -41,7 +43,7 @@ from flcav.releases.verification.testing import ConditionResults, VerificationFr
 from flcav.statistics.power import plan_scenes
 from flcav.storage.files import sha256, write_json
 
-MARGIN = 0.03  # AP50
+MARGIN, MOST_MARGIN = 0.03, 0.5  # AP50
 GUARD_REDRAWS = 200  # of the scenes, of each slice
 Results = Mapping[str, ConditionResults]  # by condition
 
@@ -173,12 +175,36 @@ def read_verification(folder: Path) -> Verification:
     if not path.is_file():
         raise InputError(f"{folder}: was not verified")
     found = Verification.from_json(read_json(path), str(path))
-    if found.candidate != read_candidate(folder).weights or sha256(folder / WEIGHTS) != found.candidate:
+    described = read_candidate(folder)
+    if found.candidate != described.weights or sha256(folder / WEIGHTS) != found.candidate:
         raise InputError(f"{path}: is the verification of other weights")
-    refuses = any(each.judgement in ("lost", "doubted") for each in found.guards)
-    if found.accepted and (found.whole is None or refuses or not found.whole.low > -found.margin):
+    if found.driving != described.driving and described.rolls_back is None:
+        raise InputError(f"{path}: is a verification beside another network than the candidate replaces")
+    if found.accepted and not _supports_acceptance(found):
         raise InputError(f"{path}: says that the candidate is accepted, and its own numbers say that it is not")
     return found
+
+
+def _supports_acceptance(found: Verification) -> bool:
+    """Return whether the numbers of a verification allow that the candidate is accepted."""
+    whole = found.whole
+    if whole is None or found.reasons or found.undecided or found.kept_share != KEPT:
+        return False
+    objects = {} if found.domain is None else found.domain.objects
+    return (
+        0 < found.margin <= MOST_MARGIN
+        and -found.margin < whole.low <= whole.high
+        and -found.margin < whole.candidate - whole.driving
+        and whole.driving >= LEAST_MEASURE
+        and min(found.scenes, whole.scenes) >= LEAST_SCENES
+        and all(count >= LEAST_TARGETS for count in objects.values())
+        and all(map(_is_kept, found.guards))
+    )
+
+
+def _is_kept(guard: Comparison) -> bool:
+    halved = guard.by in FIRST and guard.driving >= LEAST_MEASURE and not guard.candidate >= DOUBTED * guard.driving
+    return guard.judgement in ("kept", "open") and not halved
 
 
 def _guard(old: Measured, new: Measured, driving: Results, candidate: Results) -> Iterator[tuple[Comparison, float]]:
