@@ -178,7 +178,7 @@ def read_verification(folder: Path) -> Verification:
     described = read_candidate(folder)
     if found.candidate != described.weights or sha256(folder / WEIGHTS) != found.candidate:
         raise InputError(f"{path}: is the verification of other weights")
-    if found.driving != described.driving and described.rolls_back is None:
+    if found.accepted and found.driving != described.driving and described.rolls_back is None:
         raise InputError(f"{path}: is a verification beside another network than the candidate replaces")
     if found.accepted and not _supports_acceptance(found):
         raise InputError(f"{path}: says that the candidate is accepted, and its own numbers say that it is not")
