@@ -8,7 +8,10 @@ import threading
 import numpy as np
 import pytest
 from fleet_clients import Walker
+from flwr.proto.control_pb2 import StartRunRequest
+from flwr.proto.fab_pb2 import Fab
 
+from flcav.federation.fleet.bundle import build_bundle
 from flcav.federation.fleet.superlink import DATABASE
 from flcav.federation.fleet.supervisor import read_processes
 from flcav.federation.rounds import Schedule, federate
@@ -38,6 +41,14 @@ def test_killed_in_mid_round(killed, weights, deployment, tmp_path):
     assert read_processes(deployment.folder)[killed] != before
     for name, array in expected.weights.items():
         np.testing.assert_array_equal(array, ended.weights[name])
+
+
+def test_a_run_that_was_begun_and_left_is_ended(weights, deployment, clients):
+    """As of a command that is killed between the begin of a run and its task."""
+    with deployment.link._control() as control:
+        control.StartRun(StartRunRequest(fab=Fab(content=build_bundle())))
+    ended = federate(clients, weights, SCHEDULE, runtime=deployment)
+    np.testing.assert_array_equal(federate(clients, weights, SCHEDULE).weights["w"], ended.weights["w"])
 
 
 def test_superlink_that_cannot_write(weights, deployment, tmp_path):

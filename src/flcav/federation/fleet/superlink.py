@@ -116,13 +116,14 @@ class SuperLink:
         ):
             number = control.StartRun(StartRunRequest(fab=Fab(content=bundle))).run_id
             self._attach(bundle, signature)
-            while not (
-                task := runtime.AcquireTask(AcquireTaskRequest(supported_task_types=[TaskType.SERVER_APP]))
-            ).token:
-                time.sleep(0.05)
-        if task.task.run_id != number:
-            raise OSError(f"the SuperLink at {self.address} runs apps of somebody else")
-        return Run(self.address, certificate, task.token)
+            while True:
+                task = runtime.AcquireTask(AcquireTaskRequest(supported_task_types=[TaskType.SERVER_APP]))
+                if task.token and task.task.run_id == number:
+                    return Run(self.address, certificate, task.token)
+                if task.token:  # of a run whose command was killed, or lost the answer, before it had its task
+                    Run(self.address, certificate, task.token).end(failed=True)
+                else:
+                    time.sleep(0.05)
 
     def _attach(self, bundle: bytes, signature: dict[str, str]) -> None:
         """Store a bundle's signature beside it; Flower does so for apps of its own hub alone."""
