@@ -63,7 +63,7 @@ def test_a_quick_study_is_the_same_with_fewer_scenes_and_epochs(study):
 RECORDED = {
     "weather": "e5217e3fd7183127",
     "signs": "af6031549073e2c9",
-    "objects": "91e0a73860e306cc",
+    "objects": "98f2d23f0988e5c6",
     "objects-streets": "7621a783ce5d6a7b",  # of the third training of the page
     "trajectory": "3b5f95cc2d111a7a",
     "trajectory-cameras": "9889f4d36a9b6fc9",
