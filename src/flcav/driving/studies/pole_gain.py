@@ -40,7 +40,7 @@ OVERLAP = 0.3  # bird's-eye IoU of a found car: what braking needs, when boxes a
 
 @dataclass
 class FusionTally:
-    """What vehicle and poles find of the cars around, look by look."""
+    """Detections of the cars around by the vehicle and by poles, look by look."""
 
     scenario: list[str] = field(default_factory=list)
     own: list[Boxes] = field(default_factory=list)

@@ -43,7 +43,7 @@ NAMES: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class Found(Record):
-    """What one rule found with one seed."""
+    """Failures found by one search rule with one seed."""
 
     frames: int  # tested
     failing: int  # of them with a failure

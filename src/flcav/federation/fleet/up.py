@@ -38,7 +38,7 @@ MOST_VEHICLES = 64  # on this machine
 
 @dataclass(frozen=True)
 class Ready:
-    """Where a running fleet is reached."""
+    """Addresses of a running fleet."""
 
     proxy: str  # host:port
     superlink: str  # host:port on the operator's host

@@ -21,7 +21,7 @@ NONCE, TASK = re.compile("[0-9a-f]{32}"), re.compile("[A-Za-z0-9_.:-]{1,64}")
 
 @dataclass(frozen=True)
 class FLRequest:
-    """What a vehicle asks for, and why."""
+    """Request of a vehicle for federated learning of a task, with its loss."""
 
     nonce: str  # drawn by the vehicle, 32 hexadecimal digits
     time: float  # when it was made [s since 1970]

@@ -153,7 +153,7 @@ class Deployment:
 
 
 class RegionalDeployment:
-    """Where each region's clients are deployed: in a fleet of their own, or side by side in one."""
+    """Deployment of several regions: each in a fleet of its own, or side by side in one."""
 
     deployed: Literal[True] = True
 
