@@ -220,7 +220,9 @@ def request(
 @fleet.command()
 def up(
     folder: Path = FLEET,
-    vehicles: int = typer.Option(0, "--vehicles", min=0, max=64, help="Vehicles on this machine beside."),
+    vehicles: int | None = typer.Option(
+        None, "--vehicles", min=1, max=64, help="Vehicles on this machine, too. Without: servers alone."
+    ),
     host: str = typer.Option("127.0.0.1", "--host", help="Address that the proxy listens on."),
     port: int = typer.Option(0, "--port", min=0, max=65535, help="Port of the proxy; 0: a free one."),
 ) -> None:
@@ -228,7 +230,7 @@ def up(
     from flcav.federation.fleet.up import run_fleet
     from flcav.federation.runtimes.vehicle_app import prepare
 
-    run_fleet(folder, host, port, vehicles, prepare, typer.echo, _updater())
+    run_fleet(folder, host, port, vehicles or 0, prepare, typer.echo, _updater())
 
 
 @fleet.command("vehicle")

@@ -5,7 +5,17 @@ from typing import Any, cast
 
 import pytest
 
-from flcav.experiments.distillation.run import ARMS, BOTH, GRAPH, IDEAL, NO_ROAD, PLAIN, PRETRAINED, compare_labels
+from flcav.experiments.distillation.run import (
+    ARMS,
+    AVERAGE,
+    DENSEST,
+    IDEAL,
+    JOINED,
+    PRETRAINED,
+    ROAD,
+    TRACKS,
+    compare_labels,
+)
 from flcav.experiments.distillation.tables import tables
 from flcav.pipeline.recipe import EDGE, MAIN, load_run_recipe
 from flcav.pipeline.results.run import Spent
@@ -13,16 +23,7 @@ from flcav.pipeline.results.training import LabelQuality
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/distillation"))
-AP50 = {
-    PRETRAINED: 0.5,
-    NO_ROAD: 0.52,
-    PLAIN: 0.58,
-    "regression": 0.59,
-    "contrast": 0.55,
-    BOTH: 0.6,
-    GRAPH: 0.61,
-    IDEAL: 0.6,
-}
+AP50 = {PRETRAINED: 0.5, ROAD: 0.55, AVERAGE: 0.54, TRACKS: 0.58, DENSEST: 0.585, JOINED: 0.6, IDEAL: 0.61}
 
 
 def run_of(seed: int, more: float) -> Any:
@@ -46,16 +47,16 @@ def test_every_arm_of_the_recipe_is_compared_in_stage_two() -> None:
     assert all(arm.stages == (EDGE,) for arm in RECIPE.arms.values())
 
 
-def test_means_differences_and_the_share_that_the_trained_detector_brings() -> None:
+def test_means_differences_and_the_share_that_tracks_bring() -> None:
     found = compare_labels(RECIPE, cast(Any, [run_of(1, 0.0), run_of(2, 0.02)]))
-    assert found.ap50[BOTH].mean == pytest.approx(0.61)
-    assert found.differences[f"{BOTH} - {PLAIN}"].mean == pytest.approx(0.02)
-    assert found.differences[f"{GRAPH} - {BOTH}"].mean == pytest.approx(0.01)
+    assert found.ap50[JOINED].mean == pytest.approx(0.61)
+    assert found.differences[f"{JOINED} - {TRACKS}"].mean == pytest.approx(0.02)
+    assert found.differences[f"{AVERAGE} - {TRACKS}"].mean == pytest.approx(-0.04)
     assert found.closed.mean == pytest.approx(0.8)  # (.58 - .5) / (.6 - .5)
-    assert found.seeds["1"][BOTH].up_mb == 32.5
+    assert found.seeds["1"][JOINED].up_mb == 32.5
     assert found.seeds["1"][PRETRAINED].labels == ()
     shown = tables(found)
-    assert "| regression and contrast | 0.800 | 0.400 | 0.750 | 0.450 |" in shown["labels"]
-    assert "| plain pseudo-labels | 0.800 | 0.400 | 0.800 | 0.400 |" in shown["labels"]
+    assert "| tracks and road labels, VRCSP pole | 0.800 | 0.400 | 0.750 | 0.450 |" in shown["labels"]
+    assert "| tracks, no road sensor | 0.800 | 0.400 | 0.800 | 0.400 |" in shown["labels"]
     assert "32.50 MB" in shown["arms"]
-    assert any("that the trained one brings: 0.800" in sentence for sentence in found.sentences())
+    assert any("that tracks bring without one: 0.800" in sentence for sentence in found.sentences())

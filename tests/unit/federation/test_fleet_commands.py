@@ -73,7 +73,7 @@ def test_what_is_refused_in_a_sentence(flcav, fleet, tmp_path):
         refused = {
             ("init", fleet): "has an authority already",
             ("up", fleet, "--port", port): f"127.0.0.1:{port}: cannot be listened on (Address already in use)",
-            ("up", fleet, "--vehicles", -1): "-1 is not in the range 0<=x<=64",
+            ("up", fleet, "--vehicles", 0): "0 is not in the range 1<=x<=64",
             ("up", tmp_path / "other/fleet"): "registry of another authority",
             ("up", tmp_path / "none"): "no such folder",
             ("status", tmp_path / "none"): "has no authority",

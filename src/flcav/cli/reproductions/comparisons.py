@@ -63,8 +63,10 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engi
 
 def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
     from flcav.experiments.distillation.run import compare_labels, draw_labels
+    from flcav.experiments.scales import shrink_recipe
 
-    results = compare_labels(*_run_seeds(Target.distillation, "distillation", out, seeds, scale, jobs, engine, stale))
+    own = _run_seeds(Target.distillation, "distillation", out, seeds, scale, jobs, engine, stale, shrink_recipe)
+    results = compare_labels(*own)
     write_figures(out, results.as_json(), {"arms.png": draw_labels(results)}, results.sentences())
 
 

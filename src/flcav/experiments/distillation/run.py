@@ -1,8 +1,8 @@
 """Comparison of labels for stage II, the arms of recipes/runs/distillation.yaml: same frames, steps and budget.
 
-Arms differ only in their labels, in the terms of the loss, and in whether a pose graph corrects vehicles' poses. Every
-arm has a ledger of its own with the boxes that its vehicles send. Over seeds, which have recordings of their own,
-intervals cover training and traffic. The verdicts on all differences are corrected together.
+Arms differ only in their labels and in the pole that these come from. Every arm has a ledger of its own with the boxes
+that its vehicles send. Over seeds, which have recordings of their own, intervals cover training and traffic. The
+verdicts on all differences are corrected together.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,33 +21,32 @@ from flcav.statistics.verdicts import describe_means
 from flcav.storage.records import Record
 
 TASK, TOWN = "objects", "grid"
-PRETRAINED, NO_ROAD, PLAIN, IDEAL, BOTH, GRAPH = (
+PRETRAINED, TRACKS, JOINED, DENSEST, ROAD, AVERAGE, IDEAL = (
     "pretrained",
-    "no road sensor",
-    "plain pseudo-labels",
-    "ideal labels",
-    "regression and contrast",
-    "both with a pose graph",
+    "tracks, no road sensor",
+    "tracks and road labels, VRCSP pole",
+    "tracks and road labels, densest pole",
+    "road labels, VRCSP pole",
+    "road average, VRCSP pole",
+    "ideal road labels, VRCSP pole",
 )
 ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     PRETRAINED: (MAIN, PRETRAIN),
-    NO_ROAD: ("no_road", EDGE),
-    PLAIN: ("plain", EDGE),
-    "regression": ("regression", EDGE),
-    "contrast": ("contrastive", EDGE),
-    BOTH: (MAIN, EDGE),
-    GRAPH: ("pose_graph", EDGE),
+    ROAD: ("road", EDGE),
+    AVERAGE: ("average", EDGE),
+    TRACKS: ("tracks", EDGE),
+    DENSEST: ("densest", EDGE),
+    JOINED: (MAIN, EDGE),
     IDEAL: ("ideal", EDGE),
 }
 COMPARED = (  # (after, before): claims that the difference is positive
-    (BOTH, PRETRAINED),
-    (BOTH, NO_ROAD),
-    (BOTH, PLAIN),
-    (BOTH, "regression"),
-    (BOTH, "contrast"),
-    (GRAPH, BOTH),
-    (PLAIN, PRETRAINED),
-    (IDEAL, PLAIN),
+    (JOINED, PRETRAINED),
+    (JOINED, TRACKS),
+    (JOINED, DENSEST),
+    (JOINED, ROAD),
+    (AVERAGE, TRACKS),
+    (AVERAGE, ROAD),
+    (IDEAL, JOINED),
 )
 
 
@@ -68,14 +67,14 @@ class DistillationResult(Record):
     seeds: Mapping[str, Mapping[str, DistillationArm]]  # by seed and arm
     ap50: Mapping[str, MeanOverSeeds]  # by arm
     differences: Mapping[str, MeanOverSeeds]  # "after - before", in AP50
-    closed: MeanOverSeeds  # share of the gain with ideal labels that the trained road detector's bring
+    closed: MeanOverSeeds  # share of the gain with the road sensor that tracks bring without one
     recipe: Mapping[str, Json]
     provenance: Provenance
 
     def sentences(self) -> list[str]:
-        """Return AP50 by arm, the verdicts on differences, and what the trained road detector costs, in words."""
+        """Return AP50 by arm, the verdicts on differences, and what tracks bring without a road sensor, in words."""
         reached = [f"{arm}: AP50 {mean.describe()}" for arm, mean in self.ap50.items()]
-        share = f"share of the gain with an ideal road detector that the trained one brings: {self.closed.describe()}"
+        share = f"share of the gain with the road sensor that tracks bring without one: {self.closed.describe()}"
         return [*reached, *describe_means(self.differences), share]
 
 
@@ -87,7 +86,7 @@ def compare_labels(recipe: RunRecipe, runs: Sequence[Run]) -> DistillationResult
     def gain(seed: Mapping[str, DistillationArm], after: str, before: str) -> float:
         return seed[after].ap50 - seed[before].ap50
 
-    shares = [gap_closed(*(seed[name].ap50 for name in (PRETRAINED, PLAIN, IDEAL))) for seed in each]
+    shares = [gap_closed(*(seed[name].ap50 for name in (PRETRAINED, TRACKS, JOINED))) for seed in each]
     return DistillationResult(
         seeds=seeds,
         ap50={name: mean_over_seeds([seed[name].ap50 for seed in each], share=True) for name in ARMS},
