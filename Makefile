@@ -14,7 +14,8 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
-# Whole pipelines at toy scale: runs of all recipes and examples, stopped and killed ones, the installed wheel, studies.
+# Whole pipelines at toy scale: runs of all recipes and examples, stopped and killed ones, the installed wheel, studies; and
+# the tests that take longest of others: coverage of intervals, optima against all plans, full disks.
 test-runs: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 

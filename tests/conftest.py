@@ -8,7 +8,8 @@ from flcav.machine.threads import use_threads
 
 use_threads(1)  # of each of the two workers and its children: threads that wait for a core burn time
 
-LONGEST = ("test_runs.py", "test_run_recipes.py", "test_examples.py", "test_wheel.py", "test_stopped_runs.py")
+LONGEST = ("test_runs.py", "test_run_recipes.py", "test_wheel.py", "test_stopped_runs.py")  # of make test-runs
+FIRST = ("test_record.py", "test_cli_allocate.py", "test_record_sensors.py", "test_allocation.py")  # of make test
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -31,8 +32,10 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest files first, so that the workers of `make test` end together.
+    """Put the longest files first, so that the workers end together.
 
-    The first compiles the LiDAR's functions, the second the cameras': the others find them in Numba's cache.
+    In `make test` one worker compiles the functions of LiDARs and cameras while the other does what needs none of them:
+    the rest finds them in Numba's cache.
     """
-    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+    order = (*LONGEST, *FIRST)
+    items.sort(key=lambda item: order.index(item.path.name) if item.path.name in order else len(order))

@@ -5,6 +5,7 @@ table of that name, made from the folder's result.json, or from results.json whe
 where it is of a run's seeds, from theirs and summary.json. All other text stays.
 """
 
+import functools
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -127,6 +128,7 @@ def fill(page: str, tables: Tables) -> str:
     return _SPAN.sub(filled, page)
 
 
+@functools.cache
 def tables_of(folder: Path) -> Tables:
     """Return the tables of a reproduction's folder as Markdown, by name."""
     if (folder / RESULTS).is_file():

@@ -76,6 +76,7 @@ def _read_objects(root: ElementTree.Element, place: Place) -> None:
             find(root, place.offset_m, place.net)
 
 
+@pytest.mark.slow
 def test_mutated_maps_are_read_or_refused_in_a_sentence(sloping: dict[str, Path], place: Place, tmp_path: Path) -> None:
     sentences = []
     for number in range(READ):

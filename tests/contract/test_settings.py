@@ -230,6 +230,7 @@ def test_a_command_computes_on_one_thread(command, call):
     assert torch.get_num_threads() == 1
 
 
+@pytest.mark.slow
 def test_threads_are_those_asked_for_whatever_the_environment_and_are_in_the_card(drives, tmp_path):
     code = (
         "import json, sys\nfrom flcav.cli.main import run\n"

@@ -316,6 +316,7 @@ def test_output_below_a_file(data: Path, tmp_path: Path, refused: Callable[..., 
     assert (tmp_path / "file").read_text() == "kept"
 
 
+@pytest.mark.slow
 def test_a_full_disk_while_weights_are_written(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = shell("train", "objects", "--data", data, "--out", out, "--epochs", 1, file_bytes=BUDGET_B)
@@ -324,6 +325,7 @@ def test_a_full_disk_while_weights_are_written(data: Path, tmp_path: Path) -> No
     assert all(name.startswith("events/") for name in left_in(out))  # curves, whole as far as they go
 
 
+@pytest.mark.slow
 def test_a_full_disk_while_a_picture_is_written(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "out" / "frame.png"
     done = shell("birdseye", data, "--out", out, file_bytes=10_000)

@@ -87,6 +87,7 @@ def test_out_is_a_page_that_tells_the_plan(tmp_path, capsys):
     assert f"<td>{plan['tasks'][0]['samples']:,}</td>" in page
 
 
+@pytest.mark.slow
 def test_links_too_slow_limit_the_plan_until_nothing_can_be_carried(tmp_path, capsys):
     values = yaml.safe_load((RECIPES[0].parents[1] / "graphs" / "three_layers.yaml").read_text())
     errors = []
@@ -230,6 +231,7 @@ def test_a_plan_goes_on_from_progress(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out) == plan
 
 
+@pytest.mark.slow
 def test_time_to_train_is_kept_and_said(tmp_path, capsys):
     values = yaml.safe_load(RECIPES[0].read_text()) | {"horizon_s": 100}
     limits = {"samples": [100, 400], "edge_rounds": [0, 6], "cloud_rounds": [0, 2]}

@@ -140,6 +140,7 @@ def test_a_recording_has_the_log_of_each_drive_and_else_the_bytes_of_one_without
             assert sha256(path) == sha256(recorded / path.relative_to(plain)), path
 
 
+@pytest.mark.slow
 def test_workers_write_the_same_logs_and_a_lost_one_is_recorded_again(recorded: Path, tmp_path: Path) -> None:
     recipe, out = Recipe.model_validate(RECIPE | {"navigation_s": 5.0}), tmp_path / "data"
     record(recipe, out, jobs=2, progress=ignore_progress)

@@ -211,6 +211,7 @@ def test_an_interruption_while_files_move_is_made_good(
     assert digests(tmp_path / "data") == uninterrupted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("jobs", "number"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGINT)])
 def test_a_killed_recording_is_finished_by_the_same_command(
     tmp_path: Path, jobs: int, number: int, uninterrupted: dict[str, str]

@@ -81,6 +81,7 @@ def test_seeds_train_every_candidate_and_shares_are_of_the_same_seed(
     assert len(results.sentences()) == 1 + len(NETWORKS)
 
 
+@pytest.mark.slow
 def test_every_candidate_is_trained_and_scored(tmp_path: Path) -> None:
     """The step itself, on four sweeps and two optimiser steps."""
     from flcav.pipeline.engine import run_steps

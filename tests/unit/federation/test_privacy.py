@@ -314,6 +314,7 @@ def test_what_makes_no_sense_is_one_sentence():
             Privacy(**{"clip": 1.0, "noise": 1.0, **wrong})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["central", "local"])
 @pytest.mark.parametrize("selection", [EVERY, POISSON, UNIFORM, Selection(rule="round-robin", clients=4)])
 @pytest.mark.parametrize(("epsilon", "rounds"), [(0.5, 3), (8.0, 12), (60.0, 1)])

@@ -45,6 +45,7 @@ class Mortal(Regression):
         return found if own is None else replace(found, own=found.weights)
 
 
+@pytest.mark.slow
 def test_clients_in_two_processes_federate_to_the_same_bits_and_one_killed_is_named():
     clients = {name: Mortal(each.inputs, each.targets) for name, each in vehicles("grid", 4).items()}
     clients["grid/cav1"].killed = True

@@ -105,6 +105,7 @@ def test_the_ledger_has_the_bytes_that_are_left(kind: str, per_weight: float):
     assert abs(update_bytes(START, Upload(**KINDS[kind])) - fewer[0]) <= 16  # metrics of other values
 
 
+@pytest.mark.slow
 def test_fp16_and_int8_end_near_and_top_k_gets_there_by_what_it_kept():
     plain = run(Upload())[0]
     for kind, error in (("fp16", 1e-3), ("int8", 0.05)):

@@ -82,6 +82,7 @@ def test_on_a_slope_points_are_as_high_as_above_level_ground() -> None:
     np.testing.assert_array_equal(flat[:, [0, 1, 3]], points[:, [0, 1, 3]])
 
 
+@pytest.mark.slow
 def test_cars_on_slopes_are_found_and_stand_on_the_road(tmp_path: Path) -> None:
     shared = {"seed": 5, "scenes": 3, "spins_per_scene": 2, "every_s": 6.0, "warmup_s": 30.0, "cavs": 0}
     record(EmbeddedSource(Recipe.model_validate({"town": "hilly_grid", "poles": (6,), **shared})), tmp_path / "data")

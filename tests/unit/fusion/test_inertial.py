@@ -139,6 +139,7 @@ def test_the_imu_leads_from_pose_to_pose() -> None:
     assert np.degrees(Rotation.from_matrix(turn.T @ at[start + 50, :3, :3]).magnitude()) < 0.01
 
 
+@pytest.mark.slow
 def test_errors_are_what_the_covariance_says_and_small_between_near_frames() -> None:
     rig, rows, relative = rig_of(), [], []
     for seed in range(24):

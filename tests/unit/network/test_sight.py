@@ -149,6 +149,7 @@ def test_a_vehicle_does_not_block_its_own_antenna():
     assert links.state[0, :, 0].tolist() == [PathState.LOS, PathState.LOS]
 
 
+@pytest.mark.slow
 def test_shadowing_is_a_stream_of_its_own_for_each_link_and_has_the_clauses_statistics():
     times = np.arange(4000.0)
     path = np.c_[np.tile([0.0, 5.0], 2000), np.full(4000, -80.0)]  # 5 m to and fro

@@ -44,7 +44,7 @@ def test_small_instances_equal_exhaustive_search(model, seed, objective):
     assert plan.gap == pytest.approx(0, abs=2e-9)
 
 
-@pytest.mark.parametrize("tasks", [3, 10, 30, 100, 300])
+@pytest.mark.parametrize("tasks", [3, 10, 30, 100, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("model", "seed"), [("additive", 0), ("additive", 1), ("effective", 0), ("federated", 0), ("shared", 0)]
 )
@@ -120,6 +120,7 @@ def test_marginal_values_are_the_slope_of_the_relaxed_optimum():
         assert rate == pytest.approx(1000 * (less - more) / (2 * step[link]), rel=0.02)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(
     seed=st.integers(0, 10**6),

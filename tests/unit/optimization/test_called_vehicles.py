@@ -92,6 +92,7 @@ def verified(values: dict[str, Any], plan: Allocation) -> tuple[str, ...]:
     return tuple(verify_allocation(parsed(values).model_dump_json(), json.dumps(told)).faults)
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(
     seed=st.integers(0, 10**6),

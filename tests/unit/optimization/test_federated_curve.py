@@ -160,6 +160,7 @@ def test_a_drift_that_costs_leaves_the_cloud_link_idle_whatever_its_budget(objec
         assert plan.objective == pytest.approx(searched(values), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_area_and_what_more_budget_saves_work_with_it() -> None:
     values = written(5, 3, "federated", SMALL, 200.0)
     area, weighted = (allocate(parsed(values | {"objective": name})) for name in ("area", "weighted"))
@@ -171,6 +172,7 @@ def test_the_area_and_what_more_budget_saves_work_with_it() -> None:
         assert each.objective == pytest.approx(more, rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("model", "more"), [("federated", {}), ("additive", {"merge": 0.05})])
 def test_links_of_vehicles_limit_such_plans_too(seed: int, model: str, more: dict[str, float]) -> None:

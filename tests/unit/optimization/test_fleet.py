@@ -65,6 +65,7 @@ def busiest_s(asked: Problem, shares: Any) -> float:
     return max(busy.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_near_the_best_of_all_plans_that_can_be_carried(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -100,6 +101,7 @@ def test_slow_links_limit_the_plan_and_it_says_so() -> None:
     assert busiest_s(asked, shares) <= 30 * (1 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", ["max-min", "area"])
 def test_other_objectives_are_carried_too(objective: str) -> None:
     tasks = [{"uplink_mbps": fleet(2, 2, 2)} for _ in range(3)]

@@ -30,6 +30,7 @@ def history(noise: float) -> History:
     return History(COUNTS, 1 - error + drawn, np.ones(len(COUNTS)), RUNS)
 
 
+@pytest.mark.slow
 def test_a_run_is_predicted_by_the_others_alone() -> None:
     told = history(0.02)
     found = hold_out_runs(told, fit)
@@ -59,6 +60,7 @@ def test_two_runs_are_too_few() -> None:
         hold_out_runs(history(0.0).select(COUNTS[:, 0] < 100), fit)
 
 
+@pytest.mark.slow
 def test_the_command_tells_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = history(0.02)
     rows = [f"t,{s:g},{e:g},{c:g},{a:.6f},{r}" for (s, e, c), a, r in zip(COUNTS, told.accuracy, RUNS, strict=True)]
@@ -114,6 +116,7 @@ def test_a_curve_is_that_of_a_mean_seed() -> None:
     assert level_seeds(alone) == Levelled(alone, {})
 
 
+@pytest.mark.slow
 def test_seeds_held_out_are_predicted_without_their_level_and_then_from_pretraining() -> None:
     told = several_seeds(0.0)
     found = hold_out_runs(told, fit)

@@ -90,6 +90,7 @@ LOGGED = {  # the last three rows are logged a second time, as after a resume
 }
 
 
+@pytest.mark.slow
 def test_rows_logged_twice_count_once_and_are_told() -> None:
     told = parse_histories(LOGGED, "runs.csv", "a")["a"]
     once = parse_histories({name: column[:8] for name, column in LOGGED.items()}, "runs.csv", "a")["a"]

@@ -30,6 +30,7 @@ def timed(seed: int, tasks: int, model: str, horizon_s: float, **more: Any) -> d
     return values | {"horizon_s": horizon_s}
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
@@ -109,6 +110,7 @@ def test_rounds_that_the_limits_ask_for_and_time_forbids_are_refused_in_a_senten
         allocate(parsed(values))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("linked", [False, True])
 @pytest.mark.parametrize("seed", range(5))
 def test_named_vehicles_come_near_the_best_of_all_plans(seed: int, linked: bool) -> None:

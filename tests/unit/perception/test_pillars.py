@@ -83,6 +83,7 @@ def test_no_intensity_is_no_input():
     np.testing.assert_array_equal(np.asarray(maps[0]), np.asarray(maps[1]))
 
 
+@pytest.mark.slow
 def test_it_learns_to_find_a_box():
     """Overfitting: after training on one sweep with two cars it finds both, and nothing else of a high score."""
     rng = np.random.default_rng(1)

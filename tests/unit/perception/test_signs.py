@@ -264,6 +264,7 @@ class WithoutAugmentation(SignsTask):
         return samples[index]
 
 
+@pytest.mark.slow
 def test_it_learns_eight_pictures():
     samples = [painted(seed) for seed in range(8)]
     network = build_network(SIGNS, TINY, 0)

@@ -196,6 +196,7 @@ def test_no_other_plan_fits_what_is_left() -> None:
     assert plan.tasks == first.tasks
 
 
+@pytest.mark.slow
 def test_the_curve_of_least_aicc_is_planned_by() -> None:
     counts = history().resources
     samples, edge, cloud = counts.T

@@ -94,6 +94,7 @@ def test_a_budget_is_shared_by_both_stages() -> None:
         plan(budgets[1] / 2, 6, 6, 2)
 
 
+@pytest.mark.slow
 def test_a_budget_alone_gives_one_noise_for_all_regions() -> None:
     asked = Rules(privacy=Privacy(epsilon=6.0), selection=Selection(rule="uniform", clients=2))
     planned = plan_private_rounds(asked, [8, 4], 3, 4, 2)

@@ -182,6 +182,7 @@ def test_no_step_reaches_the_drawing_of_results_or_the_command_line(run):
     assert bool(observing) == (run in (record_split, recording.record_step))
 
 
+@pytest.mark.slow
 def test_an_edit_of_flcav_makes_stale_what_it_should(tmp_path):
     copy = tmp_path / "flcav"
     shutil.copytree(PACKAGES["flcav"], copy, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors", "towns"))

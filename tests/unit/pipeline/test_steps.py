@@ -457,6 +457,7 @@ def test_a_failing_step_ends_the_run_and_keeps_what_was_finished(tmp_path):
     assert not (tmp_path / "broken" / "done.json").exists()
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_from_its_last_finished_step(tmp_path):
     code = (
         "import sys; sys.path.insert(0, sys.argv[2]); from pathlib import Path; import test_steps as t\n"

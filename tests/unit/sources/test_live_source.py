@@ -46,6 +46,7 @@ def make_source(**changes: object) -> LiveSource:
     return LiveSource(load_town("grid"), Starting(), {"ego": RIG}, **values)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.slow
 def test_a_drive_is_recorded_whole_by_any_number_of_processes(tmp_path: Path) -> None:
     for jobs in (1, 2):
         assert record(make_source(), tmp_path / f"jobs{jobs}", jobs=jobs)

@@ -128,6 +128,7 @@ def test_sizes_are_drawn_by_category_and_the_ends_of_cars_are_bowed(source: Embe
     assert again.model(0)[:2] == trace.model(0)[:2]
 
 
+@pytest.mark.slow
 def test_returns_of_a_resized_car_lie_in_its_box(source: EmbeddedSource):
     frame = next(source.frames(source.scenes()[0]))
     boxes = frame.annotations.boxes.transform(inverse(frame.world_from_sensor("velodyne")))

@@ -61,6 +61,7 @@ def coverage(seeds: int, crossed: bool, planted: tuple[float, float, float], sha
     return hits / times
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planted", PLANTED)
 @pytest.mark.parametrize("crossed", [False, True], ids=["own scenes", "shared scenes"])
 @pytest.mark.parametrize("seeds", [3, 5, 8])
@@ -68,6 +69,7 @@ def test_intervals_contain_the_truth_in_95_of_100_repetitions(seeds: int, crosse
     assert 0.93 <= coverage(seeds, crossed, planted, share=True) <= 0.97
 
 
+@pytest.mark.slow
 def test_numbers_that_are_no_shares_are_covered_as_often() -> None:
     assert 0.93 <= coverage(3, False, PLANTED[0], share=False) <= 0.97
     assert 0.93 <= coverage(3, True, PLANTED[0], share=False) <= 0.97
@@ -136,6 +138,7 @@ def test_holm_corrects_as_by_hand() -> None:
     assert correct_p_values([]) == []
 
 
+@pytest.mark.slow
 def test_a_page_of_true_hypotheses_has_a_wrong_verdict_in_at_most_one_of_twenty() -> None:
     rng, wrong, uncorrected, pages = np.random.default_rng(2), 0, 0, 1500
     for _ in range(pages):

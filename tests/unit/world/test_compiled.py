@@ -3,6 +3,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 INNER = "from flcav.machine.compiled import inlined\n@inlined\ndef inner(x):\n    return x + {}\n"
 MIDDLE = """
 from flcav.machine.compiled import inlined
@@ -33,6 +35,7 @@ def ran(folder: Path) -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.slow
 def test_what_is_kept_is_made_anew_when_an_inlined_function_of_another_file_changes(tmp_path: Path) -> None:
     for name, text in (("inner", INNER.format(1)), ("middle", MIDDLE), ("outer", OUTER)):
         (tmp_path / f"{name}.py").write_text(text)
@@ -54,6 +57,7 @@ print(outer({0}(1)), sum(outer.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.slow
 def test_what_is_kept_of_a_class_that_is_called_otherwise_now_is_made_anew(tmp_path: Path) -> None:
     (tmp_path / "outer.py").write_text("from records import *\n")
     for name in ("Before", "After"):

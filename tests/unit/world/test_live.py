@@ -382,6 +382,7 @@ def test_a_scene_follows_snapshots_and_frames_are_those_of_a_recording():
     assert len(live[-1].lidar["lidar"]) > 1000
 
 
+@pytest.mark.slow
 def test_the_sumo_process_ends_with_the_one_that_started_it():
     code = (
         "from flcav import load_town\n"

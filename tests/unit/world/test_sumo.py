@@ -155,6 +155,7 @@ def test_names_of_folders_do_not_matter(name: str, tmp_path: Path):
     assert same(recorded(asked(tmp_path / name, net=net), [50]), recorded(asked(tmp_path / "plain"), [50]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["idle", "killed idle", "killed at work"])
 def test_it_ends_with_the_process_that_started_it_without_a_word(when: str, tmp_path: Path):
     job = asked(tmp_path / "job")
