@@ -104,7 +104,7 @@ def entries() -> Iterator[Any]:
             yield pytest.param(page, entry, id=f"{page}-{number}")
 
 
-@pytest.mark.parametrize(("page", "entry"), entries())
+@pytest.mark.parametrize(("page", "entry"), [*entries()])
 def test_sentences_say_what_the_results_hold(page: str, entry: Mapping[str, Any]) -> None:
     says = " ".join(entry["says"].split())
     assert says in sentences(page), f"{page} no longer says this: change or remove the entry in figures.yaml"

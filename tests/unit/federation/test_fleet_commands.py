@@ -14,6 +14,7 @@ from flcav.federation.fleet.authority import open_authority
 from flcav.federation.fleet.keys import request_certificate, take_certificate
 from flcav.federation.fleet.page import make_page
 from flcav.federation.fleet.traffic import Traffic
+from flcav.federation.fleet.vehicle import VehicleSettings
 
 
 @pytest.fixture
@@ -68,6 +69,8 @@ def test_what_is_refused_in_a_sentence(flcav, fleet, tmp_path):
     assert flcav("init", tmp_path / "other/fleet")[0] == 0
     for name in ("ca.crt", "ca.key"):
         (tmp_path / "other/fleet" / name).write_bytes((fleet / name).read_bytes())
+    (tmp_path / "garbled").mkdir()
+    (tmp_path / "garbled/ca.crt").write_text("none")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         refused = {
@@ -77,6 +80,7 @@ def test_what_is_refused_in_a_sentence(flcav, fleet, tmp_path):
             ("up", tmp_path / "other/fleet"): "registry of another authority",
             ("up", tmp_path / "none"): "no such folder",
             ("status", tmp_path / "none"): "has no authority",
+            ("list", tmp_path / "garbled"): "ca.crt: is no certificate (PEM)",
             ("vehicle", fleet): "is no vehicle's folder",
             ("revoke", fleet, "cav-9"): "has no certificate in force",
             ("key", tmp_path / "x", "--vehicle", "../x"): "an identifier has",
@@ -92,6 +96,14 @@ def test_what_is_refused_in_a_sentence(flcav, fleet, tmp_path):
     assert not (tmp_path / "x").exists()
 
 
+def refused(ended) -> str:
+    """Return the sentence of a command that was refused."""
+    code, _, said = ended
+    assert code == 2
+    assert said.count("\n") == 1
+    return said
+
+
 def test_expired_certificate_of_a_vehicle_on_this_machine(flcav, fleet):
     own, authority = fleet / "vehicles/vehicle-001", open_authority(fleet)
     given = authority.register(request_certificate(own, "vehicle-001"), days=1 / 86400)
@@ -100,6 +112,14 @@ def test_expired_certificate_of_a_vehicle_on_this_machine(flcav, fleet):
     code, _, said = flcav("up", fleet, "--vehicles", 1)
     assert code == 2
     assert "the certificate of 'vehicle-001' is expired; flcav fleet rotate gives another" in said
+    VehicleSettings("127.0.0.1:1", 1, 2).save(own)
+    assert refused(flcav("vehicle", own)).startswith(f"flcav: {own / 'vehicle.crt'}: is expired since 20")
+    (own / "vehicle.crt").write_bytes((fleet / "ca.crt").read_bytes())
+    assert "is for another key than" in refused(flcav("vehicle", own))
+    (own / "vehicle.crt").write_text("none")
+    assert "vehicle.crt: is no certificate (PEM)" in refused(flcav("vehicle", own))
+    (own / "vehicle.crt").unlink()
+    assert "has no certificate yet" in refused(flcav("vehicle", own))
 
 
 def test_page(flcav, fleet):

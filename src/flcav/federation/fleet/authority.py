@@ -127,12 +127,7 @@ def found_authority(folder: Path, hosts: tuple[str, ...] = ()) -> Authority:
 
 def open_authority(folder: Path) -> Authority:
     """Return the authority in `folder`; raises `InputError` where there is none, or its parts are of several."""
-    if not (folder / AUTHORITY).exists():
-        raise InputError(f"{folder}: has no authority; make one with flcav fleet init {folder}")
-    try:
-        certificate = x509.load_pem_x509_certificate((folder / AUTHORITY).read_bytes())
-    except ValueError:
-        raise InputError(f"{folder / AUTHORITY}: is no certificate (PEM)") from None
+    certificate = _load_certificate(folder)
     key = load_key(folder / AUTHORITY_KEY)
     if key.public_key() != certificate.public_key():
         raise InputError(f"{folder}: {AUTHORITY_KEY} is the key of another authority than {AUTHORITY}'s")
@@ -148,7 +143,13 @@ def open_authority(folder: Path) -> Authority:
 
 def open_registry(folder: Path) -> Registry:
     """Return the registry of the authority in `folder`; raises `InputError` where it is another one's."""
+    return Registry.open(folder / REGISTRY, _load_certificate(folder).fingerprint(hashes.SHA256()).hex())
+
+
+def _load_certificate(folder: Path) -> x509.Certificate:
     if not (folder / AUTHORITY).exists():
         raise InputError(f"{folder}: has no authority; make one with flcav fleet init {folder}")
-    certificate = x509.load_pem_x509_certificate((folder / AUTHORITY).read_bytes())
-    return Registry.open(folder / REGISTRY, certificate.fingerprint(hashes.SHA256()).hex())
+    try:
+        return x509.load_pem_x509_certificate((folder / AUTHORITY).read_bytes())
+    except ValueError:
+        raise InputError(f"{folder / AUTHORITY}: is no certificate (PEM)") from None

@@ -86,6 +86,20 @@ def request_certificate(folder: Path, vehicle: str) -> Path:
     return at / REQUEST
 
 
+def check_certificate(folder: Path) -> None:
+    """Check that the vehicle in `folder` has a certificate of its key that is in force, else raise `InputError`."""
+    try:
+        own = x509.load_pem_x509_certificate((folder / CERTIFICATE).read_bytes())
+    except ValueError:
+        raise InputError(f"{folder / CERTIFICATE}: is no certificate (PEM)") from None
+    except FileNotFoundError:
+        raise InputError(f"{folder}: has no certificate yet; flcav fleet install takes it") from None
+    if own.public_key() != load_key(folder / KEY).public_key():
+        raise InputError(f"{folder / CERTIFICATE}: is for another key than {folder / KEY}")
+    if own.not_valid_after_utc < datetime.now(UTC):
+        raise InputError(f"{folder / CERTIFICATE}: is expired since {own.not_valid_after_utc:%Y-%m-%dT%H:%M:%SZ}")
+
+
 def take_certificate(folder: Path, certificate: bytes, authority: bytes) -> None:
     """Put the certificate of a vehicle's key, and the authority's, both PEM, into its `folder`; a new key is then used.
 

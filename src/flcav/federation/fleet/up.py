@@ -19,6 +19,7 @@ from flcav.federation.fleet.keys import (
     AUTHORITY,
     CERTIFICATE,
     REQUEST,
+    check_certificate,
     request_certificate,
     take_certificate,
     write_private,
@@ -149,9 +150,13 @@ def run_fleet(
 
 
 def run_vehicle(folder: Path, prepare: Prepare, others: Mapping[str, Callable[[Path], None]] = {}) -> None:
-    """Run the vehicle in `folder`, with `others` of its processes, until this process is told to end."""
+    """Run the vehicle in `folder`, with `others` of its processes, until this process is told to end.
+
+    Raises `InputError` where the vehicle's certificate is not in force.
+    """
     if not (folder / SETTINGS).exists():
         raise InputError(f"{folder}: is no vehicle's folder, without {SETTINGS}")
+    check_certificate(folder)
     with _alone(folder):
         import_flower()
         supervise(folder, vehicle_processes(folder, prepare, others))
