@@ -97,6 +97,7 @@ def main() -> None:
             sensor.listen(count)
             sensors.append(sensor)
         ticks_per_s(world, 20)
+        time.sleep(1.0)
         counts["camera"] = counts["lidar"] = 0
         figures["real_time_factor"] = ticks_per_s(world, 200) * DT_S
         time.sleep(1.0)

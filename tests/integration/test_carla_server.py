@@ -85,6 +85,33 @@ def test_messages_that_no_client_sends_leave_the_server_up(port):
     assert msgpack.unpackb(_ask(port, version)) == [1, 1, None, [[1, "0.9.16"]]]
 
 
+def test_a_cue_is_answered_after_the_state_of_its_tick(port):
+    """A client that has the answer before polls for the state, with a core that the sensors need."""
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as link, socket.socket() as stream:
+        unpacker = msgpack.Unpacker()
+
+        def call(method, *arguments):
+            link.sendall(wire.pack([0, 1, method, [[False], *arguments]]))
+            while True:
+                unpacker.feed(link.recv(1 << 16))
+                for _, _, error, answer in unpacker:
+                    assert error is None
+                    return answer[0][1]
+
+        try:
+            call("set_episode_settings", wire.Settings(synchronous=True, fixed_dt_s=0.05).packed())
+            _, (token,) = call("get_episode_info")
+            stream.connect(("127.0.0.1", port + 1))
+            stream.sendall(token[:4])
+            stream.recv(1 << 20)  # the state as it is
+            for _ in range(3):
+                frame = call("tick_cue")
+                state = stream.recv(1 << 20, socket.MSG_DONTWAIT)
+                assert int.from_bytes(state[12:20], "little") == frame
+        finally:
+            call("set_episode_settings", wire.Settings().packed())
+
+
 def test_a_port_in_use_is_one_sentence(port, capsys):
     with pytest.raises(SystemExit) as left:
         run(["carla", "serve", "suburb", "--port", str(port)])

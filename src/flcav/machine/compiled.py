@@ -20,13 +20,26 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
     is appended to the qualified name, which is part of the cache's key. (Numba alone reads an index before it compares
     the time of the file, and breaks off where the index names a class that the file no longer has.)
     """
+    return _compile(function, counted=True)
+
+
+def kernel(function: Callable[P, T]) -> Callable[P, T]:
+    """Return `function` compiled as `compiled` does, without counts of references to its arrays: it may make none.
+
+    Such counts are atomic. Where a loop over pixels passes arrays to inlined functions, they take half of its time, and
+    more where several threads run it, each with the same arrays.
+    """
+    return _compile(function, counted=False)
+
+
+def _compile(function: Callable[P, T], *, counted: bool) -> Callable[P, T]:
     sources = {Path(function.__code__.co_filename)} | _inlined_files(function)
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(sources)))
-    function.__qualname__ += f"_{digest.hexdigest()[:12]}"
+    function.__qualname__ += f"_{digest.hexdigest()[:12]}{'' if counted else '_uncounted'}"
     try:
-        return numba.njit(nogil=True, cache=True)(function)
+        return numba.njit(nogil=True, cache=True, _nrt=counted)(function)  # pyright: ignore[reportCallIssue]
     except RuntimeError:  # no folder for the cache can be written
-        return numba.njit(nogil=True)(function)
+        return numba.njit(nogil=True, _nrt=counted)(function)  # pyright: ignore[reportCallIssue]
 
 
 def inlined(function: Callable[P, T]) -> Callable[P, T]:

@@ -1,9 +1,14 @@
-"""Thread count of the numerical libraries. It decides the order of sums, and so the last bits of results."""
+"""Thread count of the numerical libraries, and work shared among threads.
+
+The thread count of the libraries decides the order of sums, and so the last bits of results.
+"""
 
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 
 VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -33,3 +38,22 @@ def threads_of_children(count: int) -> Iterator[None]:
     finally:
         for name, value in before.items():
             os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+
+
+def share_among_threads(work: Callable[[int, int], None], count: int, threads: int, *, whole: int = 1) -> None:
+    """Call `work(first, last)` for contiguous ranges of `count` items, each in a thread: the first in the caller's own.
+
+    Ranges but the last have a multiple of `whole` items. `work` does not share its own work so.
+    """
+    step = -(-count // (threads * whole)) * whole
+    starts = range(step, count, step) if step else ()
+    others = [_pool(os.getpid()).submit(work, first, min(first + step, count)) for first in starts]
+    work(0, min(step, count))
+    for other in others:
+        other.result()
+
+
+@lru_cache(maxsize=1)
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Return the threads of this `process`, which a forked one does not inherit."""
+    return ThreadPoolExecutor()

@@ -138,6 +138,7 @@ class Scene:
         far_m: NDArray[np.float32],
         *,
         hidden: int | None = None,
+        threads: int = 1,
     ) -> NDArray[np.bool_]:
         """Return (N,) whether anything but the actor `hidden` occludes each ray before its end `far_m` (N,) [m].
 
@@ -145,7 +146,7 @@ class Scene:
         `far_m` is not positive is never occluded.
         """
         self._hide(hidden)
-        return self._assembly.find_occluded(origins, directions, far_m)
+        return self._assembly.find_occluded(origins, directions, far_m, threads=threads)
 
     def cast_each(
         self,

@@ -58,8 +58,9 @@ def test_same_arguments_same_bytes(street: Scene):
     rain = WEATHERS["heavy_rain"]
     camera = Camera(width=160, height=96)
     one, other = (photograph(street, AHEAD, camera, rain, np.random.default_rng(3)) for _ in range(2))
+    shared = photograph(street, AHEAD, camera, rain, np.random.default_rng(3), threads=3)
     different = photograph(street, AHEAD, camera, rain, np.random.default_rng(4))
-    assert one.rgb.tobytes() == other.rgb.tobytes()
+    assert one.rgb.tobytes() == other.rgb.tobytes() == shared.rgb.tobytes()
     assert one.rgb.tobytes() != different.rgb.tobytes()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flcav.machine.compiled import compiled
+from flcav.machine.compiled import kernel
 from flcav.sensors.camera.tone import GRAINS, develop, grain
 from flcav.sensors.frame import SEMANTICS
 from flcav.sensors.lens import Lens, compute_pixel_rays
@@ -42,13 +42,15 @@ def photograph(
     rng: np.random.Generator,
     *,
     hidden: int | None = None,
+    threads: int = 1,
 ) -> Exposure:
     """Return the image at the scene's instant and its ground truth, without the actor `hidden` (the carrier).
 
     `world_from_camera` (4, 4) is the pose of the optical frame (x right, y down, z forward): for a mount with body axes
-    `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments, and the same state of `rng`, give the same bytes.
+    `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments, and the same state of `rng`, give the same bytes, with
+    any number of `threads`.
     """
-    picture = render(scene, world_from_camera, camera, weather, rng, hidden=hidden)
+    picture = render(scene, world_from_camera, camera, weather, rng, hidden=hidden, threads=threads)
     shape = (camera.height, camera.width)
     if camera.drops and weather.rain_mm_h > 0:
         add_drops(picture.radiance.reshape(*shape, 3), weather.rain_mm_h, rng)
@@ -67,7 +69,7 @@ def _labels(picture: RadianceImage) -> tuple[NDArray[np.uint8], NDArray[np.int32
     return semantic, instance
 
 
-@compiled
+@kernel
 def _label(seen, appearance, painted, sky, road_line, semantic, instance):
     for ray in range(len(semantic)):
         row = seen.row[ray]

@@ -17,7 +17,9 @@ DARKEST = 0.15  # value where all rays are blocked
 SPAN = 4  # blocks along each side of the neighbourhood that is averaged over
 
 
-def compute_ambient_occlusion(scene: Scene, seen: GBuffer, lens: Lens, hidden: int | None) -> NDArray[np.float32]:
+def compute_ambient_occlusion(
+    scene: Scene, seen: GBuffer, lens: Lens, hidden: int | None, threads: int = 1
+) -> NDArray[np.float32]:
     """Return the ambient occlusion (N,) of each pixel: the unoccluded share of the hemisphere, scaled to DARKEST..1.
 
     Only objects within REACH_M occlude; the actor `hidden` does not.
@@ -27,7 +29,8 @@ def compute_ambient_occlusion(scene: Scene, seen: GBuffer, lens: Lens, hidden: i
     origin, towards = np.empty((*blocks, 3), np.float32), np.empty((*blocks, 3), np.float32)
     far = np.full(blocks, -1, np.float32)
     _hemisphere(seen, lens.width, columns, rows, _ways(), origin, towards, far)
-    blocked = scene.find_occluded(origin.reshape(-1, 3), towards.reshape(-1, 3), far.ravel(), hidden=hidden)
+    starts, aims = origin.reshape(-1, 3), towards.reshape(-1, 3)
+    blocked = scene.find_occluded(starts, aims, far.ravel(), hidden=hidden, threads=threads)
     out = np.empty(len(seen), np.float32)
     _spread(seen, blocked.reshape(blocks), lens.width, lens.height, columns, rows, out)
     return out

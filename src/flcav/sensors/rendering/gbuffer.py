@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import heading_vectors
-from flcav.machine.compiled import compiled, inlined
+from flcav.machine.compiled import inlined, kernel
 from flcav.sensors.rendering.appearance import Appearance
 from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
@@ -26,6 +26,11 @@ class GBuffer(NamedTuple):
 
     def __len__(self) -> int:
         return len(self.distance)
+
+    def part(self, of: slice) -> "GBuffer":
+        """Return some of the hits, as views."""
+        near = self.ray[of], self.distance[of], self.instance[of], self.row[of]
+        return GBuffer(*near, self.normal[of], self.position[of])
 
 
 def fill_gbuffer(
@@ -53,7 +58,7 @@ def fill_gbuffer(
     return out
 
 
-@compiled
+@kernel
 def _look_up(pose, directions, face, first, normals, bodies, appearance, out):
     lift = np.float32(LIFT_M)
     for ray in range(len(directions)):

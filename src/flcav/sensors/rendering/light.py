@@ -131,24 +131,26 @@ def _exposure(ambient: float) -> float:
     return float(0.92 * max(ambient, 2e-3) ** -0.55 if ambient < 1.0 else 0.92)
 
 
-def compute_lamplight(scene: Scene, seen: GBuffer, lamps: Lamps, hidden: int | None) -> NDArray[np.float32]:
+def compute_lamplight(
+    scene: Scene, seen: GBuffer, lamps: Lamps, hidden: int | None, threads: int = 1
+) -> NDArray[np.float32]:
     """Return the irradiance (N, 3) of lamps at each hit; only the strongest lamp there casts shadows."""
     light, most, towards = (np.zeros((len(seen), 3), np.float32) for _ in range(3))
     far = np.empty(len(seen), np.float32)
     light_up(seen, lamps, light, most, towards, far)
-    _add_where_free(light, most, scene.find_occluded(seen.position, towards, far, hidden=hidden))
+    _add_where_free(light, most, scene.find_occluded(seen.position, towards, far, hidden=hidden, threads=threads))
     return light
 
 
-def compute_sun_visibility(scene: Scene, seen: GBuffer, light: Illumination, hidden: int | None) -> NDArray[np.float32]:
+def compute_sun_visibility(
+    scene: Scene, seen: GBuffer, light: Illumination, hidden: int | None, threads: int = 1
+) -> NDArray[np.float32]:
     """Return for each hit (N,) 0 where it is in the sun's shadow, else 1; also 1 where it faces away from the sun."""
     far = np.empty(len(seen), np.float32)
     _facing(seen, light.to_sun, max(light.sun) > DARK, far)
-    return (
-        (~scene.find_occluded(seen.position, np.array([light.to_sun]), far, hidden=hidden))
-        .view(np.uint8)
-        .astype(np.float32)
-    )
+    to_sun = np.array([light.to_sun])
+    blocked = scene.find_occluded(seen.position, to_sun, far, hidden=hidden, threads=threads)
+    return (~blocked).view(np.uint8).astype(np.float32)
 
 
 def soften(lit: NDArray[np.float32], seen: GBuffer, width: int) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.machine.memory import keep_freed_memory
+from flcav.machine.threads import share_among_threads
 from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.rendering import rain, supersampling
 from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion
@@ -46,6 +47,7 @@ class _World(NamedTuple):
     lamps: Lamps
     pixel_angle: np.float32
     hidden: int | None
+    threads: int
 
 
 def render(
@@ -56,21 +58,21 @@ def render(
     rng: np.random.Generator,
     *,
     hidden: int | None,
+    threads: int = 1,
 ) -> RadianceImage:
     """Return the radiance of every pixel of `lens` at the scene's instant: see `camera.photograph`.
 
     `world_from_camera` (4, 4) is the pose of the optical frame, `hidden` the actor left out (the carrier); `rng` draws
-    the rain.
+    the rain. Rays are cast and shaded by `threads` threads.
     """
     keep_freed_memory()
     rays, light, appearance = compute_pixel_rays(lens), compute_light(weather), build_appearance(scene)
     state = compute_lamp_state(scene, float(light.lamps), low_sight=bool(light.extinction > LOW_SIGHT))
     angle = np.float32(1 / lens.intrinsics()[0, 0])
-    world = _World(
-        scene, appearance, light, state, collect_lamps(scene, state) if light.lamps > 0 else no_lamps(), angle, hidden
-    )
+    lamps = collect_lamps(scene, state) if light.lamps > 0 else no_lamps()
+    world = _World(scene, appearance, light, state, lamps, angle, hidden, threads)
     seen = _meet(world, world_from_camera, rays)
-    open_sky = compute_ambient_occlusion(scene, seen, lens, hidden)
+    open_sky = compute_ambient_occlusion(scene, seen, lens, hidden, threads)
     radiance, painted = _radiance(world, seen, open_sky, lens.width)
     if light.wetness > MIRRORS:
         _mirror(world, world_from_camera, lens, rays, seen, radiance)
@@ -95,21 +97,27 @@ def _meet(
     rays: NDArray[np.float32],
     near_m: NDArray[np.float32] | None = None,
 ) -> GBuffer:
-    hits = world.scene.cast(world_from_camera, rays, near_m=near_m, far_m=FAR_M, hidden=world.hidden)
+    reach, hidden, threads = FAR_M, world.hidden, world.threads
+    hits = world.scene.cast(world_from_camera, rays, near_m=near_m, far_m=reach, hidden=hidden, threads=threads)
     return fill_gbuffer(world.scene, world.appearance, world_from_camera, rays, hits)
 
 
 def _radiance(
     world: _World, seen: GBuffer, open_sky: NDArray[np.float32], width: int | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    scene, light, hidden = world.scene, world.light, world.hidden
-    lit = compute_sun_visibility(scene, seen, light, hidden)
+    scene, light, hidden, threads = world.scene, world.light, world.hidden, world.threads
+    lit = compute_sun_visibility(scene, seen, light, hidden, threads)
     if width is not None:  # the rays are those of a whole image
         lit = soften(lit, seen, width)
-    lamplight = compute_lamplight(scene, seen, world.lamps, hidden) if light.lamps > 0 else NO_LAMPS
+    lamplight = compute_lamplight(scene, seen, world.lamps, hidden, threads) if light.lamps > 0 else NO_LAMPS
     radiance, painted = np.empty((len(seen), 3), np.float32), np.empty(len(seen), np.bool_)
-    tables = (light, world.appearance, world.state)
-    shade(seen, *tables, lit, lamplight, open_sky, world.pixel_angle, radiance, painted)
+    tables, angle = (light, world.appearance, world.state), world.pixel_angle
+
+    def shade_part(first: int, last: int) -> None:
+        at = slice(first, last)
+        shade(seen.part(at), *tables, lit[at], lamplight[at], open_sky[at], angle, radiance[at], painted[at])
+
+    share_among_threads(shade_part, len(seen), threads)
     return radiance, painted
 
 
@@ -125,7 +133,7 @@ def _further(
 ) -> NDArray[np.float32]:
     """Return the radiance (S, 3) of further rays, each within a `pixel` (S,): taken from a pixel nearby, or shaded."""
     scene, appearance = world.scene, world.appearance
-    hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=world.hidden)
+    hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=world.hidden, threads=world.threads)
     donor = np.empty(len(rays), np.int32)
     supersampling.donors(hits, pixel, seen, scene.surfaces.first, appearance.material, width, donor)
     out, rest = radiance[donor], np.flatnonzero(donor < 0)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import heading_vectors, transform_points
-from flcav.machine.compiled import compiled, inlined
+from flcav.machine.compiled import inlined, kernel
 from flcav.world.materials import Material
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
@@ -133,7 +133,7 @@ def lamp_light(lamp, x, y, z, nx, ny, nz, lamps):
     return incidence * spread * beam * beam * end / max(square, np.float32(9))
 
 
-@compiled
+@kernel
 def light_up(survey, lamps, light, most, towards, distance):
     """Write the irradiance of lamps at N hits: `light` (N, 3) of all but the strongest lamp, `most` (N, 3) of that one.
 

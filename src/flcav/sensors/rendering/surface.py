@@ -6,7 +6,7 @@ approximation of the Fresnel term. The air blends radiance into its own by exp(-
 
 import numpy as np
 
-from flcav.machine.compiled import compiled
+from flcav.machine.compiled import kernel
 from flcav.sensors.rendering.facade import shade_facade
 from flcav.sensors.rendering.ground import asphalt, find_paint, grass, paving
 from flcav.sensors.rendering.noise import fade, hash_pair, sample_noise
@@ -29,7 +29,7 @@ SHEEN, SHEEN_GLOSS = 0.28, 22.0  # strength and exponent of that sheen
 ROAD_LINE = 0.5  # painted share of a pixel above which its class is road marking
 
 
-@compiled
+@kernel
 def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angle, radiance, painted):
     """Shade the N hits of a G-buffer: write their `radiance` (N, 3), and whether they are `painted` (N,) road.
 

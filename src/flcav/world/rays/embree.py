@@ -7,13 +7,13 @@ same from run to run.
 import ctypes
 import weakref
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import pose
+from flcav.machine.threads import share_among_threads
 from flcav.world.rays import loader as c
 from flcav.world.rays.hits import Hits
 from flcav.world.rays.packets import LANES, occlude_packets, trace_groups, trace_packets
@@ -121,22 +121,28 @@ class Assembly:
         return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
 
     def find_occluded(
-        self, origins: NDArray[np.float32], directions: NDArray[np.float32], far_m: NDArray[np.float32]
+        self,
+        origins: NDArray[np.float32],
+        directions: NDArray[np.float32],
+        far_m: NDArray[np.float32],
+        *,
+        threads: int = 1,
     ) -> NDArray[np.bool_]:
         """Return (N,) whether each ray is occluded before its end `far_m` (N,) [m]; never where that is not positive.
 
         `origins` (N, 3) [m] and unit `directions` (N, 3), or (1, 3) for all, are in the assembly's frame.
         """
-        out = np.empty(len(far_m), np.bool_)
-        occlude_packets(
-            _address("rtcOccluded16"),
-            self.handle,
-            ctypes.addressof(_BLOCK_ARGUMENTS),
-            np.ascontiguousarray(origins, np.float32),
-            np.ascontiguousarray(directions, np.float32),
-            np.ascontiguousarray(far_m, np.float32),
-            out,
-        )
+        start, towards, far = (np.ascontiguousarray(each, np.float32) for each in (origins, directions, far_m))
+        out = np.empty(len(far), np.bool_)
+        cast = np.flatnonzero(far > 0) if threads > 1 else np.arange(len(far))
+        arguments = ctypes.addressof(_BLOCK_ARGUMENTS)
+
+        def part(first: int, last: int) -> None:
+            at = slice(cast[first] if first else 0, cast[last] if last < len(cast) else len(far))
+            aimed = towards if len(towards) == 1 else towards[at]
+            occlude_packets(_address("rtcOccluded16"), self.handle, arguments, start[at], aimed, far[at], out[at])
+
+        share_among_threads(part, len(cast), threads, whole=LANES)  # of rays that are cast: any number, same packets
         return out
 
 
@@ -230,13 +236,7 @@ def _trace(
             *hits,
         )
 
-    if threads == 1 or len(rays) <= LANES:
-        part(0, len(rays))
-        return hits
-    step = -(-len(rays) // (threads * LANES)) * LANES
-    starts = range(0, len(rays), step)
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda start: part(start, min(start + step, len(rays))), starts))
+    share_among_threads(part, len(rays), threads, whole=LANES)
     return hits
 
 

@@ -1,5 +1,6 @@
 """Calls without a network: what is refused, in which words, and the same images from the same seed."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from flcav.sources.carla.server import calls as carla_calls
 from flcav.sources.carla.server import catalogue, wire
 from flcav.sources.carla.server.blueprints import Refused, check, list_blueprints
 from flcav.sources.carla.server.calls import Calls
+from flcav.sources.carla.server.episode import Measurement
 from flcav.sources.carla.server.maps import Maps
 from flcav.sources.carla.server.sensing.table import KINDS, Clock
 from flcav.sources.carla.server.weather import to_weather
@@ -143,28 +145,38 @@ def test_a_car_drives_and_is_where_it_was_put(calls):
     assert calls.episode.speed(calls.episode.actors[car.id]) > 3.0
 
 
-def look(maps, seed):
-    """Return what all sensors on a car send in two ticks, of a new episode."""
+def look(maps, seed, *, later=False):
+    """Return what all sensors on a moving car send in three ticks; `later`: with images drawn after the last."""
     calls = Calls(maps, "suburb", seed=seed, traffic=0, port=2000)
     car = invoke(calls, "spawn_actor", (describe("vehicle.tesla.model3"), place(calls)))
     noisy = (("noise_lat_stddev", "1e-6"), ("noise_accel_stddev_x", "0.1"))
     for name in KINDS:
         told = describe(name, *CAMERA, *noisy)
         invoke(calls, "spawn_actor_with_parent", (told, [[0.0, 0.0, 2.4], [0.0, 0.0, 0.0]], car.id, 0))
-    sent = []
-    for _ in range(2):
+    invoke(calls, "set_actor_target_velocity", (car.id, [10.0, 0.0, 0.0]))
+    measured: list[tuple[Measurement, bytes | Callable[[], bytes]]] = []
+    for _ in range(3):
         calls.episode.step(0.05)
         for each in calls.episode.measure(0.05, lambda stream: True):
-            sent.append((each.stream, each.header, each.body if isinstance(each.body, bytes) else each.body()))
+            body = each.body
+            measured.append((each, body if isinstance(body, bytes) or (each.late and later) else body()))
+    sent = [(each.stream, each.header, body if isinstance(body, bytes) else body()) for each, body in measured]
     calls.episode.close()
     return sent
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_one_others(maps):
     first, second, other = (look(maps, seed) for seed in (1, 1, 2))
-    assert len(first) == 2 * 9
+    assert len(first) == 3 * 9
     assert first == second
     assert first != other
+
+
+def test_an_image_that_is_drawn_after_further_ticks_is_that_of_its_tick(maps):
+    at_once = look(maps, 1)
+    images = [body for stream, _, body in at_once if stream == at_once[0][0]]
+    assert len(set(images)) == 3
+    assert look(maps, 1, later=True) == at_once
 
 
 @pytest.mark.parametrize(("tick_s", "due"), [(0.0, [1, 2, 3, 4, 5, 6]), (0.1, [1, 3, 5]), (0.15, [1, 4])])

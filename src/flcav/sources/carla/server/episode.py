@@ -5,7 +5,8 @@ Every tick the world makes a step; then all actors take their places, and the se
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from dataclasses import replace
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ from flcav.world.commands import Controls, Drive, Push, Remove, Simulate, Spawn,
 from flcav.world.live import LiveWorld, Obstructed, Settings
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
+from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]
 
@@ -89,8 +91,7 @@ class Episode:
         self.tick, self.time_s = 0, 0.0
         self._begun_s = time.monotonic()
         self._bodies: dict[str, Actor] = {}  # by name in the live world
-        self._scene: Scene | None = None  # of the sensors
-        self._survey: Scene | None = None  # of the calls
+        self._scenes: dict[str, Scene] = {}  # one for each of the threads that look at the town at once
         self.recorder = Recorder()
         self._spawned = 0
         self.spectator = self._add(wire.Description(0, "spectator", ()), np.eye(4))
@@ -110,7 +111,7 @@ class Episode:
             world.apply(Spawn("car", "car", 0, *self.spectator.pose[:2, 3].tolist(), anywhere=True))
             world.step({"car": Controls(throttle=1.0)})
         told = {"image_size_x": "32", "image_size_y": "32", "fov": "90"}
-        self.look().photograph(Sensor("sensor.camera.rgb", told, 0, self.spectator.pose))
+        self.look("images")().photograph(Sensor("sensor.camera.rgb", told, 0, self.spectator.pose))
 
     @property
     def age_s(self) -> float:
@@ -371,7 +372,7 @@ class Episode:
 
     def measure(self, dt_s: float, is_heard: Callable[[int], bool]) -> Iterator[Measurement]:
         """Yield what each sensor that is due and heard sends, in the order in which they were spawned."""
-        sight: Sight | None = None
+        looks: dict[str, Callable[[], Sight]] = {}
         collisions = find_collisions(self.world.snapshot.collisions, self._describe)
         for actor in list(self.actors.values()):
             if (sensor := actor.sensor) is None or actor.clock is None or not is_heard(actor.stream):
@@ -386,10 +387,13 @@ class Episode:
             if (elapsed := actor.clock.take(self.time_s, dt_s)) is None:
                 continue
             sensor.elapsed_s = elapsed
-            sight = sight or self.look()
+            scene = "images" if kind.late else "rays"
+            look = looks.get(scene) or looks.setdefault(scene, self.look(scene))
             if kind.measure is not None:
-                yield Measurement(actor.stream, header, partial(kind.measure, sight, sensor), kind.rays, kind.late)
-            elif found := find_obstacle(sight, sensor, self._describe(sensor.carrier), self._describe):
+                seen_from = replace(sensor) if kind.late else sensor  # an image is drawn while its sensor moves on
+                body = partial(_measure, kind.measure, look, seen_from)
+                yield Measurement(actor.stream, header, body, kind.rays, kind.late)
+            elif found := find_obstacle(look(), sensor, self._describe(sensor.carrier), self._describe):
                 yield Measurement(actor.stream, header, found)
 
     def _describe(self, name: str) -> wire.Actor:
@@ -398,25 +402,32 @@ class Episode:
             return self._bodies[name].record(self.port)
         return describe_thing("vehicle" if name.startswith(PARKED) else name.partition(":")[0])
 
-    def look(self) -> Sight:
-        """Return the town as sensors see it now."""
-        self._scene = self._follow_with(self._scene)
-        names = self.world.snapshot.trace.actor.tolist()
-        numbers = [self._bodies[name].id if name in self._bodies else 0 for name in names]
-        weather, frame = to_weather(self.weather), self.served.frame
-        return Sight(self._scene, weather, frame, self.seed, self.tick, np.array(numbers, np.uint32))
+    def look(self, scene: str) -> Callable[[], Sight]:
+        """Return how to look at the town as it is now, once or more often, later too, with the scene of that name."""
+        trace, weather, tick = self.world.snapshot.trace, to_weather(self.weather), self.tick
+        numbers = [self._bodies[name].id if name in self._bodies else 0 for name in trace.actor.tolist()]
+
+        @cache
+        def sight() -> Sight:
+            at = self._follow_with(scene, trace)
+            return Sight(at, weather, self.served.frame, self.seed, tick, np.array(numbers, np.uint32))
+
+        return sight
 
     def survey(self) -> Scene:
         """Return the town as calls see it now: a scene of its own, since sensors may be looking at theirs."""
-        self._survey = self._follow_with(self._survey)
-        return self._survey
+        return self._follow_with("calls", self.world.snapshot.trace)
 
-    def _follow_with(self, scene: Scene | None) -> Scene:
-        trace = self.world.snapshot.trace
-        if scene is None:
-            return Scene(self.served.town, trace)
-        scene.follow(trace)
-        return scene
+    def _follow_with(self, name: str, trace: Trace) -> Scene:
+        if name in self._scenes:
+            self._scenes[name].follow(trace)
+        else:
+            self._scenes[name] = Scene(self.served.town, trace)
+        return self._scenes[name]
+
+
+def _measure(sense: Callable[[Sight, Sensor], bytes], look: Callable[[], Sight], sensor: Sensor) -> bytes:
+    return sense(look(), sensor)
 
 
 class Place(NamedTuple):

@@ -1,8 +1,9 @@
 """The server: remote procedure calls at one port, streams at the next, one loop.
 
 In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends what sensors measure, in order,
-then the world's state, upon which a client goes on, and then the cameras' images, which take longest. A reader who does
-not keep up is waited for, and dropped after `STUCK_S`.
+then the world's state and the answer to its cue, upon which a client goes on, and then the cameras' images, which take
+longest: they are drawn beside the next ticks, and the next images wait for them. A reader who does not keep up is
+waited for, and dropped after `STUCK_S`.
 """
 
 import asyncio
@@ -10,6 +11,7 @@ import logging
 import socket
 import struct
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -45,6 +47,9 @@ class Server:
         self._worlds: set[int] = set()  # streams of the world's state, of earlier episodes too
         self._published_s = 0.0  # when the world's state was last sent
         self._state = b""  # the last one of the world, for clients that come between two ticks
+        # A client that has the answer to its cue waits for the state by polling, which takes a core from the sensors.
+        self._cued: deque[tuple[asyncio.StreamWriter, bytes]] = deque()  # answers to cues of ticks that are to come
+        self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick
 
     async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
         """Serve until cancelled, calls at the first of two bound sockets and streams at the second."""
@@ -69,9 +74,11 @@ class Server:
                 while self._calls.ticks and self._calls.settings.synchronous:
                     self._calls.ticks -= 1
                     await self._tick()
+                self._answer_cues()
                 due = time.monotonic()
                 continue
             self._calls.ticks = 0
+            self._answer_cues()
             due = max(due + self._calls.dt_s, time.monotonic())
             await self._sleep_until(due)
             if not self._calls.settings.synchronous:
@@ -104,10 +111,26 @@ class Server:
             await asyncio.sleep(self._published_s + PACE_S - time.monotonic())
         self._publish_state(episode)
         self._published_s = time.monotonic()
-        for each in measurements:
-            if each.late:
-                await self._measure(each, episode)
+        self._answer_cues(1)
+        if images := [each for each in measurements if each.late]:
+            if self._drawing is not None:
+                await self._drawing
+            self._drawing = asyncio.create_task(self._draw(images, episode))
         await self._await_readers(self._connections)
+
+    async def _draw(self, images: list[Measurement], episode: Episode) -> None:
+        try:
+            for each in images:
+                await self._measure(each, episode)
+        except Exception:  # a server that fails one image draws the next
+            log.exception("an image failed")
+
+    def _answer_cues(self, most: int | None = None) -> None:
+        """Answer the cues of the ticks that were made; of all that wait, where none is to come."""
+        for _ in range(len(self._cued) if most is None else min(most, len(self._cued))):
+            writer, reply = self._cued.popleft()
+            with suppress(ConnectionError, RuntimeError):
+                writer.write(reply)
 
     async def _measure(self, each: Measurement, episode: Episode) -> None:
         """Send what a sensor measures, beside this thread where it casts rays, so that calls are answered meanwhile."""
@@ -187,8 +210,13 @@ class Server:
                 for message in unpacker:
                     call = wire.read_call(message)
                     response = self._answer(call)
-                    if call.number is not None:
-                        writer.write(wire.pack_reply(call.number, response))
+                    if call.number is None:
+                        continue
+                    reply = wire.pack_reply(call.number, response)
+                    if call.method == "tick_cue" and self._calls.settings.synchronous:
+                        self._cued.append((writer, reply))
+                    else:
+                        writer.write(reply)
                 await self._await_readers({writer})
         except ConnectionError:
             pass

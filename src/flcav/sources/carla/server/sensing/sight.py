@@ -1,5 +1,6 @@
 """What sensors see at one tick, and a sensor with its state from tick to tick."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -17,6 +18,8 @@ from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 
 Array = NDArray[np.float64]
+
+THREADS = min(len(os.sched_getaffinity(0)), 4)  # that draw an image
 
 
 @dataclass
@@ -88,5 +91,7 @@ class Sight:
             camera = Camera(width=width, height=height, fov_deg=key[3], noise=0.0)
             pose, hidden = sensor.pose @ BODY_FROM_OPTICAL, self.find_inside(sensor)
             rng = stream(self.seed, "carla", "camera", self.tick)
-            self._exposures[key] = photograph(self.scene, pose, camera, self.weather, rng, hidden=hidden)
+            self._exposures[key] = photograph(
+                self.scene, pose, camera, self.weather, rng, hidden=hidden, threads=THREADS
+            )
         return self._exposures[key]
