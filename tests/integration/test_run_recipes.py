@@ -305,7 +305,7 @@ def test_a_town_from_a_map_federates(tmp_path: Path, monkeypatch: pytest.MonkeyP
     import_town(RECIPES.parent / shown[1], tmp_path / shown[2])
     steps = {step.name: step for step in Graph(recipe, path.parent).steps}  # `test_the_loop` runs such ones
     assert set(steps["mine-edge-objects"].arguments["settings"].version) == {"town.net.xml", "town.yaml"}
-    assert "test-cloud-fl-objects-ring" in steps
+    assert "test-cloud-fl-objects-arterial" in steps
 
 
 def test_a_history_is_made_of_recorded_datasets(

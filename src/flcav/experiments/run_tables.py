@@ -15,13 +15,14 @@ from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import RunFinding
+from flcav.pipeline.results.training import LabelQuality
 from flcav.pipeline.spread import read_spreads, widen_anew
 from flcav.storage.markdown import format_bullets, format_table
 
 
 def tables(run: Run) -> dict[str, str]:
-    """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, what cloud rounds do,
-    rounds of vehicles on a network, spread of retraining.
+    """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, labels, what cloud rounds
+    do, rounds of vehicles on a network, spread of retraining.
 
     Findings are judged anew, by the present table of the spread of retraining, so that results of before a change of
     either are judged as others are.
@@ -39,6 +40,7 @@ def tables(run: Run) -> dict[str, str]:
         **cloud_tables(run),
     }
     own |= {"sensors": _sensors(run)} if any(each.chosen for each in run.arms[MAIN].placed) else {}
+    own |= {"labels": labels} if (labels := _labels(run)) else {}
     own |= {} if run.recipe.federation.network is None else {"rounds": _rounds(run)}
     return own | {"spread": _spread(run)} if run.recipe.retrainings else own
 
@@ -149,6 +151,27 @@ def _rounds(run: Run) -> str:
             )
     header = ("task", "vehicle", "speed", "rounds planned", "combined", FAILED, "time of its rounds, s")
     return format_table(header, rows)
+
+
+LABELS = ("precision", "recall", "of the right ones, at IoU .7", "centre off by m", "size off by m")
+
+
+def _describe_labels(quality: LabelQuality) -> list[str]:
+    """Return precision, recall, tight share and box errors of labels as a table's cells, in the order of `LABELS`."""
+    shares = quality.precision, quality.recall, quality.tight, quality.offset_m, quality.size_m
+    return ["" if share is None else f"{share:.2f}" for share in shares]
+
+
+def _labels(run: Run) -> str | None:
+    """Return how good the labels of edge FL are, before the first round and, where they are made anew, the last."""
+    settings, rows = resolve_settings(run.recipe), []
+    for name, arm in run.arms.items():
+        for stage in arm.stages:
+            for quality in dict.fromkeys((stage.labels or ())[:: max(1, len(stage.labels or ()) - 1)]):
+                counts = quality.round, quality.labels, quality.targets
+                rows.append([stage.region, settings[name].labels[stage.task], *counts, *_describe_labels(quality)])
+    heads = ("region", "labels", "before round", "number", "objects", *LABELS)
+    return format_table(heads, rows) if rows else None
 
 
 def _sensors(run: Run) -> str:

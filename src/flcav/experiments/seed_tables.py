@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flcav.experiments.run_tables import judge_anew
+from flcav.experiments.run_tables import LABELS, judge_anew
 from flcav.pipeline.analysis.costs import list_home_costs
 from flcav.pipeline.recipe import MAIN, PRETRAIN
 from flcav.pipeline.results.run import Run, Summary
@@ -16,8 +16,8 @@ from flcav.storage.markdown import format_table
 
 
 def tables(runs: Sequence[Run], summary: Summary) -> dict[str, str]:
-    """Return Markdown by name: claims with the numbers of seeds that decide them, seeds, means over seeds."""
-    return {"claims": _claims(summary), "seeds": _seeds(runs), "means": _means(summary)}
+    """Return Markdown by name: claims with the numbers of seeds that decide them, seeds, means over seeds, labels."""
+    return {"claims": _claims(summary), "seeds": _seeds(runs), "means": _means(summary), "labels": _labels(runs)}
 
 
 def _claims(summary: Summary) -> str:
@@ -69,6 +69,19 @@ def _means(summary: Summary) -> str:
         for each in summary.differences
     ]
     return format_table(("region, task: after - before", "mean over seeds", "kind", "verdict"), rows)
+
+
+def _labels(runs: Sequence[Run]) -> str:
+    """Return the quality of the labels of the first round in each region: mean over seeds, least and most."""
+    rows = []
+    for region in runs[0].recipe.with_role("federate"):
+        stages = [stage for run in runs for stage in run.arms[MAIN].stages if stage.region == region and stage.labels]
+        first = [stage.labels[0] for stage in stages if stage.labels]
+        columns = zip(*((q.precision, q.recall, q.tight, q.offset_m, q.size_m) for q in first), strict=True)
+        known = [[value for value in column if value is not None] for column in columns]
+        cells = [f"{np.mean(own):.2f} ({min(own):.2f} to {max(own):.2f})" if own else "" for own in known]
+        rows += [[region, sum(quality.targets for quality in first), *cells]] if first else []
+    return format_table(("region", "objects", *LABELS), rows)
 
 
 def draw_seeds(runs: Sequence[Run]) -> bytes:
