@@ -129,6 +129,11 @@ def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(tmp_path:
         labels = next(each.labels for each in found.arms[name].stages if each.stage == EDGE)
         assert labels is not None
         assert labels[0].recall == (1 if name == "truth" else labels[0].recall)
+        if parts := labels[0].by_returns:
+            assert [each.returns for each in parts] == [5, 20, 100]
+            assert sum(each.targets for each in parts) == labels[0].targets
+            assert sum(each.found for each in parts) == pytest.approx((labels[0].recall or 0) * labels[0].targets)
+        assert parts or name != "truth"
         assert name not in ("truth", "missed") or labels[0].precision in (1, None)
     sent = Ledger.load(work / "cloud-fl-objects" / LEDGER).entries
     assert {entry.client for entry in sent if entry.stage == CLOUD} == {"grid", "grid/cav0"}

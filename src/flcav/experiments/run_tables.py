@@ -169,8 +169,10 @@ def _labels(run: Run) -> str | None:
         for stage in arm.stages:
             for quality in dict.fromkeys((stage.labels or ())[:: max(1, len(stage.labels or ()) - 1)]):
                 counts = quality.round, quality.labels, quality.targets
-                rows.append([stage.region, settings[name].labels[stage.task], *counts, *_describe_labels(quality)])
-    heads = ("region", "labels", "before round", "number", "objects", *LABELS)
+                parts = [f"from {each.returns}: {each.found} of {each.targets}" for each in quality.by_returns or ()]
+                cells = [*counts, *_describe_labels(quality), "; ".join(parts)]
+                rows.append([stage.region, settings[name].labels[stage.task], *cells])
+    heads = ("region", "labels", "before round", "number", "objects", *LABELS, "found, by returns")
     return format_table(heads, rows) if rows else None
 
 

@@ -12,10 +12,11 @@ from flcav.perception.metrics import match
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample
-from flcav.perception.objects.truth import asked_of, in_range, network_from_lidar
+from flcav.perception.objects.truth import asked_of, ground_truth, in_range, network_from_lidar
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.results.training import LabelHistory, LabelQuality
+from flcav.pipeline.results.training import Found, LabelHistory, LabelQuality
 
+RETURNS = 5, 20, 100  # of targets, from which their recall is counted apart
 TIGHT = 0.7  # IoU in 3D of a box that is as good as an annotated one
 LABELS = "labels.json"  # quality of the labels before each round, in the folder of a stage
 
@@ -38,7 +39,7 @@ def measure_labels(
     They are compared with ground truth, which nobody learns from here.
     """
     each = {name: iter(own) for name, own in samples.items()}
-    found, targets, neutral = [], [], []
+    found, targets, neutral, returns = [], [], [], []
     for i in frames:
         frame, sample = split.data.frame(i), next(each[f"{region}/{split.data.keys[i].agent}"])
         truth, move = asked_of(frame, config), network_from_lidar(frame, config)
@@ -47,21 +48,30 @@ def measure_labels(
         found.append(Boxes.from_array(boxes.array(), boxes.label, np.ones(len(boxes))))
         targets.append(truth.targets)
         neutral.append(truth.neutral)
+        known = ground_truth(frame, config)
+        returns.append(known.returns[known.target])
     matches, tight = (match(found, targets, neutral, overlap) for overlap in (0.5, TIGHT))
     right, there, count = int(matches.hit.sum()), int(matches.targets.sum()), len(matches.hit)
     quality = LabelQuality(round_, count, there, right / count if count else None, right / there if there else None)
     if not right:
         return quality
-    pairs = [_pair(*frame) for frame in zip(found, targets, strict=True)]
-    labels, objects = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    paired = [assign_targets(own, truth, 0.5) for own, truth in zip(found, targets, strict=True)]
+    labels = np.concatenate([own.array()[target >= 0] for own, target in zip(found, paired, strict=True)])
+    objects = np.concatenate([own.array()[target[target >= 0]] for own, target in zip(targets, paired, strict=True)])
+    met = np.concatenate([np.isin(np.arange(len(own)), target) for own, target in zip(targets, paired, strict=True)])
     offset = np.linalg.norm(labels[:, :3] - objects[:, :3], axis=1)
     size = np.abs(labels[:, 3:6] - objects[:, 3:6]).max(axis=1)
     return replace(
-        quality, tight=int(tight.hit.sum()) / right, offset_m=float(np.median(offset)), size_m=float(np.median(size))
+        quality,
+        tight=int(tight.hit.sum()) / right,
+        offset_m=float(np.median(offset)),
+        size_m=float(np.median(size)),
+        by_returns=_count_by_returns(np.concatenate(returns), met),
     )
 
 
-def _pair(found: Boxes, targets: Boxes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the boxes (N, 7) of a frame's right labels, and those of their objects."""
-    target = assign_targets(found, targets, 0.5)
-    return found.array()[target >= 0], targets.array()[target[target >= 0]]
+def _count_by_returns(returns: NDArray[np.int64], met: NDArray[np.bool_]) -> tuple[Found, ...]:
+    """Return the targets, and those that are `met`, by their number of LiDAR `returns`, (T,) each."""
+    kind = np.searchsorted(RETURNS, returns, side="right") - 1
+    kinds = range(len(RETURNS))
+    return tuple(Found(RETURNS[k], int((kind == k).sum()), int(met[kind == k].sum())) for k in kinds)
