@@ -2,6 +2,7 @@
 
 import os
 import random
+import signal
 import socket
 import subprocess
 import sys
@@ -110,6 +111,26 @@ def test_a_cue_is_answered_after_the_state_of_its_tick(port):
                 assert int.from_bytes(state[12:20], "little") == frame
         finally:
             call("set_episode_settings", wire.Settings().packed())
+
+
+@pytest.mark.parametrize(
+    ("how", "code", "told"),
+    [(signal.SIGTERM, 0, ""), pytest.param(signal.SIGINT, 130, "flcav: interrupted\n", marks=pytest.mark.slow)],
+)
+def test_it_ends_without_a_word_about_its_clients_and_leaves_nothing(how, code, told, tmp_path):
+    port = _find_port()
+    command = [sys.executable, "-m", "flcav", "carla", "serve", "suburb", "--port", str(port)]
+    here = {"cwd": tmp_path, "env": os.environ | {"TMPDIR": str(tmp_path)}}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **here) as server:
+        assert server.stdout is not None
+        assert "ready" in server.stdout.readline()
+        with socket.create_connection(("127.0.0.1", port)), socket.create_connection(("127.0.0.1", port + 1)) as stream:
+            stream.sendall(b"\x01\x00\x00\x00")
+            stream.recv(1)
+            server.send_signal(how)
+            _, errors = server.communicate(timeout=30)
+    assert (server.returncode, errors) == (code, told)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_port_in_use_is_one_sentence(port, capsys):

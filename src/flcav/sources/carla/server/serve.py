@@ -8,6 +8,7 @@ waited for, and dropped after `STUCK_S`.
 
 import asyncio
 import logging
+import signal
 import socket
 import struct
 import time
@@ -61,6 +62,12 @@ class Server:
         finally:
             for server in servers:
                 server.close()
+            for writer in self._connections:
+                writer.transport.abort()
+            while self._connections:  # each is forgotten when its reader has come to the end
+                await asyncio.sleep(0.001)
+            if self._drawing is not None:
+                await self._drawing
             self._calls.episode.close()
 
     # ---- ticks
@@ -283,5 +290,13 @@ def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
 
 
 def serve(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
-    """Serve clients until interrupted, at the sockets of `open_doors`."""
-    asyncio.run(Server(calls).run(doors, ready))
+    """Serve clients until interrupted or terminated (SIGTERM), at the sockets of `open_doors`."""
+
+    async def run() -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+        await Server(calls).run(doors, ready)
+
+    with suppress(asyncio.CancelledError):
+        asyncio.run(run())
