@@ -19,7 +19,7 @@ from flcav.world.weather import Weather
 
 Array = NDArray[np.float64]
 
-THREADS = min(len(os.sched_getaffinity(0)), 4)  # that draw an image
+THREADS = min(os.cpu_count() or 1, 4)  # that draw an image
 
 
 @dataclass
