@@ -164,18 +164,19 @@ def _describe_labels(quality: LabelQuality) -> list[str]:
 
 def _labels(run: Run) -> str | None:
     """Return how good the labels of edge FL are, before the first round and, where they are made anew, the last."""
-    settings, rows, told = resolve_settings(run.recipe), [], False
+    settings, rows, kinds = resolve_settings(run.recipe), [], []
     for name, arm in run.arms.items():
         for stage in arm.stages:
             own = stage.labels or ()
             for quality in dict.fromkeys((*own[:1], *own[-1:])):
                 counts = quality.round, quality.labels, quality.targets
-                parts = [f"from {each.returns}: {each.found} of {each.targets}" for each in quality.by_returns or ()]
-                cells, told = [*counts, *_describe_labels(quality), "; ".join(parts)], told or bool(parts)
-                rows.append([stage.region, settings[name].labels[stage.task], *cells])
-    heads = ("region", "labels", "before round", "number", "objects", *LABELS, "found, by returns")
-    shown = len(heads) - (not told)  # results of before do not tell returns
-    return format_table(heads[:shown], [row[:shown] for row in rows]) if rows else None
+                known = quality.by_returns or ()  # results of before do not tell
+                kinds = kinds or [f"recall from {each.returns} returns" for each in known]
+                parts = [f"{each.found / each.targets:.2f}" if each.targets else "" for each in known]
+                kind = settings[name].labels[stage.task]
+                rows.append([stage.region, kind, *counts, *_describe_labels(quality), *parts])
+    heads = ("region", "labels", "before round", "number", "objects", *LABELS, *kinds)
+    return format_table(heads, rows) if rows else None
 
 
 def _sensors(run: Run) -> str:
