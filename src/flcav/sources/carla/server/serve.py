@@ -29,6 +29,7 @@ PACE_S = 0.008
 LEARNT_S = 3.0  # clients have learnt of a new map by then
 LISTENER_S = 0.3  # a tick waits so long for the connection of a stream whose token a client has just asked for
 MOST_CONNECTIONS = 512
+MOST_CUES = 1000  # whose answers wait for their ticks; clients have one each
 CHUNK = 1 << 16
 BACKLOG = 1 << 20  # bytes in a connection's buffer from which its reader is waited for
 
@@ -220,7 +221,8 @@ class Server:
                     if call.number is None:
                         continue
                     reply = wire.pack_reply(call.number, response)
-                    if call.method == "tick_cue" and self._calls.settings.synchronous:
+                    waits = call.method == "tick_cue" and self._calls.settings.synchronous
+                    if waits and len(self._cued) < MOST_CUES:
                         self._cued.append((writer, reply))
                     else:
                         writer.write(reply)
