@@ -16,7 +16,7 @@ from flcav.geometry import Boxes
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.objects.truth import asked_of, ground_truth
+from flcav.perception.objects.truth import asked_of
 from flcav.perception.ops.rotated import iou
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.quality import RETURNS
@@ -52,10 +52,10 @@ def explain_region(
     """Return what stands against a label of each target of a region's frames, and the targets' returns (T,)."""
     split, reasons, returns = Frames.open(folder / f"{region}-edge-objects"), list[str](), [np.zeros(0, np.int64)]
     for i, tracks in load_tracks(folder / f"{region}-tracks-objects").items():
-        frame = split.data.frame(i)
-        truth = ground_truth(frame, config)
-        reasons += explain(tracks, asked_of(frame, config).targets, threshold)
-        returns.append(truth.returns[truth.target])
+        truth = asked_of(split.data.frame(i), config)
+        assert truth.returns is not None  # of annotated frames
+        reasons += explain(tracks, truth.targets, threshold)
+        returns.append(truth.returns)
     return reasons, np.concatenate(returns)
 
 

@@ -15,7 +15,6 @@ from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import RunFinding
-from flcav.pipeline.results.training import LabelQuality
 from flcav.pipeline.spread import read_spreads, widen_anew
 from flcav.storage.markdown import format_bullets, format_table
 
@@ -153,13 +152,13 @@ def _rounds(run: Run) -> str:
     return format_table(header, rows)
 
 
-LABELS = ("precision", "recall", "of the right ones, at IoU .7", "centre off by m", "size off by m")
-
-
-def _describe_labels(quality: LabelQuality) -> list[str]:
-    """Return precision, recall, tight share and box errors of labels as a table's cells, in the order of `LABELS`."""
-    shares = quality.precision, quality.recall, quality.tight, quality.offset_m, quality.size_m
-    return ["" if share is None else f"{share:.2f}" for share in shares]
+LABELS = {  # heading -> field of `LabelQuality`
+    "precision": "precision",
+    "recall": "recall",
+    "of the right ones, at IoU .7": "tight",
+    "centre off by m": "offset_m",
+    "size off by m": "size_m",
+}
 
 
 def _labels(run: Run) -> str | None:
@@ -172,9 +171,10 @@ def _labels(run: Run) -> str | None:
                 counts = quality.round, quality.labels, quality.targets
                 known = quality.by_returns or ()  # results of before do not tell
                 kinds = kinds or [f"recall from {each.returns} returns" for each in known]
-                parts = [f"{each.found / each.targets:.2f}" if each.targets else "" for each in known]
-                kind = settings[name].labels[stage.task]
-                rows.append([stage.region, kind, *counts, *_describe_labels(quality), *parts])
+                shares = [getattr(quality, field) for field in LABELS.values()]
+                shares += [each.found / each.targets if each.targets else None for each in known]
+                cells = ["" if share is None else f"{share:.2f}" for share in shares]
+                rows.append([stage.region, settings[name].labels[stage.task], *counts, *cells])
     heads = ("region", "labels", "before round", "number", "objects", *LABELS, *kinds)
     return format_table(heads, rows) if rows else None
 

@@ -77,7 +77,7 @@ def _labels(runs: Sequence[Run]) -> str:
     for region in runs[0].recipe.with_role("federate"):
         stages = [stage for run in runs for stage in run.arms[MAIN].stages if stage.region == region and stage.labels]
         first = [stage.labels[0] for stage in stages if stage.labels]
-        columns = zip(*((q.precision, q.recall, q.tight, q.offset_m, q.size_m) for q in first), strict=True)
+        columns = ([getattr(quality, field) for quality in first] for field in LABELS.values())
         known = [[value for value in column if value is not None] for column in columns]
         cells = [f"{np.mean(own):.2f} ({min(own):.2f} to {max(own):.2f})" if own else "" for own in known]
         rows += [[region, sum(quality.targets for quality in first), *cells]] if first else []

@@ -162,6 +162,7 @@ class FrameTruth:
     hidden: Boxes  # in range without a return: counted, and neutral too
     occlusion: NDArray[np.float64] | None = None  # (targets,) occluded share in [0, 1]; None: not known
     weather: str | None = None  # weather class of the frame; None between the classes, and where it is not known
+    returns: NDArray[np.int64] | None = None  # (targets,) LiDAR returns; None: not known
 
 
 def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
@@ -175,8 +176,9 @@ def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
     weather = None if frame.weather is None else classify_weather(frame.weather)
     hidden = frame.annotations.occlusion[truth.target].astype(float)
     occlusion = None if np.isnan(hidden).any() else hidden
-    boxes = truth.boxes
-    return FrameTruth(frame.scene, boxes[truth.target], boxes[neutral], boxes[truth.hidden], occlusion, weather)
+    boxes, returns = truth.boxes, truth.returns[truth.target]
+    own = boxes[truth.target], boxes[neutral], boxes[truth.hidden]
+    return FrameTruth(frame.scene, *own, occlusion, weather, returns)
 
 
 def select_class(boxes: Boxes, name: str) -> Boxes:

@@ -12,7 +12,7 @@ from flcav.perception.metrics import match
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample
-from flcav.perception.objects.truth import asked_of, ground_truth, in_range, network_from_lidar
+from flcav.perception.objects.truth import asked_of, in_range, network_from_lidar
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.results.training import Found, LabelHistory, LabelQuality
 
@@ -48,8 +48,7 @@ def measure_labels(
         found.append(Boxes.from_array(boxes.array(), boxes.label, np.ones(len(boxes))))
         targets.append(truth.targets)
         neutral.append(truth.neutral)
-        known = ground_truth(frame, config)
-        returns.append(known.returns[known.target])
+        returns.append(truth.returns)
     matches, tight = (match(found, targets, neutral, overlap) for overlap in (0.5, TIGHT))
     right, there, count = int(matches.hit.sum()), int(matches.targets.sum()), len(matches.hit)
     quality = LabelQuality(round_, count, there, right / count if count else None, right / there if there else None)

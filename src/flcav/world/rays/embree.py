@@ -134,7 +134,7 @@ class Assembly:
         """
         start, towards, far = (np.ascontiguousarray(each, np.float32) for each in (origins, directions, far_m))
         out = np.empty(len(far), np.bool_)
-        cast = np.flatnonzero(far > 0) if threads > 1 else np.arange(len(far))
+        cast = np.flatnonzero(far > 0)
         arguments = ctypes.addressof(_BLOCK_ARGUMENTS)
 
         def part(first: int, last: int) -> None:
