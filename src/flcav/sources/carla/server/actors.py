@@ -2,21 +2,34 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.geometry import rotations
 from flcav.sensors.frame import SEMANTICS
+from flcav.sources.carla.frames import MapFrame, mirror, mirror_spin, to_rotation
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.sensing.sight import Sensor
 from flcav.sources.carla.server.sensing.table import Clock
 from flcav.sources.carla.server.wire import BoundingBox, Transform
+from flcav.world.snapshot import Snapshot
 
 Array = NDArray[np.float64]
 
 NOTHING = (0.0, 0.0, 0.0)
 STILL = (NOTHING, NOTHING, NOTHING)
 STANDING, WAITING = wire.VehicleControl(), wire.WalkerControl()
+
+
+class Place(NamedTuple):
+    """Where an actor is, and how it moves."""
+
+    pose: Array  # (4, 4) world from body
+    location: wire.Vector
+    rotation: wire.Vector
+    motion: Sequence[wire.Vector]  # velocity, angular velocity, acceleration
 
 
 @dataclass
@@ -78,3 +91,29 @@ class Actor:
             return b""
         names = {"van": "car", "prop": "static"}
         return bytes([SEMANTICS[names.get(self.category, self.category)]])
+
+    def take(self, place: Place) -> None:
+        """Take a place; the origin of a walker is its middle, `lift` above its feet."""
+        x, y, z = place.location
+        self.pose, self.motion = place.pose, place.motion
+        self.pose[2, 3] += self.lift
+        self.transform = Transform((x, y, z + self.lift), place.rotation)
+
+
+def list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]:
+    """Return the places of the first `count` actors of a snapshot; the parked ones are its last."""
+    trace = snapshot.trace
+    tilt, yaw, position = trace.tilts(0)[:count], trace.yaw[0, :count], trace.position[0, :count]
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = rotations(yaw, *tilt.T)
+    poses[:, :3, 3] = position
+    spin = np.column_stack((np.zeros((count, 2)), trace.yaw_rate[0, :count]))
+    columns = (
+        frame.to_location(position),
+        to_rotation(np.column_stack((yaw, tilt))),
+        mirror(trace.velocity[0, :count]),
+        np.degrees(mirror_spin(spin)),
+        mirror(trace.acceleration[0, :count]),
+    )
+    rows = zip(*((map(tuple, column.tolist())) for column in columns))
+    return [Place(pose, location, rotation, motion) for pose, (location, rotation, *motion) in zip(poses, rows)]

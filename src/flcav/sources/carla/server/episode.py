@@ -4,7 +4,7 @@ Every tick the world makes a step; then all actors take their places, and the se
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
 from typing import NamedTuple
@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import rotations
-from flcav.sources.carla.frames import MapFrame, from_mount, mirror, mirror_spin, to_rotation, to_vector
+from flcav.sources.carla.frames import from_mount, mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.actors import Actor
+from flcav.sources.carla.server.actors import Actor, list_places
 from flcav.sources.carla.server.blueprints import Blueprint, Refused, check, list_blueprints
 from flcav.sources.carla.server.driving import steer_towards
 from flcav.sources.carla.server.lights import Lights, find_approaches
@@ -182,7 +181,7 @@ class Episode:
         self._bodies[name] = actor
         snapshot = self.world.snapshot
         row = snapshot.row(name)
-        _take_place(actor, _list_places(snapshot, self.served.frame, row + 1)[row])
+        actor.take(list_places(snapshot, self.served.frame, row + 1)[row])
         return actor
 
     def destroy(self, actor: Actor) -> None:
@@ -295,10 +294,10 @@ class Episode:
     def _follow(self, snapshot: Snapshot, dt_s: float) -> None:
         """Take the places of all actors from the world."""
         names = [name for name in snapshot.trace.actor.tolist() if not name.startswith(PARKED)]
-        places = _list_places(snapshot, self.served.frame, len(names))
+        places = list_places(snapshot, self.served.frame, len(names))
         for row, name in enumerate(names):
             actor = self._bodies.get(name) or self._meet(snapshot, row)
-            _take_place(actor, places[row])
+            actor.take(places[row])
         if len(self._bodies) > len(names):
             for name in set(self._bodies) - set(names):
                 del self.actors[self._bodies.pop(name).id]
@@ -428,38 +427,3 @@ class Episode:
 
 def _measure(sense: Callable[[Sight, Sensor], bytes], look: Callable[[], Sight], sensor: Sensor) -> bytes:
     return sense(look(), sensor)
-
-
-class Place(NamedTuple):
-    """Where an actor is, and how it moves."""
-
-    pose: Array  # (4, 4) world from body
-    location: wire.Vector
-    rotation: wire.Vector
-    motion: Sequence[wire.Vector]  # velocity, angular velocity, acceleration
-
-
-def _list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]:
-    """Return the places of the first `count` actors of a snapshot; the parked ones are its last."""
-    trace = snapshot.trace
-    tilt, yaw, position = trace.tilts(0)[:count], trace.yaw[0, :count], trace.position[0, :count]
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = rotations(yaw, *tilt.T)
-    poses[:, :3, 3] = position
-    spin = np.column_stack((np.zeros((count, 2)), trace.yaw_rate[0, :count]))
-    columns = (
-        frame.to_location(position),
-        to_rotation(np.column_stack((yaw, tilt))),
-        mirror(trace.velocity[0, :count]),
-        np.degrees(mirror_spin(spin)),
-        mirror(trace.acceleration[0, :count]),
-    )
-    rows = zip(*((map(tuple, column.tolist())) for column in columns))
-    return [Place(pose, location, rotation, motion) for pose, (location, rotation, *motion) in zip(poses, rows)]
-
-
-def _take_place(actor: Actor, place: Place) -> None:
-    x, y, z = place.location
-    actor.pose, actor.motion = place.pose, place.motion
-    actor.pose[2, 3] += actor.lift
-    actor.transform = Transform((x, y, z + actor.lift), place.rotation)
