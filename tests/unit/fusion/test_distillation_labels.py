@@ -34,6 +34,7 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels import quality, road_average
 from flcav.pipeline.labels.quality import measure_labels, read_history
 from flcav.pipeline.labels.road_average import RoadAverageLabels
+from flcav.pipeline.results.training import Found
 from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.world.map.layers import MapLane, MapLayers
 
@@ -228,6 +229,7 @@ def test_precision_and_recall_of_labels_count_targets_once_and_neutral_ones_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     truth = FrameTruth("s", boxes((10, 0), (20, 0), (30, 0), z=-1.0), boxes((40, 0), z=-1.0), Boxes.empty())
+    truth = replace(truth, returns=np.array([19, 20, 500]))
     keys = [SimpleNamespace(agent="cav1"), SimpleNamespace(agent="cav0")]
     data = SimpleNamespace(keys=keys, frame=lambda i: frame([BOTH]))
     monkeypatch.setattr(quality, "asked_of", lambda frame, config: truth)
@@ -240,6 +242,7 @@ def test_precision_and_recall_of_labels_count_targets_once_and_neutral_ones_not(
     assert (found.precision, found.recall) == (pytest.approx(3 / 5), pytest.approx(3 / 6))
     assert (found.tight, found.size_m) == (pytest.approx(3 / 3), 0)  # .3 m along 4 m or more: IoU above .7
     assert found.offset_m == 0  # the median of 0, 0 and .3
+    assert found.by_returns == (Found(5, 2, 2), Found(20, 2, 1), Found(100, 2, 0))
     low = Sample(points, replace(boxes((10.5, 0), z=-1.0), size=boxes((10.5, 0)).size - (0, 0, 0.4)))
     worse = measure_labels(3, split, (0, 1), "grid", {"grid/cav0": [low], "grid/cav1": [low]}, CONFIG)
     assert (worse.tight, worse.offset_m, worse.size_m) == (0, pytest.approx(0.5), pytest.approx(0.4))

@@ -48,7 +48,7 @@ def measure_labels(
         found.append(Boxes.from_array(boxes.array(), boxes.label, np.ones(len(boxes))))
         targets.append(truth.targets)
         neutral.append(truth.neutral)
-        returns.append(truth.returns)
+        returns += [] if truth.returns is None else [truth.returns]
     matches, tight = (match(found, targets, neutral, overlap) for overlap in (0.5, TIGHT))
     right, there, count = int(matches.hit.sum()), int(matches.targets.sum()), len(matches.hit)
     quality = LabelQuality(round_, count, there, right / count if count else None, right / there if there else None)
@@ -65,7 +65,7 @@ def measure_labels(
         tight=int(tight.hit.sum()) / right,
         offset_m=float(np.median(offset)),
         size_m=float(np.median(size)),
-        by_returns=_count_by_returns(np.concatenate(returns), met),
+        by_returns=_count_by_returns(np.concatenate(returns), met) if len(returns) == len(targets) else None,
     )
 
 
