@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from performed_steps import in_mb, perform, uplinks
+from safetensors.numpy import load_file
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
-from flcav.experiments.gap.megabytes import UPLOADED, trace_bytes
+from flcav.experiments.gap.megabytes import IN_BYTES, UPLOADED, trace_bytes
 from flcav.federation.privacy import Privacy
 from flcav.network.ledger import LINKS, Ledger
+from flcav.perception.objects import imitation
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.pipeline.analysis.histories import ORIGIN, HistoryOrigin
@@ -112,11 +114,15 @@ def test_a_forecast_refuses_what_the_run_would(tmp_path: Path) -> None:
         forecast_run(recipe.model_copy(update={"federation": federation}))
 
 
-def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(tmp_path: Path) -> None:
-    """Both stages take the tracks of one step; the cloud's own training crosses no link."""
+def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both stages take the tracks of one step; the cloud's own training crosses no link; a frozen head stays."""
     recipe = shrunk("gap")
-    arms = {name: arm for name, arm in recipe.arms.items() if name in ("joined", "truth", "missed", "sweeps6")}
-    found = run(recipe.model_copy(update={"arms": arms}), tmp_path)
+    asked = ("joined", "truth", "missed", "occlusion", "bare", "frozen", "imitating", "longer", "longest", "sweeps6")
+    arms = {name: arm for name, arm in recipe.arms.items() if name in asked}
+    recipe = recipe.model_copy(update={"arms": arms})
+    found = run(recipe, tmp_path)
     work = tmp_path / "work"
     assert {path.name for path in work.glob("*tracks*")} == {"grid-tracks-objects", "grid-tracks-objects-joined"}
     split = Frames.open(work / "grid-edge-objects")
@@ -125,7 +131,7 @@ def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(tmp_path:
     watched = Frames.open(work / "suburb-validation-objects")
     assert (len(watched.data), len(watched.vehicles)) == (11, 1)
     assert 0 < (Pretrained.load(work / "pretrain-objects").track_threshold or 0) <= 1
-    for name in (MAIN, "joined", "truth", "missed"):
+    for name in (MAIN, "joined", "truth", "missed", "occlusion"):
         labels = next(each.labels for each in found.arms[name].stages if each.stage == EDGE)
         assert labels is not None
         assert labels[0].recall == (1 if name == "truth" else labels[0].recall)
@@ -134,12 +140,31 @@ def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(tmp_path:
             assert sum(each.targets for each in parts) == labels[0].targets
             assert sum(each.found for each in parts) == pytest.approx((labels[0].recall or 0) * labels[0].targets)
         assert parts or name != "truth"
-        assert name not in ("truth", "missed") or labels[0].precision in (1, None)
+        assert name not in ("truth", "missed", "occlusion") or labels[0].precision in (1, None)
     sent = Ledger.load(work / "cloud-fl-objects" / LEDGER).entries
     assert {entry.client for entry in sent if entry.stage == CLOUD} == {"grid", "grid/cav0"}
     (cloud,) = (each for each in found.arms[MAIN].stages if each.stage == CLOUD)
     assert cloud.records
     assert cloud.records[0].clients == ("grid", "cloud-replay")
+    ended = {
+        name: load_file(work / f"{step}" / WEIGHTS)
+        for name, step in (
+            (PRETRAIN, "pretrain-objects"),
+            *((arm, f"cloud-fl-objects-{arm}") for arm in ("bare", "frozen", "imitating")),
+        )
+    }
+    head = {name: own["head.weight"] for name, own in ended.items()}
+    same = {name: np.array_equal(own, head[PRETRAIN]) for name, own in head.items()}
+    assert same == {PRETRAIN: True, "bare": False, "frozen": True, "imitating": False}
+    np.testing.assert_array_equal(head["imitating"], head["bare"])  # a teacher of one step sees nothing
+    monkeypatch.setattr(imitation, "SEEN", 0.0)
+    (tmp_path / "again").mkdir()
+    for stage in ("grid-edge-fl-objects-imitating", "cloud-fl-objects-imitating"):
+        perform(recipe, tmp_path, tmp_path / "again", (stage,))
+        blind, seen = (load_file(folder / stage / WEIGHTS)["head.weight"] for folder in (work, tmp_path / "again"))
+        assert not np.array_equal(blind, seen)
+    backbone = next(name for name in ended["frozen"] if name.startswith("backbone") and name.endswith("weight"))
+    assert not np.array_equal(ended["frozen"][backbone], ended[PRETRAIN][backbone])
 
     book = Ledger.load(work / "grid-central-objects-sweeps6" / LEDGER)
     (upload,) = (row.bytes / 1e6 for row in book.entries if row.link == "wireless")  # of the one frame there is
@@ -150,6 +175,11 @@ def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(tmp_path:
     up = [row for row in sent if (row.stage, row.link, row.direction) == (EDGE, "wireless", "up")]
     assert {row.round for row in up} == {0, 1}  # errors, and weights
     assert [point.mb for point in curves["edge FL on tracks"]] == [0, sum(row.bytes for row in up) / 1e6]
+    longer = curves[IN_BYTES]
+    assert [point.label for point in longer] == ["pretraining", "1 round", "6 rounds", "16 rounds"]
+    one_mb = (sent_mb := [point.mb for point in longer])[1] - sum(row.bytes for row in up if row.round == 0) / 1e6
+    assert [mb - sent_mb[1] for mb in sent_mb[2:]] == pytest.approx([5 * one_mb, 15 * one_mb], rel=0.01)
+    assert one_mb < 0.3 * sum(row.bytes for row in up if row.round) / 1e6  # in 8 bits of 32
     assert len({point.ap50 for points in curves.values() for point in points[:1]}) == 1  # all begin with one network
 
 

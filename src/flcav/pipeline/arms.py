@@ -15,6 +15,7 @@ from flcav.federation.trainable import statistics_names
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.pose_graph import check_gtsam
 from flcav.perception.distillation import Imitates
+from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.weights import to_arrays
@@ -44,6 +45,7 @@ OF_ROUNDS = (  # fields of `Training` of federations alone
     "final_rate",
     "average_rounds",
     "start_share",
+    "imitation",
 )
 LEARNED = (  # those that decide a federation
     *PLANNED,
@@ -222,6 +224,7 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
         raise InputError("federation.replay: the cloud's own training, which no topic is for; leave out 'cloud_topics'")
     if setting.fault is not None and not all(LABEL_SOURCES[kind].tracked for kind in setting.labels.values()):
         raise InputError(f"fault: '{setting.fault}' is one of labels by tracks; choose 'tracks' or 'road+tracks'")
+    _check_imitation(setting)
     _check_numbers(recipe, setting, edge)
     _check_bare_labels(setting)
     if isinstance(edge, FedMD) and setting.central is None:
@@ -242,6 +245,15 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
             raise InputError(f"cloud_strategy{given}, among edge servers: {error}") from None
     for task in recipe.tasks if how.personal or how.upload.layers or how.score_statistics else ():
         _check_arrays(task, recipe.tasks[task].network, setting)
+
+
+def _check_imitation(setting: Setting) -> None:
+    """Raise `InputError` where an arm keeps the boxes of a task without any, or of one with another loss."""
+    for task, training in setting.training.items():
+        if training.imitation and task != OBJECTS.name:
+            raise InputError(f"training.imitation: it keeps boxes, and '{task}' has none; give it to 'objects' alone")
+        if training.imitation and LABEL_SOURCES[setting.labels[task]].averaged:
+            raise InputError(f"training.imitation: the labels '{setting.labels[task]}' have a loss of their own")
 
 
 def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:

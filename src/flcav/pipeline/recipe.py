@@ -33,7 +33,9 @@ MORE_EDGE = "more_edge"  # after stage II: as many further edge rounds as stage 
 
 Role = Literal["pretrain", "federate", "unseen"]
 SplitName = Literal["pool", "validation", "registry", "edge", "test"]
-Fault = Literal["missed", "unsure", "false", "boxes"]  # see `flcav.pipeline.labels.faults`
+Fault = Literal[  # see `flcav.pipeline.labels.faults`
+    "missed", "unsure", "range", "occlusion", "false", "boxes", "presence"
+]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_]*$")]
 Count = Annotated[int, Field(ge=0, le=10**6)]
 Positive = Annotated[float, Field(gt=0)]
@@ -82,6 +84,9 @@ class Training(Config):
     final_rate: float = Field(default=0.1, gt=0)  # learning rate of their last, and of further rounds after them
     average_rounds: int = Field(default=3, ge=1)  # last rounds of a federation whose models its result averages
     start_share: float = Field(default=0.3, ge=0, lt=1)  # of the pretrained weights in the result of stage II
+    imitation: float = Field(
+        default=0.0, ge=0
+    )  # weight of the loss by which detectors keep the boxes of the pretrained network in stages II and III
 
 
 SIZES: Mapping[str, tuple[Splits, Training]] = {

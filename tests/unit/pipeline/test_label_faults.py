@@ -5,7 +5,13 @@ import pytest
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
+from flcav.perception.objects.loss import classification_loss
+from flcav.perception.objects.model import CONFIGURATIONS
+from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.targets import assign_anchors
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.task import build_network
 from flcav.pipeline.arms import Names, check_federations, resolve_settings
 from flcav.pipeline.labels.faults import change_labels, give_fault
 from flcav.pipeline.recipe import RunRecipe
@@ -21,6 +27,7 @@ def cars(*places: tuple[float, float, float], height: float = 1.5, score: float 
 
 
 TRUTH = Sample(POINTS, cars((10, 0, 0), (20, 5, 1)), cars((40, 0, 0)))
+HIDDEN = np.array([0.9, 0.2])
 LABELS = Sample(POINTS, cars((10.4, 0.1, 0.02), (30, -5, 0), height=1.8, score=0.7))  # one near, one of nothing
 
 
@@ -34,7 +41,7 @@ LABELS = Sample(POINTS, cars((10.4, 0.1, 0.02), (30, -5, 0), height=1.8, score=0
     ],
 )
 def test_one_fault_changes_one_thing(fault: str, places: list[float], neutral: list[float]) -> None:
-    changed = change_labels(TRUTH, LABELS, fault)  # type: ignore[arg-type]
+    changed = change_labels(TRUTH, LABELS, HIDDEN, fault)  # type: ignore[arg-type]
     assert changed.boxes.center[:, 0].tolist() == places
     assert changed.ignore.center[:, 0].tolist() == neutral
     assert changed.points is TRUTH.points
@@ -43,23 +50,53 @@ def test_one_fault_changes_one_thing(fault: str, places: list[float], neutral: l
     np.testing.assert_array_equal(changed.boxes.array()[1:2] if fault == "boxes" else changed.boxes.array()[:1], right)
 
 
-@pytest.mark.parametrize("fault", ["missed", "unsure", "false", "boxes"])
+def test_of_what_is_missed_it_is_the_far_or_the_occluded_alone() -> None:
+    """Objects at 10 and 30 m are labelled, of those at 20, 25, 40 m and at 5 m none; occlusion unknown is none."""
+    truth = Sample(POINTS, cars((10, 0, 0), (20, 0, 0), (25, 0, 0), (0, 40, 0), (30, 0, 0), (5, 0, 0)))
+    hidden = np.array([0.9, 0.5, 0.49, np.nan, 1.0, 0.0])
+    labels = Sample(POINTS, cars((10, 0, 0), (30, 0, 0), score=0.7))
+    left = {
+        fault: change_labels(truth, labels, hidden, fault).boxes.center[:, :2].tolist()  # type: ignore[arg-type]
+        for fault in ("missed", "range", "occlusion")
+    }
+    assert left["missed"] == [[10, 0], [30, 0]]
+    assert left["range"] == [[10, 0], [20, 0], [30, 0], [5, 0]]
+    assert left["occlusion"] == [[10, 0], [25, 0], [0, 40], [30, 0], [5, 0]]
+
+
+def test_presence_teaches_where_objects_are_and_no_box() -> None:
+    """Whatever the boxes' heights and headings, the loss of presence is the same, and it is that of the scores."""
+    network, points = build_network(OBJECTS, CONFIGURATIONS["pillars"], 1), np.ones((9, 4), np.float32)
+    losses = []
+    for boxes in (cars((10, 0, 0)), cars((10, 0, 0), height=2.5), cars((10, 0, np.pi))):
+        sample = change_labels(Sample(points, boxes), LABELS, np.zeros(1), "presence")
+        assert sample.boxes is boxes
+        losses.append(OBJECTS.loss(network.eval(), [sample]).item())
+    assert losses[0] == losses[1] == losses[2]
+    targets = [assign_anchors(sample, network.config)]
+    scores = classification_loss(predict(network, [points]), targets, network.config)
+    assert losses[0] == pytest.approx(scores.item())
+
+
+@pytest.mark.parametrize("fault", ["missed", "unsure", "range", "occlusion", "false", "boxes", "presence"])
 def test_nothing_is_labelled_or_nothing_is_there(fault: str) -> None:
     nothing = Sample(POINTS, Boxes.empty())
-    unlabelled, empty = (change_labels(*pair, fault) for pair in ((TRUTH, nothing), (nothing, LABELS)))  # type: ignore[arg-type]
-    assert len(unlabelled.boxes) == (0 if fault in ("missed", "unsure") else 2)
+    pairs = ((TRUTH, nothing, HIDDEN), (nothing, LABELS, np.empty(0)))
+    unlabelled, empty = (change_labels(*pair, fault) for pair in pairs)  # type: ignore[arg-type]
+    assert len(unlabelled.boxes) == {"missed": 0, "unsure": 0, "occlusion": 1}.get(fault, 2)
     assert len(empty.boxes) == (2 if fault == "false" else 0)
 
 
 def test_every_vehicle_keeps_its_frames() -> None:
     both = {"grid/cav0": [TRUTH, TRUTH], "grid/cav1": [TRUTH]}
-    found = give_fault(both, {name: [LABELS] * len(own) for name, own in both.items()}, "missed")
+    hidden = {name: [HIDDEN] * len(own) for name, own in both.items()}
+    found = give_fault(both, {name: [LABELS] * len(own) for name, own in both.items()}, hidden, "missed")
     assert {name: [len(each.boxes) for each in own] for name, own in found.items()} == {
         "grid/cav0": [1, 1],
         "grid/cav1": [1],
     }
     with pytest.raises(ValueError, match="shorter"):
-        give_fault(both, {name: [LABELS] for name in both}, "missed")
+        give_fault(both, {name: [LABELS] for name in both}, hidden, "missed")
 
 
 def recipe(labels: str) -> RunRecipe:

@@ -2,7 +2,8 @@
 
 It is the first question about federated learning: why not send the data? A sweep goes up with its annotation, which is
 ground truth here and free, as it is nowhere else; in exchange vehicles label by themselves and send weights. Both take
-as many optimiser steps. Bytes are those of the wireless uplink; uploaded sweeps take the wireline one as well.
+as many optimiser steps; of updates in 8 bits there are as many more rounds, and steps, as the bytes last for. Bytes are
+those of the wireless uplink; uploaded sweeps take the wireline one as well.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,13 +16,15 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import score_network
 from flcav.perception.weights import load_network
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import CENTRAL, MAIN, RunRecipe
+from flcav.pipeline.recipe import CENTRAL, EDGE, MAIN, MORE_EDGE, RunRecipe
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.training.checkpoints import load_round_network
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 
 FEDERATED: Mapping[str, str] = {"edge FL on tracks": MAIN, "edge FL on ground truth": "truth"}  # by name: arm
+IN_BYTES = "edge FL on ground truth, int8"
+LONGER = (("longer", EDGE), ("longer", MORE_EDGE), ("longest", MORE_EDGE))  # arms and stages of that curve
 UPLOADED = "centralised on uploaded sweeps"
 ROUNDS = (1, 2, 3, 5, 10)  # after which a federation is tested; those that it has
 
@@ -67,6 +70,13 @@ def trace_bytes(run: Run, work: Path, region: str) -> Curves:
             ap50 = score_network(OBJECTS, ended, test.data, test.vehicles)
             yield AtBytes(plural(number, "round"), sum(up) / BYTES_PER_MB, ap50)
 
+    def in_bytes() -> Iterator[AtBytes]:
+        for arm, stage in LONGER:
+            folder = work / run.steps.stage(arm, stage, region, task)
+            number = sum(each.rounds for each in run.arms[arm].stages if each.stage in (EDGE, stage))
+            ap50 = run.test(arm=arm, stage=stage, region=region, task=task).estimate.mean
+            yield AtBytes(plural(number, "round"), Ledger.load(folder / LEDGER).used_mb("wireless"), ap50)
+
     def uploaded() -> Iterator[AtBytes]:
         for arm, own in list_uploads(run.recipe):
             book = Ledger.load(work / run.steps.central(arm, region, task) / LEDGER)
@@ -74,7 +84,7 @@ def trace_bytes(run: Run, work: Path, region: str) -> Curves:
             yield AtBytes(plural(own, "sweep"), book.used_mb("wireless"), ap50)
 
     curves = {name: (begun, *federated(arm)) for name, arm in FEDERATED.items()}
-    return {**curves, UPLOADED: (begun, *uploaded())}
+    return {**curves, IN_BYTES: (begun, *in_bytes()), UPLOADED: (begun, *uploaded())}
 
 
 def list_uploads(recipe: RunRecipe) -> list[tuple[str, int]]:

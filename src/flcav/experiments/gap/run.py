@@ -14,7 +14,7 @@ from flcav.config import Json
 from flcav.experiments.gap.megabytes import Curves, MeanAtBytes, average_curves
 from flcav.pipeline.analysis.histories import gap_closed
 from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import Run
 from flcav.report import style
 from flcav.report.charts import figures
@@ -23,47 +23,69 @@ from flcav.statistics.verdicts import describe_means
 from flcav.storage.records import Record
 
 TASK, TOWN, HOME = "objects", "grid", "suburb"
-PRETRAINED, MORE, ORACLE = "pretrained", "more pretraining", "centralised on ground truth"
-TRUTH, TWICE, FOURFOLD = (
-    f"edge FL on ground truth{how}" for how in ("", ", twice the steps", ", four times the steps")
+PRETRAINED, ORACLE = "pretrained", "centralised on ground truth"
+TRUTH, TWICE, FOURFOLD, COARSE, LONGER, LONGEST = (
+    f"edge FL on ground truth{how}"
+    for how in (
+        "",
+        ", twice the steps",
+        ", four times the steps",
+        ", int8",
+        ", int8, twice the rounds",
+        ", int8, four times the rounds",
+    )
 )
 MISSED, UNSURE = "ground truth, missed objects background", "ground truth, missed objects neutral"
-FALSE, BOXES = "ground truth, and false boxes", "ground truth, boxes of tracks"
-ROAD, TRACKS = "edge FL on road labels", "edge FL on tracks"
-JOINED, DENSEST = "edge FL on road labels and tracks", "edge FL on road labels and tracks, densest pole"
-GLOBAL = "edge + cloud FL on tracks, with replay"
+FAR, OCCLUDED = "ground truth, missed far objects background", "ground truth, missed occluded objects background"
+FALSE, BOXES, PRESENCE = "ground truth, and false boxes", "ground truth, boxes of tracks", "ground truth, no boxes"
+ROAD, TRACKS, JOINED = "edge FL on road labels", "edge FL on tracks", "edge FL on road labels and tracks"
+GLOBAL, REPLAY, FROZEN, IMITATING = (
+    f"edge + cloud FL on tracks{how}" for how in ("", ", with replay", ", head frozen", ", with imitation")
+)
+GLOBAL_TRUTH, GLOBAL_PRESENCE = "edge + cloud FL on ground truth", "edge + cloud FL on ground truth, no boxes"
 ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     PRETRAINED: (MAIN, PRETRAIN),
-    MORE: ("more", CENTRAL),
     ROAD: ("road", EDGE),
     TRACKS: (MAIN, EDGE),
     JOINED: ("joined", EDGE),
-    DENSEST: ("densest", EDGE),
     MISSED: ("missed", EDGE),
     UNSURE: ("unsure", EDGE),
+    FAR: ("range", EDGE),
+    OCCLUDED: ("occlusion", EDGE),
     FALSE: ("false", EDGE),
     BOXES: ("boxes", EDGE),
+    PRESENCE: ("presence", EDGE),
     TRUTH: ("truth", EDGE),
     TWICE: ("twice", EDGE),
     FOURFOLD: ("fourfold", EDGE),
-    GLOBAL: (MAIN, CLOUD),
+    COARSE: ("longer", EDGE),
+    LONGER: ("longer", MORE_EDGE),
+    LONGEST: ("longest", MORE_EDGE),
+    GLOBAL: ("bare", CLOUD),
+    REPLAY: (MAIN, CLOUD),
+    FROZEN: ("frozen", CLOUD),
+    IMITATING: ("imitating", CLOUD),
+    GLOBAL_TRUTH: ("truth", CLOUD),
+    GLOBAL_PRESENCE: ("presence", CLOUD),
     ORACLE: ("oracle", CENTRAL),
 }
-AT_HOME = (PRETRAINED, GLOBAL)  # scored in the town of pretraining, too
+AT_HOME = tuple(name for name, (_, stage) in ARMS.items() if stage in (PRETRAIN, CLOUD))  # scored there, too
 COMPARED = (  # (after, before): claims that the difference in AP50 is positive
     (TRUTH, PRETRAINED),
     (TRACKS, PRETRAINED),
-    (TRACKS, MORE),
     (TRACKS, ROAD),
     (JOINED, TRACKS),
-    (JOINED, DENSEST),
     (TRUTH, TRACKS),
     (TRUTH, MISSED),
-    (UNSURE, MISSED),
+    (TRUTH, FAR),
+    (TRUTH, OCCLUDED),
     (TRUTH, FALSE),
     (TRUTH, BOXES),
+    (TRUTH, PRESENCE),
     (TWICE, TRUTH),
     (FOURFOLD, TWICE),
+    (LONGER, COARSE),
+    (LONGEST, LONGER),
     (ORACLE, TRUTH),
 )
 
@@ -89,7 +111,8 @@ class GapResult(Record):
     closed50: Mapping[str, MeanOverSeeds]  # share of what edge FL on ground truth gains in AP50
     closed70: Mapping[str, MeanOverSeeds]
     differences: Mapping[str, MeanOverSeeds]  # "after - before", in AP50
-    cost_at_home: Mapping[str, MeanOverSeeds]  # of edge + cloud FL against pretrained, in AP50 and AP70
+    home50: Mapping[str, MeanOverSeeds]  # change in AP50 in the town of pretraining, by arm
+    home70: Mapping[str, MeanOverSeeds]
     megabytes: Mapping[str, tuple[MeanAtBytes, ...]]  # AP50 against uplink megabytes, by curve
     recipe: Mapping[str, Json]
     provenance: Provenance
@@ -101,7 +124,10 @@ class GapResult(Record):
             f"AP70 {self.ap70[arm].describe()}, of its gain on truth {self.closed70[arm].describe()}"
             for arm, mean in self.ap50.items()
         ]
-        home = [f"at home, {name}: {mean.describe(sign=True)}" for name, mean in self.cost_at_home.items()]
+        home = [
+            f"at home, {name}: AP50 {mean.describe(sign=True)}, AP70 {self.home70[name].describe(sign=True)}"
+            for name, mean in self.home50.items()
+        ]
         at_bytes = [
             f"{name}, {point.label}, {point.mb:.1f} MB: AP50 {point.ap50.describe()}"
             for name, points in self.megabytes.items()
@@ -134,7 +160,8 @@ def compare_gap(recipe: RunRecipe, runs: Sequence[Run], curves: Sequence[Curves]
         closed50={arm: closed(arm, "ap50") for arm in ARMS},
         closed70={arm: closed(arm, "ap70") for arm in ARMS},
         differences={f"{after} - {before}": gain(each, after, before, "ap50") for after, before in COMPARED},
-        cost_at_home={name: gain(at_home, GLOBAL, PRETRAINED, name.lower()) for name in ("AP50", "AP70")},
+        home50={arm: gain(at_home, arm, PRETRAINED, "ap50") for arm in AT_HOME[1:]},
+        home70={arm: gain(at_home, arm, PRETRAINED, "ap70") for arm in AT_HOME[1:]},
         megabytes=average_curves(curves),
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
         provenance=provenance(),

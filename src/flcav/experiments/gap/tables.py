@@ -31,11 +31,18 @@ def _arms(results: GapResult) -> str:
 
 
 def _home(results: GapResult) -> str:
-    rows = [[f"{name}, difference", mean.describe(sign=True)] for name, mean in results.cost_at_home.items()]
+    rows = []
     for name in AT_HOME:
         own = [seed[name] for seed in results.home.values()]
-        rows.append([name, f"AP50 {_mean([each.ap50 for each in own])}, AP70 {_mean([each.ap70 for each in own])}"])
-    return format_table((f"in {HOME}", "mean over seeds"), rows)
+        row = [name]
+        for field, change in (("ap50", results.home50), ("ap70", results.home70)):
+            row += [
+                _mean([getattr(each, field) for each in own]),
+                change[name].describe(sign=True) if name in change else "",
+            ]
+        rows.append(row)
+    titles = ("AP50", "against pretrained", "AP70", "against pretrained")
+    return format_table((f"in {HOME}", *titles), rows)
 
 
 def _megabytes(results: GapResult) -> str:

@@ -40,9 +40,9 @@ from flcav.pipeline.results.plans import Plan, TaskPlan
 from flcav.pipeline.results.training import StageResult, StatisticsScore
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.regions import (
+    choose_loss,
     drive_region,
     label_samples,
-    learn_by_distillation,
     load_uploads,
     open_buffered_fleet,
     save_clock,
@@ -317,14 +317,13 @@ def cloud_step(
 
     Vehicles train in so many `processes` of a `runtime`, or in the `fleet` of this folder.
     """
-    first, task, learning = settings.first, settings.learning.task, settings.learning.resolve()
+    first, task = settings.first, settings.learning.task
+    learning = choose_loss(work, settings, first.pretrain)
     noise = StageResult.load(work.inputs[next(iter(settings.edges.values()))]).noise
     settings = settings.model_copy(update={"federation": take_noise(settings.federation, noise)})
     plan, start = Plan.load(work.inputs[first.plan]), load_stage_network(learning.task, work.inputs[first.pretrain])
     share = share_plan_budget(plan, settings.budgets_mb, task)
     book = Ledger(share, read_entries(work, first.pretrain, *settings.edges.values()))
-    if settings.distillation is not None:
-        learning = learn_by_distillation(learning, settings.distillation)
     before, rounds = len(book.entries), plan.tasks[task].cloud_rounds
     servers = _open_servers(work, settings, learning, start.config, rounds, book)
     federation = _open_federation(work, settings, learning, start, servers, book)

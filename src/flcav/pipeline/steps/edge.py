@@ -27,9 +27,9 @@ from flcav.pipeline.steps.memory import Memory, remember
 from flcav.pipeline.steps.outline import Outline
 from flcav.pipeline.steps.regions import (
     LabelledSamples,
+    choose_loss,
     drive_region,
     label_samples,
-    learn_by_distillation,
     open_buffered_fleet,
     save_clock,
     score_labels,
@@ -197,9 +197,8 @@ def _open_federation(
     work: Work, settings: EdgeSettings, labelled: LabelledSamples, rounds: int, book: Ledger
 ) -> EdgeFederation:
     """Return the federation of the region's vehicles, after sending them what they lack."""
-    inputs, learning, samples = settings.inputs, settings.learning.resolve(), labelled.samples
-    if settings.distillation is not None:
-        learning = learn_by_distillation(learning, settings.distillation)
+    inputs, samples = settings.inputs, labelled.samples
+    learning = choose_loss(work, settings, inputs.pretrain)
     start = load_stage_network(learning.task, work.inputs[inputs.edge or inputs.pretrain])
     clients = make_clients(learning, start.config, samples)
     earlier = 0 if inputs.edge is None else StageResult.load(work.inputs[inputs.edge]).rounds

@@ -10,17 +10,17 @@ from flcav.federation.buffered_rounds import count_participations
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.strategies import exchanges_more
-from flcav.fusion.distillation import Distillation
 from flcav.network.clock.records import save_rounds
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger
 from flcav.network.radio.links import RadioLinks
 from flcav.perception.objects.distillation.loss import DistillationTerms, DistilledObjects
+from flcav.perception.objects.imitation import ImitatingObjects
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.label_sources import LABEL_SOURCES, LabelSource
-from flcav.pipeline.labels.faults import give_fault
+from flcav.pipeline.labels.faults import give_fault, read_occlusion
 from flcav.pipeline.labels.pseudo_labels import (
     annotated_samples,
     label_frames,
@@ -103,7 +103,8 @@ def label_samples(
         samples = label_frames(label_tracked(tracks, threshold, frozen.config), *where)
         if settings.fault is not None:
             truth = annotated_samples(task, frozen.config, split, frames, inputs.region)
-            samples = give_fault(truth, samples, settings.fault)
+            hidden = read_occlusion(split, frames, inputs.region, frozen.config)
+            samples = give_fault(truth, samples, hidden, settings.fault)
         return LabelledSamples(samples, poles)
     return LabelledSamples(pseudo_label_samples(frozen, threshold, *where), poles)
 
@@ -120,10 +121,21 @@ def load_uploads(work: Work, learning: Learning, config: Any, pretrained: str, p
     return samples
 
 
-def learn_by_distillation(learning: Learning, how: Distillation) -> Learning:
-    """Return the settings of a training whose loss is that of federated distillation."""
-    on = ("regression" in how.terms, "contrastive" in how.terms)
-    return replace(learning, task=DistilledObjects(DistillationTerms(*on, how.contrastive_weight, how.temperature)))
+def choose_loss(work: Work, settings: FederationSettings, pretrained: str) -> Learning:
+    """Return the settings of a federation's training, with the loss that they ask for.
+
+    It is the task's own, that of federated distillation, or the task's own with imitation of the network of the step
+    `pretrained`.
+    """
+    learning, how = settings.learning.resolve(), settings.distillation
+    if how is not None:
+        on = ("regression" in how.terms, "contrastive" in how.terms)
+        terms = DistillationTerms(*on, how.contrastive_weight, how.temperature)
+        return replace(learning, task=DistilledObjects(terms))
+    if weight := learning.training.imitation:
+        teacher = load_stage_network(learning.task, work.inputs[pretrained])
+        return replace(learning, task=ImitatingObjects(teacher, weight))
+    return learning
 
 
 def score_labels(
