@@ -15,7 +15,7 @@ from flcav.config import InputError
 from flcav.experiments.gap.megabytes import IN_BYTES, UPLOADED, trace_bytes
 from flcav.federation.privacy import Privacy
 from flcav.network.ledger import LINKS, Ledger
-from flcav.perception.objects import imitation
+from flcav.perception.objects.distillation import imitation
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.pipeline.analysis.histories import ORIGIN, HistoryOrigin

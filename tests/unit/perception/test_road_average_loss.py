@@ -8,7 +8,7 @@ import torch
 
 from flcav.geometry import Boxes
 from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.distillation.loss import (
+from flcav.perception.objects.distillation.road_average import (
     DistillationTerms,
     contrastive_loss,
     distillation_loss,

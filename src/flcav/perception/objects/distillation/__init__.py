@@ -1,1 +1,1 @@
-"""Federated distillation: vehicles learn from the road average of boxes."""
+"""Distillation, as losses of a detector: from the road average of boxes, and from the network that it began with."""
