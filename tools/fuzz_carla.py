@@ -127,6 +127,10 @@ def main() -> None:
     parser.add_argument("--pid", type=int, help="the server's process, whose memory is looked at")
     parser.add_argument("--memory", type=float, default=2000.0, help="MB")
     options = parser.parse_args()
+    if not ask_version(options.port):
+        parser.error(
+            f"nobody answers at port {options.port}; start `flcav carla serve grid --port {options.port}` before"
+        )
     rng, methods, begun = random.Random(options.seed), list_methods(), time.monotonic()
     sent = closed = told = 0
     while sent < options.messages:
