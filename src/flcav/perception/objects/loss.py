@@ -65,15 +65,25 @@ def box_losses(output: HeadOutput, targets: Sequence[Targets]) -> tuple[Tensor, 
     """
     device, positive = output.score.device, _positive(output, targets)
     residual = torch.cat([target.residual for target in targets]).to(device)
-    error = output.box.flatten(0, 1)[positive] - residual
-    error = torch.cat((error[:, :6], torch.sin(error[:, 6:])), 1)
-    box = F.smooth_l1_loss(error, torch.zeros_like(error), beta=SMOOTH_L1_BETA, reduction="none")
+    error = residual_errors(output.box.flatten(0, 1)[positive], residual)
+    box = smooth_l1(error)
     half_turn = torch.cat([target.direction for target in targets]).to(device)
     direction = F.cross_entropy(output.direction.flatten(0, 1)[positive], half_turn, reduction="none")
     if output.log_variance is None:
         return box, direction, None
     log_variance = output.log_variance.flatten(0, 1)[positive].clamp(*LOG_VARIANCES)
     return box, direction, gaussian_nll(error.detach(), log_variance)
+
+
+def residual_errors(found: Tensor, wanted: Tensor) -> Tensor:
+    """Return the errors (P, 7) of residuals (P, 7): differences, of the yaw its sine."""
+    error = found - wanted
+    return torch.cat((error[:, :6], torch.sin(error[:, 6:])), 1)
+
+
+def smooth_l1(error: Tensor) -> Tensor:
+    """Return the smooth L1 loss of each error; shape of `error`."""
+    return F.smooth_l1_loss(error, torch.zeros_like(error), beta=SMOOTH_L1_BETA, reduction="none")
 
 
 def _positive(output: HeadOutput, targets: Sequence[Targets]) -> Tensor:

@@ -8,11 +8,10 @@ where that sees an object. It needs no samples of what was learned before.
 
 from collections.abc import Sequence
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from flcav.perception.objects.loss import BOX_WEIGHT, DIRECTION_WEIGHT, SMOOTH_L1_BETA, second_loss
+from flcav.perception.objects.loss import BOX_WEIGHT, DIRECTION_WEIGHT, residual_errors, second_loss, smooth_l1
 from flcav.perception.objects.model import HeadOutput, Second
 from flcav.perception.objects.predict import voxels_of
 from flcav.perception.objects.samples import Sample
@@ -48,8 +47,6 @@ def imitation_loss(output: HeadOutput, teacher: HeadOutput) -> Tensor:
     if not where.any():
         return output.box.sum() * 0
     share = score[where] / score[where].sum()
-    error = output.box[where] - teacher.box[where]
-    error = torch.cat((error[:, :6], torch.sin(error[:, 6:])), 1)
-    box = F.smooth_l1_loss(error, torch.zeros_like(error), beta=SMOOTH_L1_BETA, reduction="none").sum(1)
+    box = smooth_l1(residual_errors(output.box[where], teacher.box[where])).sum(1)
     direction = F.cross_entropy(output.direction[where], teacher.direction[where].softmax(1), reduction="none")
     return ((BOX_WEIGHT * box + DIRECTION_WEIGHT * direction) * share).sum()
