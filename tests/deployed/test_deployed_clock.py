@@ -4,10 +4,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from waiting import LONGEST_S, wait_for
 
 from flcav.federation.fleet.authority import open_authority
 from flcav.federation.fleet.bundle import TRUSTED
@@ -16,15 +16,8 @@ from flcav.federation.fleet.keys import AUTHORITY, request_certificate
 from flcav.federation.fleet.status import read_status
 from flcav.federation.fleet.up import read_ready
 
-HERE, LIMIT_S = Path(__file__).parent, 180.0
+HERE = Path(__file__).parent
 NAME = "without-clock"  # after all others: no federation of other tests has it
-
-
-def wait(done):
-    end = time.monotonic() + LIMIT_S
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.2)
 
 
 @pytest.mark.parametrize(("ahead_s", "told"), [(86400, "ahead"), (-86400, "behind")])
@@ -47,11 +40,11 @@ def test_clock_of_a_node_a_day_off(ahead_s, told, deployment, tmp_path):
         [sys.executable, str(HERE / "run_late_vehicle.py"), str(own), str(clock)], start_new_session=True
     )
     try:
-        wait(is_named)
+        wait_for(is_named)
         assert not is_online()
         clock.write_text("0")
-        wait(is_online)
+        wait_for(is_online)
     finally:
         authority.registry.revoke(name)
         os.kill(process.pid, signal.SIGTERM)
-        process.wait(30)
+        process.wait(LONGEST_S)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from run_walkers import walk
+from waiting import LONGEST_S
 
 from flcav.federation.fleet.authority import found_authority
 from flcav.federation.fleet.status import LEAST_ROOM, read_status
@@ -15,7 +16,7 @@ from flcav.federation.fleet.supervisor import LOGS
 from flcav.federation.fleet.up import VEHICLES
 from flcav.federation.runtimes.deployed import Deployment, fleet_up
 
-COUNT, FULL_S, TOLD_S = 2, 6.0, 60.0
+COUNT, FULL_S = 2, 6.0
 LATE = "vehicle-002"
 
 
@@ -65,7 +66,7 @@ class Filler(threading.Thread):
         self._path, self._told, self.ended = disk / "filler", told, False
 
     def run(self) -> None:
-        begun, end = time.monotonic(), time.monotonic() + TOLD_S
+        begun, end = time.monotonic(), time.monotonic() + LONGEST_S
         while time.monotonic() < end and not (self._told() and time.monotonic() > begun + FULL_S):
             for size in (1 << 20, 1 << 10):
                 try:
@@ -102,7 +103,7 @@ def test_full_disks(disks):
         found = walk(Deployment(fleet), COUNT, 4, lasts_s=0.5, before_round=begin)
         assert process.poll() is None
     for filler in fillers.values():
-        filler.join(TOLD_S)
+        filler.join(LONGEST_S)
         assert filler.ended
     np.testing.assert_array_equal(expected["w"], found["w"])
     assert [*fleet.rglob("*.part"), *disk.rglob("*.part")] == []

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 import yaml
+from waiting import read_all_traffic
 
 from flcav.federation.fleet.authority import open_registry
-from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.fleet.up import VEHICLES
 
 RECIPE = {
@@ -66,7 +66,7 @@ def begin(tmp_path, embedded):
 
 def count_bytes(folder: Path) -> dict[str, int]:
     """Return the bytes that each vehicle's app has sent."""
-    return {name: own.content_up for name, own in read_traffic(folder).vehicles.items()}
+    return {name: own.content_up for name, own in read_all_traffic(folder).vehicles.items()}
 
 
 def test_same_weights_ledger_and_record(tmp_path, embedded, begin, deployment):

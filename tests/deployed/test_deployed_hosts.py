@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from run_walkers import walk
+from waiting import LONGEST_S, wait_for
 
 from flcav.federation.fleet.authority import found_authority, open_authority
 from flcav.federation.fleet.bundle import TRUSTED, make_publisher
@@ -20,7 +21,6 @@ from flcav.federation.fleet.up import READY, VEHICLES, read_ready
 HERE = Path(__file__).parent
 OPERATOR, HUB, COUNT, PORT = "flcav-op", "flcav-hub", 4, 9443
 NAMES = [f"cav-{number}" for number in range(1, COUNT + 1)]
-UP_S = 240.0  # for all to be there, on a busy machine
 
 
 def ip(*arguments, check=True):
@@ -90,17 +90,10 @@ def fleet(hosts, tmp_path_factory):
             trusted = authority.folder / TRUSTED
             install_vehicle(own, base / f"{name}.crt", authority.folder / AUTHORITY, trusted, f"10.77.0.1:{PORT}")
             (authority.folder / VEHICLES / name).symlink_to(own)
-        wait(lambda: (authority.folder / READY).exists(), base / "up.log")
+        wait_for((authority.folder / READY).exists, tell=(base / "up.log").read_text)
         for name in NAMES:
             stack.enter_context(running(name, base / f"{name}.log", "-m", "flcav", "fleet", "vehicle", base / name))
         yield authority.folder
-
-
-def wait(done, log=None):
-    end = time.monotonic() + UP_S
-    while not done():
-        assert time.monotonic() < end, log.read_text() if log is not None and log.exists() else "too late"
-        time.sleep(0.1)
 
 
 def reaches(host, address, port):
@@ -123,11 +116,13 @@ def test_radio_cut_in_mid_round(fleet, tmp_path):
     expected = walk(None, COUNT, 3)
     log, out = tmp_path / "log", tmp_path / "out.npy"
     with running(OPERATOR, tmp_path / "run.log", HERE / "run_walkers.py", fleet, COUNT, 3, log, out) as process:
-        wait(lambda: log.exists() and len(log.read_text().splitlines()) > COUNT, tmp_path / "run.log")
+        wait_for(
+            lambda: log.exists() and len(log.read_text().splitlines()) > COUNT, tell=(tmp_path / "run.log").read_text
+        )
         ip("-n", "cav-2", "link", "set", "eth0", "down")
         time.sleep(8)
         ip("-n", "cav-2", "link", "set", "eth0", "up")
-        process.wait(UP_S)
+        process.wait(LONGEST_S)
     assert process.returncode == 0, (tmp_path / "run.log").read_text()
     found = np.load(out)
     np.testing.assert_array_equal(expected["w"], found)

@@ -4,7 +4,6 @@ import base64
 import os
 import signal
 import ssl
-import time
 from dataclasses import replace
 from datetime import timedelta
 
@@ -17,6 +16,7 @@ from flwr.app import Message, MessageType, RecordDict
 from flwr.proto.control_pb2 import ListRunsRequest
 from flwr.proto.fleet_pb2 import ActivateNodeRequest, ActivateNodeResponse, PullMessagesRequest
 from flwr.proto.node_pb2 import Node
+from waiting import LONGEST_S, wait_for
 
 from flcav.config import InputError
 from flcav.federation.fleet import bundle
@@ -57,7 +57,8 @@ def reach(deployment, folder=None, authority=None):
     context = ssl.create_default_context(cafile=str((authority or deployment.folder) / AUTHORITY))
     if folder is not None:
         context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
-    return httpx.Client(base_url=f"https://{read_ready(deployment.folder).proxy}", verify=context, trust_env=False)
+    url = f"https://{read_ready(deployment.folder).proxy}"
+    return httpx.Client(base_url=url, verify=context, trust_env=False, timeout=LONGEST_S)
 
 
 def signed_headers(key: ec.EllipticCurvePrivateKey, late_s: float = 0.0) -> dict[str, str]:
@@ -88,21 +89,20 @@ def node_of(deployment, name):
 
 
 def wait_enrolled(deployment, name):
-    end = time.monotonic() + 20
-    while time.monotonic() < end:
-        found = {own.name: own.node for own in open_authority(deployment.folder).registry.list_vehicles()}
-        if found.get(name) is not None:
-            return
-        time.sleep(0.1)
-    raise AssertionError(f"{name} was not enrolled")
+    """Wait until a vehicle has a node."""
+    wait_for(
+        lambda: any(
+            own.name == name and own.node is not None
+            for own in open_authority(deployment.folder).registry.list_vehicles()
+        )
+    )
 
 
 def wait_refused(deployment, who, why):
     """Wait until the proxy has told of a refusal."""
-    end = time.monotonic() + 20
-    while not any(each.startswith(who) and each.endswith(why) for each in read_traffic(deployment.folder).refused):
-        assert time.monotonic() < end
-        time.sleep(0.1)
+    wait_for(
+        lambda: any(each.startswith(who) and each.endswith(why) for each in read_traffic(deployment.folder).refused)
+    )
 
 
 def test_registered_vehicle_comes_in_and_a_revoked_one_is_out_at_once(deployment, authority, tmp_path):
@@ -128,11 +128,15 @@ def test_clock_that_is_off_is_named_and_comes_in_once_corrected(late_s, told, de
 
 
 def test_expired(deployment, authority, tmp_path):
-    own = a_vehicle(authority, tmp_path, "short-lived", days=3 / 86400)
+    own = a_vehicle(authority, tmp_path, "short-lived", days=8 / 86400)
     with reach(deployment, own) as client:
         assert activate(client, load_key(own / KEY)).status_code != 401  # but it may not be enrolled yet
-        time.sleep(3.5)
-        late = activate(client, load_key(own / KEY))  # TLS has looked at the date when the connection began
+
+        def call_late():  # on the same connection: TLS has looked at the date when it began
+            answer = activate(client, load_key(own / KEY))
+            return answer if answer.status_code == 401 else None
+
+        late = wait_for(call_late, every_s=1.0)
     assert (late.status_code, late.text) == (401, "the certificate of short-lived is expired")
     with reach(deployment, own) as client, pytest.raises(httpx.TransportError):
         activate(client, load_key(own / KEY))
@@ -149,15 +153,16 @@ def test_fl_request_sent_twice(deployment):
         send_request(one, server, asked)
     before = read_processes(deployment.folder)["proxy"]
     os.kill(before, signal.SIGKILL)
-    end = time.monotonic() + 60
-    while True:
+
+    def is_refused():
         try:
             with pytest.raises(InputError, match="a request with this nonce came before"):
                 send_request(another, server, asked)
-            break
         except OSError:  # the proxy is starting
-            assert time.monotonic() < end
-            time.sleep(0.2)
+            return False
+        return True
+
+    wait_for(is_refused)
     assert read_processes(deployment.folder)["proxy"] != before
     came = [each for each in read_status(deployment.folder).requests if each not in earlier]
     assert [(each.vehicle, each.request) for each in came] == [(one.name, asked)]
@@ -249,13 +254,9 @@ def ask(deployment, app, signature):
     run.identify()
     node = node_of(deployment, "vehicle-001").node_id
     sent = run.grid.push_messages([Message(RecordDict(), node, MessageType.QUERY)])
-    end = time.monotonic() + 60
-    while time.monotonic() < end:
-        if found := [*run.grid.pull_messages(sent)]:
-            run.end()
-            return found[0]
-        time.sleep(0.2)
-    raise AssertionError("no answer")
+    (found,) = wait_for(lambda: [*run.grid.pull_messages(sent)])
+    run.end()
+    return found
 
 
 def test_tampered_app(deployment, tmp_path):

@@ -3,7 +3,6 @@
 import os
 import signal
 import ssl
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import httpx
 import pytest
 from release_drives import Drives, make_frame
 from release_parties import write_noisy, write_weights
+from waiting import LONGEST_S, read_all_traffic, wait_for
 
 from flcav.cli.main import run
 from flcav.config import InputError
@@ -22,7 +22,6 @@ from flcav.federation.fleet.keys import AUTHORITY, request_certificate, take_cer
 from flcav.federation.fleet.releases.offer import LARGEST_FILE, read_reports
 from flcav.federation.fleet.status import read_status
 from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.fleet.up import VEHICLES, read_ready
 from flcav.federation.fleet.vehicle import VehicleSettings
 from flcav.federation.messages.release_report import LARGEST, RELEASES, REPORT, ReleaseReport, ShadowReport
@@ -41,7 +40,6 @@ from flcav.releases.rollout.updater import FOLDER, open_client
 from flcav.releases.vehicles.installation import Installed, read_installed
 from flcav.storage.files import sha256
 
-LONGEST_S = 900  # that anything takes on a busy machine
 NAMES = [f"vehicle-{number:03d}" for number in (1, 2, 3)]
 
 
@@ -131,17 +129,10 @@ def test_every_byte_of_the_first_release_is_booked(parties):
     metadata = sum(path.stat().st_size for path in parties.folder.glob("*/repository/metadata/*.json"))
     for entry in entries:
         assert size < entry.bytes < size + metadata + 100_000  # looks at the timestamp, TLS
-    crossed = read_traffic(parties.fleet).vehicles
-    assert all(crossed[name].socket_down >= crossed[name].release_down >= size for name in NAMES)
-
-
-def wait_for(what):
-    """Return what `what` returns once that is something."""
-    end = time.monotonic() + LONGEST_S
-    while not (found := what()):
-        assert time.monotonic() < end
-        time.sleep(0.02)
-    return found
+    crossed = read_all_traffic(parties.fleet).vehicles
+    for entry in entries:
+        own = crossed[entry.client]
+        assert own.socket_down >= own.release_down >= entry.bytes
 
 
 def test_canaries_first_and_killed_in_mid_update(parties):

@@ -5,10 +5,10 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import yaml
+from waiting import wait_for
 
 RECIPE = {
     "seed": 1,
@@ -26,7 +26,6 @@ RECIPE = {
 CLOUD = "cloud-fl-weather"
 FEDERATING = "ring-edge-fl-weather", "grid-edge-fl-weather", CLOUD
 KEPT = ".safetensors", ".parquet"
-LIMIT_S = 600.0
 
 
 def command(recipe: Path, out: Path, *more: str) -> list[str]:
@@ -41,11 +40,8 @@ def run_to_the_end(asked: list[str]) -> None:
 def kill_after_first_cloud_round(asked: list[str], out: Path) -> None:
     """Run a command until its first cloud round is kept, and kill it with its group."""
     process = subprocess.Popen(asked, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-    end = time.monotonic() + LIMIT_S
-    while not (out / "work" / CLOUD / "round1.safetensors").exists():
-        assert process.poll() is None
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    wait_for(lambda: process.poll() is not None or (out / "work" / CLOUD / "round1.safetensors").exists())
+    assert process.poll() is None
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert not (out / "work" / CLOUD / "done.json").exists()

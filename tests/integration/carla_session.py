@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 DT_S = 0.05
+LONGEST_S = 300.0  # that one measurement takes on a busy machine
 
 
 @contextmanager
@@ -175,8 +176,8 @@ def sensors(client: Any) -> None:
         }
         slow = listen(world, "sensor.other.gnss", car, sensor_tick=0.1)
         frames = [world.tick() for _ in range(4)]
-        got = {name: [box.get(timeout=20) for _ in frames] for name, box in sent.items()}
-        assert [slow.get(timeout=5).frame for _ in range(2)] == frames[::2]
+        got = {name: [box.get(timeout=LONGEST_S) for _ in frames] for name, box in sent.items()}
+        assert [slow.get(timeout=LONGEST_S).frame for _ in range(2)] == frames[::2]
         for name, measured in got.items():
             assert [each.frame for each in measured] == frames, name
         last = {name: measured[-1] for name, measured in got.items()}
@@ -216,7 +217,7 @@ def events(client: Any) -> None:
             listen(world, "sensor.other.obstacle", car, distance=20),
         )
         world.tick()
-        obstacle = seen.get(timeout=5)
+        obstacle = seen.get(timeout=LONGEST_S)
         assert obstacle.other_actor.id == other.id
         assert 1 < obstacle.distance < 9
         car.apply_control(carla.VehicleControl(throttle=1.0))
@@ -224,7 +225,7 @@ def events(client: Any) -> None:
             world.tick()
             if not hits.empty():
                 break
-        hit = hits.get(timeout=5)
+        hit = hits.get(timeout=LONGEST_S)
         assert hit.actor.id == car.id
         assert hit.other_actor.id == other.id
         assert hit.normal_impulse.dot(ahead.get_forward_vector()) < 0
@@ -276,7 +277,7 @@ SESSIONS = {each.__name__: each for each in (the_world, actors, walkers, sensors
 
 if __name__ == "__main__":
     genuine = carla.Client("127.0.0.1", int(sys.argv[2]))
-    genuine.set_timeout(60.0)
+    genuine.set_timeout(LONGEST_S)
     SESSIONS[sys.argv[1]](genuine)
     time.sleep(0.1)
     print("passed", flush=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgpack
 import pytest
+from waiting import LONGEST_S
 
 from flcav.cli.main import run
 from flcav.sources.carla.server import wire
@@ -60,13 +61,17 @@ def test_the_genuine_client(session, port):
     pytest.importorskip("carla", reason="needs the extra 'carla'")
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     done = subprocess.run(
-        [sys.executable, str(SESSION), session, str(port)], capture_output=True, text=True, timeout=300, env=environment
+        [sys.executable, str(SESSION), session, str(port)],
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_S,
+        env=environment,
     )
     assert done.stdout.endswith("passed\n"), done.stdout + done.stderr
 
 
 def _ask(port: int, message: bytes) -> bytes:
-    with socket.create_connection(("127.0.0.1", port), timeout=30) as link:
+    with socket.create_connection(("127.0.0.1", port), timeout=LONGEST_S) as link:
         link.sendall(message)
         link.shutdown(socket.SHUT_WR)
         answer = b""
@@ -88,7 +93,7 @@ def test_messages_that_no_client_sends_leave_the_server_up(port):
 
 def test_a_cue_is_answered_after_the_state_of_its_tick(port):
     """A client that has the answer before polls for the state, with a core that the sensors need."""
-    with socket.create_connection(("127.0.0.1", port), timeout=30) as link, socket.socket() as stream:
+    with socket.create_connection(("127.0.0.1", port), timeout=LONGEST_S) as link, socket.socket() as stream:
         unpacker = msgpack.Unpacker()
 
         def call(method, *arguments):
@@ -128,7 +133,7 @@ def test_it_ends_without_a_word_about_its_clients_and_leaves_nothing(how, code, 
             stream.sendall(b"\x01\x00\x00\x00")
             stream.recv(1)
             server.send_signal(how)
-            _, errors = server.communicate(timeout=30)
+            _, errors = server.communicate(timeout=LONGEST_S)
     assert (server.returncode, errors) == (code, told)
     assert list(tmp_path.iterdir()) == []
 

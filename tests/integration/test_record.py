@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from waiting import LONGEST_S
 
 from flcav.cli.main import run
 from flcav.config import read_config
@@ -81,7 +82,7 @@ def test_a_scene_s_frames_are_recorded_by_several_processes(recipe: Path, tmp_pa
         assert process.poll() is None
         time.sleep(0.002)
     process.kill()
-    process.wait(20)
+    process.wait(LONGEST_S)
     simulated = traffic.stat().st_mtime_ns
     record(EmbeddedSource(Recipe.model_validate(long)), two, jobs=1)
     assert digests(one) == digests(two)
@@ -112,7 +113,7 @@ def test_interrupted_then_finished(recipe: Path, reference: Path, tmp_path: Path
         assert process.poll() is None
         time.sleep(0.002)
     process.send_signal(number)
-    _, said = process.communicate(timeout=20)
+    _, said = process.communicate(timeout=LONGEST_S)
     if number == signal.SIGINT:
         assert process.returncode == 130
         assert "Traceback" not in said

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 from toy_run import RECIPE, TOY, timeless, without
+from waiting import LONGEST_S, wait_for
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
@@ -165,15 +166,17 @@ def test_a_stopped_run_leaves_no_process_behind(number: signal.Signals, tmp_path
         os.killpg(process.pid, number)  # as the terminal does
     else:
         process.send_signal(number)  # the parent alone
-    _, said = process.communicate(timeout=30)
+    _, said = process.communicate(timeout=LONGEST_S)
     assert "Traceback" not in said
     if number == signal.SIGINT:
         assert process.returncode == 130
         assert said.endswith("flcav: interrupted; the same command goes on where it stopped\n")
-    for _ in range(300):
+
+    def is_empty():
         try:
             os.killpg(process.pid, 0)
         except ProcessLookupError:
-            return
-        time.sleep(0.1)
-    pytest.fail("processes of a stopped run go on")
+            return True
+        return False
+
+    wait_for(is_empty, tell=lambda: "processes of a stopped run go on")
