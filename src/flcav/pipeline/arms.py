@@ -99,7 +99,15 @@ class Setting:
     @property
     def edge_federation(self) -> Federation:
         """Return the federation without what decides stage III alone."""
-        of_cloud = ("personal", "cloud_strategy", "cloud_rate", "replay", "score_statistics", "cloud_topics")
+        of_cloud = (
+            "personal",
+            "cloud_strategy",
+            "cloud_rate",
+            "cloud_start_share",
+            "replay",
+            "score_statistics",
+            "cloud_topics",
+        )
         return self.federation.model_copy(update={name: Federation.model_fields[name].default for name in of_cloud})
 
 

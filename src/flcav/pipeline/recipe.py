@@ -289,6 +289,7 @@ class Federation(Rules):
     cloud_rate: float | None = Field(
         default=None, gt=0
     )  # learning rate of the first cloud round; default: `final_rate`
+    cloud_start_share: float = Field(default=0.0, ge=0, lt=1)  # of the pretrained weights in the result of stage III
     replay: float = Field(
         default=0.0, ge=0, lt=1
     )  # weight in the cloud's averages of its own training on the samples of stage I, which it has

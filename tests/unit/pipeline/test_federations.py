@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from federated_recipes import PRIVACY, settings
 from line_task import LineTask, Slope
+from safetensors.numpy import load_file
 
 from flcav.config import InputError
 from flcav.federation.privacy import account_epsilon
@@ -38,6 +39,7 @@ from flcav.pipeline.steps.cloud import (
     score_statistics,
 )
 from flcav.pipeline.training import statistics
+from flcav.pipeline.training.checkpoints import round_path
 from flcav.pipeline.training.edge_rounds import EdgeFederation, federate_edge
 from flcav.pipeline.training.learning import Learning, Strategies, load_stage_network, make_clients
 from flcav.pipeline.training.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
@@ -313,6 +315,28 @@ def test_cloud_rounds_begin_the_learning_rate_anew_where_that_is_asked_for_and_s
         )
         assert rates == pytest.approx(expected)
         rates.clear()
+
+
+def test_a_share_of_the_pretrained_weights_is_in_the_result_of_stage_three(tmp_path: Path) -> None:
+    """By hand, from the files of the last two of three rounds; no round and no message changes."""
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2, average_rounds=2), 3)
+    network = learning.build_network()
+    clients = make_clients(learning, Slope(), {"a/cav0": [np.float32(1), np.float32(2)]})
+    starts = {"a": RegionStart(clients, {name: array + 1 for name, array in to_arrays(network).items()}, earlier=2)}
+    books = {share: Ledger(LinkMegabytes(1.0, 1.0)) for share in (0.0, 0.75)}
+    for share, book in books.items():
+        how = (Strategies(FEDAVG, FEDAVG), book, tmp_path / str(share), ignore_progress)
+        federation = CloudFederation(learning, network, starts, dict.fromkeys(starts, 1), *how, start_share=share)
+        federate_cloud(federation, 3, Rules())
+    found = to_arrays(load_stage_network(learning.task, tmp_path / "0.75"))
+    rounds = [load_file(round_path(tmp_path / "0.0", number)) for number in (2, 3)]
+    for name, begun in to_arrays(network).items():
+        wanted = 0.75 * begun + 0.25 * (rounds[0][name] + rounds[1][name]) / 2
+        np.testing.assert_allclose(found[name], wanted, rtol=1e-6)
+        assert not np.allclose(wanted, begun)
+    assert books[0.0].entries == books[0.75].entries
+    _, (main, shared) = settings({"shared": {"cloud_start_share": 0.75}})
+    assert shared.edge_federation == main.edge_federation
 
 
 def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:

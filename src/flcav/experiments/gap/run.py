@@ -39,10 +39,20 @@ MISSED, UNSURE = "ground truth, missed objects background", "ground truth, misse
 FAR, OCCLUDED = "ground truth, missed far objects background", "ground truth, missed occluded objects background"
 FALSE, BOXES, PRESENCE = "ground truth, and false boxes", "ground truth, boxes of tracks", "ground truth, no boxes"
 ROAD, TRACKS, JOINED = "edge FL on road labels", "edge FL on tracks", "edge FL on road labels and tracks"
-GLOBAL, REPLAY, FROZEN, IMITATING = (
-    f"edge + cloud FL on tracks{how}" for how in ("", ", with replay", ", head frozen", ", with imitation")
+GLOBAL, REPLAY, FROZEN, IMITATING, HALF, QUARTER = (
+    f"edge + cloud FL on tracks{how}"
+    for how in (
+        "",
+        ", with replay",
+        ", head frozen",
+        ", with imitation",
+        ", half pretrained",
+        ", three quarters pretrained",
+    )
 )
-GLOBAL_TRUTH, GLOBAL_PRESENCE = "edge + cloud FL on ground truth", "edge + cloud FL on ground truth, no boxes"
+GLOBAL_TRUTH, QUARTER_TRUTH, GLOBAL_PRESENCE = (
+    f"edge + cloud FL on ground truth{how}" for how in ("", ", three quarters pretrained", ", no boxes")
+)
 ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     PRETRAINED: (MAIN, PRETRAIN),
     ROAD: ("road", EDGE),
@@ -65,7 +75,10 @@ ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     REPLAY: (MAIN, CLOUD),
     FROZEN: ("frozen", CLOUD),
     IMITATING: ("imitating", CLOUD),
+    HALF: ("half", CLOUD),
+    QUARTER: ("three_quarters", CLOUD),
     GLOBAL_TRUTH: ("truth", CLOUD),
+    QUARTER_TRUTH: ("truth_three_quarters", CLOUD),
     GLOBAL_PRESENCE: ("presence", CLOUD),
     ORACLE: ("oracle", CENTRAL),
 }

@@ -106,6 +106,7 @@ class CloudFederation:
     shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
     keeps_statistics: bool = False  # whether each region's statistics of batch normalisation are written, too
     rate: float | None = None  # of the first round, where it is restarted
+    start_share: float = 0.0  # of the network that the cloud begins with in the result
     replay: TaskClient | None = None  # the cloud's own training on the samples of stage I
     replay_share: float = 0.0  # of it in each of the cloud's averages
     topics: str | None = None  # ROS namespace by which edge servers and cloud exchange messages; None: in memory
@@ -232,7 +233,7 @@ def federate_cloud(
             on_round=partial(_keep_round, own, servers, state, checkpoints),
             runtime=own.open_topics(done),
         )
-    losses = checkpoints.finish(own.network, learning.training.average_rounds)
+    losses = checkpoints.finish(own.network, learning.training.average_rounds, own.start_share)
     if rules.personal:
         _save_regional_models(learning, own.folder, states)
     return losses
@@ -388,6 +389,7 @@ def _open_federation(
         shared=shared,
         keeps_statistics=bool(settings.validation),
         rate=settings.federation.cloud_rate,
+        start_share=settings.federation.cloud_start_share,
         replay=_open_replay(work, settings, learning, start.config) if settings.federation.replay else None,
         replay_share=settings.federation.replay,
         topics=settings.federation.cloud_topics,

@@ -16,7 +16,7 @@ from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.engine import Step, Work
 from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import SweepComparison, SweepDetections, Tested
 from flcav.pipeline.results.training import ScoredRound, StageResult, Watched
@@ -186,6 +186,7 @@ def list_validations(outline: Outline, stage: str, task: str) -> Iterator[Step]:
     names, main = outline.names, outline.settings[MAIN]
     for region in main.regions:
         trained, training = names.stage(MAIN, stage, region, task), main.training[task]
+        shares = {EDGE: training.start_share, CLOUD: main.federation.cloud_start_share}
         settings = RoundsSettings(
             task=task,
             region=region,
@@ -194,7 +195,7 @@ def list_validations(outline: Outline, stage: str, task: str) -> Iterator[Step]:
             trained=trained,
             frames=names.recording(region, "validation", task),
             averaged=training.average_rounds,
-            share=training.start_share if stage == EDGE else 0.0,
+            share=shares.get(stage, 0.0),
         )
         yield make_step(names.rounds(trained, region), rounds_step, settings)
 
