@@ -42,7 +42,7 @@ from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.tests import Difference
-from flcav.pipeline.results.training import Pretrained
+from flcav.pipeline.results.training import Pretrained, StageResult
 from flcav.pipeline.running import RESULTS, run
 from flcav.pipeline.steps.graph import Graph
 from flcav.pipeline.tables import parse_history
@@ -119,7 +119,19 @@ def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(
 ) -> None:
     """Both stages take the tracks of one step; the cloud's own training crosses no link; a frozen head stays."""
     recipe = shrunk("gap")
-    asked = ("joined", "truth", "missed", "occlusion", "bare", "frozen", "imitating", "longer", "longest", "sweeps6")
+    asked = (
+        "joined",
+        "truth",
+        "missed",
+        "occlusion",
+        "bare",
+        "frozen",
+        "imitating",
+        "longer",
+        "longest",
+        "sweeps6",
+        "joint",
+    )
     arms = {name: arm for name, arm in recipe.arms.items() if name in asked}
     recipe = recipe.model_copy(update={"arms": arms})
     found = run(recipe, tmp_path)
@@ -165,6 +177,17 @@ def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(
         assert not np.array_equal(blind, seen)
     backbone = next(name for name in ended["frozen"] if name.startswith("backbone") and name.endswith("weight"))
     assert not np.array_equal(ended["frozen"][backbone], ended[PRETRAIN][backbone])
+
+    joint, edge = (StageResult.load(work / step) for step in ("central-objects-joint", "grid-edge-fl-objects"))
+    uploaded = Pretrained.load(work / "pretrain-objects").uploaded
+    assert joint.samples == sum(map(len, uploaded.values())) + edge.samples
+    assert (joint.region, joint.rounds) == (None, edge.rounds)
+    tested = {test.region for test in found.tested if test.arm == "joint"}
+    assert tested == {"suburb", "grid"}
+    against = {
+        (each.region, each.stage) for each in found.differences if (each.arm, each.before_arm) == (MAIN, "joint")
+    }
+    assert against == {("suburb", CLOUD), ("grid", CLOUD)}
 
     book = Ledger.load(work / "grid-central-objects-sweeps6" / LEDGER)
     (upload,) = (row.bytes / 1e6 for row in book.entries if row.link == "wireless")  # of the one frame there is

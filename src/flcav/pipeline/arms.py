@@ -84,7 +84,7 @@ class Setting:
     distillation: Distillation  # where the labels are the road average
     federation: Federation
     training: Mapping[str, Training]  # by task
-    central: Literal["pretrain", "federate"] | None
+    central: Literal["pretrain", "federate", "all"] | None
     uploads: int | None  # frames of each region that centralised training has; None: all
     regions: tuple[str, ...]  # that federate
     stages: tuple[str, ...]  # after pretraining
@@ -411,8 +411,8 @@ class Names:
         return f"{CLOUD}-fl-{task}" + self._suffix(arm, LEARNED, task)
 
     def central(self, arm: str, region: str, task: str) -> str:
-        """Return the centralised training of an arm in a region; further pretraining is the same in all."""
-        shared = self._settings[arm].central == PRETRAIN
+        """Return the centralised training of an arm in a region; but on the region's own frames it is one for all."""
+        shared = self._settings[arm].central != "federate"
         return f"{CENTRAL}-{task}-{arm}" if shared else f"{region}-{CENTRAL}-{task}-{arm}"
 
     def stage(self, arm: str, stage: str, region: str, task: str) -> str:

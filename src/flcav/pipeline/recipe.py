@@ -27,6 +27,7 @@ from flcav.world.weather import WeatherSchedule
 
 MAIN = "main"  # the arm that the recipe itself describes
 PRETRAIN, EDGE, CLOUD, CENTRAL = "pretrain", "edge", "cloud", "central"
+ALL = "all"  # regions that centralised training is on
 TRACKING = "tracking"  # of the objects around training frames, for labels of stages II and III
 ELSEWHERE = "elsewhere"  # the claim that federated learning helps in regions that do not federate
 MORE_EDGE = "more_edge"  # after stage II: as many further edge rounds as stage III has, without the cloud
@@ -320,8 +321,8 @@ class Arm(Config):
     fault: Fault | None = None  # learn from ground truth with this one fault of the labels, which come from tracks
     distillation: Mapping[str, Any] = {}  # fields of `Distillation` that differ from the run
     training: Mapping[str, Any] = {}  # fields of `Training` that differ from the run, for every task
-    central: Literal["pretrain", "federate"] | None = (
-        None  # train centrally on the ground truth of the regions of this role
+    central: Literal["pretrain", "federate", "all"] | None = (
+        None  # train centrally on the ground truth of the regions of this role; all: one network on that of both
     )
     uploads: int | None = Field(
         default=None, ge=1
@@ -475,8 +476,8 @@ class RunRecipe(Config):
         return Requests.model_validate(self._name_requests(self.lifelong))
 
     def _check_arm(self, name: str, arm: Arm) -> None:
-        if arm.central == PRETRAIN and not all(task.pretrains for task in self.tasks.values()):
-            raise ValueError(f"arms.{name}.central: more pretraining goes with samples of stage I, and a plan has none")
+        if arm.central in (PRETRAIN, ALL) and not all(task.pretrains for task in self.tasks.values()):
+            raise ValueError(f"arms.{name}.central: '{arm.central}' goes with samples of stage I, and a plan has none")
         federating = self.with_role("federate")
         for field, known in (("regions", federating), ("labels", tuple(self.tasks))):
             for each in getattr(arm, field) or ():

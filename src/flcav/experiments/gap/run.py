@@ -24,6 +24,7 @@ from flcav.storage.records import Record
 
 TASK, TOWN, HOME = "objects", "grid", "suburb"
 PRETRAINED, ORACLE = "pretrained", "centralised on ground truth"
+JOINT, LONG_JOINT = (f"centralised on ground truth of both towns{how}" for how in ("", ", four times the steps"))
 TRUTH, TWICE, FOURFOLD, COARSE, LONGER, LONGEST = (
     f"edge FL on ground truth{how}"
     for how in (
@@ -80,9 +81,15 @@ ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     GLOBAL_TRUTH: ("truth", CLOUD),
     QUARTER_TRUTH: ("truth_three_quarters", CLOUD),
     GLOBAL_PRESENCE: ("presence", CLOUD),
+    JOINT: ("joint", CENTRAL),
+    LONG_JOINT: ("joint_fourfold", CENTRAL),
     ORACLE: ("oracle", CENTRAL),
 }
-AT_HOME = tuple(name for name, (_, stage) in ARMS.items() if stage in (PRETRAIN, CLOUD))  # scored there, too
+AT_HOME = (
+    *(name for name, (_, stage) in ARMS.items() if stage in (PRETRAIN, CLOUD)),
+    JOINT,
+    LONG_JOINT,
+)  # scored there, too
 COMPARED = (  # (after, before): claims that the difference in AP50 is positive
     (TRUTH, PRETRAINED),
     (TRACKS, PRETRAINED),

@@ -10,7 +10,7 @@ from flcav.perception.outcomes import Outcomes, Values, difference, share_test_s
 from flcav.perception.tasks import task_named
 from flcav.pipeline.analysis.findings import is_joint, name_stage, pair_of
 from flcav.pipeline.arms import Setting, name_repeat
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
+from flcav.pipeline.recipe import ALL, CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.pipeline.results.saved import OUTCOMES
 from flcav.pipeline.results.tests import Difference, RegionalTest, Test, Tested
 from flcav.pipeline.spread import difference_key, test_key
@@ -102,7 +102,7 @@ def list_differences(graph: Graph, work: Path) -> list[Difference]:
                 earlier = EDGE if stage in (CLOUD, MORE_EDGE) and region in arm.regions else PRETRAIN
                 pairs.append(((arm.name, stage), (arm.name, earlier), region, task))
             if arm.name != MAIN and (region in main.regions or stage != EDGE):
-                own = {CENTRAL: EDGE, MORE_EDGE: CLOUD}.get(stage, stage)
+                own = CLOUD if arm.central == ALL else {CENTRAL: EDGE, MORE_EDGE: CLOUD}.get(stage, stage)
                 pairs.append(((MAIN, own), (arm.name, stage), region, task))
     found: dict[tuple[str, str], Difference] = {}
     for after, before, region, task in pairs:

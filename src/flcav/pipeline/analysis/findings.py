@@ -20,7 +20,7 @@ import numpy as np
 
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.label_sources import LABEL_SOURCES
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, ELSEWHERE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
+from flcav.pipeline.recipe import ALL, CENTRAL, CLOUD, EDGE, ELSEWHERE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference, RunFinding, Test
 from flcav.statistics.seeds import MeanOverSeeds, of_one_training
@@ -105,7 +105,7 @@ def _name_claim(each: Difference) -> str:
 def _is_bound(own: Setting, other: Setting, task: str) -> bool:
     """Return whether an arm is an upper bound of the run: it learns from truth that the run does not have."""
     first, second = (LABEL_SOURCES[each.labels[task]].bound or each.fault is not None for each in (own, other))
-    return other.central == "federate" or (second and not first)
+    return other.central in ("federate", ALL) or (second and not first)
 
 
 def _question(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) -> str:

@@ -24,7 +24,7 @@ from flcav.pipeline.frames import Frames
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.labels.pseudo_labels import fit_label_threshold
 from flcav.pipeline.labels.tracks import fit_track_threshold
-from flcav.pipeline.recipe import CENTRAL, EDGE, PRETRAIN, Budgets
+from flcav.pipeline.recipe import ALL, CENTRAL, EDGE, PRETRAIN, Budgets
 from flcav.pipeline.results.plans import Plan
 from flcav.pipeline.results.saved import LEDGER, WEIGHTS
 from flcav.pipeline.results.training import Pretrained, StageResult, Validated
@@ -208,6 +208,20 @@ class MoreSettings(StepSettings):
         return (self.plan, self.pretrain, *self.pools.values())
 
 
+class JointSettings(StepSettings):
+    """Settings of centralised training on the samples of stage I and on the annotated frames of all vehicles."""
+
+    learning: LearningSettings
+    regions: Mapping[str, RegionInputs]  # whose vehicles' frames it has
+    pools: Mapping[str, str]  # recordings of the candidates for upload, by region
+    vehicles: int  # whose local steps it takes: those of the largest region
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Return the names of the steps whose results it takes."""
+        return (*self.pools.values(), *(step for inputs in self.regions.values() for step in inputs.needs))
+
+
 class OracleSettings(StepSettings):
     """Settings of centralised training on the annotated frames of a region's vehicles."""
 
@@ -229,6 +243,18 @@ def more_step(work: Work, settings: MoreSettings) -> None:
     trained = load_stage_network(learning.task, work.inputs[settings.pretrain])
     samples = load_uploads(work, learning, trained.config, settings.pretrain, settings.pools)
     _train_on(work, learning, trained, samples, settings.plan, settings.vehicles, None)
+
+
+def joint_step(work: Work, settings: JointSettings) -> None:
+    """Continue training centrally on ground truth of all regions, for as many steps as stage II takes in the largest."""
+    learning, (first, *_) = settings.learning.resolve(), settings.regions.values()
+    trained = load_stage_network(learning.task, work.inputs[first.pretrain])
+    samples = load_uploads(work, learning, trained.config, first.pretrain, settings.pools)
+    for inputs in settings.regions.values():
+        split = Frames.open(work.inputs[inputs.frames])
+        held = learning.task.samples(split.data, trained.config, select_group(work, split, inputs))
+        samples += [held[number] for number in range(len(held))]
+    _train_on(work, learning, trained, samples, first.plan, settings.vehicles, None)
 
 
 def oracle_step(work: Work, settings: OracleSettings) -> None:
@@ -276,6 +302,15 @@ def list_central_steps(outline: Outline, arm: Setting, task: str) -> Iterator[St
             vehicles=max(outline.vehicles[region] for region in arm.regions),
         )
         yield make_step(names.central(arm.name, arm.regions[0], task), more_step, settings)
+        return
+    if arm.central == ALL:
+        settings = JointSettings(
+            learning=learning,
+            regions={region: outline.inputs(arm, region, task, CENTRAL) for region in arm.regions},
+            pools=outline.pools(task),
+            vehicles=max(outline.vehicles[region] for region in arm.regions),
+        )
+        yield make_step(names.central(arm.name, arm.regions[0], task), joint_step, settings)
         return
     for region in arm.regions:
         inputs = outline.inputs(arm, region, task, CENTRAL)

@@ -15,7 +15,19 @@ from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings
 from flcav.pipeline.frames import count_training_frames
 from flcav.pipeline.label_sources import LABEL_SOURCES, choose_labels
 from flcav.pipeline.labels.tracks import WINDOW_EVERY_S, WINDOW_S
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, Region, Role, RunRecipe, SplitName, find_path
+from flcav.pipeline.recipe import (
+    ALL,
+    CLOUD,
+    EDGE,
+    MAIN,
+    MORE_EDGE,
+    PRETRAIN,
+    Region,
+    Role,
+    RunRecipe,
+    SplitName,
+    find_path,
+)
 from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.steps.settings import LearningSettings, RegionInputs
 from flcav.pipeline.training.starting_weights import find_start
@@ -50,15 +62,16 @@ class Outline:
     def tested(self, arm: Setting) -> list[tuple[str, str, str]]:
         """Return stage, region and task of every test of an arm.
 
-        Pretrained networks (of the run itself, and others) and those of cloud FL are tested in every region, others in
-        the regions that federate in the arm. Of a retraining it is what it is of the arm itself.
+        Pretrained networks (of the run itself, and others) and those for all regions, of cloud FL or centralised
+        training on all, are tested in every region, others in the regions that federate in the arm. Of a retraining it
+        is what it is of the arm itself.
         """
         tests, main = [], name_repeat(MAIN, arm.repeat)
         for task in self.recipe.tasks:
             if arm.name == main or self.names.pretrain(arm.name, task) != self.names.pretrain(main, task):
                 tests += [(PRETRAIN, region, task) for region in self.recipe.regions]
             for stage in arm.stages:
-                where = tuple(self.recipe.regions) if stage == CLOUD else arm.regions
+                where = tuple(self.recipe.regions) if stage == CLOUD or arm.central == ALL else arm.regions
                 tests += [(stage, region, task) for region in where]
         return tests
 
