@@ -60,7 +60,8 @@ def test_the_arms_are_those_of_the_recipe() -> None:
     assert {arm for arm, _ in ARMS.values()} == {MAIN, *RECIPE.arms} - {arm for arm, _ in list_uploads(RECIPE)}
     assert {name for pair in COMPARED for name in pair} <= {*ARMS}
     remedies = {arm: own for arm, own in RECIPE.arms.items() if "cloud" in own.stages and own.central is None}
-    assert {ARMS[name][0] for name in AT_HOME} == {MAIN, *remedies}
+    joint = {arm for arm, own in RECIPE.arms.items() if own.central == "all"}
+    assert {ARMS[name][0] for name in AT_HOME} == {MAIN, *remedies, *joint}
     assert {own.federation["replay"] for own in remedies.values()} == {0}  # one remedy at a time
     assert {*FEDERATED.values()} <= {MAIN, *RECIPE.arms}
     assert [number for _, number in list_uploads(RECIPE)] == [6, 15, 30, 59]

@@ -246,7 +246,7 @@ def more_step(work: Work, settings: MoreSettings) -> None:
 
 
 def joint_step(work: Work, settings: JointSettings) -> None:
-    """Continue training centrally on ground truth of all regions, for as many steps as stage II takes in the largest."""
+    """Continue training centrally on ground truth of all regions, as long as stage II takes in the largest."""
     learning, (first, *_) = settings.learning.resolve(), settings.regions.values()
     trained = load_stage_network(learning.task, work.inputs[first.pretrain])
     samples = load_uploads(work, learning, trained.config, first.pretrain, settings.pools)
