@@ -38,7 +38,7 @@ class Spawn:
 
 @dataclass(frozen=True)
 class Remove:
-    """An actor disappears."""
+    """An actor disappears; of SUMO's traffic nobody sets out in its place."""
 
     name: str
 

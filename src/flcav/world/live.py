@@ -157,7 +157,11 @@ class LiveWorld:
             case commands.Spawn():
                 self._spawn(command)
             case commands.Remove(name):
-                bodies.remove(bodies.row(name))
+                if self._traffic is not None and name in self._flow.name:
+                    self._traffic.remove(name)
+                    self._flow = self._traffic.at(self._time_s)
+                else:
+                    bodies.remove(bodies.row(name))
             case commands.Drive(name, controls):
                 _check_numbers(controls.throttle, controls.steer, controls.brake)
                 _check_category(body := bodies.find(name), VEHICLES, "vehicle")

@@ -2,6 +2,7 @@
 
 import pickle
 import zlib
+from collections.abc import Mapping
 from functools import cached_property, lru_cache
 from hashlib import sha256
 from typing import NamedTuple
@@ -44,6 +45,7 @@ class Scene:
         Raises `OSError` where the ray casting engine is missing.
         """
         self.town = town
+        self.paints: Mapping[str, tuple[float, float, float]] = {}  # linear RGB by actor; others are painted by name
         self._engine = Embree()
         self._town_model = _town_model(town)
         self._cast(trace)

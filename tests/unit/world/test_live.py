@@ -326,6 +326,24 @@ def test_traffic_brakes_for_what_stands_in_its_way():
         assert speed(run(world, 60), name) > 2
 
 
+def test_traffic_that_is_removed_is_gone_and_nobody_sets_out_in_its_place():
+    with LiveWorld(load_town("grid"), BUSY) as world:
+        before = [name for name in run(world, 5).trace.actor.tolist() if not name.startswith("parked")]
+        gone = [next(name for name in before if name.startswith(kind)) for kind in ("veh", "ped")]
+        for name in gone:
+            world.apply(Remove(name))
+            assert name not in world.snapshot.trace.actor
+        moved = {name: place(world.snapshot, name) for name in before if name not in gone}
+        after = run(world, 40)
+        left = [name for name in after.trace.actor.tolist() if not name.startswith("parked")]
+        assert sorted(left) == sorted(moved)
+        assert max(float(np.linalg.norm(place(after, name) - begun)) for name, begun in moved.items()) > 3
+        with replay(world.town, BUSY, world.history) as again:
+            assert content(again.snapshot) == content(after)
+        with pytest.raises(InputError, match="there is none of this name"):
+            world.apply(Remove(gone[0]))
+
+
 def test_lights_are_those_of_sumo():
     town = load_town("grid")
     times = np.arange(1, 1200, 7) / 10

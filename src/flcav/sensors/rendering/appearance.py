@@ -1,6 +1,7 @@
 """Appearance tables of a scene: materials, semantic classes, colours and textures, by surface row and instance."""
 
 import zlib
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
@@ -147,7 +148,7 @@ def _appearance(scene: Scene, of_town: _OfTown) -> Appearance:
         first_actor=actors,
         corner=corner,
         corner_normal=corner_normal,
-        colour=_colours([str(name) for name in trace.actor]),
+        colour=_colours([str(name) for name in trace.actor], scene.paints),
         mirror=MIRROR,
         gloss=GLOSS,
         markings=of_town.markings,
@@ -170,13 +171,13 @@ def _corners(category: str, shape: int, size: tuple[float, ...]) -> tuple[NDArra
     return mesh.vertices[mesh.faces], mesh.corner_normals()
 
 
-def _colours(names: list[str]) -> NDArray[np.float32]:
-    """Return the colours (I, M, 3) by instance and material, chosen by a hash of each actor's name."""
+def _colours(names: list[str], paints_of: Mapping[str, tuple[float, float, float]]) -> NDArray[np.float32]:
+    """Return the colours (I, M, 3) by instance and material, chosen by a hash of each actor's name, or its paint."""
     out = np.tile(COLOUR, (len(names) + 1, 1, 1))
     for instance, name in enumerate(names, start=1):
         number = zlib.crc32(name.encode())
         paints = PAINT_COLOURS[number % len(PAINT_REFLECTIVITY)]
-        out[instance, Material.PAINT] = paints[number // len(PAINT_REFLECTIVITY) % len(paints)]
+        out[instance, Material.PAINT] = paints_of.get(name, paints[number // len(PAINT_REFLECTIVITY) % len(paints)])
         out[instance, Material.CLOTH] = CLOTH_COLOURS[number // 64 % len(CLOTH_COLOURS)]
         out[instance, Material.TROUSERS] = TROUSER_COLOURS[number // 1024 % len(TROUSER_COLOURS)]
         out[instance, Material.SKIN] *= SKIN_TONES[number // 8192 % len(SKIN_TONES)]

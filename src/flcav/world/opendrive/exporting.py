@@ -1,12 +1,14 @@
 """Export of a town's roads as an OpenDRIVE map, in the town's coordinates.
 
 netconvert writes the plan; what it leaves out or writes in its own way is put right here: the geo-reference, heights,
-and traffic lights, of which each approach gets one signal of CARLA's type, named "junction_link".
+where lanes may be changed, driving lanes that go on as lanes for bicycles alone, crosswalks, which end where they
+began, and traffic lights, of which each approach gets one signal of CARLA's type, named "junction_link".
 """
 
 import shutil
 import tempfile
 import xml.etree.ElementTree as ElementTree
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +39,14 @@ def export_town(town: Town) -> str:
     header.attrib["date"], header.attrib["name"] = "", town.name
     ElementTree.SubElement(header, "geoReference").text = _format_projection(town.geo)
     _keep_signals(root, {name_signal(link) for link in list_approaches(read_net(town.net)).values()})
+    _part_types(root)
+    for mark in root.iter("roadMark"):
+        if mark.get("type") != "none":
+            mark.set("laneChange", "none" if "solid" in mark.get("type", "") else "both")
+    for outline in root.iterfind(".//object[@type='crosswalk']/outline"):
+        last = deepcopy(outline[0])
+        last.set("id", str(len(outline)))
+        outline.append(last)
     if town.relief is not None:
         for road in root.iterfind("road"):
             _raise_road(road, town)
@@ -85,6 +95,36 @@ def _keep_signals(root: ElementTree.Element, kept: set[str]) -> None:
                 controller.remove(control)
         if not len(controller):
             root.remove(controller)
+
+
+def _part_types(root: ElementTree.Element) -> None:
+    """Let driving lanes lead through junctions to driving lanes alone, since cars cannot take others.
+
+    A lane across a junction that begins at a lane for bicycles is one for bicycles; netconvert calls it a driving lane.
+    """
+    roads = [(road.get("id"), road) for road in root.iterfind("road")]
+    lanes = {(number, lane.get("id")): lane for number, road in roads for lane in road.iter("lane")}
+
+    def differ(*ends: tuple[str | None, str | None]) -> bool:
+        kinds = {lanes[end].get("type") for end in ends}
+        return "driving" in kinds and len(kinds) > 1
+
+    for junction in root.iterfind("junction"):
+        for way in junction.findall("connection"):
+            for link in way.findall("laneLink"):
+                start, across = (way.get("incomingRoad"), link.get("from")), (way.get("connectingRoad"), link.get("to"))
+                if differ(start, across) and lanes[across].get("type") == "driving":
+                    lanes[across].set("type", lanes[start].get("type", ""))
+                elif differ(start, across):
+                    way.remove(link)
+            if way.find("laneLink") is None:
+                junction.remove(way)
+    for number, road in roads:
+        for beyond in road.iterfind("link/*[@elementType='road']"):
+            for lane in road.iter("lane"):
+                link = lane.find(f"link/{beyond.tag}")
+                if link is not None and differ((number, lane.get("id")), (beyond.get("elementId"), link.get("id"))):
+                    lane[0].remove(link)
 
 
 def _raise_road(road: ElementTree.Element, town: Town) -> None:

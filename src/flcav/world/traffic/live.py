@@ -62,6 +62,7 @@ class SumoTraffic:
         self._ground, self._town = ground, town
         self._kinds = {name: (category, shape) for name, category, shape in list_vehicle_types()}
         self._lights: dict[str, str] = {}
+        self._gone: list[str] = []  # who left since the last step of SUMO
         with tempfile.TemporaryDirectory(prefix="flcav_live_") as folder:
             job = write_live_job(town, Path(folder), seed=seed, vehicles=vehicles, pedestrians=pedestrians)
             self._sumo = Sumo(job)
@@ -76,9 +77,20 @@ class SumoTraffic:
         """
         changed = {name: state for name, state in lights.items() if self._lights.get(name) != state}
         self._lights |= changed
-        request = Request(_list_vehicles(bodies), _list_dangers(bodies), changed, halted)
+        request = Request(_list_vehicles(bodies), _list_dangers(bodies), changed, halted, self._gone)
         self._before, self._after = self._after, self._sumo.step(request)
+        self._gone = []
         self.ticks += 1
+        self._line_up()
+
+    def remove(self, name: str) -> None:
+        """Let a vehicle or pedestrian leave at once; no other sets out in its place."""
+        del self._before[name]
+        self._gone.append(name)
+        self._line_up()
+
+    def _line_up(self) -> None:
+        """Take those who are there both before and after the step of SUMO under way."""
         names = sorted((name for name in self._before if name in self._after), key=number_of)
         self._ends = tuple(
             np.array([state[name][1:] for name in names], np.float64).reshape(-1, 4)

@@ -44,6 +44,7 @@ class Request(NamedTuple):
     dangers: Sequence[Danger] = ()  # to brake for
     lights: Mapping[str, str] = {}  # letters of each junction's links, where they changed
     halted: Sequence[str] = ()  # vehicles that a collision has stopped
+    gone: Sequence[str] = ()  # SUMO's own vehicles and pedestrians that leave at once, and are not followed
 
 
 class Simulation:
@@ -83,6 +84,8 @@ class Simulation:
         """Make a step that obeys the request."""
         for light, state in request.lights.items():
             self.sumo.trafficlight.setRedYellowGreenState(light, state)
+        for name in request.gone:
+            self._remove(name)
         self._mirror(request.bodies if self._drives else ())
         for name in request.halted:
             if name in self._tours:
@@ -124,6 +127,14 @@ class Simulation:
         for name in sumo.simulation.getDepartedIDList():  # those whom a script has entered, too
             if name not in self._own:
                 self._tours[name] = _type_of(sumo.vehicle, name), list(sumo.vehicle.getRoute(name))
+
+    def _remove(self, name: str) -> None:
+        """Let one of SUMO's own leave, if it is still there."""
+        self._halted.pop(name, None)
+        if self._tours.pop(name, None) is not None:
+            self.sumo.vehicle.remove(name)
+        elif name in self._walkers.states:
+            self.sumo.person.remove(name)
 
     def _follow(self, name: str, kind: str, edges: list[str]) -> None:
         """Let the next vehicle enter when one has arrived, if there is a next one."""

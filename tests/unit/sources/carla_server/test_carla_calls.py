@@ -78,6 +78,8 @@ def test_two_wheelers_are_as_wide_as_their_riders():
         ("sensor.lidar.ray_cast", ("channels", "1e3"), "'channels' = 1e3 is not within 1 and 512"),
         ("sensor.lidar.ray_cast", ("range", "nan"), "'range' = nan is not within"),
         ("sensor.other.obstacle", ("only_dynamics", "maybe"), "neither true nor false"),
+        ("vehicle.audi.tt", ("color", "red"), "'color' = 'red' is no colour, such as 255,0,0"),
+        ("vehicle.audi.tt", ("color", "0,0,256"), "is no colour"),
     ],
 )
 def test_attributes_out_of_range_are_refused(name, attribute, told):
@@ -185,6 +187,95 @@ def test_sensors_are_due_every_sensor_tick(tick_s, due):
     taken = {tick: clock.take(tick * 0.05, 0.05) for tick in range(1, 7)}
     assert [tick for tick, elapsed in taken.items() if elapsed is not None] == due
     assert taken[due[-1]] == pytest.approx(max(tick_s, 0.05))
+
+
+def test_impulses_and_velocities_of_one_tick_add_up(calls):
+    """As where a reset stops a car and then its turning, or two bodies push it."""
+    car = invoke(calls, "spawn_actor", (describe("vehicle.tesla.model3"), place(calls))).id
+    actor = calls.episode.actors[car]
+    invoke(calls, "set_actor_target_velocity", (car, [9.0, 3.0, 0.0]))
+    calls.episode.step(0.05)
+    invoke(calls, "set_actor_target_velocity", (car, [0.0, 0.0, 0.0]))
+    invoke(calls, "set_actor_target_angular_velocity", (car, [0.0, 0.0, 0.0]))
+    assert calls.episode.motion(actor)[0].tolist() == [0.0, 0.0, 0.0]
+    mass = calls.episode.world.bodies.find(actor.name).blueprint.mass_kg
+    for _ in range(2):
+        invoke(calls, "add_actor_impulse", (car, [3.0 * mass, 0.0, 0.0]))
+    assert calls.episode.motion(actor)[0].tolist() == pytest.approx([6.0, 0.0, 0.0])
+
+
+def test_the_town_s_traffic_is_driven_and_destroyed_as_any_other(maps):
+    """It goes on from where it is; who reads of it leaves it to the town."""
+    calls = Calls(maps, "grid", seed=3, traffic=6, port=2000)
+    try:
+        for _ in range(40):
+            calls.episode.step(0.05)
+        first, second, *others = (each for each in calls.episode.actors.values() if each.kind == "vehicle")
+        for read in ("get_physics_control", "get_telemetry_data", "get_vehicle_light_state"):
+            invoke(calls, read, (second.id,))
+        assert invoke(calls, "get_wheel_steer_angle", (second.id, 0)) == 0
+        assert not calls.episode.is_own(second)
+        before = first.pose[:3, 3].copy()
+        batch = [
+            [[wire.COMMANDS.index("apply_control_to_vehicle"), [first.id, [0.0, 0.0, 1.0, False, False, False, 0]]]]
+        ]
+        assert invoke(calls, "apply_batch", (batch, False)) == [wire.succeed(first.id)]
+        assert calls.episode.is_own(first)
+        np.testing.assert_allclose(first.pose[:3, 3], before)
+        for _ in range(100):
+            calls.episode.step(0.05)
+        assert calls.episode.actors[first.id] is first
+        assert calls.episode.speed(first) == pytest.approx(0.0, abs=0.01)
+        for each in (first, second, *others):
+            assert invoke(calls, "destroy_actor", (each.id,)) is True
+        calls.episode.step(0.05)
+        assert not [each for each in calls.episode.actors.values() if each.kind == "vehicle"]
+        assert invoke(calls, "get_actor_bounding_box", (second.id,)).extent == (0.0, 0.0, 0.0)
+    finally:
+        calls.episode.close()
+
+
+def test_a_walker_whose_ai_is_stopped_stands_and_obeys_its_control(calls):
+    walker = invoke(calls, "spawn_actor", (describe("walker.pedestrian.0001"), place(calls))).id
+    actor = calls.episode.actors[walker]
+    invoke(calls, "set_actor_simulate_physics", (walker, False))
+    for _ in range(5):
+        invoke(calls, "set_walker_state", (walker, place(calls), 1.4))
+        calls.episode.step(0.05)
+        assert np.linalg.norm(actor.motion[0]) == pytest.approx(1.4)
+    for _ in range(20):
+        calls.episode.step(0.05)
+    assert np.linalg.norm(actor.motion[0]) == 0
+    begun = actor.pose[:2, 3].copy()
+    invoke(calls, "apply_control_to_walker", (walker, [[0.0, 1.0, 0.0], 1.4, False]))
+    for _ in range(20):
+        calls.episode.step(0.05)
+    assert np.linalg.norm(actor.pose[:2, 3] - begun) > 1
+
+
+def test_cars_have_the_colour_that_they_are_spawned_with(calls):
+    shares = {}
+    for colour in ("255,0,0", "0,0,255"):
+        car = invoke(calls, "spawn_actor", (describe("vehicle.tesla.model3", ("color", colour)), place(calls))).id
+        mount = [[-6.0, 0.0, 2.5], [-12.0, 0.0, 0.0]]
+        camera = invoke(
+            calls, "spawn_actor_with_parent", (describe("sensor.camera.rgb", *CAMERA), mount, car, 0, "")
+        ).id
+        calls.episode.step(0.05)
+        sensor = calls.episode.actors[camera].sensor
+        seen = calls.episode.look("images")().photograph(sensor).rgb[28:, 16:48].astype(float).mean((0, 1))
+        shares[colour] = seen / seen.sum()
+        invoke(calls, "destroy_actor", (camera,))
+        invoke(calls, "destroy_actor", (car,))
+    assert shares["255,0,0"][0] > 1.2 * shares["0,0,255"][0]
+    assert shares["0,0,255"][2] > 1.2 * shares["255,0,0"][2]
+
+
+def test_rays_that_meet_nothing_are_answered_as_clients_read_them(calls):
+    (x, y, z), _ = calls.episode.served.spawn_points[0]
+    assert invoke(calls, "project_point", ([x, y, z], [0.0, 0.0, 1.0], 5.0)) == [False, [(0.0, 0.0, 0.0), 0]]
+    hit, (_, tag) = invoke(calls, "project_point", ([x, y, z], [0.0, 0.0, -1.0], 5.0))
+    assert (hit, tag) == (True, 1)
 
 
 def test_weather_is_clear_at_zero_and_thick_at_a_hundred():

@@ -43,6 +43,7 @@ class Actor:
     name: str = ""  # of its body in the live world; empty without one
     category: str = ""  # of that body
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)  # length, width, height [m]
+    paint: wire.Vector | None = None  # linear RGB, of a vehicle that a client spawned
     parent: int = 0
     mount: Array | None = None  # (4, 4) parent from actor, of one that is attached
     stream: int = 0  # of a sensor
@@ -57,6 +58,7 @@ class Actor:
     lamps: int = 0  # flags of a vehicle's lamps
     simulated: bool = True
     falling: bool = True
+    guided_s: float = 0.0  # time at which its AI last placed a walker
     constant: Array | None = None  # (3,) velocity that is kept up, in the body's frame [m/s]
     events: list[bytes] = field(default_factory=list)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
+from zlib import crc32
 
 from flcav.config import shorten
 from flcav.interface.wording import suggest
@@ -11,6 +12,7 @@ from flcav.world.map.parameters import CLUTTER
 from flcav.world.shapes import SHAPES
 
 COLOURS = ("17,37,103", "107,18,14", "180,180,180", "25,25,25", "230,230,230")
+GAMMA = 2.2  # of sRGB, about
 LARGEST_INT = 2**31
 
 
@@ -99,8 +101,24 @@ def _check_value(name: str, variation: wire.Variation, field: Field | None, valu
             raise Refused(f"{name}: attribute '{variation.id}' = {shorten(value)} is no number") from None
         if not low <= number <= high:
             raise Refused(f"{name}: attribute '{variation.id}' = {value} is not within {low:g} and {high:g}")
+    elif variation.type == COLOUR and not _is_colour(value):
+        raise Refused(f"{name}: attribute '{variation.id}' = {shorten(value)} is no colour, such as 255,0,0")
     elif variation.type == BOOL and value.lower() not in ("true", "false", "0", "1"):
         raise Refused(f"{name}: attribute '{variation.id}' = {shorten(value)} is neither true nor false")
+
+
+def find_paint(description: wire.Description) -> wire.Vector | None:
+    """Return the linear RGB of the attribute "color" of a checked description, of sRGB; None where it has none."""
+    told = next((each.value for each in description.attributes if each.type == COLOUR), None)
+    if told is None:
+        return None
+    red, green, blue = ((int(part) / 255) ** GAMMA for part in told.split(","))
+    return red, green, blue
+
+
+def _is_colour(value: str) -> bool:
+    parts = [part.strip() for part in value.split(",")]
+    return len(parts) == 3 and all(part.isdecimal() and int(part) <= 255 for part in parts)
 
 
 def _full(extent: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -130,7 +148,8 @@ def _vehicle(name: str, body: catalogue.Body) -> list[wire.Variation]:
         _fixed("has_lights", BOOL, "false" if body.category == "bicycle" else "true"),
         _fixed("has_dynamic_doors", BOOL, "false"),
     ]
-    told.append(_free("color", COLOUR, *COLOURS))
+    first = crc32(name.encode()) % len(COLOURS)  # makes differ where clients choose none
+    told.append(_free("color", COLOUR, *COLOURS[first:], *COLOURS[:first]))
     if two:
         told.append(_free("driver_id", INT, "0"))
     return told

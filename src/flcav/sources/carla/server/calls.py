@@ -14,7 +14,7 @@ import numpy as np
 from flcav.config import InputError, shorten
 from flcav.sources.carla.frames import mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.actors import Actor
+from flcav.sources.carla.server.actors import NOTHING, Actor
 from flcav.sources.carla.server.blueprints import Refused, list_blueprints
 from flcav.sources.carla.server.episode import Counters, Episode
 from flcav.sources.carla.server.maps import Maps
@@ -202,6 +202,7 @@ class Calls:
         self.episode.push(walker, speed * walker.pose[:3, 0])
         ahead = mirror(walker.pose[:3, 0])
         walker.walk = wire.WalkerControl((float(ahead[0]), float(ahead[1]), 0.0), speed)
+        walker.guided_s = self.episode.time_s
 
     def set_actor_target_velocity(self, actor: int, velocity: Vector) -> None:
         """Give an actor a velocity [m/s]."""
@@ -222,8 +223,8 @@ class Calls:
     def add_actor_impulse(self, actor: int, impulse: Vector) -> None:
         """Apply an impulse [N s]."""
         body = self.episode.body(actor, *BODIES)
-        velocity = mirror(np.array(body.motion[0])) + mirror(np.array(impulse)) / self._mass(body)
-        self.episode.push(body, velocity)
+        velocity, _ = self.episode.motion(body)
+        self.episode.push(body, velocity + mirror(np.array(impulse)) / self._mass(body))
 
     def add_actor_force(self, actor: int, force: Vector) -> None:
         """Apply a force [N] during a tick."""
@@ -242,8 +243,8 @@ class Calls:
         """Apply an angular impulse; about the vertical axis alone."""
         body = self.episode.body(actor, *BODIES)
         inertia = self.episode.world.bodies.find(body.name).blueprint.inertia_kgm2
-        rate = mirror_spin(np.radians(body.motion[1]))[2] + mirror_spin(np.array(impulse))[2] / inertia
-        self._turn(body, float(rate))
+        _, rate = self.episode.motion(body)
+        self._turn(body, rate + float(mirror_spin(np.array(impulse))[2]) / inertia)
 
     def add_actor_torque(self, actor: int, torque: Vector) -> None:
         """Apply a torque during a tick."""
@@ -251,7 +252,8 @@ class Calls:
         self.add_actor_angular_impulse(actor, (x * self.dt_s, y * self.dt_s, z * self.dt_s))
 
     def _turn(self, body: Actor, yaw_rate: float) -> None:
-        self.episode.push(body, mirror(np.array(body.motion[0])), yaw_rate)
+        velocity, _ = self.episode.motion(body)
+        self.episode.push(body, velocity, yaw_rate)
 
     def _mass(self, body: Actor) -> float:
         return self.episode.world.bodies.find(body.name).blueprint.mass_kg
@@ -278,8 +280,9 @@ class Calls:
         self.episode.find(actor, "vehicle", "walker")
 
     def get_actor_bounding_box(self, actor: int) -> BoundingBox:
-        """Return an actor's box."""
-        return self.episode.find(actor).bounding_box()
+        """Return an actor's box; an empty one of who is no more, as a client's Traffic Manager asks for some time."""
+        found = self.episode.actors.get(actor)
+        return BoundingBox(NOTHING, NOTHING) if found is None else found.bounding_box()
 
     def get_actor_component_names(self, actor: int) -> wire.Packed:
         """Return the names of an actor's components: none."""
@@ -304,7 +307,7 @@ class Calls:
 
     def get_ackermann_controller_settings(self, actor: int) -> wire.Packed:
         """Return the gains of CARLA's Ackermann controller."""
-        self.episode.body(actor, "vehicle")
+        self.episode.find(actor, "vehicle")
         return [0.15, 0.0, 0.25, 0.01, 0.0, 0.01]
 
     def apply_ackermann_controller_settings(self, actor: int, settings: wire.Packed) -> None:
@@ -322,7 +325,7 @@ class Calls:
 
     def apply_physics_control(self, actor: int, physics: wire.Packed) -> None:
         """Set a vehicle's physics, which stays that of its size."""
-        self.episode.body(actor, "vehicle")
+        self.episode.find(actor, "vehicle")
 
     def get_telemetry_data(self, actor: int) -> wire.Packed:
         """Return a vehicle's telemetry."""
@@ -360,9 +363,11 @@ class Calls:
 
     def get_wheel_steer_angle(self, actor: int, wheel: int) -> float:
         """Return the angle of a wheel [deg]."""
-        vehicle = self.episode.body(actor, "vehicle")
+        vehicle = self.episode.find(actor, "vehicle")
+        if wheel >= 2 or not self.episode.is_own(vehicle):
+            return 0.0
         limit, _ = self.episode.steering(vehicle)
-        return float(np.degrees(limit) * vehicle.control.steer) if wheel < 2 else 0.0
+        return float(np.degrees(limit) * vehicle.control.steer)
 
     # ---- traffic lights
 
@@ -474,7 +479,7 @@ class Calls:
     def project_point(self, location: Vector, direction: Vector, distance: float) -> wire.Packed:
         """Return where a ray meets the town, as an optional labelled point."""
         found = project(self.episode, location, direction, distance)
-        return [False] if not found else [True, found[0]]
+        return [True, found[0]] if found else [False, [NOTHING, 0]]
 
     def cast_ray(self, start: Vector, end: Vector) -> wire.Packed:
         """Return where a ray meets the town, as labelled points."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from flcav.sources.carla.frames import from_mount, mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.actors import Actor, list_places
-from flcav.sources.carla.server.blueprints import Blueprint, Refused, check, list_blueprints
+from flcav.sources.carla.server.actors import WAITING, Actor, list_places
+from flcav.sources.carla.server.blueprints import Blueprint, Refused, check, find_paint, list_blueprints
 from flcav.sources.carla.server.driving import steer_towards
 from flcav.sources.carla.server.lights import Lights, find_approaches
 from flcav.sources.carla.server.maps import ServedMap
@@ -43,6 +43,7 @@ TRAFFIC_OF = {  # category -> blueprint by which clients know SUMO's traffic
     "bicycle": "vehicle.gazelle.omafiets",
     "pedestrian": "walker.pedestrian.0001",
 }
+UNGUIDED_S = 0.5  # a walker whose AI has not placed it for so long stands
 PARKED = "parked"  # begins the names of parked vehicles, which are no actors to clients
 NOWHERE = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
@@ -177,7 +178,7 @@ class Episode:
             raise Refused("Spawn failed because of collision at spawn position") from None
         actor = self._add(description, pose)
         actor.name, actor.category, actor.size = name, blueprint.category, blueprint.size
-        actor.parent = parent
+        actor.parent, actor.paint = parent, find_paint(description)
         self._bodies[name] = actor
         snapshot = self.world.snapshot
         row = snapshot.row(name)
@@ -186,7 +187,7 @@ class Episode:
 
     def destroy(self, actor: Actor) -> None:
         """Remove an actor; sensors that it carries stay where they are."""
-        if actor is self.spectator or actor.light is not None or (actor.name and not self.is_own(actor)):
+        if actor is self.spectator or actor.light is not None:
             raise Refused(f"actor {actor.id} is a {actor.description.id} of the town, which cannot be destroyed")
         del self.actors[actor.id]
         if actor.name:
@@ -201,16 +202,33 @@ class Episode:
         return actor.name.startswith("c")
 
     def body(self, number: int, *kinds: str) -> Actor:
-        """Return an actor whose body clients move; raises `Refused` for others."""
+        """Return an actor that has a body, which clients move from now on; raises `Refused` for others."""
         actor = self.find(number, *kinds)
         if not self.is_own(actor):
-            raise Refused(f"actor {number} is a {actor.description.id} that clients cannot move")
+            self._take_over(actor)
         return actor
+
+    def _take_over(self, actor: Actor) -> None:
+        """Take one of SUMO's traffic out of it: it goes on from its place and velocity as clients drive it."""
+        snapshot = self.world.snapshot
+        trace, row = snapshot.trace, snapshot.row(actor.name)
+        (x, y, z), velocity = trace.position[0, row].tolist(), trace.velocity[0, row]
+        yaw, (length, width, height) = float(trace.yaw[0, row]), trace.size[row].tolist()
+        shape, size = int(trace.shape[row]), (length, width, height)
+        self.world.apply(Remove(actor.name))
+        del self._bodies[actor.name]
+        self._spawned += 1
+        actor.name = f"c{self._spawned}"
+        self._bodies[actor.name] = actor
+        self.world.apply(Spawn(actor.name, actor.category, shape, x, y, yaw, z, size, anywhere=True))
+        self.push(actor, velocity)
 
     # ---- motion
 
     def place(self, actor: Actor, transform: Transform) -> None:
         """Move an actor to another pose."""
+        if actor.name and not self.is_own(actor):
+            self._take_over(actor)
         pose = self.served.frame.from_transform(*transform)
         if actor.parent and actor.mount is not None:
             actor.mount = from_mount(*transform)
@@ -242,7 +260,9 @@ class Episode:
         )
 
     def walk(self, actor: Actor, control: wire.WalkerControl) -> None:
-        """Set a walker's direction and speed."""
+        """Set a walker's direction and speed; it walks by them also where its AI had switched its physics off."""
+        if not actor.simulated:
+            self.simulate(actor, physics=True)
         actor.walk = control
         x, y, _ = mirror(np.array(control.direction)) * control.speed
         self.world.apply(Walk(actor.name, (float(x), float(y))))
@@ -252,6 +272,12 @@ class Episode:
     def _turn(self, actor: Actor, yaw: float) -> None:
         x, y, z = actor.pose[:3, 3].tolist()
         self.world.apply(commands.Place(actor.name, x, y, yaw, z - actor.lift))
+
+    def motion(self, actor: Actor) -> tuple[Array, float]:
+        """Return the velocity (3,) [m/s], in the town's frame, and the yaw rate [rad/s] that an actor has by now."""
+        bodies = self.world.bodies
+        row = bodies.row(actor.name)
+        return bodies.velocity[row].copy(), float(bodies.yaw_rate[row])
 
     def push(self, actor: Actor, velocity: Array, yaw_rate: float | None = None) -> None:
         """Give an actor another velocity (3,) [m/s] in the town's frame."""
@@ -271,6 +297,9 @@ class Episode:
         for actor in self._bodies.values():
             if actor.constant is not None:
                 self.push(actor, actor.pose[:3, :3] @ actor.constant)
+            if not actor.simulated and actor.walk.speed and self.time_s > actor.guided_s + UNGUIDED_S:
+                actor.walk = WAITING
+                self.push(actor, np.zeros(3))
             if actor.ackermann is not None:
                 limit, _ = self.steering(actor)
                 self.drive(actor, steer_towards(actor.ackermann, actor.control, self.speed(actor), limit, dt_s))
@@ -418,11 +447,12 @@ class Episode:
         return self._follow_with("calls", self.world.snapshot.trace)
 
     def _follow_with(self, name: str, trace: Trace) -> Scene:
-        if name in self._scenes:
-            self._scenes[name].follow(trace)
-        else:
+        if name not in self._scenes:
             self._scenes[name] = Scene(self.served.town, trace)
-        return self._scenes[name]
+        scene = self._scenes[name]
+        scene.paints = {own: actor.paint for own, actor in list(self._bodies.items()) if actor.paint is not None}
+        scene.follow(trace)
+        return scene
 
 
 def _measure(sense: Callable[[Sight, Sensor], bytes], look: Callable[[], Sight], sensor: Sensor) -> bytes:

@@ -82,7 +82,7 @@ class ServedMap:
     def speed_limits_kmh(self, points: Array) -> Array:
         """Return the limit (N,) [km/h] of the lane nearest to each of `points` (N, >=2)."""
         tree, speeds = self._limits
-        return 3.6 * speeds[tree.query(points[:, :2])[1]]
+        return np.round(3.6 * speeds[tree.query(points[:, :2])[1]], 1)
 
 
 def _driving_lanes(net: RoadNet) -> Iterator[Lane]:

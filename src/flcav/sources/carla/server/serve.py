@@ -30,6 +30,10 @@ LEARNT_S = 3.0  # clients have learnt of a new map by then
 LISTENER_S = 0.3  # a tick waits so long for the connection of a stream whose token a client has just asked for
 MOST_CONNECTIONS = 512
 MOST_CUES = 1000  # whose answers wait for their ticks; clients have one each
+CUES = ("tick_cue",)  # calls that are answered after the next tick in synchronous mode
+# In asynchronous mode, so that a client has a state with the new actor when it learns of it, as with CARLA, which
+# answers few calls a frame: a walker's AI that a client starts ends where its walker is in no state.
+SPAWNS = ("spawn_actor", "spawn_actor_with_parent")
 CHUNK = 1 << 16
 BACKLOG = 1 << 20  # bytes in a connection's buffer from which its reader is waited for
 
@@ -50,7 +54,7 @@ class Server:
         self._published_s = 0.0  # when the world's state was last sent
         self._state = b""  # the last one of the world, for clients that come between two ticks
         # A client that has the answer to its cue waits for the state by polling, which takes a core from the sensors.
-        self._cued: deque[tuple[asyncio.StreamWriter, bytes]] = deque()  # answers to cues of ticks that are to come
+        self._cued: deque[tuple[asyncio.StreamWriter, bytes]] = deque()  # answers that wait for the next ticks
         self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick
 
     async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
@@ -76,6 +80,7 @@ class Server:
     async def _tick_forever(self) -> None:
         due = time.monotonic()
         while True:
+            self._answer_cues()  # and spawnings since the last tick of asynchronous mode
             if self._calls.settings.synchronous:
                 await self._cue.wait()
                 self._cue.clear()
@@ -86,7 +91,6 @@ class Server:
                 due = time.monotonic()
                 continue
             self._calls.ticks = 0
-            self._answer_cues()
             due = max(due + self._calls.dt_s, time.monotonic())
             await self._sleep_until(due)
             if not self._calls.settings.synchronous:
@@ -134,7 +138,7 @@ class Server:
             log.exception("an image failed")
 
     def _answer_cues(self, most: int | None = None) -> None:
-        """Answer the cues of the ticks that were made; of all that wait, where none is to come."""
+        """Answer what waits for the ticks that were made; all that waits, where none is to come."""
         for _ in range(len(self._cued) if most is None else min(most, len(self._cued))):
             writer, reply = self._cued.popleft()
             with suppress(ConnectionError, RuntimeError):
@@ -221,7 +225,7 @@ class Server:
                     if call.number is None:
                         continue
                     reply = wire.pack_reply(call.number, response)
-                    waits = call.method == "tick_cue" and self._calls.settings.synchronous
+                    waits = call.method in (CUES if self._calls.settings.synchronous else SPAWNS)
                     if waits and len(self._cued) < MOST_CUES:
                         self._cued.append((writer, reply))
                     else:

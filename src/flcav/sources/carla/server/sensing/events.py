@@ -16,8 +16,20 @@ AHEAD = np.array([[1.0, 0.0, 0.0]], np.float32)
 TAG_NAMES = {number: name for name, number in SEMANTICS.items()}
 
 
+TAG_OF = {  # kind of a thing -> its semantic class
+    "tree": "vegetation",
+    "clutter": "static",
+    "post": "pole",
+    "lamp": "pole",
+    "sign": "traffic_sign",
+    "signal": "traffic_light",
+    "vehicle": "car",
+}
+
+
 def describe_thing(kind: str) -> Actor:
-    """Return the record of a thing of the town, such as a building."""
+    """Return the record of a thing of the town, such as a building, by CARLA's name of its class."""
+    kind = TAG_OF.get(kind, kind).replace("_", "")
     nowhere = BoundingBox((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     return Actor(0, 0, Description(0, f"static.{kind}", ()), nowhere, b"", b"")
 
