@@ -240,8 +240,9 @@ def test_a_walker_whose_ai_is_stopped_stands_and_obeys_its_control(calls):
     actor = calls.episode.actors[walker]
     invoke(calls, "set_actor_simulate_physics", (walker, False))
     for _ in range(5):
-        invoke(calls, "set_walker_state", (walker, place(calls), 1.4))
+        invoke(calls, "set_walker_state", (walker, place(calls), 1.4))  # above the ground, as its mesh may be on hills
         calls.episode.step(0.05)
+        assert actor.pose[2, 3] - actor.lift == pytest.approx(calls.episode.world.height(*actor.pose[:2, 3]))
         assert np.linalg.norm(actor.motion[0]) == pytest.approx(1.4)
     for _ in range(20):
         calls.episode.step(0.05)

@@ -195,10 +195,12 @@ class Calls:
         self.episode.place(self.episode.find(actor), transform)
 
     def set_walker_state(self, actor: int, transform: Transform, speed: float) -> None:
-        """Place a walker that walks at a speed; its location is that of its feet."""
+        """Place a walker that walks at a speed; its location is that of its feet, which the ground is put under."""
         walker = self.episode.body(actor, "walker")
+        east, north, height = self.episode.served.frame.from_location(transform.location).tolist()
         x, y, z = transform.location
-        self.episode.place(walker, Transform((x, y, z + walker.lift), transform.rotation))
+        z += self.episode.world.height(east, north, height) - height + walker.lift
+        self.episode.place(walker, Transform((x, y, z), transform.rotation))
         self.episode.push(walker, speed * walker.pose[:3, 0])
         ahead = mirror(walker.pose[:3, 0])
         walker.walk = wire.WalkerControl((float(ahead[0]), float(ahead[1]), 0.0), speed)
