@@ -477,7 +477,8 @@ class RunRecipe(Config):
 
     def _check_arm(self, name: str, arm: Arm) -> None:
         if arm.central in (PRETRAIN, ALL) and not all(task.pretrains for task in self.tasks.values()):
-            raise ValueError(f"arms.{name}.central: '{arm.central}' goes with samples of stage I, and a plan has none")
+            what = "more pretraining" if arm.central == PRETRAIN else "training on all regions"
+            raise ValueError(f"arms.{name}.central: {what} goes with samples of stage I, and a plan has none")
         federating = self.with_role("federate")
         for field, known in (("regions", federating), ("labels", tuple(self.tasks))):
             for each in getattr(arm, field) or ():

@@ -94,7 +94,7 @@ class Names:
 
 
 def arm(name: str, stages: Sequence[str], regions: Sequence[str] = ("ring",), repeat: int = 0) -> SimpleNamespace:
-    return SimpleNamespace(name=name, stages=stages, regions=regions, repeat=repeat)
+    return SimpleNamespace(name=name, stages=stages, regions=regions, repeat=repeat, central=None)
 
 
 def graph_of(

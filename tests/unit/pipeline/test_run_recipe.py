@@ -66,6 +66,7 @@ ARM = {"placement": {"rule": "densest"}}
             "a plan of 0 samples trains nothing in stage I: name the 'weights' to begin with",
         ),
         ({"tasks": STARTED, "arms": {"more": {"central": "pretrain"}}}, "more pretraining goes with samples"),
+        ({"tasks": STARTED, "arms": {"joint": {"central": "all"}}}, "training on all regions goes with samples"),
         ({"tasks": STARTED, "federation": {"replay": 0.3}}, "the cloud trains on samples of stage I"),
         ({"regions": {"grid": {"role": "federate"}}}, "one with the role pretrain is wanted"),
         ({"regions": {"suburb": {"role": "pretrain"}}}, "one with the role federate is wanted"),
