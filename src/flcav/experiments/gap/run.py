@@ -85,8 +85,8 @@ ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     LONG_JOINT: ("joint_fourfold", CENTRAL),
     ORACLE: ("oracle", CENTRAL),
 }
-FOR_ALL = tuple(name for name, (_, stage) in ARMS.items() if stage in (PRETRAIN, CLOUD))  # towns
-AT_HOME = (*FOR_ALL, JOINT, LONG_JOINT)  # scored in the town of pretraining, too
+FOR_ALL = tuple(name for name, (_, stage) in ARMS.items() if stage in (PRETRAIN, CLOUD))
+AT_HOME = (*FOR_ALL, JOINT, LONG_JOINT)  # one network for both towns: scored in that of pretraining, too
 COMPARED = (  # (after, before): claims that the difference in AP50 is positive
     (TRUTH, PRETRAINED),
     (TRACKS, PRETRAINED),

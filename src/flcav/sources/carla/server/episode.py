@@ -204,12 +204,13 @@ class Episode:
     def body(self, number: int, *kinds: str) -> Actor:
         """Return an actor that has a body, which clients move from now on; raises `Refused` for others."""
         actor = self.find(number, *kinds)
-        if not self.is_own(actor):
-            self._take_over(actor)
+        self._take_over(actor)
         return actor
 
     def _take_over(self, actor: Actor) -> None:
-        """Take one of SUMO's traffic out of it: it goes on from its place and velocity as clients drive it."""
+        """Take an actor out of SUMO's traffic, if it is in it: it goes on as it moves, and clients drive it."""
+        if not actor.name or self.is_own(actor):
+            return
         snapshot = self.world.snapshot
         trace, row = snapshot.trace, snapshot.row(actor.name)
         (x, y, z), velocity = trace.position[0, row].tolist(), trace.velocity[0, row]
@@ -227,8 +228,7 @@ class Episode:
 
     def place(self, actor: Actor, transform: Transform) -> None:
         """Move an actor to another pose."""
-        if actor.name and not self.is_own(actor):
-            self._take_over(actor)
+        self._take_over(actor)
         pose = self.served.frame.from_transform(*transform)
         if actor.parent and actor.mount is not None:
             actor.mount = from_mount(*transform)
