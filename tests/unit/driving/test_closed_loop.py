@@ -11,7 +11,7 @@ from shapely.affinity import translate
 from flcav.config import InputError
 from flcav.driving.corridor import find_meeting, find_occupied
 from flcav.driving.couplings import TASKS, leave_out
-from flcav.driving.driver import EMERGENCY_MPS2, Motion, Settings, decide
+from flcav.driving.driver import EMERGENCY_MPS2, GAIN_MPS2, Motion, Settings, _cover, decide
 from flcav.driving.jobs import Job, Sensed, run_job
 from flcav.driving.loop import LOOP
 from flcav.driving.measures import Drive, Hit, judge_collision, score_drive
@@ -57,7 +57,25 @@ def test_a_leader_is_followed_at_the_equilibrium_of_the_model() -> None:
     gap = (2.0 + 1.2 * speed) / np.sqrt(1 - (speed / wanted) ** 4)  # of the paper, eq. 7
     ahead = see((50.0 + gap + HALF_M + 4.5 / 2, 0.0, 0.0, speed, 0.0))
     told = decide(straight(), at(50.0, speed), ahead, CAR, Settings(margin_m=0.0)).acceleration
-    assert told == pytest.approx(0.0, abs=0.15)
+    assert told == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("speed", [0.0, 6.0, 13.9, 16.0])
+def test_a_start_covers_the_integral_of_its_speed(speed: float) -> None:
+    time = np.linspace(0.0, TIMES_S[-1], 40_001)
+    driven = np.minimum(speed + GAIN_MPS2 * time, max(13.9, speed))
+    covered = np.concatenate(([0.0], np.cumsum((driven[1:] + driven[:-1]) / 2 * np.diff(time))))
+    np.testing.assert_allclose(_cover(speed, 13.9, GAIN_MPS2), np.interp(TIMES_S, time, covered), atol=1e-4)
+
+
+@pytest.mark.parametrize("aside", [-1.5, 0.4])
+@pytest.mark.parametrize("speed", [3.0, 10.0])
+def test_the_wheels_follow_the_circle_through_the_point_that_is_aimed_at(aside: float, speed: float) -> None:
+    told = decide(straight(), Motion(50.0, aside, 0.0, speed, 50.0), see(), CAR).controls.steer
+    ahead, left = 3.5 + 0.35 * speed, -aside
+    radius = (ahead**2 + left**2) / (2 * left)  # of the circle that leaves along the x axis and meets the point
+    assert ahead**2 + (left - radius) ** 2 == pytest.approx(radius**2)
+    assert np.tan(told * CAR.steer_limit_rad) == pytest.approx(CAR.wheelbase_m / radius)
 
 
 def test_red_and_yellow_lights() -> None:
@@ -107,6 +125,15 @@ def test_the_corridor_agrees_with_polygons() -> None:
             assert not np.isfinite(found.low[row, 0]), (x, y, angle)
     assert len(off) > 40
     assert np.max(np.abs(off)) < 1.3  # the spacing of the points of a footprint
+
+
+@pytest.mark.parametrize(("ahead", "within"), [(-4.0, True), (-12.0, False), (76.0, True), (85.0, False)])
+def test_the_corridor_reaches_from_6_m_behind_to_80_m_ahead(ahead: float, within: bool) -> None:
+    there = see((100.0 + ahead, 0.0, 0.0, 0.0, 0.0))
+    found = find_occupied(straight(), 100.0, there.boxes, there.path, there.yaw, 0.9, np.zeros(there.yaw.shape))
+    assert np.isfinite(found.low[0, 0]) == within
+    if within:
+        assert found.low[0, 0] == pytest.approx(max(ahead - 4.5 / 2, -6.0), abs=1.0)
 
 
 def test_meeting_needs_the_same_place_at_the_same_time() -> None:

@@ -29,6 +29,7 @@ from flcav.network.messages import unpack
 from flcav.optimization.problem import Problem
 from flcav.perception.networks import resolve_network
 from flcav.perception.tracking.tracker import Tracker
+from flcav.perception.trajectory.config import FUTURE
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.statistics.estimates import Estimate
 from flcav.world.map.roads import read_net
@@ -158,6 +159,25 @@ def test_a_heading_the_wrong_way_round_changes_no_forecast() -> None:
         assert other.path[0] == pytest.approx(told[0].path[0], abs=0.5)
         assert other.yaw[0] == pytest.approx(told[0].yaw[0], abs=0.1)
         assert np.hypot(*(other.path[0, 8] - ahead)) < 6.0
+
+
+def test_a_forecast_moves_on_with_its_track_and_keeps_its_last_velocity() -> None:
+    network, roads = resolve_network(TRAJECTORY, None), load_roads("ring")
+    route = draw_route(read_net(load_town("ring").net), np.random.default_rng(5), 200.0)
+    following = Following(network, roads, CERTAIN)
+    for tick in range(26):
+        x, y, yaw = route.at(20.0 + 0.8 * tick)
+        last = following.step(replace(cars((x, y)), yaw=np.full(1, yaw)), tick / 10, frozenset())
+    late = following.step(cars(), 2.8, frozenset())  # without a detection for 0.3 s
+    assert last.motion == late.motion == ("forecast",)
+    moved = late.path[0, 0] - last.boxes.center[0, :2]
+    assert moved == pytest.approx(0.3 * last.velocity[0], abs=1e-6)
+    steps = np.diff(last.path[0], axis=0)
+    beyond = steps[FUTURE:]
+    assert len(beyond) >= 2
+    assert beyond == pytest.approx(np.broadcast_to(steps[FUTURE - 1], beyond.shape), abs=1e-6)
+    heading = np.arctan2(steps[:, 1], steps[:, 0])
+    assert np.cos(last.yaw[0, :-1] - heading) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_an_error_model_without_a_kind_of_motion_is_refused(tmp_path: Path) -> None:

@@ -112,6 +112,18 @@ def test_the_pole_nearest_to_a_cells_errors_covers_them(ring: Scenery):
     assert (second.errors, second.pole) == (0, None)
 
 
+def test_the_cell_with_most_errors_per_frame_comes_first_and_no_pole_is_named_that_covers_none(ring: Scenery):
+    far = [error(250.0 + number, 0.0, track=f"car{number}") for number in range(4)]
+    found = {0: far[:1], 1: far[1:2], 2: far[2:3], 3: [], 4: far[3:]}  # 3 errors in 4 frames, 1 in 1
+    cells = {number: ("many",) if number < 4 else ("dense",) for number in range(5)}
+    tested = [Trial(ring.town, cells, found, dict.fromkeys(range(5), False))]
+    rows = measure_cells(mean, OUTCOMES, tested, 40.0)
+    assert [(row.cell, row.errors, row.frames, row.pole) for row in rows] == [
+        (("dense",), 1, 1, None),
+        (("many",), 3, 4, None),
+    ]
+
+
 def test_frames_are_in_the_cell_of_their_values(drive: Dataset, urban: Domain):
     measured = measure(drive)
     cells = cells_of(urban, measured, ("junction", "speed_limit"))

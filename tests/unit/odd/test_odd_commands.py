@@ -4,11 +4,13 @@ import json
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pyarrow.csv
 import pytest
 
 from flcav.cli.main import run
 from flcav.dataset.store import Dataset
+from flcav.odd.domain import read_domain
 from flcav.odd.measure import measure
 from flcav.perception.networks import register_errors
 
@@ -64,6 +66,11 @@ def test_cover_writes_its_report(drive: Dataset, tmp_path: Path, capsys: pytest.
     printed = json.loads(answer(capsys, "cover", "urban", "--data", str(drive.folder), "--out", str(out), "--json"))
     assert json.loads((out / "coverage.json").read_text()) == printed
     assert printed["runs"] == 4
+    domain, by = read_domain("urban"), set(printed["by"])
+    grades = {row["attribute"]: row["grade"] for row in printed["attributes"]}
+    assert set(grades) <= {*domain.tested, *by}
+    assert len(grades) > len(by)
+    assert printed["grade"] == pytest.approx(np.mean(list(grades.values())))
     assert printed["cells"] == []
     assert (out / "matrix.html").is_file()
 
