@@ -95,6 +95,16 @@ class Rules(Config):
             return ()
         return clients if self.privacy.local else (SERVER,)
 
+    def settle_threshold(self, clients: Sequence[str]) -> "Rules":
+        """Return the rules with the number of clients that secure aggregation needs, where every round has as many.
+
+        So clients know it, and answer no server that shows them fewer.
+        """
+        if self.secure is None or self.selection.rule == "planned":
+            return self
+        needed = self.secure.needed(len(self.selection.choose(clients, 1, 0)))
+        return self.model_copy(update={"secure": self.secure.model_copy(update={"threshold": needed})})
+
     @property
     def personal_arrays(self) -> Patterns:
         """Return the patterns of the arrays that are not averaged between regions."""

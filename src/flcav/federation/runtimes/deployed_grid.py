@@ -15,6 +15,7 @@ from pathlib import Path
 from flwr.app import ConfigRecord, Error, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
+from flcav.federation.fleet.authority import load_certificate
 from flcav.federation.fleet.status import Followed, FollowedRound
 from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
 from flcav.federation.fleet.traffic import read_traffic
@@ -40,6 +41,7 @@ class DeployedGrid(WrappedGrid):
     ) -> None:
         """Reach nodes of the fleet in `folder` with the clients' `names`, which are `vehicles` of its registry."""
         self._folder, self._link, self.names, self._vehicles, self._account = folder, link, names, vehicles, account
+        self.authority = load_certificate(folder)
         self._rounds: tuple[FollowedRound, ...] = ()
         self._waits: dict[str, str] = {}  # by client why it is waited for
         self._begin()

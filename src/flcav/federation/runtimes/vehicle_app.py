@@ -13,13 +13,14 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
+from cryptography import x509
 from flwr.app import Context, Error, Message, MessageType, RecordDict
 from flwr.clientapp import ClientApp
 from flwr.common.serde import recorddict_from_proto, recorddict_to_proto
 from flwr.proto.recorddict_pb2 import RecordDict as ProtoRecordDict
 
 from flcav.federation.client import PARTITION, client_app
-from flcav.federation.fleet.keys import write_private
+from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, KEY, check_certificate, load_key, write_private
 from flcav.federation.fleet.vehicle import FOLDER, SETTINGS, load_settings
 from flcav.federation.messages.conduct import Requests
 from flcav.federation.messages.records import GRANT, GRANTED, OVER_BUDGET, to_arrays
@@ -27,6 +28,7 @@ from flcav.federation.noise import Secret
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.deadline import TimedClients
 from flcav.federation.runtimes.embedded import wire_bytes
+from flcav.federation.secure.certified import Identity
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable, Weights
 from flcav.plugins import load_named
@@ -74,6 +76,16 @@ def load_assignment(folder: Path) -> Assignment:
     return _load(folder / ASSIGNMENT, found.st_mtime_ns, found.st_size)
 
 
+def load_identity(folder: Path) -> Identity:
+    """Return key and certificates of the vehicle in `folder`, by which it masks updates.
+
+    Raises `InputError` where it has none that are in force.
+    """
+    check_certificate(folder)
+    own, authority = (x509.load_pem_x509_certificate((folder / name).read_bytes()) for name in (CERTIFICATE, AUTHORITY))
+    return Identity(load_key(folder / KEY), own, authority)
+
+
 def prepare(folder: Path) -> None:
     """Read a vehicle's assignment, if there is one, so that forks of this process have it, and the modules it needs."""
     with contextlib.suppress(Exception):  # the app says what is wrong, in the place of its answer
@@ -102,7 +114,8 @@ class VehicleApp(ClientApp):
         clients = {own.client: own.trainable}
         secrets = {} if own.secret is None else {own.client: own.secret}
         timed = clients if limit is None else TimedClients(clients, limit)
-        app = client_app(timed, own.strategy, own.rules, secrets, own.spent)
+        identity = None if own.rules.secure is None else load_identity(self._folder)
+        app = client_app(timed, own.strategy, own.rules, secrets, own.spent, identity)
         content, grant = message.content, None
         if GRANT in content:
             grant = int(content.config_records[GRANT][GRANTED])  # type: ignore[arg-type]
