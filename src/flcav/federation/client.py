@@ -66,6 +66,7 @@ from flcav.statistics.streams import derive_seed
 
 PARTITION = "partition-id"  # key of Flower's simulation in a node's config: place of the client among all
 OWN, RESIDUAL = "own", "residual"  # records of a node's state: what strategy and compression keep between rounds
+OWN_DIGESTS = "own-digests"  # record in the place of `OWN` that stays with the client: of the last two, the last first
 KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
 HIDDEN = "hidden"  # an update that was masked, until the sum of its round is unmasked
 
@@ -76,7 +77,8 @@ def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
     """
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"
     guards = is_local(rules) or rules.secure is not None
-    return (*((OWN, RESIDUAL) if keeps else ()), *((ANSWERED,) if guards else ()))
+    digests = (OWN_DIGESTS,) if isinstance(strategy, FedMD) else ()
+    return (*((OWN, RESIDUAL) if keeps else ()), *digests, *((ANSWERED,) if guards else ()))
 
 
 def client_app(
@@ -86,6 +88,7 @@ def client_app(
     secrets: Mapping[str, Secret] = {},
     spent: int = 0,
     identity: Identity | None = None,
+    simulated: bool = False,
 ) -> ClientApp:
     """Return a Flower client app that trains the one of `trainables` (by client name) that its node stands for.
 
@@ -93,9 +96,9 @@ def client_app(
     the client's name. `secrets` are those of the clients, by name, that local noise is drawn by unless it is seeded;
     they are in no message. What it answers and what not, see `conduct`; `spent` are the rounds of earlier federations
     that count against its privacy budget. Under masks a client with an `identity` takes part with certified ones alone.
-    To a query it answers with its place and with what it keeps between rounds;
-    before it has any state, it takes over what the message brings of that. Questions (`ASK`) are for clients that
-    `Answers`.
+    To a query it answers with its place and with what it keeps between rounds; networks of FedMD's clients stay with
+    them, and a query gets their digests. Where clients are `simulated`, and have one checkpoint, it gets all, and a
+    client without any state takes over what the message brings. Questions (`ASK`) are for clients that `Answers`.
 
     What error feedback leaves out, and a strategy's own arrays, are taken over where the server gets the update and can
     use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
@@ -171,11 +174,16 @@ def client_app(
     @app.query()
     def query(message: Message, context: Context) -> Message:
         kept = (OWN, RESIDUAL, ANSWERED)
-        if message.content and (context.state or not {*message.content} <= {*kept}):
+        if message.content and (not simulated or context.state or not {*message.content} <= {*kept}):
             raise RequestRefused("a client's state is its own once it has any")
         for key in message.content:
             context.state[key] = message.content[key]
         found = {key: context.state[key] for key in kept if key in context.state}
+        if OWN in found and isinstance(strategy, FedMD) and not simulated:
+            now = np.frombuffer(requests.digest(RecordDict({OWN: found.pop(OWN)})), np.uint8)
+            before = [each for each in _recorded(context, OWN_DIGESTS).values() if not np.array_equal(each, now)]
+            context.state[OWN_DIGESTS] = to_arrays(dict(zip(("last", "before"), (now, *before), strict=False)))
+            found[OWN_DIGESTS] = context.state[OWN_DIGESTS]
         place = MetricRecord({PARTITION: int(context.node_config[PARTITION])})
         return Message(RecordDict({**found, METRICS: place}), reply_to=message)
 
@@ -190,6 +198,8 @@ def client_app(
         layers = {"layers": rules.upload.layers} if rules.upload.layers else {}
         how = {**correction.arguments(), **layers}
         if isinstance(strategy, FedMD):
+            if not own and OWN_DIGESTS in context.state:
+                raise InputError("its network of the last round is in the folder of a vehicle")
             how |= {"own": own, "imitation_steps": strategy.steps}
         update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)
         if isinstance(strategy, FedMD):

@@ -114,7 +114,7 @@ def open_link(
         opened, far = runtime.open(clients, Agreement(strategy, rules, secrets, spent), states, account), True
     else:
         timing = (lambda each: each) if limit_s is None else (lambda each: TimedClients(each, limit_s))
-        opened = runtime.open(clients, lambda each: make_app(timing(each)), states)
+        opened = runtime.open(clients, lambda each: make_app(timing(each), simulated=True), states)
     with opened as inner:
         lossy = LossyGrid(inner, account, inner.names) if account.outages else inner
         metered = MeteredGrid(BudgetedGrid(lossy, account, inner.names), account, inner.names)
