@@ -52,6 +52,7 @@ from flcav.federation.secure.messages import answer_secretly, complain, mask_upd
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.trainable import (
+    Accounts,
     Correction,
     LocalUpdate,
     Trainable,
@@ -62,6 +63,7 @@ from flcav.federation.trainable import (
     learned_names,
 )
 from flcav.federation.upload import Arrays, subtract
+from flcav.network.ledger import BudgetExceeded
 from flcav.statistics.streams import derive_seed
 
 PARTITION = "partition-id"  # key of Flower's simulation in a node's config: place of the client among all
@@ -201,7 +203,12 @@ def client_app(
             if not own and OWN_DIGESTS in context.state:
                 raise InputError("its network of the last round is in the folder of a vehicle")
             how |= {"own": own, "imitation_steps": strategy.steps}
-        update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)
+        try:
+            update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)
+        except BudgetExceeded as error:
+            if isinstance(trainable, Accounts):
+                raise
+            raise RuntimeError(f"no budget is its own: {error}") from None  # which would end the federation
         if isinstance(strategy, FedMD):
             _record(context, OWN, getattr(update, "own", {}))
         if not isinstance(strategy, Exchanges):

@@ -11,13 +11,13 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from flwr.app import Context, Error, Message, RecordDict
+from flwr.app import ConfigRecord, Context, Error, Message, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.federation.attendance import ClientFailed
 from flcav.federation.fleet.authority import found_authority
 from flcav.federation.fleet.keys import AUTHORITY, request_certificate, take_certificate
-from flcav.federation.messages.records import LOST_BY_NETWORK, OVER_BUDGET, to_arrays
+from flcav.federation.messages.records import ASK, LOST_BY_NETWORK, OVER_BUDGET, to_arrays
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.deployed import Agreement
@@ -25,7 +25,9 @@ from flcav.federation.runtimes.deployed_grid import DeployedGrid
 from flcav.federation.runtimes.embedded import keep_identity, wire_bytes
 from flcav.federation.runtimes.link import open_link
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.vehicle_app import Assignment, VehicleApp
+from flcav.federation.runtimes.vehicle_app import Assignment, VehicleApp, load_identity
+from flcav.federation.secure.masks import draw_keys
+from flcav.federation.secure.parties import PublicKeys
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedbuff import FedBuff
@@ -222,3 +224,44 @@ def test_an_answer_of_any_rule_is_within_what_is_granted(folder: Path, monkeypat
         assert not state.records[0].failed
     assert all(size < limit for limit, size in granted)
     assert min(limit for limit, _ in granted) < 10**5
+
+
+def of_keys(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Lie:
+    """Return a lie in the place of the keys of a client under masks."""
+
+    def lie(asked: Message, answer: Message) -> Message:
+        if ASK not in asked.content or asked.content.config_records[ASK][ASK] != "keys":
+            return answer
+        record = ConfigRecord(change(dict(answer.content.config_records[ASK])))
+        return Message(RecordDict({ASK: record}), reply_to=asked)
+
+    return lie
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda own: {kind: own[kind] for kind in ("ciphers", "masks")}, "a certificate or a signature is missing"),
+        (lambda own: {**own, "signatures": bytes(96)}, "no certified vehicle has signed"),
+        (lambda own: {**own, "signatures": b""}, "a certificate or a signature is missing"),
+        (lambda own: {**own, "certificates": own["certificates"][:-1]}, "no certified vehicle has signed"),
+        (lambda own: {**own, "certificates": [b"a", b"b"]}, "a certificate or a signature that is not in bytes"),
+        (lambda own: {**own, "masks": draw_keys()[1]}, "another signature"),
+    ],
+)
+def test_keys_that_no_certified_vehicle_has_signed_cost_their_client_the_round(folder: Path, change: Any, told: str):
+    """The other vehicles would refuse to take part with it."""
+    state, _ = run(folder, {FIRST + 1: of_keys(change)}, "masks")
+    assert all(record.failed.keys() == {"cav1"} and told in record.failed["cav1"] for record in state.records)
+    assert all(record.clients == ("cav0", "cav2") for record in state.records)
+
+
+def test_a_vehicle_that_stands_for_two_clients_counts_once(folder: Path):
+    identity, kept = load_identity(folder / f"v{FIRST}"), PublicKeys(*(draw_keys()[1] for _ in range(2)))
+
+    def pose(own: dict[str, Any]) -> dict[str, Any]:
+        certificate, signature = identity.sign("cav1", 1, kept)
+        return {"ciphers": kept.cipher, "masks": kept.mask, "certificates": certificate, "signatures": signature}
+
+    state, _ = run(folder, {FIRST + 1: of_keys(pose)}, "masks", rounds=1)
+    assert state.records[0].failed == {"cav1": "keys of the vehicle of cav0"}
