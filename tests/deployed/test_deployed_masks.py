@@ -50,7 +50,7 @@ class Server:
 def test_a_server_neither_invents_vehicles_nor_begins_a_round_of_masks_anew_with_another_training(
     clients, weights, deployment
 ):
-    rules = Rules.model_validate(NOISY).settle_threshold([*clients])
+    rules = Rules.model_validate(NOISY).settle_threshold([*clients], certified=True)
     agreed = Agreement(FEDAVG, rules, {name: draw_secret() for name in clients}, 0)
     with deployment.open(clients, agreed, {}, open_account()) as grid:
         server = Server(grid, weights)

@@ -56,7 +56,7 @@ class SecureRound:
         """
         clients = self.here.chosen
         while True:
-            needed = self.how.needed(len(self.here.chosen))
+            needed = self.how.needed(len(self.here.chosen), certified=self.authority is not None)
             self.total = SecureSum(self._exchange, needed, self.round, self.authority)
             try:
                 asks = self.total.agree(clients)

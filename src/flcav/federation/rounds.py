@@ -180,7 +180,7 @@ def federate(
     if rounds <= done:
         return LocalUpdate(weights, 0, 0.0)
     kept, account = kept_records(strategy, rules), replace(account, concealed=rules.hides_draws)
-    rules = rules.settle_threshold(names)
+    rules = rules.settle_threshold(names, certified=getattr(runtime, "deployed", False))
     secrets = {party: state.keep_secret(party) for party in rules.secret_parties(names) if party in clients}
     spent = least_participations(rules.selection, len(names), earlier) if buffers is None else buffers.least_before
     with open_link(clients, runtime, account, strategy, rules, state.clients, secrets, spent) as link:

@@ -264,7 +264,7 @@ def masked(fleet):
 
 def assign(clients: dict[str, Path], rules: dict) -> None:
     for name, own in clients.items():
-        found = Rules.model_validate(rules).settle_threshold([*clients])
+        found = Rules.model_validate(rules).settle_threshold([*clients], certified=True)
         Assignment(os.urandom(4).hex(), name, Counting(), strategy_named("fedavg"), found, draw_secret()).save(own)
 
 

@@ -67,10 +67,8 @@ def answer_secretly(
         peers, threshold = _peers(asked), _number(asked[THRESHOLD])
         if identity is not None:
             check_certified(identity.authority, round_, _signed(asked, peers))
-        if threshold < how.needed(len(peers)):
-            raise ValueError(
-                f"a threshold of {threshold} of {len(peers)} clients: {how.needed(len(peers))} are agreed on"
-            )
+        if threshold < (needed := how.needed(len(peers), certified=identity is not None)):
+            raise ValueError(f"a threshold of {threshold} of {len(peers)} clients: {needed} are agreed on")
         sealed = client.share(peers, threshold)
         record = ConfigRecord({NAMES: [*sealed], SHARES: [*sealed.values()]})
     else:
