@@ -2,7 +2,7 @@
 
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -34,3 +34,51 @@ class Walker:
 
     def count_samples(self, steps):
         return self.samples
+
+
+@dataclass(frozen=True)
+class Liar(Walker):
+    """A client whose vehicle lies about its answer, in the process that it answers one message in."""
+
+    lie: str = ""
+
+    def train(self, weights, *, steps, learning_rate, seed, proximal=0.0, shift=None, centre=None, layers=()):
+        from flcav.federation import client
+        from flcav.federation.messages.records import LOST_BY_NETWORK
+        from flcav.federation.runtimes import vehicle_app
+
+        if self.lie == "raises":
+            raise OSError("no power")
+        answer, size = client.reply, vehicle_app.wire_bytes
+        if self.lie == "large":
+            junk = {"junk": np.zeros(250_000)}
+            client.reply = lambda message, update, extra: answer(message, update, junk)
+        vehicle_app.wire_bytes = lambda content: 0 if self.lie == "large" else size(content) + 2**63
+        if self.lie == "lost by the network":
+            vehicle_app.OVER_BUDGET = LOST_BY_NETWORK
+        return super().train(weights, steps=steps, learning_rate=learning_rate, seed=seed)
+
+
+@dataclass(frozen=True)
+class SentOutput(LocalUpdate):
+    """Outputs that are sent, and a network that is kept."""
+
+    own: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Imitator:
+    """A client that sends outputs of a network of its own, which learns from the mean; and a server with one."""
+
+    rate: float = 0.5
+
+    def outputs(self, weights):
+        return {"outputs": weights["w"] * 2}
+
+    def imitate(self, weights, outputs, *, steps, learning_rate, seed):
+        return {"w": weights["w"] + self.rate * (outputs["outputs"] - weights["w"])}
+
+    def train(self, weights, *, steps, learning_rate, seed, own=None, imitation_steps=1):
+        start = own or {"w": np.zeros_like(weights["outputs"])}
+        network = {"w": self.imitate(start, weights, steps=0, learning_rate=0, seed=0)["w"] + self.rate}
+        return SentOutput(self.outputs(network), 3, self.rate, own=network)

@@ -34,6 +34,7 @@ from flcav.federation.messages.records import (
     NORM,
     SAMPLES,
     SEND,
+    UNMASK,
     VECTOR,
     LocalWork,
     read_arrays,
@@ -45,11 +46,13 @@ from flcav.federation.messages.records import (
 from flcav.federation.noise import Secret, derive_key
 from flcav.federation.privacy import change_norm
 from flcav.federation.rules import RegionalModels, Rules
+from flcav.federation.secure.certified import Identity
 from flcav.federation.secure.masks import to_integers
 from flcav.federation.secure.messages import answer_secretly, complain, mask_update
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.trainable import (
+    Accounts,
     Correction,
     LocalUpdate,
     Trainable,
@@ -60,11 +63,14 @@ from flcav.federation.trainable import (
     learned_names,
 )
 from flcav.federation.upload import Arrays, subtract
+from flcav.network.ledger import BudgetExceeded
 from flcav.statistics.streams import derive_seed
 
 PARTITION = "partition-id"  # key of Flower's simulation in a node's config: place of the client among all
 OWN, RESIDUAL = "own", "residual"  # records of a node's state: what strategy and compression keep between rounds
+OWN_DIGESTS = "own-digests"  # record in the place of `OWN` that stays with the client: of the last two, the last first
 KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
+HIDDEN = "hidden"  # an update that was masked, until the sum of its round is unmasked
 
 
 def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
@@ -73,7 +79,8 @@ def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
     """
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"
     guards = is_local(rules) or rules.secure is not None
-    return (*((OWN, RESIDUAL) if keeps else ()), *((ANSWERED,) if guards else ()))
+    digests = (OWN_DIGESTS,) if isinstance(strategy, FedMD) else ()
+    return (*((OWN, RESIDUAL) if keeps else ()), *digests, *((ANSWERED,) if guards else ()))
 
 
 def client_app(
@@ -82,15 +89,18 @@ def client_app(
     rules: Rules,
     secrets: Mapping[str, Secret] = {},
     spent: int = 0,
+    identity: Identity | None = None,
+    simulated: bool = False,
 ) -> ClientApp:
     """Return a Flower client app that trains the one of `trainables` (by client name) that its node stands for.
 
     A node stands for the client at the place `PARTITION` of its config. Its seed is derived from the round's seed and
     the client's name. `secrets` are those of the clients, by name, that local noise is drawn by unless it is seeded;
     they are in no message. What it answers and what not, see `conduct`; `spent` are the rounds of earlier federations
-    that count against its privacy budget. To a query it answers with its place and with what it keeps between rounds;
-    before it has any state, it takes over what the message brings of that. Questions (`ASK`) are for clients that
-    `Answers`.
+    that count against its privacy budget. Under masks a client with an `identity` takes part with certified ones alone.
+    To a query it answers with its place and with what it keeps between rounds; networks of FedMD's clients stay with
+    them, and a query gets their digests. Where clients are `simulated`, and have one checkpoint, it gets all, and a
+    client without any state takes over what the message brings. Questions (`ASK`) are for clients that `Answers`.
 
     What error feedback leaves out, and a strategy's own arrays, are taken over where the server gets the update and can
     use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
@@ -102,10 +112,13 @@ def client_app(
         """Return what is asked for; raises `RequestRefused` where the client is not to answer."""
         asked, before = asked_for(message.content), recall_answered(context)
         repeatable = rules.secure is None and OWN not in context.state and RESIDUAL not in context.state
-        answered = before.admit(work.round, asked, requests.digest(message.content), rules, repeatable)
+        digest = requests.digest(message.content, LOST if rules.secure is None else ASK)
+        answered = before.admit(work.round, asked, digest, rules, repeatable)
         if (most := requests.affordable) is not None and answered.rounds > most - spent:
             raise RequestRefused(f"a round more than the {most} that the privacy budget of {name} affords")
         keep_answered(context, answered)
+        if HIDDEN in context.state and (asked == UNMASK or answered.round > before.round):
+            del context.state[HIDDEN], context.state[f"{HIDDEN}-{SAMPLES}"]
         return asked
 
     @app.train()
@@ -114,29 +127,35 @@ def client_app(
         work = LocalWork.from_record(message.content.config_records[CONFIG])
         asked = admit(message, context, name, work)
         if rules.secure is not None and asked != MASKED:
-            return answer_secretly(message, context, name, rules.secure)
+            return answer_secretly(message, context, name, rules.secure, work.round, identity)
         seed = derive_seed(work.seed, name)
         key = derive_key(secrets[name], "noise", work.round, work.seed) if name in secrets else None
         if asked == COUNT:
             return reply_norm(message, 0.0, count_samples(trainables[name], work.steps))
-        if asked == MASKED and (complaint := complain(message, context)) is not None:
-            return complaint
+        if rules.secure is not None:
+            if (complaint := complain(message, context)) is not None:
+                return complaint
+            if HIDDEN not in context.state:
+                start = read_arrays(message.content, ARRAYS)
+                update, _, _ = _train(trainables[name], message, context, start, work, seed)
+                about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
+                values = flatten(update, start, rules, seed, key)
+                _keep(context, HIDDEN, LocalUpdate({VECTOR: values}, *about))
+            hidden, peers = _recall(context, HIDDEN), message.content.config_records[ASK][NAMES]
+            values = np.asarray(hidden.weights[VECTOR], np.float64)
+            integers = to_integers(values, rules.secure.largest, len(peers) + 1)  # type: ignore[arg-type]
+            return reply(message, replace(hidden, weights={VECTOR: mask_update(context, integers)}), {})
         extra, own, sent = {}, {}, _optional(message.content, EXTRA)
         if asked == SEND:
-            start, update = _recall(context)
+            start, update = _recorded(context, KEPT_START), _recall(context, KEPT)
         else:
             start = read_arrays(message.content, ARRAYS)
             update, extra, own = _train(trainables[name], message, context, start, work, seed)
         if asked == NORM:
-            _keep(context, start, update)
+            context.state[KEPT_START] = to_arrays(start)
+            _keep(context, KEPT, update)
             names = [each for each in learned_names(start) if each in rules.upload.exchanged(start)]
             return reply_norm(message, change_norm(subtract(update.weights, start, names)), update.samples)
-        if rules.secure is not None:
-            peers = len(message.content.config_records[ASK][NAMES]) + 1  # type: ignore[arg-type]
-            integers = to_integers(flatten(update, start, rules, seed, key), rules.secure.largest, peers)
-            masked = {VECTOR: mask_update(context, integers)}
-            about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
-            return reply(message, LocalUpdate(masked, *about), {})
         encoded, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)
         if rules.hides_draws:  # neither the ledger's bytes nor the server's figures are to tell who was drawn
             encoded = replace(encoded, samples=min(encoded.samples, 1), loss=0.0)
@@ -157,11 +176,16 @@ def client_app(
     @app.query()
     def query(message: Message, context: Context) -> Message:
         kept = (OWN, RESIDUAL, ANSWERED)
-        if message.content and (context.state or not {*message.content} <= {*kept}):
+        if message.content and (not simulated or context.state or not {*message.content} <= {*kept}):
             raise RequestRefused("a client's state is its own once it has any")
         for key in message.content:
             context.state[key] = message.content[key]
         found = {key: context.state[key] for key in kept if key in context.state}
+        if OWN in found and isinstance(strategy, FedMD) and not simulated:
+            now = np.frombuffer(requests.digest(RecordDict({OWN: found.pop(OWN)})), np.uint8)
+            before = [each for each in _recorded(context, OWN_DIGESTS).values() if not np.array_equal(each, now)]
+            context.state[OWN_DIGESTS] = to_arrays(dict(zip(("last", "before"), (now, *before), strict=False)))
+            found[OWN_DIGESTS] = context.state[OWN_DIGESTS]
         place = MetricRecord({PARTITION: int(context.node_config[PARTITION])})
         return Message(RecordDict({**found, METRICS: place}), reply_to=message)
 
@@ -176,8 +200,15 @@ def client_app(
         layers = {"layers": rules.upload.layers} if rules.upload.layers else {}
         how = {**correction.arguments(), **layers}
         if isinstance(strategy, FedMD):
+            if not own and OWN_DIGESTS in context.state:
+                raise InputError("its network of the last round is in the folder of a vehicle")
             how |= {"own": own, "imitation_steps": strategy.steps}
-        update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)
+        try:
+            update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)
+        except BudgetExceeded as error:
+            if isinstance(trainable, Accounts):
+                raise
+            raise RuntimeError(f"no budget is its own: {error}") from None  # which would end the federation
         if isinstance(strategy, FedMD):
             _record(context, OWN, getattr(update, "own", {}))
         if not isinstance(strategy, Exchanges):
@@ -203,16 +234,14 @@ def _record(context: Context, key: str, arrays: Weights) -> None:
         context.state[key] = to_arrays(arrays)
 
 
-def _keep(context: Context, start: Weights, update: Update) -> None:
-    context.state[KEPT], context.state[KEPT_START] = to_arrays(update.weights), to_arrays(start)
-    context.state[f"{KEPT}-{SAMPLES}"] = to_metrics(update)
+def _keep(context: Context, key: str, update: Update) -> None:
+    context.state[key], context.state[f"{key}-{SAMPLES}"] = to_arrays(update.weights), to_metrics(update)
 
 
-def _recall(context: Context) -> tuple[Weights, Update]:
-    metrics = context.state.metric_records[f"{KEPT}-{SAMPLES}"]
+def _recall(context: Context, key: str) -> LocalUpdate:
+    metrics = context.state.metric_records[f"{key}-{SAMPLES}"]
     samples, loss = metrics[SAMPLES], metrics[LOSS]
-    update = LocalUpdate(_recorded(context, KEPT), int(samples), float(loss))  # type: ignore[arg-type]
-    return _recorded(context, KEPT_START), update
+    return LocalUpdate(_recorded(context, key), int(samples), float(loss))  # type: ignore[arg-type]
 
 
 def check_arguments(trainables: Mapping[str, Trainable], wanted: Iterable[str], why: str) -> None:

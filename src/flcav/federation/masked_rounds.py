@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from cryptography import x509
 from flwr.app import ConfigRecord, RecordDict
 
 from flcav.federation.attendance import Attendance, Intake
@@ -41,8 +42,10 @@ class SecureRound:
     how: SecureAggregation
     expected: Expected  # of the updates
     here: Attendance
+    round: int
     records: Mapping[str, Any]  # of the training message, the round's local work among them
     ask: Ask
+    authority: x509.Certificate | None = None  # that has certified the clients; None: their keys are not signed
     total: SecureSum | None = None  # under the masks that were agreed last
 
     def collect(self) -> Intake:
@@ -53,7 +56,8 @@ class SecureRound:
         """
         clients = self.here.chosen
         while True:
-            self.total = SecureSum(self._exchange, self.how.needed(len(self.here.chosen)))
+            needed = self.how.needed(len(self.here.chosen), certified=self.authority is not None)
+            self.total = SecureSum(self._exchange, needed, self.round, self.authority)
             try:
                 asks = self.total.agree(clients)
             except TooFewClients as error:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
+from cryptography import x509
 from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
@@ -179,11 +180,14 @@ def federate(
     if rounds <= done:
         return LocalUpdate(weights, 0, 0.0)
     kept, account = kept_records(strategy, rules), replace(account, concealed=rules.hides_draws)
+    rules = rules.settle_threshold(names, certified=getattr(runtime, "deployed", False))
     secrets = {party: state.keep_secret(party) for party in rules.secret_parties(names) if party in clients}
     spent = least_participations(rules.selection, len(names), earlier) if buffers is None else buffers.least_before
     with open_link(clients, runtime, account, strategy, rules, state.clients, secrets, spent) as link:
         server = Server(
-            link.grid, link.names, strategy, rules, schedule.work, state, earlier, centre, account.find_away, buffering
+            *(link.grid, link.names, strategy, rules, schedule.work, state, earlier, centre, account.find_away),
+            buffering,
+            link.authority,
         )
         for number in range(done + 1, rounds + 1):
             before_round(number, weights)
@@ -245,6 +249,7 @@ class Server:
     centre: Weights | None = None  # that clients are pulled to
     away: Callable[[int], Mapping[str, str]] = lambda _: {}  # by client why it is not there when a round begins
     buffering: Buffering | None = None  # of a strategy whose rounds are buffers
+    authority: x509.Certificate | None = None  # of the clients' fleet
 
     def run_round(self, number: int, start: Weights) -> Weights:
         """Return the weights after round `number`, which begins with `start`; a record is added to the state.
@@ -312,7 +317,8 @@ class Server:
         if here.shortage is not None:
             return Intake()
         if self.rules.secure is not None:
-            round_.masked = SecureRound(self.rules.secure, round_.expected, here, {**records, **local}, self._ask)
+            about = self.rules.secure, round_.expected, here, round_.work.round, {**records, **local}, self._ask
+            round_.masked = SecureRound(*about, self.authority)
             return round_.masked.collect()
         plain = self.rules.privacy is None and not selection.weighs
         updates = Intake(find_weigher(self.strategy) if plain else None)

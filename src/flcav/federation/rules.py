@@ -16,12 +16,17 @@ from flcav.federation.upload import Patterns, Upload, name_like
 class SecureAggregation(Config):
     """Secure aggregation: the server learns the sum of the updates alone, and all clients count the same."""
 
-    threshold: int | None = Field(default=None, ge=2, le=10**6)  # clients that have to stay; default: more than half
+    threshold: int | None = Field(default=None, ge=2, le=10**6)  # who have to stay; default: over 1/2, on fleets 2/3
     largest: float = Field(default=8.0, gt=0, le=1e6)  # largest change of a weight in a round; more is cut off
 
-    def needed(self, clients: int) -> int:
-        """Return the threshold among so many clients of a round; two at least, as the sum of one is its update."""
-        return max(clients // 2 + 1, 2) if self.threshold is None else self.threshold
+    def needed(self, clients: int, certified: bool = False) -> int:
+        """Return the threshold among so many clients of a round; two at least, as the sum of one is its update.
+
+        Clients that are `certified` do not trust the server to tell all of them the same. From two thirds on they
+        reveal too little for a single update, whatever it tells each: see `SecureClient.reveal`.
+        """
+        least = max(clients // 2 + 1, -(-2 * clients // 3) if certified else 2, 2)
+        return least if self.threshold is None else self.threshold
 
 
 MOST_SAMPLES, LARGEST = 10**12, 1e12  # of any limit
@@ -94,6 +99,16 @@ class Rules(Config):
         if self.privacy is None or self.privacy.seeded:
             return ()
         return clients if self.privacy.local else (SERVER,)
+
+    def settle_threshold(self, clients: Sequence[str], certified: bool) -> "Rules":
+        """Return the rules with the number of clients that secure aggregation needs, where every round has as many.
+
+        So clients know it, and answer no server that shows them fewer.
+        """
+        if self.secure is None or self.selection.rule == "planned":
+            return self
+        needed = self.secure.needed(len(self.selection.choose(clients, 1, 0)), certified)
+        return self.model_copy(update={"secure": self.secure.model_copy(update={"threshold": needed})})
 
     @property
     def personal_arrays(self) -> Patterns:

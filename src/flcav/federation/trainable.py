@@ -122,6 +122,13 @@ def count_samples(client: Trainable, steps: int) -> int:
 
 
 @runtime_checkable
+class Accounts(Protocol):
+    """A client with a link of its own to clients, whose budget its training may exceed: an edge server."""
+
+    account: Any  # of that link, `flcav.federation.runtimes.metered.Account`
+
+
+@runtime_checkable
 class Answers(Protocol):
     """A client that answers questions beside its training, on data that stay with it."""
 

@@ -1,5 +1,7 @@
 """What a client answers: each round once, in order, as agreed, within its budget; and never with other noise."""
 
+import contextlib
+import itertools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -8,22 +10,30 @@ from typing import Any
 import numpy as np
 import pytest
 from flwr.app import ConfigRecord, Message, MessageType, RecordDict
+from flwr.common.serde import recorddict_to_proto
 
 from flcav.federation.client import client_app
 from flcav.federation.messages.conduct import ANSWERED
-from flcav.federation.messages.records import ARRAYS, ASK, CONFIG, LOST, read_arrays, to_arrays
+from flcav.federation.messages.records import ARRAYS, ASK, CONFIG, LOST, VECTOR, read_arrays, to_arrays
 from flcav.federation.noise import draw_secret
 from flcav.federation.privacy import Privacy, account_epsilon
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.metered import Account
+from flcav.federation.secure.masks import agree, to_values
+from flcav.federation.secure.messages import SecureSum, TooFewClients
+from flcav.federation.secure.parties import PublicKeys, SecureClient, add_mask
+from flcav.federation.secure.shamir import SHARE_BYTES, join_shares
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes
+from flcav.perception.distillation import SentOutputs
+from flcav.statistics.streams import derive_seed
 
 START = {"w": np.zeros(50, np.float32)}
 SCHEDULE = Schedule(9, 1, 0.1, 0.1, 1)
@@ -235,3 +245,141 @@ def test_what_was_answered_is_kept_with_the_state(name: str):
     assert again.records[-1].clients == tuple(clients)
     with pytest.raises(OSError, match=r"RequestRefused.*of round 1, after .* of round 3 was answered"):
         federate(clients, START, replace(SCHEDULE, rounds=1), account, rules=rules, state=again)
+
+
+class LyingServer:
+    """A server of secure aggregation that invents two of three clients, and so takes off the masks of the third."""
+
+    def __init__(self, server: Server) -> None:
+        self.server = server
+
+    def learn(self, round_: int, seed: int | None = None, start: Weights = START) -> np.ndarray:
+        """Return the first client's update in a round, which may have begun before."""
+        keys = self.server.ask("keys", round_, start, seed).config_records[ASK]
+        names, own = ["cav0", "e1", "e2"], PublicKeys(keys["ciphers"], keys["masks"])  # type: ignore[arg-type]
+        evil = {name: SecureClient.draw(name) for name in names[1:]}
+        peers = {"cav0": own} | {name: each.keys for name, each in evil.items()}
+        kinds = {"ciphers": [each.cipher for each in peers.values()], "masks": [each.mask for each in peers.values()]}
+        shared: Any = self.server.ask("shares", round_, start, seed, names=names, threshold=2, **kinds).config_records[
+            ASK
+        ]
+        sealed = dict(zip(shared["names"], shared["shares"], strict=True))
+        for name, each in evil.items():
+            each.share(peers, 2)
+            assert not each.take({"cav0": sealed[name]})
+        junk = [evil[name].share(peers, 2)["cav0"] for name in evil]
+        answer = self.server.ask("masked", round_, start, seed, names=[*evil], shares=junk)
+        masked = read_arrays(answer, ARRAYS)[VECTOR].astype(np.uint32)
+        shares = {place: each.opened["cav0"][:SHARE_BYTES] for place, each in enumerate(evil.values(), 1)}
+        masked = add_mask(masked, join_shares(shares), plus=False)
+        for name, each in evil.items():
+            masked = add_mask(masked, agree(each.private, own.mask, "mask"), plus=name < "cav0")
+        return to_values(masked, 8.0, 3)
+
+
+def test_a_round_of_masks_that_restarts_hides_the_same_noisy_update_and_no_other():
+    """Of an update the server learns what one answer tells, however often it begins the round anew."""
+    with serve("noise and masks") as server:
+        liar = LyingServer(server)
+        first = liar.learn(1)
+        assert np.std(first) > 1  # with noise of 4
+        for _ in range(20):
+            np.testing.assert_array_equal(liar.learn(1), first)
+        for other in ({"seed": 5}, {"start": {"w": START["w"] + 1}}):
+            with pytest.raises(ConnectionRefusedError, match="another training of round 1 than that whose update"):
+                liar.learn(1, **other)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(liar.learn(1), first)
+        assert not np.array_equal(liar.learn(2, seed=5), first)
+        server.refuses("keys", 1)
+
+
+def test_an_update_under_masks_is_trained_once_in_a_round(monkeypatch: pytest.MonkeyPatch):
+    trained: list[int] = []
+    train = Vehicle.train
+
+    def drifting(self: Vehicle, weights: Weights, *, seed: int, **how: Any) -> LocalUpdate:
+        """Train as on a machine whose sums come out differently each time."""
+        trained.append(seed)
+        found = train(self, weights, seed=seed)
+        return LocalUpdate({"w": found.weights["w"] + np.float32(1e-6) * len(trained)}, 37, 0.1)
+
+    monkeypatch.setattr(Vehicle, "train", drifting)
+    for name in ("secure", "noise and masks"):
+        trained.clear()
+        with serve(name) as server:
+            liar = LyingServer(server)
+            first = liar.learn(1)
+            assert name != "secure" or first == pytest.approx(trained[0] % 7 + 1, abs=1e-5)  # it does take masks off
+            for _ in range(5):
+                np.testing.assert_array_equal(liar.learn(1), first)
+            assert len(trained) == 1
+            liar.learn(2)
+            assert len(trained) == 2
+
+
+def test_clients_know_how_many_a_round_of_masks_needs(monkeypatch: pytest.MonkeyPatch):
+    """A server that shows a client of five two of them is refused: three are needed."""
+    agree_ = SecureSum.agree
+
+    def showing_few(self: SecureSum, chosen: list[str]) -> Any:
+        self._threshold = 2
+        return agree_(self, chosen[:2])
+
+    clients = {f"cav{i}": Vehicle() for i in range(5)}
+    federate(clients, START, replace(SCHEDULE, rounds=1), rules=Rules.model_validate({"secure": {}}))
+    monkeypatch.setattr(SecureSum, "agree", showing_few)
+    with pytest.raises(TooFewClients, match="0 clients shared their secrets"):
+        federate(clients, START, replace(SCHEDULE, rounds=1), rules=Rules.model_validate({"secure": {}}))
+
+
+class Imitator:
+    """A client of FedMD: it sends outputs, and keeps a network."""
+
+    def train(self, weights: Weights, *, own: Weights | None = None, **_: Any) -> Any:
+        network = {"net": own["net"] + 1 if own else np.full(5, 7.0, np.float32)}
+        return SentOutputs({"p": weights["p"] + 1}, 3, 0.1, network)
+
+
+def test_no_request_gets_the_network_of_a_client_that_sends_outputs():
+    strategy, network = FedMD(), np.full(5, 7.0, np.float32)
+    with EmbeddedGrid(client_app({"cav0": Imitator()}, strategy, Rules()), ["cav0"]) as grid:
+        server, told = Server(grid), list[RecordDict]()
+        told.append(server.send({CONFIG: SCHEDULE.work(1).record(), ARRAYS: to_arrays({"p": np.zeros((4, 3))})}))
+        assert np.array_equal(grid.read_states(["own"])["cav0"]["own"]["net"], network)
+        for kind in (MessageType.TRAIN, MessageType.QUERY, MessageType.EVALUATE, "query.ask", "query.own", "train.own"):
+            for content in ({}, {"own": ConfigRecord()}, {ASK: ConfigRecord({ASK: "own"})}, {"own": to_arrays({})}):
+                for key in ({}, {CONFIG: SCHEDULE.work(2).record()}):
+                    with contextlib.suppress(ConnectionRefusedError, ValueError):
+                        told.append(server.send({**content, **key}, kind))
+        assert len(told) > 1  # a query is answered
+        for content in told:
+            assert "own" not in content
+            for key in content.array_records:
+                for array in read_arrays(content, key).values():
+                    assert not (array.size == 5 and np.array_equal(array, network))
+            assert network.tobytes() not in recorddict_to_proto(content).SerializeToString()
+
+
+@pytest.mark.parametrize("name", ["secure", "noise and masks", "local"])
+def test_no_request_gets_an_update_without_its_masks_or_noise(name: str):
+    """Whatever kind of message asks, whatever for, before, during and after a round: the change is in no answer."""
+    change = np.float32(derive_seed(SCHEDULE.work(1).seed, "cav0") % 7 + 1)
+    plain, told = np.full(50, change, np.float32).tobytes(), list[RecordDict]()
+    kinds = (MessageType.TRAIN, MessageType.QUERY, MessageType.EVALUATE, "query.ask", "train.plain")
+    with serve(name) as server:
+
+        def try_all(round_: int) -> None:
+            for kind, asked in itertools.product(kinds, (None, "norm", "send", "count", "unmask", "update", "shares")):
+                ask = {} if asked is None else {ASK: ConfigRecord({ASK: asked})}
+                for more in ({}, {ARRAYS: to_arrays(START), CONFIG: SCHEDULE.work(round_).record()}):
+                    with contextlib.suppress(ConnectionRefusedError, ValueError):
+                        told.append(server.send({**ask, **more}, kind))
+
+        try_all(1)
+        if name != "local":
+            LyingServer(server).learn(2)
+            try_all(2)
+            server.ask("keys", 3)
+            try_all(3)
+    assert told
+    assert not any(plain in recorddict_to_proto(content).SerializeToString() for content in told)

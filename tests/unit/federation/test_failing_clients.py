@@ -22,6 +22,7 @@ from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.krum import Krum
 from flcav.federation.strategies.median import Median
 from flcav.federation.trainable import LocalUpdate, Trainable
+from flcav.network.ledger import BudgetExceeded
 
 SCHEDULE = Schedule(rounds=2, steps=5, learning_rate=0.05, final_learning_rate=0.01, seed=3)
 
@@ -89,6 +90,25 @@ def test_half_of_all_have_to_tell_their_samples_and_half_of_those_drawn_have_to_
         run(deaf, "uniform", 1)
     record = run(deaf | {"grid/cav2": vehicles("grid", 5)["grid/cav2"]}, "uniform", 1).records[0]
     assert (record.clients, {*record.failed}) == (("grid/cav2",), {"grid/cav0", "grid/cav1"})
+
+
+def test_a_client_s_word_that_a_budget_is_exceeded_ends_nothing_and_an_edge_server_s_does():
+    class Claiming(Regression):
+        def train(self, weights: Any, **how: Any) -> LocalUpdate:
+            raise BudgetExceeded("wireless uplink budget exceeded")
+
+    clients, state = vehicles("grid", 3), FederationState()
+    first = clients["grid/cav0"]
+    given = {**clients, "grid/cav0": Claiming(first.inputs, first.targets)}
+    for rules in (Rules(), Rules.model_validate({"secure": {}})):
+        federate(given, START, SCHEDULE, edge(), rules=rules, state=state)
+        assert all(record.failed.keys() == {"grid/cav0"} for record in state.records)
+        assert "wireless uplink budget exceeded" in state.records[0].failed["grid/cav0"]
+        state.records.clear()
+    account = Account(ledger(wireless_mb=1e-4), "cloud", "regression", "wireless")
+    server = EdgeServer(clients, 1, account, START)
+    with pytest.raises(BudgetExceeded, match="wireless uplink budget exceeded"):
+        federate({"grid": server}, START, SCHEDULE, edge())
 
 
 @pytest.mark.parametrize("least", [None, 1, "all"])

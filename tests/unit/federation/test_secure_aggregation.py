@@ -16,7 +16,7 @@ from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.secure.masks import add_vectors, agree, draw_keys, expand, seal, to_integers, to_values, unseal
 from flcav.federation.secure.messages import TooFewClients
-from flcav.federation.secure.parties import SecureClient, SumLost, settle_complaints, unmask_sum
+from flcav.federation.secure.parties import SecureClient, SumLost, add_mask, settle_complaints, unmask_sum
 from flcav.federation.secure.shamir import find_wrong_shares, join_shares, split_secret
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
@@ -311,3 +311,46 @@ def test_a_key_of_another_than_the_client_s_own_is_told_when_it_drops_out():
     shares = {name: clients[name].reveal(NAMES[1:], NAMES[:1]) for name in NAMES[1:]}
     with pytest.raises(SumLost, match=f"{NAMES[0]} dropped out, and had shared a key that is not its own"):
         unmask_sum(total, keys, NAMES[1:], NAMES[:1], shares)
+
+
+def lie_to_each(threshold: int) -> Any:
+    """Return the update of the first of five clients, to which a server shows two others, and each another list.
+
+    Raises ValueError where a client reveals nothing.
+    """
+    one, *others = names = [f"cav{i}" for i in range(5)]
+    clients = {name: SecureClient.draw(name) for name in names}
+    keys = {name: client.keys for name, client in clients.items()}
+    sealed = {name: client.share(keys, threshold) for name, client in clients.items()}
+    shown = {name: [other for other in names if other != name] for name in names} | {one: others[: threshold - 1]}
+    for name, client in clients.items():
+        assert not client.take({other: sealed[other][name] for other in shown[name]})
+    masked = clients[one].mask(np.arange(7, dtype=np.uint32))
+    shares = {}
+    for name in others:
+        gone = [other for other in shown[one] if other != name]
+        shares[name] = clients[name].reveal([each for each in names if each not in gone], gone)
+    places = {name: place for place, name in enumerate(names)}
+
+    def joined(owner: str) -> bytes:
+        return join_shares({places[holder]: each[owner] for holder, each in shares.items() if holder != owner})
+
+    masked = add_mask(masked, joined(one), plus=False)
+    for other in shown[one]:
+        masked = add_mask(masked, agree(joined(other), keys[one].mask, "mask"), plus=other < one)
+    return masked
+
+
+def test_a_threshold_of_two_thirds_keeps_an_update_from_a_server_that_tells_each_client_another_list():
+    secure = SecureAggregation()
+    np.testing.assert_array_equal(lie_to_each(secure.needed(5)), np.arange(7))
+    with pytest.raises(ValueError, match="shares are revealed once, one of each client, to a server that has enough"):
+        lie_to_each(secure.needed(5, certified=True))
+    for number in range(2, 300):
+        threshold = secure.needed(number, certified=True)
+        assert number / 2 < threshold <= number
+        beyond = number - threshold  # so many keys at most are revealed by each client
+        for shown in range(threshold - 1, number):  # of one client's peers; `threshold` shares of each key are wanted
+            by_others, by_shown = (number - 1 - shown) * min(shown, beyond), shown * min(shown - 1, beyond)
+            assert by_others + by_shown + shown + 1 - threshold < threshold * shown  # and by the client itself
+    assert SecureAggregation(threshold=3).needed(5, certified=True) == 3

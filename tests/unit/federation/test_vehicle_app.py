@@ -1,15 +1,22 @@
 """The app of a deployed vehicle: what it keeps in its folder, and the same answer to the same request."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from cryptography import x509
 from flwr.app import ConfigRecord, Context, Message, MessageType, RecordDict
+from flwr.common.serde import recorddict_to_proto
 from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.config import InputError
+from flcav.federation.fleet.authority import SERVER, SERVER_KEY, found_authority
+from flcav.federation.fleet.keys import AUTHORITY, load_key, request_certificate, take_certificate
 from flcav.federation.fleet.vehicle import VehicleSettings
+from flcav.federation.messages.conduct import recall_answered
 from flcav.federation.messages.records import (
     ARRAYS,
     ASK,
@@ -21,11 +28,16 @@ from flcav.federation.messages.records import (
     read_arrays,
     to_arrays,
 )
+from flcav.federation.noise import draw_secret
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import keep_identity, wire_bytes
-from flcav.federation.runtimes.vehicle_app import Assignment, VehicleApp, load_assignment
+from flcav.federation.runtimes.vehicle_app import Assignment, VehicleApp, load_assignment, load_identity
+from flcav.federation.secure.certified import Identity
+from flcav.federation.secure.parties import SecureClient
 from flcav.federation.strategies import strategy_named
+from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import LocalUpdate
+from flcav.perception.distillation import SentOutputs
 
 TRAINED: list[int] = []
 
@@ -160,3 +172,196 @@ def test_another_assignment_begins_with_its_own_state(folder):
     assert load_assignment(folder).federation == "g"
     assert ask(folder, 1).has_content()
     assert len(TRAINED) == 2
+
+
+@dataclass(frozen=True)
+class Imitating:
+    """A client of FedMD, whose network is the sum of what it was sent."""
+
+    def train(self, weights, *, steps, learning_rate, seed, own=None, imitation_steps=1):
+        before = own["net"] if own else np.full(3, 100.0, np.float32)
+        return SentOutputs(weights, 3, 0.5, {"net": before + weights["w"].sum()})
+
+
+def query(folder: Path, content: RecordDict | None = None) -> RecordDict:
+    message = Message(content or RecordDict(), 2, MessageType.QUERY)
+    message.metadata.__dict__["_message_id"] = "1"
+    return VehicleApp(folder)(message, Context(1, 2, {}, RecordDict(), {})).content
+
+
+def train(folder: Path, federation: str, round_: int, state: dict | None = None, start: float = 1.0) -> None:
+    """Train in a round, of a federation that begins where a state is given."""
+    if state is not None:
+        Assignment(federation, "town/cav0", Imitating(), FedMD(), Rules(), state=state).save(folder)
+    content = {ARRAYS: to_arrays({"w": np.full(4, start, np.float32)}), CONFIG: LocalWork(round_, 1, 0.1, 7).record()}
+    message = Message(RecordDict(content), 2, MessageType.TRAIN)
+    message.metadata.__dict__["_message_id"] = "1"
+    assert VehicleApp(folder)(message, Context(1, 2, {}, RecordDict(), {})).has_content()
+
+
+def network(folder: Path, federation: str) -> float:
+    """Return a weight of the network in a vehicle's folder."""
+    _, state, _ = VehicleApp(folder)._read(load_assignment(folder))
+    assert load_assignment(folder).federation == federation
+    return float(read_arrays(state, "own")["net"][0])
+
+
+def test_the_network_of_fedmd_stays_with_its_vehicle_and_goes_on_in_the_next_federation(tmp_path):
+    train(tmp_path, "f", 1, {})
+    states = []
+    for round_ in (1, 2, 3):
+        if round_ > 1:
+            train(tmp_path, "f", round_)
+        told = query(tmp_path)
+        assert "own" not in told
+        assert (
+            np.full(3, network(tmp_path, "f"), np.float32).tobytes()
+            not in recorddict_to_proto(told).SerializeToString()
+        )
+        states.append({"own-digests": read_arrays(told, "own-digests")})
+        assert query(tmp_path) == told
+        assert len([*tmp_path.glob("*.network.bin")]) == min(round_, 2)
+    assert network(tmp_path, "f") == 112
+    train(tmp_path, "g", 1, states[2])  # as in the next cloud round
+    assert network(tmp_path, "g") == 116
+    train(tmp_path, "h", 1, states[1])  # as where the server was stopped before its checkpoint of the third round
+    assert network(tmp_path, "h") == 112
+    with pytest.raises(InputError, match="its network of the last round is no longer in the vehicle's folder"):
+        train(tmp_path, "i", 1, states[0])
+    train(tmp_path, "j", 1, {})
+    assert network(tmp_path, "j") == 104
+    train(tmp_path, "k", 1, {"own": {"net": np.zeros(3, np.float32)}})  # of a run that began within one process
+    assert network(tmp_path, "k") == 4
+    with pytest.raises(ValueError, match="a client's state is its own"):
+        query(tmp_path, RecordDict({"own": to_arrays({"net": np.zeros(3)})}))
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    """Folders of three vehicles of an authority, of one of another, and the authority's."""
+    folders = {}
+    for place, vehicles in (("ours", ("v1", "v2", "v3")), ("theirs", ("x1", "x2"))):
+        authority = found_authority(tmp_path_factory.mktemp(place))
+        folders[place] = authority.folder
+        for name in vehicles:
+            own = folders[name] = authority.folder / "vehicles" / name
+            certificate = authority.register(request_certificate(own, name))
+            take_certificate(own, certificate, (authority.folder / AUTHORITY).read_bytes())
+        authority.registry.close()
+    return folders
+
+
+NOISY = {"secure": {}, "privacy": {"where": "local", "clip": 1, "noise": 4}}
+
+
+@pytest.fixture
+def masked(fleet):
+    """Three vehicles' folders, by client, with local noise under masks."""
+    clients = {f"town/cav{number}": fleet[f"v{number}"] for number in (1, 2, 3)}
+    assign(clients, NOISY)
+    return clients
+
+
+def assign(clients: dict[str, Path], rules: dict) -> None:
+    for name, own in clients.items():
+        found = Rules.model_validate(rules).settle_threshold([*clients], certified=True)
+        Assignment(os.urandom(4).hex(), name, Counting(), strategy_named("fedavg"), found, draw_secret()).save(own)
+
+
+def answer(folder: Path, ask: dict, round_: int = 1, seed: int = 7) -> RecordDict:
+    content = {ARRAYS: to_arrays({"w": np.zeros(4, np.float32)}), CONFIG: LocalWork(round_, 1, 0.1, seed).record()}
+    message = Message(RecordDict({**content, ASK: ConfigRecord(ask)}), 2, MessageType.TRAIN)
+    message.metadata.__dict__["_message_id"] = "1"
+    return VehicleApp(folder)(message, Context(1, 2, {}, RecordDict(), {})).content
+
+
+def keys_of(folder: Path, round_: int = 1) -> dict:
+    return dict(answer(folder, {ASK: "keys"}, round_).config_records[ASK])
+
+
+def roster(keys: dict[str, dict], **others) -> dict:
+    """Return a request for shares by the keys of clients."""
+    kinds = {kind: [each[kind] for each in keys.values()] for kind in next(iter(keys.values()))}
+    return {ASK: "shares", "names": [*keys], **kinds, "threshold": 2, **others}
+
+
+def test_a_vehicle_shares_masks_with_vehicles_that_the_authority_certified_alone(fleet, masked, tmp_path):
+    """A server that invents peers, or uses keys of others, gets no shares, and so no update."""
+    me = masked["town/cav1"]
+    keys = {name: keys_of(own) for name, own in masked.items()}
+    mine, other = keys["town/cav1"], keys["town/cav2"]
+    identity = load_identity(fleet["x1"])
+    made = {name: SecureClient.draw(name) for name in ("a", "b")}
+    bare = {name: {"ciphers": own.keys.cipher, "masks": own.keys.mask} for name, own in made.items()}
+
+    def signed(by: Identity, name: str, round_: int = 1) -> dict:
+        certificate, signature = by.sign(name, round_, made[name].keys)
+        return {**bare[name], "certificates": certificate, "signatures": signature}
+
+    ours = load_identity(fleet["v2"])
+    server = x509.load_pem_x509_certificate((fleet["ours"] / SERVER).read_bytes())
+    posing = Identity(load_key(fleet["ours"] / SERVER_KEY), server, ours.authority)
+    nobody = {"certificates": b"", "signatures": b""}
+    for peers, why in (
+        ({"a": {**bare["a"], **nobody}, "b": {**bare["b"], **nobody}}, "a certificate or a signature is missing"),
+        ({"a": signed(identity, "a"), "b": signed(identity, "b")}, "no certified vehicle has signed"),
+        ({"a": signed(Identity(identity.key, ours.certificate, ours.authority), "a")}, "another signature"),
+        ({"a": {**other, **bare["a"]}}, "another signature"),  # a vehicle's certificate and signature of its own keys
+        ({"a": other}, "another signature"),  # that vehicle under another name
+        ({"a": signed(ours, "a", 2)}, "another signature"),  # of another round
+        ({"a": signed(ours, "a"), "b": signed(ours, "b")}, "'b' takes part with keys of the vehicle of 'a'"),
+        ({"a": signed(posing, "a")}, "the certificate is no vehicle's"),
+        ({"a": {**signed(ours, "a"), "certificates": b"x"}}, "no certified vehicle has signed"),
+        ({"a": {**signed(ours, "a"), "signatures": bytes(96)}}, "another signature"),
+        ({"a": {**signed(ours, "a"), "signatures": bytes(95)}}, "a certificate or a signature is missing"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            answer(me, roster({"town/cav1": mine, **peers}))
+    bare_ask = {kind: each for kind, each in roster(keys).items() if kind not in ("certificates", "signatures")}
+    with pytest.raises(ValueError, match="a certificate or a signature is missing"):
+        answer(me, bare_ask)
+    with pytest.raises(ValueError, match="a threshold of 1 of"):
+        answer(me, roster({"town/cav1": mine}, threshold=1))
+    assert "shares" in answer(me, roster(keys)).config_records[ASK]
+    Assignment("none", "a", Counting(), strategy_named("fedavg"), Rules.model_validate(NOISY)).save(tmp_path)
+    with pytest.raises(InputError, match="has no certificate yet"):
+        keys_of(tmp_path)
+
+
+def mask_all(masked: dict[str, Path], seed: int = 7, round_: int = 1) -> dict[str, np.ndarray]:
+    """Return the masked update of each vehicle, in a round that begins, or begins anew."""
+    keys = {name: keys_of(own, round_) for name, own in masked.items()}
+    shared: dict[str, Any] = {
+        name: dict(answer(own, roster(keys), round_).config_records[ASK]) for name, own in masked.items()
+    }
+    sealed = {other: dict(zip(each["names"], each["shares"], strict=True)) for other, each in shared.items()}
+    found = {}
+    for name, own in masked.items():
+        others = {other: sealed[other][name] for other in masked if other != name}
+        asked = answer(own, {ASK: "masked", "names": [*others], "shares": [*others.values()]}, round_, seed)
+        found[name] = read_arrays(asked, ARRAYS)["#masked"].astype(np.uint32)
+    return found
+
+
+def test_a_vehicle_hides_one_update_of_a_round_whatever_processes_answer(masked):
+    """Each message finds another process; what was answered is on the disk before it is sent."""
+    sums = [sum(mask_all(masked).values(), np.zeros(4, np.uint32)) for _ in range(3)]
+    assert len(TRAINED) == 3  # once by each vehicle
+    hidden = {
+        name: read_arrays(VehicleApp(own)._read(load_assignment(own))[1], "hidden") for name, own in masked.items()
+    }
+    with pytest.raises(ValueError, match="another training of round 1 than that whose update was masked"):
+        mask_all(masked, seed=8)
+    for name, own in masked.items():
+        after = VehicleApp(own)._read(load_assignment(own))[1]
+        np.testing.assert_array_equal(read_arrays(after, "hidden")["#masked"], hidden[name]["#masked"])
+        assert recall_answered(Context(1, 2, {}, after, {})).rounds == 1
+    assert len(TRAINED) == 3
+    assert not np.array_equal(sums[0], sums[1])  # the sums still have each client's own mask
+
+
+def test_a_vehicle_answers_no_more_rounds_than_its_budget_affords(masked):
+    assign(masked, {**NOISY, "privacy": {**NOISY["privacy"], "epsilon": 2.5}})
+    keys_of(masked["town/cav1"])
+    with pytest.raises(ValueError, match="more than the 1 that the privacy budget of town/cav1 affords"):
+        keys_of(masked["town/cav1"], 2)

@@ -127,7 +127,7 @@ def found_authority(folder: Path, hosts: tuple[str, ...] = ()) -> Authority:
 
 def open_authority(folder: Path) -> Authority:
     """Return the authority in `folder`; raises `InputError` where there is none, or its parts are of several."""
-    certificate = _load_certificate(folder)
+    certificate = load_certificate(folder)
     key = load_key(folder / AUTHORITY_KEY)
     if key.public_key() != certificate.public_key():
         raise InputError(f"{folder}: {AUTHORITY_KEY} is the key of another authority than {AUTHORITY}'s")
@@ -143,10 +143,11 @@ def open_authority(folder: Path) -> Authority:
 
 def open_registry(folder: Path) -> Registry:
     """Return the registry of the authority in `folder`; raises `InputError` where it is another one's."""
-    return Registry.open(folder / REGISTRY, _load_certificate(folder).fingerprint(hashes.SHA256()).hex())
+    return Registry.open(folder / REGISTRY, load_certificate(folder).fingerprint(hashes.SHA256()).hex())
 
 
-def _load_certificate(folder: Path) -> x509.Certificate:
+def load_certificate(folder: Path) -> x509.Certificate:
+    """Return the certificate of the authority in `folder`; raises `InputError` where there is none."""
     if not (folder / AUTHORITY).exists():
         raise InputError(f"{folder}: has no authority; make one with flcav fleet init {folder}")
     try:

@@ -1,7 +1,8 @@
 """Conduct of a client: it answers each round once, in order, in the way that was agreed, and within its budget.
 
 A server that asks otherwise could average noise away, see an update without its masks, or the same change from two
-sides. A client keeps what it answered last among its state; nothing that the server sends changes it.
+sides. A client keeps what it answered last among its state, before the answer leaves; nothing that the server sends
+changes it.
 """
 
 import hashlib
@@ -32,6 +33,7 @@ from flcav.federation.selection import Selection
 
 ANSWERED = "answered"  # record of a node's state
 UPDATE = "update"  # asked for where nothing else is
+NOTHING = bytes(32)  # in the place of a digest
 MOST_ROUNDS = 10**6  # that a budget is looked up for
 
 
@@ -55,24 +57,28 @@ class Answered:
     round: int = 0
     place: int = 0  # of the request among those that are agreed on
     rounds: int = 0  # in which it has answered so far
-    digest: bytes = bytes(32)  # of the request
+    digest: bytes = NOTHING  # of the request; under secure aggregation of the training that the round's update is of
 
     def admit(self, round_: int, asked: str, digest: bytes, rules: Rules, repeatable: bool) -> "Answered":
         """Return what is answered last after a request for `asked` in a round; raises `RequestRefused`.
 
         The same request may come again, as after a stop of the server, where the same answer can be given:
-        `repeatable`. Under secure aggregation a round may restart, with new masks, until its sum is unmasked.
+        `repeatable`. Under secure aggregation a round may restart, with new masks, until its sum is unmasked; what they
+        hide stays the update of the first training that was asked for, by its `digest`.
         """
-        requests = agreed_requests(rules)
+        requests, masked = agreed_requests(rules), rules.secure is not None
         if asked not in requests:
             raise RequestRefused(f"a request for '{asked}', and agreed are {', '.join(requests)}")
         place = requests.index(asked)
         if round_ > self.round and place == 0:
-            return Answered(round_, place, self.rounds + 1, digest)
+            return Answered(round_, place, self.rounds + 1, NOTHING if masked else digest)
         if round_ == self.round:
-            again = rules.secure is not None and place == 0 and requests[self.place] != UNMASK
+            again = masked and place == 0 and requests[self.place] != UNMASK
             if place == self.place + 1 or again:
-                return Answered(round_, place, self.rounds, digest)
+                if asked == MASKED and self.digest not in (NOTHING, digest):
+                    raise RequestRefused(f"another training of round {round_} than that whose update was masked")
+                trained = self.digest if masked and asked != MASKED else digest
+                return Answered(round_, place, self.rounds, trained)
             if place == self.place and digest == self.digest and repeatable:
                 return self
         told = f"{requests[self.place]} of round {self.round}" if self.rounds else "nothing"
@@ -115,12 +121,15 @@ class Requests:
         """Number of rounds in which a client's budget affords an answer, see `affordable_answers`."""
         return affordable_answers(self._privacy)
 
-    def digest(self, content: RecordDict) -> bytes:
-        """Return the digest of all that is asked, which is 32 bytes (BLAKE2b); not of the note that nothing arrives."""
+    def digest(self, content: RecordDict, without: str = LOST) -> bytes:
+        """Return the digest of all that is asked, which is 32 bytes (BLAKE2b); not of the note that nothing arrives.
+
+        without: another record that does not count.
+        """
         hashed = hashlib.blake2b(digest_size=32)
         with self._lock:
             for key, record in sorted(content.items()):
-                if key != LOST:
+                if key not in (LOST, without):
                     hashed.update(f"{key!r} ".encode())
                     hashed.update(
                         self._digest_arrays(key, [*record.items()])

@@ -26,6 +26,7 @@ OVER_BUDGET = 101  # error code in the place of an answer over that
 LOST_BY_NETWORK = 100  # error code in the place of an answer that does not arrive; Flower's own codes are below
 KEYS, SHARES, MASKED, UNMASK = "keys", "shares", "masked", "unmask"  # ask, in this order, under secure aggregation
 NAMES, CIPHERS, MASKS = "names", "ciphers", "masks"  # entries of its messages; that of shares is `SHARES`
+CERTIFICATES, SIGNATURES = "certificates", "signatures"  # entries beside keys, of clients with an authority
 SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
 
 NUMBERS = {  # types of arrays in messages, by name

@@ -198,7 +198,15 @@ class PartlyDeployed:
     def open(
         self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
     ) -> Iterator["JoinedGrid"]:
-        """Yield the grid of `clients`, of which the vehicles are deployed, see `Deployment.open`."""
+        """Yield the grid of `clients`, of which the vehicles are deployed, see `Deployment.open`.
+
+        Raises `InputError` under masks, which vehicles have in common with certified vehicles alone.
+        """
+        if agreed.rules.secure is not None:
+            own = min(self.own)
+            raise InputError(
+                f"secure: {own} trains in the server's process, and vehicles share masks with vehicles alone"
+            )
         here = {name: client for name, client in clients.items() if name in self.own}
         there = {name: client for name, client in clients.items() if name not in self.own}
         app = client_app(here, agreed.strategy, agreed.rules, agreed.secrets, agreed.spent)

@@ -15,10 +15,12 @@ from pathlib import Path
 from flwr.app import ConfigRecord, Error, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
+from flcav.federation.fleet.authority import load_certificate
 from flcav.federation.fleet.status import Followed, FollowedRound
 from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
 from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.messages.records import GRANT, GRANTED, LOST_BY_NETWORK, OVER_BUDGET, read_arrays
+from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.federation.state import ClientStates, RoundRecord
@@ -30,6 +32,7 @@ POLL_S, PAUSE_S = 0.2, 1.0  # between looks for answers; before a vehicle that w
 RAISED = 2  # Flower's error code of an app that raised an exception, whose words are the reason
 FULL = re.compile(rf"\[Errno (?:{errno.ENOSPC}|{errno.EDQUOT}|{errno.EFBIG})\] ([A-Z][A-Za-z ]*)")
 TRANSPORT = (3, 4, 5, 8)  # Flower's error codes of messages and nodes that are not available, and of a crashed app
+SPARE_BYTES, CLIENT_BYTES = 1 << 16, 512  # of the largest answer, beside arrays; of what it has for each client
 
 
 class DeployedGrid(WrappedGrid):
@@ -40,6 +43,8 @@ class DeployedGrid(WrappedGrid):
     ) -> None:
         """Reach nodes of the fleet in `folder` with the clients' `names`, which are `vehicles` of its registry."""
         self._folder, self._link, self.names, self._vehicles, self._account = folder, link, names, vehicles, account
+        self.authority = load_certificate(folder)
+        self._largest = 0  # request to train so far [bytes]
         self._rounds: tuple[FollowedRound, ...] = ()
         self._waits: dict[str, str] = {}  # by client why it is waited for
         self._begin()
@@ -101,9 +106,13 @@ class DeployedGrid(WrappedGrid):
         return {name: found[name] for name in self.names.values() if name in found}
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
-        """Yield the replies in the order of the messages; raises `BudgetExceeded` where one was kept for its size."""
+        """Yield the replies in the order of the messages, as errors those that are over their grants.
+
+        Who says that it kept an answer for its size comes last: `BudgetExceeded` is raised where that can be, since an
+        answer of another client was larger than the grant or, where none came, the largest that there can be is.
+        """
         asked = {message.metadata.dst_node_id: message for message in messages}
-        exchange = _Exchange(self._count_losses())
+        exchange, kept, largest = _Exchange(self._count_losses()), list[int](), 0
         answers: dict[int, Message] = {}
         end = time.monotonic() + (timeout or float("inf"))
         for node, message in asked.items():
@@ -115,27 +124,61 @@ class DeployedGrid(WrappedGrid):
                     self._pull(exchange, asked, answers)
                 except SuperLinkLost:
                     self._renew()
-                    exchange = _Exchange(self._count_losses())
+                    exchange = _Exchange(self._count_losses(), exchange.granted)
                 if node not in answers:
                     if time.monotonic() > end:
+                        yield from self._judge(exchange, {own: asked[own] for own in kept}, largest)
                         return
                     exchange.notice(self._count_losses())
                     time.sleep(POLL_S)
             reply = answers.pop(node)
             answers[node] = message  # answered; only its place is looked at
             if reply.has_error() and reply.error.code == OVER_BUDGET:
-                raise BudgetExceeded(f"{self.names[node]}: {reply.error.reason} on the {self._account.link} uplink")
+                kept.append(node)
+                continue
+            size = wire_bytes(reply.content) if reply.has_content() else 0
+            if size > exchange.granted[node]:
+                told = f"an answer of {size} bytes, where {exchange.granted[node]} were granted"
+                reply = Message(Error(RAISED, told), reply_to=message)
+            else:
+                largest = max(largest, size)
             yield reply
+        yield from self._judge(exchange, {own: asked[own] for own in kept}, largest)
+
+    def _judge(self, exchange: "_Exchange", kept: Mapping[int, Message], largest: int) -> Iterator[Message]:
+        """Yield an error for each node that says it kept its answer, or raise `BudgetExceeded` where that can be.
+
+        kept: what these nodes were asked. largest: bytes of the answers that came.
+        """
+        for node, message in kept.items():
+            granted = exchange.granted[node]
+            if granted < (largest or self._most_bytes):
+                name, link = self.names[node], self._account.link
+                raise BudgetExceeded(
+                    f"{name}: an answer of more than the {granted} bytes that are left on the {link} uplink"
+                )
+            yield Message(Error(RAISED, f"no answer, as if {granted} bytes were too few for it"), reply_to=message)
+
+    @property
+    def _most_bytes(self) -> int:
+        """Return more than the bytes of any answer to a request to train so far.
+
+        That is weights, up to twice as much for numbers of 16 bits in 32, twice that for coordinates or a strategy's
+        arrays beside them, and what secure aggregation has for each client.
+        """
+        return 4 * self._largest + CLIENT_BYTES * len(self.names) + SPARE_BYTES
 
     def _push(self, exchange: "_Exchange", due: Mapping[int, Message]) -> None:
         """Send requests to nodes, with the bytes that their answers may have."""
-        left = max(0, int(self._account.ledger.left_mb(self._account.link) * 1e6))
-        grant = ConfigRecord({GRANTED: min(left, 2**62)})
-        sent = []
+        left, sent = min(max(0, int(self._account.ledger.left_mb(self._account.link) * 1e6)), 2**62), []
         for node, message in due.items():
-            content = {**message.content}
-            if GRANT in content or message.metadata.message_type == MessageType.TRAIN:
-                content[GRANT] = grant
+            content, trains = {**message.content}, message.metadata.message_type == MessageType.TRAIN
+            if trains:
+                self._largest = max(self._largest, wire_bytes(message.content))
+            most = min(left, self._most_bytes) if trains else left if GRANT in content else 2**62
+            granted = exchange.granted.setdefault(node, most)
+            if trains or GRANT in content:
+                content[GRANT] = ConfigRecord({GRANTED: granted})
             sent.append(Message(RecordDict(content), node, message.metadata.message_type))
         for identifier, node in zip(self._grid.push_messages(sent), due, strict=True):
             exchange.sent(node, identifier)
@@ -153,6 +196,8 @@ class DeployedGrid(WrappedGrid):
                 self._wait_for(exchange, node, reason)
             elif reason is not None:
                 answers[node] = Message(Error(LOST_BY_NETWORK, reason), reply_to=asked[node])
+            elif reply.has_error() and reply.error.code != OVER_BUDGET:  # whatever code a vehicle gives it
+                answers[node] = Message(Error(RAISED, str(reply.error.reason)), reply_to=asked[node])
             else:
                 answers[node] = reply
 
@@ -177,7 +222,8 @@ def _excuse(reply: Message) -> str | None:
 class _Exchange:
     """Who was asked in a run, by which message, and who is to be asked again when."""
 
-    def __init__(self, losses: Mapping[int, int]) -> None:
+    def __init__(self, losses: Mapping[int, int], granted: Mapping[int, int] = {}) -> None:
+        self.granted = dict(granted)  # bytes of an answer, by node
         self.nodes: dict[str, int] = {}  # of the messages that are out, by their ids
         self._losses = dict(losses)
         self._due: dict[int, float] = {}  # of nodes that were asked: when they are to be asked again

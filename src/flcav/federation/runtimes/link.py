@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, Union
 
+from cryptography import x509
 from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
@@ -74,6 +75,7 @@ class Link:
     ask: Ask
     read_states: ReadStates  # of what clients keep between rounds
     follow: Callable[[RoundRecord], None] = lambda _: None  # called with the record of each round that has ended
+    authority: x509.Certificate | None = None  # that has certified the clients; None: they are not certified
 
 
 @contextlib.contextmanager
@@ -112,13 +114,13 @@ def open_link(
         opened, far = runtime.open(clients, Agreement(strategy, rules, secrets, spent), states, account), True
     else:
         timing = (lambda each: each) if limit_s is None else (lambda each: TimedClients(each, limit_s))
-        opened = runtime.open(clients, lambda each: make_app(timing(each)), states)
+        opened = runtime.open(clients, lambda each: make_app(timing(each), simulated=True), states)
     with opened as inner:
         lossy = LossyGrid(inner, account, inner.names) if account.outages else inner
         metered = MeteredGrid(BudgetedGrid(lossy, account, inner.names), account, inner.names)
         follow = getattr(inner, "follow", lambda _: None)
         ask = partial(_ask_there, inner, inner.names) if far else partial(_ask_here, clients)
-        yield Link(metered, inner.names, ask, inner.read_states, follow)
+        yield Link(metered, inner.names, ask, inner.read_states, follow, getattr(inner, "authority", None))
 
 
 @contextlib.contextmanager

@@ -13,25 +13,29 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
+from cryptography import x509
 from flwr.app import Context, Error, Message, MessageType, RecordDict
 from flwr.clientapp import ClientApp
 from flwr.common.serde import recorddict_from_proto, recorddict_to_proto
 from flwr.proto.recorddict_pb2 import RecordDict as ProtoRecordDict
 
-from flcav.federation.client import PARTITION, client_app
-from flcav.federation.fleet.keys import write_private
+from flcav.config import InputError
+from flcav.federation.client import OWN, OWN_DIGESTS, PARTITION, client_app
+from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, KEY, check_certificate, load_key, write_private
 from flcav.federation.fleet.vehicle import FOLDER, SETTINGS, load_settings
 from flcav.federation.messages.conduct import Requests
-from flcav.federation.messages.records import GRANT, GRANTED, OVER_BUDGET, to_arrays
+from flcav.federation.messages.records import GRANT, GRANTED, OVER_BUDGET, read_arrays, to_arrays
 from flcav.federation.noise import Secret
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.deadline import TimedClients
 from flcav.federation.runtimes.embedded import wire_bytes
+from flcav.federation.secure.certified import Identity
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable, Weights
 from flcav.plugins import load_named
 
 ASSIGNMENT, STATE = "assignment.pickle", "state.bin"
+NETWORK = "network.bin"  # ends the name of a file with a client's own network, which begins with its digest
 HEAD = struct.Struct(">32sQ")  # digest of the last request, bytes of the state; then the state and the last answer
 
 
@@ -74,6 +78,16 @@ def load_assignment(folder: Path) -> Assignment:
     return _load(folder / ASSIGNMENT, found.st_mtime_ns, found.st_size)
 
 
+def load_identity(folder: Path) -> Identity:
+    """Return key and certificates of the vehicle in `folder`, by which it masks updates.
+
+    Raises `InputError` where it has none that are in force.
+    """
+    check_certificate(folder)
+    own, authority = (x509.load_pem_x509_certificate((folder / name).read_bytes()) for name in (CERTIFICATE, AUTHORITY))
+    return Identity(load_key(folder / KEY), own, authority)
+
+
 def prepare(folder: Path) -> None:
     """Read a vehicle's assignment, if there is one, so that forks of this process have it, and the modules it needs."""
     with contextlib.suppress(Exception):  # the app says what is wrong, in the place of its answer
@@ -102,13 +116,15 @@ class VehicleApp(ClientApp):
         clients = {own.client: own.trainable}
         secrets = {} if own.secret is None else {own.client: own.secret}
         timed = clients if limit is None else TimedClients(clients, limit)
-        app = client_app(timed, own.strategy, own.rules, secrets, own.spent)
+        identity = None if own.rules.secure is None else load_identity(self._folder)
+        app = client_app(timed, own.strategy, own.rules, secrets, own.spent, identity)
         content, grant = message.content, None
         if GRANT in content:
             grant = int(content.config_records[GRANT][GRANTED])  # type: ignore[arg-type]
             message.content = RecordDict({key: each for key, each in content.items() if key != GRANT})
         digest = Requests(None).digest(message.content)
         last, state, answer = self._read(own)
+        answered, told = answer, _digests(state)
         asks_again = message.metadata.message_type == MessageType.TRAIN and last == digest
         if not asks_again:
             here = Context(context.run_id, context.node_id, {PARTITION: 0}, state, {})
@@ -118,6 +134,9 @@ class VehicleApp(ClientApp):
             answer = reply.content
             if message.metadata.message_type == MessageType.TRAIN:
                 self._write(own, digest, here.state, answer)
+            elif OWN_DIGESTS in answer:
+                self._keep_network(here.state, told)
+                self._write(own, last, here.state, answered)
         if grant is not None and (size := wire_bytes(answer)) > grant:
             return Message(Error(OVER_BUDGET, f"an answer of {size} bytes, and {grant} are left"), reply_to=message)
         return Message(answer, reply_to=message)
@@ -127,12 +146,41 @@ class VehicleApp(ClientApp):
         try:
             data = (self._folder / f"{own.federation}.{STATE}").read_bytes()
         except FileNotFoundError:
-            return b"", RecordDict({key: to_arrays(arrays) for key, arrays in own.state.items()}), RecordDict()
+            state = RecordDict({key: to_arrays(arrays) for key, arrays in own.state.items()})
+            if digests := _digests(state):
+                network = self._folder / f"{digests[0]}.{NETWORK}"
+                if not network.exists():
+                    raise InputError("its network of the last round is no longer in the vehicle's folder") from None
+                state[OWN] = _parse(network.read_bytes())[OWN]
+            return b"", state, RecordDict()
         digest, size = HEAD.unpack_from(data)
         parts = data[HEAD.size : HEAD.size + size], data[HEAD.size + size :]
-        state, answer = (recorddict_from_proto(ProtoRecordDict.FromString(part)) for part in parts)
+        state, answer = map(_parse, parts)
         return digest, state, answer
 
+    def _keep_network(self, state: RecordDict, told: list[str]) -> None:
+        """Write the client's own network, whose digest the server is told, for later federations that go on with it.
+
+        told: digests before. Of those the last one is kept, too: the server may be stopped before it has a checkpoint.
+        """
+        digests = _digests(state)
+        write_private(self._folder / f"{digests[0]}.{NETWORK}", _serialise(RecordDict({OWN: state[OWN]})))
+        for digest in {*told} - {*digests}:
+            (self._folder / f"{digest}.{NETWORK}").unlink(missing_ok=True)
+
     def _write(self, own: Assignment, digest: bytes, state: RecordDict, answer: RecordDict) -> None:
-        kept, sent = (recorddict_to_proto(each).SerializeToString() for each in (state, answer))
+        kept, sent = map(_serialise, (state, answer))
         write_private(self._folder / f"{own.federation}.{STATE}", HEAD.pack(digest, len(kept)) + kept + sent)
+
+
+def _digests(state: RecordDict) -> list[str]:
+    """Return the digests of a client's own networks that the server was told, the last one first."""
+    return [each.tobytes().hex() for each in read_arrays(state, OWN_DIGESTS).values()] if OWN_DIGESTS in state else []
+
+
+def _parse(data: bytes) -> RecordDict:
+    return recorddict_from_proto(ProtoRecordDict.FromString(data))
+
+
+def _serialise(records: RecordDict) -> bytes:
+    return recorddict_to_proto(records).SerializeToString()

@@ -5,12 +5,25 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
+from cryptography import x509
 from flwr.app import ConfigRecord, Context, Message, RecordDict
 
 from flcav.config import shorten
 from flcav.federation.messages.acceptance import ReplyRefused, read_entry
-from flcav.federation.messages.records import ASK, CIPHERS, KEYS, MASKED, MASKS, NAMES, SHARES, UNMASK
+from flcav.federation.messages.records import (
+    ASK,
+    CERTIFICATES,
+    CIPHERS,
+    KEYS,
+    MASKED,
+    MASKS,
+    NAMES,
+    SHARES,
+    SIGNATURES,
+    UNMASK,
+)
 from flcav.federation.rules import SecureAggregation
+from flcav.federation.secure.certified import Identity, SignedKeys, check_certified, find_vehicle
 from flcav.federation.secure.masks import Vector, add_vectors, is_public_key
 from flcav.federation.secure.parties import SEALED_BYTES, PublicKeys, SecureClient, find_liars, unmask_sum
 from flcav.federation.secure.shamir import SHARE_BYTES
@@ -35,22 +48,27 @@ class TooFewClients(OSError):
     """Fewer clients are left than secure aggregation needs."""
 
 
-def answer_secretly(message: Message, context: Context, name: str, how: SecureAggregation) -> Message:
+def answer_secretly(
+    message: Message, context: Context, name: str, how: SecureAggregation, round_: int, identity: Identity | None = None
+) -> Message:
     """Return a client's answer to the server's request for keys, shares, or shares of others.
 
-    Raises ValueError for a request that would reveal more than `how` and the protocol do.
+    identity: by which a client signs its keys of the round, and accepts those of certified peers alone; None: it has no
+    authority. Raises ValueError for a request that would reveal more than `how` and the protocol do.
     """
     asked = message.content.config_records[ASK]
     if asked[ASK] == KEYS:
         client = SecureClient.draw(name)
         record = ConfigRecord({CIPHERS: client.keys.cipher, MASKS: client.keys.mask})
+        if identity is not None:
+            record[CERTIFICATES], record[SIGNATURES] = identity.sign(name, round_, client.keys)
     elif asked[ASK] == SHARES:
         client = _recall(context)
         peers, threshold = _peers(asked), _number(asked[THRESHOLD])
-        if threshold < how.needed(len(peers)):
-            raise ValueError(
-                f"a threshold of {threshold} of {len(peers)} clients: {how.needed(len(peers))} are agreed on"
-            )
+        if identity is not None:
+            check_certified(identity.authority, round_, _signed(asked, peers))
+        if threshold < (needed := how.needed(len(peers), certified=identity is not None)):
+            raise ValueError(f"a threshold of {threshold} of {len(peers)} clients: {needed} are agreed on")
         sealed = client.share(peers, threshold)
         record = ConfigRecord({NAMES: [*sealed], SHARES: [*sealed.values()]})
     else:
@@ -80,9 +98,14 @@ def mask_update(context: Context, update: Vector) -> Vector:
 class SecureSum:
     """The server's side of one round: what it has to ask for, and the sum in the end."""
 
-    def __init__(self, exchange: Exchange, threshold: int) -> None:
-        """Ask clients by `exchange`; `threshold` of them have to be left at every step."""
-        self._exchange, self._threshold = exchange, threshold
+    def __init__(
+        self, exchange: Exchange, threshold: int, round_: int, authority: x509.Certificate | None = None
+    ) -> None:
+        """Ask clients by `exchange`; `threshold` of them have to be left at every step.
+
+        authority: that has certified who signs keys of the round; None: keys are not signed.
+        """
+        self._exchange, self._threshold, self._round, self._authority = exchange, threshold, round_, authority
         self._keys: dict[str, PublicKeys] = {}
         self._peers: list[str] = []
 
@@ -91,9 +114,21 @@ class SecureSum:
 
         Raises `TooFewClients`.
         """
-        self._keys = self._exchange(
-            {name: ConfigRecord({ASK: KEYS}) for name in chosen}, lambda _, content: read_keys(content)
-        )
+        signed, vehicles = dict[str, SignedKeys](), dict[str, str]()
+
+        def read(name: str, content: RecordDict) -> PublicKeys:
+            found = read_keys(content)
+            if self._authority is not None:
+                try:
+                    vehicle = find_vehicle(self._authority, self._round, name, found)
+                except ValueError as error:
+                    raise ReplyRefused(str(error)) from None
+                if (other := vehicles.setdefault(vehicle, name)) != name:
+                    raise ReplyRefused(f"keys of the vehicle of {other}")
+                signed[name] = found
+            return found[0]
+
+        self._keys = self._exchange({name: ConfigRecord({ASK: KEYS}) for name in chosen}, read)
         self._check(len(self._keys), "sent keys")
         ask = {
             ASK: SHARES,
@@ -102,6 +137,11 @@ class SecureSum:
             MASKS: [keys.mask for keys in self._keys.values()],
             THRESHOLD: self._threshold,
         }
+        if signed:
+            ask |= {
+                CERTIFICATES: [each[1] for each in signed.values()],
+                SIGNATURES: [each[2] for each in signed.values()],
+            }
         sealed = self._exchange(
             dict.fromkeys(self._keys, ConfigRecord(ask)),
             lambda name, content: read_shares(content, [each for each in self._keys if each != name], SEALED_BYTES),
@@ -179,6 +219,11 @@ def _peers(record: ConfigRecord) -> dict[str, PublicKeys]:
     return {name: PublicKeys(cipher, mask) for name, cipher, mask in each}
 
 
+def _signed(record: ConfigRecord, peers: Mapping[str, PublicKeys]) -> dict[str, SignedKeys]:
+    given: Any = (record.get(kind, [b""] * len(peers)) for kind in (CERTIFICATES, SIGNATURES))
+    return {name: (keys, *proof) for (name, keys), *proof in zip(peers.items(), *given, strict=True)}
+
+
 def _strings(value: Any) -> list[str]:
     return [str(each) for each in value]
 
@@ -191,12 +236,18 @@ def _bytes(value: Any) -> bytes:
     return bytes(value)
 
 
-def read_keys(content: RecordDict) -> PublicKeys:
-    """Return a client's public keys of a round; raises `ReplyRefused`."""
+def read_keys(content: RecordDict) -> SignedKeys:
+    """Return a client's public keys of a round, with a certificate and a signature that are not checked here.
+
+    Where the client has no authority these are empty. Raises `ReplyRefused`.
+    """
     found = PublicKeys(*(read_entry(content, kind) for kind in (CIPHERS, MASKS)))
     if not (is_public_key(found.cipher) and is_public_key(found.mask)):
         raise ReplyRefused("keys that nobody can agree on a secret with")
-    return found
+    certificate, signature = (read_entry(content, kind) or b"" for kind in (CERTIFICATES, SIGNATURES))
+    if not isinstance(certificate, bytes) or not isinstance(signature, bytes):
+        raise ReplyRefused("a certificate or a signature that is not in bytes")
+    return found, certificate, signature
 
 
 def read_shares(content: RecordDict, owners: Sequence[str], size: int) -> dict[str, bytes]:

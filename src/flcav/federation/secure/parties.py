@@ -96,7 +96,10 @@ class SecureClient:
     def reveal(self, survivors: Sequence[str], dropped: Sequence[str]) -> dict[str, bytes]:
         """Return this client's shares: of the survivors' seeds, and of the keys of masks of those who dropped out.
 
-        Raises ValueError where this would reveal both of a client, where it was done before, or with too few survivors.
+        A server that tells clients different lists takes off all masks of one which has them in common with `threshold`
+        - 1 others, where it gets `threshold` shares of each of their keys. A client reveals shares of no more keys than
+        there are clients beyond the threshold. Raises ValueError where this would reveal both of a client, where it was
+        done before, or with too few survivors.
         """
         if self.revealed or set(survivors) & set(dropped) or len(set(survivors)) < self.threshold:
             raise ValueError("shares are revealed once, one of each client, to a server that has enough updates")
