@@ -2,17 +2,25 @@
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
-from starlette.types import Message, Receive, Scope, Send
+from starlette.types import Receive, Scope, Send
 
 HOP_BY_HOP = {b"connection", b"keep-alive", b"transfer-encoding", b"te", b"trailer", b"upgrade", b"host"}  # RFC 9110
-LARGEST_BODY = 64_000_000  # bytes; Flower's objects have 5 MiB at most
 PIECE_BYTES = 1 << 18  # of a file
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
+QUIET_S, BODY_S = 20.0, 300.0  # that a body may pause, and take in all
+
+
+class Refused(Exception):
+    """A request is refused with an HTTP status and a sentence."""
+
+    def __init__(self, status: int, why: str) -> None:
+        super().__init__(why)
+        self.status, self.why = status, why
 
 
 @dataclass
@@ -47,49 +55,44 @@ async def send_file(send: Send, path: Path, sent: Callable[[], object]) -> None:
             sent()
 
 
-async def read_body(receive: Receive, most: int) -> bytes:
-    """Return the body of a request; raises ValueError where it is longer than `most` bytes, or breaks off."""
-    body, more = b"", True
-    while more:
-        event = await receive()
-        if event["type"] == "http.disconnect":
-            raise ValueError("the client has left")
-        body += event.get("body", b"")
-        if len(body) > most:
-            raise ValueError(f"the message has more than {most} bytes")
-        more = event.get("more_body", False)
-    return body
+async def read_body(scope: Scope, receive: Receive, most: int) -> bytes:
+    """Return the body of a request.
+
+    Raises `Refused` where it is longer than `most` bytes, pauses for more than `QUIET_S`, takes more than `BODY_S`, or
+    breaks off.
+    """
+    told = next((value for name, value in scope["headers"] if name == b"content-length"), b"0")
+    if int(told) > most:
+        raise Refused(400, f"the message has more than {most} bytes")
+    body, more = bytearray(), True
+    try:
+        async with asyncio.timeout(BODY_S):
+            while more:
+                async with asyncio.timeout(QUIET_S):
+                    event = await receive()
+                if event["type"] == "http.disconnect":
+                    raise Refused(400, "the client has left")
+                body += event.get("body", b"")
+                if len(body) > most:
+                    raise Refused(400, f"the message has more than {most} bytes")
+                more = event.get("more_body", False)
+    except TimeoutError:
+        raise Refused(408, "the message does not come") from None
+    return bytes(body)
 
 
-async def relay(client: httpx.AsyncClient, scope: Scope, receive: Receive, send: Send) -> Relayed:
-    """Pass a request on by `client`, whose base address is the other server's; return the sizes.
+async def relay(
+    client: httpx.AsyncClient, path: str, headers: Iterable[tuple[bytes, bytes]], body: bytes, send: Send
+) -> Relayed:
+    """Pass a POST request on by `client`, whose base address is the other server's; return the sizes.
 
     Where the other server cannot be reached, the answer is 503, after which Flower's nodes try again.
     """
-    done = Relayed()
-
-    async def body() -> AsyncIterator[bytes]:
-        more = True
-        while more:
-            event: Message = await receive()
-            if event["type"] == "http.disconnect":
-                raise httpx.ReadError("the client has left")
-            done.up += len(event.get("body", b""))
-            if done.up > LARGEST_BODY:
-                raise httpx.ReadError("the body is too large")
-            yield event.get("body", b"")
-            more = event.get("more_body", False)
-
-    headers = [(name, value) for name, value in scope["headers"] if name.lower() not in HOP_BY_HOP]
-    target = scope["raw_path"].decode("ascii")
-    begun = False
+    done, begun = Relayed(up=len(body)), False
     try:
-        request = client.build_request(scope["method"], target, headers=headers, content=body())
-        for name in ("accept-encoding", "user-agent", "accept"):  # httpx's own, where the caller has none
-            if name.encode() not in {key.lower() for key, _ in scope["headers"]}:
-                request.headers.pop(name, None)
-        if "content-length" in request.headers:
-            request.headers.pop("transfer-encoding", None)
+        request = client.build_request("POST", path, headers=[*headers], content=body)
+        for name in ("accept-encoding", "user-agent"):  # httpx's own
+            request.headers.pop(name, None)
         response = await client.send(request, stream=True)
         try:
             kept = [(name.lower(), value) for name, value in response.headers.raw if name.lower() not in HOP_BY_HOP]
