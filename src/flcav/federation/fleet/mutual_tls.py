@@ -208,6 +208,7 @@ def serve_https(
         log_config=None,
         access_log=False,
         server_header=False,
+        proxy_headers=False,
         backlog=BACKLOG,
         ssl_certfile=certificate,
         ssl_keyfile=key,
