@@ -164,7 +164,9 @@ def test_what_is_passed_on_is_what_was_checked(running):
 )
 def test_headers_of_another_vehicle_or_of_two_meanings(lines, running):
     own, other = running.header("cav-1"), running.header("cav-2")
-    values = (own, other) if not any(each.startswith(("flwr", "FLWR")) for each in lines[:1]) else (own[17:], other[17:])
+    values = (
+        (own, other) if not any(each.startswith(("flwr", "FLWR")) for each in lines[:1]) else (own[17:], other[17:])
+    )
     sent = [each.replace("{1}", values[0]).replace("{2}", values[1]) for each in lines]
     told = [] if any("length" in each or "chunked" in each for each in sent) else ["content-length: 5"]
     status, _ = running.send([*sent, *told], body_of("pull-messages", 11)[:5].ljust(5, b"\0"))
