@@ -1,8 +1,9 @@
 """A federation on a fleet of its own: a vehicle hangs, another is revoked, the registry is damaged; it goes on."""
 
+import contextlib
 import os
-import shutil
 import signal
+import sqlite3
 import threading
 import time
 
@@ -87,10 +88,16 @@ def test_a_vehicle_that_hangs(fleet, weights, tmp_path, monkeypatch):
 
 def test_a_damaged_registry_closes_calls_and_not_the_fleet(fleet, tmp_path):
     own, path, before = fleet.folder / VEHICLES / "vehicle-001", fleet.folder / REGISTRY, read_processes(fleet.folder)
-    shutil.copy(path, tmp_path / "kept")
+    with (
+        contextlib.closing(sqlite3.connect(path)) as now,
+        contextlib.closing(sqlite3.connect(tmp_path / "kept")) as kept,
+    ):
+        now.backup(kept)
     (tmp_path / "none").write_text("no registry")
     try:
         (tmp_path / "none").replace(path)
+        for rest in ("-wal", "-shm"):  # what SQLite would restore it from
+            path.with_name(path.name + rest).unlink(missing_ok=True)
         with reach(fleet, own) as client:
             answer = activate(client, load_key(own / KEY))
             assert (answer.status_code, answer.text) == (503, "the fleet's registry cannot be read")

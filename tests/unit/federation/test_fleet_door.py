@@ -195,6 +195,21 @@ def test_key_and_sender_in_the_body(running):
     assert len(running.reached) == 1
 
 
+@pytest.mark.parametrize("text", ["a\x1b[2J", "a\nb", "a" * 300, "\u202e"])
+def test_identifiers_that_flower_would_log(text, running):
+    node, told = Node(node_id=11), "no identifier"
+    for call, asked in {
+        "get-fab": CALLS["get-fab"](node=node, hash_str=text),
+        "pull-messages": CALLS["pull-messages"](node=node, message_ids=["a", text]),
+        "push-messages": PushMessagesRequest(
+            node=node, messages_list=[Message(metadata=Metadata(src_node_id=11, message_id=text))]
+        ),
+    }.items():
+        status, why = send_body(running, call, asked.SerializeToString())
+        assert (status, why.endswith(told)) == (400, True)
+    assert running.reached == []
+
+
 def test_a_vehicle_that_is_not_enrolled_yet_is_to_try_again(running):
     running.authority.registry.set_node(running.vehicles["cav-1"].fingerprint, None)
     assert send_body(running, "pull-messages", b"")[0] == 503

@@ -45,6 +45,7 @@ SENT = (SIGNED_AT, b"flwr-signature", b"flwr-package-name", b"flwr-package-versi
 PROTOBUF = ((b"content-type", b"application/protobuf"), (b"accept", b"application/protobuf"))
 VALUE = re.compile(rb"[!-~](?:[ -~]{0,510}[!-~])?")  # of a header
 MOST_HEADERS = 40
+LONGEST_NAME = 200  # characters of an identifier in a body
 LARGEST_OBJECT, LARGEST_CALL = 16_000_000, 4_000_000  # bytes of a body; Flower cuts arrays into pieces of 5 MiB
 
 Headers = Sequence[tuple[bytes, bytes]]
@@ -94,6 +95,7 @@ def check_body(call: str, body: bytes, vehicle: Vehicle) -> bytes:
     except DecodeError:
         raise Refused(400, f"the body is none of {call}") from None
     asked.DiscardUnknownFields()
+    _check_texts(asked)
     if isinstance(asked, ActivateNodeRequest):
         if asked.public_key != public_pem(vehicle.public_key):
             raise Refused(401, "the key to activate is not the certificate's")
@@ -103,7 +105,17 @@ def check_body(call: str, body: bytes, vehicle: Vehicle) -> bytes:
     node = asked if isinstance(asked, DeactivateNodeRequest) else asked.node  # type: ignore[attr-defined]
     named = {node.node_id}
     if isinstance(asked, PushMessagesRequest):
-        named |= {message.metadata.src_node_id for message in asked.messages_list}
+        for message in asked.messages_list:
+            _check_texts(message.metadata)
+            named.add(message.metadata.src_node_id)
     if named != {vehicle.node}:
         raise Refused(401, "the node in the body is not the certificate's")
     return asked.SerializeToString()
+
+
+def _check_texts(message: Message) -> None:
+    """Refuse identifiers that are none, which Flower would write to its log."""
+    for field, value in message.ListFields():
+        texts = [value] if isinstance(value, str) else value if field.type == field.TYPE_STRING else ()
+        if not all(text.isprintable() and len(text) <= LONGEST_NAME for text in texts):
+            raise Refused(400, f"{field.name} is no identifier")

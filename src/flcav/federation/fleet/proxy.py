@@ -36,7 +36,7 @@ from flcav.federation.fleet.calls import (
     name_key,
 )
 from flcav.federation.fleet.keys import AUTHORITY, public_der
-from flcav.federation.fleet.mutual_tls import CERTIFICATE, CONNECTION, Connection, serve_https
+from flcav.federation.fleet.mutual_tls import CERTIFICATE, CONNECTION, IN_ALL, Connection, serve_https
 from flcav.federation.fleet.registry import Registry, Vehicle
 from flcav.federation.fleet.relay import QUIET_S, TIMEOUT, Refused, Relayed, answer, keep_alive, read_body, relay
 from flcav.federation.fleet.releases.service import answer_release
@@ -49,6 +49,7 @@ from flcav.interface.wording import make_printable
 OLDEST_S = 300.0  # of a signature that Flower accepts
 SAVE_S = 0.5  # between savings of what was counted
 BUSY_S = 0.1  # that a call waits for a registry which another process holds
+LIMITS = httpx.Limits(max_connections=IN_ALL, max_keepalive_connections=20)  # to the SuperLink
 AT_ONCE = 2  # objects of one vehicle that are taken at a time, as many as Flower sends
 
 
@@ -80,11 +81,12 @@ class FleetProxy:
                 await send(event)
 
         try:
-            vehicle = self.find(certificate)
-            caller = vehicle.name
-            await self._answer(vehicle, scope, receive, soon)
-        except Refused as refused:
-            await self._refuse(soon, refused.status, caller, refused.why)
+            try:
+                vehicle = self.find(certificate)
+                caller = vehicle.name
+                await self._answer(vehicle, scope, receive, soon)
+            except Refused as refused:
+                await self._refuse(soon, refused.status, caller, refused.why)
         except TimeoutError:  # whoever does not read
             connection.abort()
 
@@ -246,7 +248,7 @@ def node_key(header: bytes) -> bytes:
 def run_proxy(folder: Path, host: str, port: int, superlink: str) -> None:
     """Run the proxy of the fleet in `folder` until the process is ended; `superlink` is host:port of the SuperLink."""
     client = httpx.AsyncClient(
-        base_url=f"https://{superlink}", verify=str(folder / AUTHORITY), timeout=TIMEOUT, trust_env=False
+        base_url=f"https://{superlink}", verify=str(folder / AUTHORITY), timeout=TIMEOUT, trust_env=False, limits=LIMITS
     )
     app = FleetProxy(client, folder)
     keys = folder / SERVER, folder / SERVER_KEY, folder / AUTHORITY

@@ -146,8 +146,6 @@ def read_status(folder: Path) -> FleetStatus:
         crossed = traffic.vehicles.get(own.name, Crossed())
         counted = crossed.socket_up, crossed.socket_down, crossed.content_up, crossed.content_down
         release = reports[own.name].report if own.name in reports else None
-        if release is not None:
-            release = replace(release, refused=make_printable(release.refused))
         told = own.name, own.describe_state(), own.expires, own.node in online
         vehicles.append(VehicleStatus(*told, *counted, release))
     try:
