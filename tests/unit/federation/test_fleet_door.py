@@ -18,9 +18,9 @@ from flwr.proto.node_pb2 import Node
 
 from flcav.federation.fleet import mutual_tls, proxy, relay
 from flcav.federation.fleet.authority import SERVER, SERVER_KEY, found_authority
-from flcav.federation.fleet.calls import CALLS, FLEET, LARGEST_CALL, MOST_HEADERS, name_key
 from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, KEY, request_certificate, take_certificate
 from flcav.federation.fleet.mutual_tls import HANDSHAKES, LARGEST_HEADER, OF_EACH, find_superfluous, serve_https
+from flcav.federation.fleet.relay import CALLS, FLEET, LARGEST_CALL, MOST_HEADERS, name_key
 from flcav.federation.fleet.traffic import read_traffic
 
 NODES = {"cav-1": 11, "cav-2": 22}
@@ -109,7 +109,7 @@ def body_of(call, node):
         return DeactivateNodeRequest(node_id=node).SerializeToString()
     asked = CALLS[call](node=Node(node_id=node))
     if call == "push-messages":
-        asked.messages_list.append(Message(metadata=Metadata(src_node_id=node)))
+        asked.messages_list.append(Message(metadata=Metadata(src_node_id=node)))  # type: ignore[attr-defined]
     return asked.SerializeToString()
 
 

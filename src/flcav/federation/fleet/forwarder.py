@@ -11,10 +11,23 @@ import httpx
 from starlette.types import Receive, Scope, Send
 
 from flcav.config import InputError
-from flcav.federation.fleet.calls import CALLS, FLEET, NODE_KEY, SENT, check_headers, choose_headers, largest_body
 from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, KEY, LOOPBACK, LOOPBACK_KEY
 from flcav.federation.fleet.mutual_tls import serve_https
-from flcav.federation.fleet.relay import TIMEOUT, Refused, answer, keep_alive, read_body, relay
+from flcav.federation.fleet.relay import (
+    CALLS,
+    FLEET,
+    NODE_KEY,
+    SENT,
+    TIMEOUT,
+    Refused,
+    answer,
+    check_headers,
+    choose_headers,
+    keep_alive,
+    largest_body,
+    read_body,
+    relay,
+)
 from flcav.federation.messages.fl_request import PATH, FLRequest
 
 LIMITS = httpx.Limits(max_connections=8)  # to the proxy, which lets a vehicle have twice as many

@@ -23,22 +23,29 @@ from starlette.types import Message, Receive, Scope, Send
 
 from flcav.config import InputError
 from flcav.federation.fleet.authority import REGISTRY, SERVER, SERVER_KEY, open_registry
-from flcav.federation.fleet.calls import (
-    CALLS,
-    FLEET,
-    NODE_KEY,
-    SIGNED_AT,
-    Headers,
-    check_body,
-    check_headers,
-    choose_headers,
-    largest_body,
-    name_key,
-)
 from flcav.federation.fleet.keys import AUTHORITY, public_der
 from flcav.federation.fleet.mutual_tls import CERTIFICATE, CONNECTION, IN_ALL, Connection, serve_https
 from flcav.federation.fleet.registry import Registry, Vehicle
-from flcav.federation.fleet.relay import QUIET_S, TIMEOUT, Refused, Relayed, answer, keep_alive, read_body, relay
+from flcav.federation.fleet.relay import (
+    CALLS,
+    FLEET,
+    NODE_KEY,
+    QUIET_S,
+    SIGNED_AT,
+    TIMEOUT,
+    Headers,
+    Refused,
+    Relayed,
+    answer,
+    check_body,
+    check_headers,
+    choose_headers,
+    keep_alive,
+    largest_body,
+    name_key,
+    read_body,
+    relay,
+)
 from flcav.federation.fleet.releases.service import answer_release
 from flcav.federation.fleet.traffic import Traffic, read_traffic
 from flcav.federation.messages.fl_request import LARGEST, check_age, parse_request
