@@ -1,11 +1,14 @@
 """Who and what a running fleet refuses: each against the proxy, the SuperLink and the vehicles that are up."""
 
 import base64
+import contextlib
 import os
 import signal
+import socket
 import ssl
 from dataclasses import replace
 from datetime import timedelta
+from pathlib import Path
 
 import httpx
 import numpy as np
@@ -52,11 +55,17 @@ def a_vehicle(authority, folder, name, days=1.0):
     return folder
 
 
-def reach(deployment, folder=None, authority=None):
-    """Return a client of the proxy with a vehicle's certificate (None: without one)."""
-    context = ssl.create_default_context(cafile=str((authority or deployment.folder) / AUTHORITY))
+def tls_of(folder, authority):
+    """Return the TLS settings of a vehicle (None: without a certificate) that trusts the servers of an authority."""
+    context = ssl.create_default_context(cafile=str(authority / AUTHORITY))
     if folder is not None:
         context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
+    return context
+
+
+def reach(deployment, folder=None, authority=None):
+    """Return a client of the proxy with a vehicle's certificate (None: without one)."""
+    context = tls_of(folder, authority or deployment.folder)
     url = f"https://{read_ready(deployment.folder).proxy}"
     return httpx.Client(base_url=url, verify=context, trust_env=False, timeout=LONGEST_S)
 
@@ -221,6 +230,44 @@ def test_call_of_another_vehicle(deployment):
     with reach(deployment, deployment.folder / VEHICLES / "vehicle-002") as client:
         answer = client.post("/v1/fleet/pull-messages", content=body.SerializeToString(), headers=signed_headers(key))
     assert (answer.status_code, answer.text) == (401, "the node's key is not the certificate's")
+
+
+def test_recorded_call_of_another_vehicle_beside_the_own_key(deployment):
+    """A header that comes twice: the first is another vehicle's, of a recorded call, the last the own certificate's."""
+    one, two = (load_key(deployment.folder / VEHICLES / name / KEY) for name in ("vehicle-001", "vehicle-002"))
+    recorded, own = signed_headers(one), signed_headers(two)["flwr-public-key"]
+    body = PullMessagesRequest(node=node_of(deployment, "vehicle-001")).SerializeToString()
+    with reach(deployment, deployment.folder / VEHICLES / "vehicle-002") as client:
+        twice = client.post(
+            "/v1/fleet/pull-messages", content=body, headers=[*recorded.items(), ("flwr-public-key", own)]
+        )
+        body_alone = client.post("/v1/fleet/pull-messages", content=body, headers=signed_headers(two))
+    assert (twice.status_code, twice.text) == (400, "the header flwr-public-key comes 2 times")
+    assert (body_alone.status_code, body_alone.text) == (401, "the node in the body is not the certificate's")
+
+
+def test_idle_connections_keep_nobody_out(deployment):
+    """Of one vehicle, and of strangers before TLS: more than the proxy has room for; another is answered, in time."""
+    host, _, port = read_ready(deployment.folder).proxy.rpartition(":")
+    proxy = read_processes(deployment.folder)["proxy"]
+    context, before = tls_of(deployment.folder / VEHICLES / "vehicle-002", deployment.folder), resident_mb(proxy)
+    with contextlib.ExitStack() as stack:
+        for number in range(250):
+            door = stack.enter_context(socket.create_connection((host, int(port)), 30))
+            if number % 5 == 0:
+                with contextlib.suppress(OSError):
+                    stack.enter_context(context.wrap_socket(door, server_hostname=host))
+        assert len(list(Path(f"/proc/{proxy}/fd").iterdir())) < 160
+        assert resident_mb(proxy) - before < 60
+        own = deployment.folder / VEHICLES / "vehicle-001"
+        with reach(deployment, own) as client:
+            assert activate(client, load_key(own / KEY)).status_code in (200, 412)
+    assert read_processes(deployment.folder)["proxy"] == proxy
+
+
+def resident_mb(pid):
+    """Return the memory of a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import typer
 
 from flcav.cli.options import check_finite
 from flcav.cli.terminal import print_json
-from flcav.interface.wording import plural
+from flcav.interface.wording import make_printable, plural
 
 if TYPE_CHECKING:
     from flcav.federation.fleet.registry import Registry, Vehicle
@@ -28,6 +28,14 @@ JSON = typer.Option(False, "--json", help="Print one JSON object instead.")
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.add_typer(fleet, name="fleet")
+
+
+@fleet.callback()
+def guard() -> None:
+    """Let nobody but its owner write what a command writes, whatever the umask of the terminal."""
+    import os
+
+    os.umask(os.umask(0o077) | 0o022)
 
 
 @fleet.command()
@@ -134,9 +142,8 @@ def list_vehicles(
             print_json({"audit": [asdict(each) for each in entries]})
             return
         for each in entries:
-            typer.echo(
-                f"{_date(each.time)} {each.action} {each.vehicle} {each.fingerprint[:16]} {each.reason}".rstrip()
-            )
+            told = f"{_date(each.time)} {each.action} {each.vehicle} {each.fingerprint[:16]} {each.reason}"
+            typer.echo(make_printable(told.rstrip(), 600))
         return
     found = registry.list_vehicles()
     if as_json:

@@ -4,6 +4,7 @@ import atexit
 import errno
 import gc
 import re
+import signal
 import sys
 
 import click
@@ -86,6 +87,8 @@ for command in (
 
 def run(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its code; only here are exceptions turned into exit codes."""
+    if arguments is None and signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a process of its own
+        signal.signal(signal.SIGINT, _interrupt)
     try:
         code = escape_markup(typer.main.get_command(app))(args=arguments, standalone_mode=False)
         if code == INTERRUPTED:  # typer's exit code for Ctrl-C
@@ -107,6 +110,12 @@ def run(arguments: list[str] | None = None) -> None:
         wrong = isinstance(error, FileNotFoundError | IsADirectoryError) or error.errno in NO_FOLDER
         code = 2 if wrong else 1
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _interrupt(*_: object) -> None:
+    """Handle the first Ctrl-C; what is pressed again while the command ends changes nothing."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 def _describe(error: click.ClickException) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flcav.federation.divergence import RoundDivergence
 from flcav.federation.noise import Secret, draw_secret
+from flcav.interface.wording import make_printable
 from flcav.storage.records import LEFT_OUT, Record
 
 Arrays = dict[str, NDArray[np.number]]  # by name
@@ -18,6 +19,7 @@ ReadStates = Callable[[Iterable[str]], ClientStates]  # of what clients keep, by
 
 SERVER, CLIENT, PERSONAL = "server", "client", "personal"
 FAILED = "failed or lost"  # begins what is told of clients without an update
+LONGEST = 500  # characters of a client's words that are told
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ def describe_failures(rounds: Sequence[Mapping[str, str]]) -> str:
 
     rounds: of each by client what was wrong, as `RoundRecord` has it. Where nobody failed, the words are "".
     """
-    failed = Counter(f"{name} ({why})" for each in rounds for name, why in each.items())
+    failed = Counter(f"{name} ({make_printable(why, LONGEST)})" for each in rounds for name, why in each.items())
     told = ", ".join(f"{each} in {count}" if len(rounds) > 1 else each for each, count in failed.items())
     return f"{FAILED}: {told}" if told else ""
 

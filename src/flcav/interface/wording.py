@@ -20,6 +20,20 @@ def suggest(name: str, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
+def make_printable(text: str, most: int = 200) -> str:
+    """Return a text of somebody else as one line for a terminal, of `most` characters and an ellipsis.
+
+    Control characters, such as escape sequences and line ends, and invisible ones, such as changes of the direction of
+    writing, are shown as Python escapes them.
+
+    >>> make_printable("well\\x1b[2J")
+    'well\\\\x1b[2J'
+    """
+    shown = [each if each.isprintable() else ascii(each)[1:-1] for each in text[: most + 1]]
+    line = "".join(shown)
+    return line if len(line) <= most else f"{line[:most]} ..."
+
+
 def plural(number: int, noun: str) -> str:
     """Return "1 scene" or "2 scenes"."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

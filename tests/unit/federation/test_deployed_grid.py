@@ -15,7 +15,7 @@ from flwr.app import ConfigRecord, Context, Error, Message, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.federation.attendance import ClientFailed
-from flcav.federation.fleet.authority import found_authority
+from flcav.federation.fleet.authority import found_authority, open_registry
 from flcav.federation.fleet.keys import AUTHORITY, request_certificate, take_certificate
 from flcav.federation.messages.records import ASK, LOST_BY_NETWORK, OVER_BUDGET, to_arrays
 from flcav.federation.rounds import Schedule, federate
@@ -105,7 +105,9 @@ class Fleet:
             Assignment("f", name, *own).save(self.folder / f"v{node}")
         with keep_identity():
             link: Any = self.link
-            yield DeployedGrid(self.folder, link, names, {node: f"v{node}" for node in names}, account)
+            with contextlib.closing(open_registry(self.folder)) as registry:
+                vehicles = {int(own.name[1:]): own for own in registry.list_vehicles()}
+            yield DeployedGrid(self.folder, link, names, {node: vehicles[node] for node in names}, account)
 
 
 @pytest.fixture(scope="module")

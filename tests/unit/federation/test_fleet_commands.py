@@ -1,20 +1,32 @@
 """`flcav fleet`: what an operator and a vehicle type, and what is refused in a sentence."""
 
+import contextlib
 import json
+import os
 import socket
+import sqlite3
+import stat
 import threading
+from functools import partial
 from pathlib import Path
 
 import httpx
 import pytest
 import uvicorn
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from flcav.cli.main import run as command
-from flcav.federation.fleet.authority import open_authority
+from flcav.federation.fleet import authority
+from flcav.federation.fleet.authority import open_authority, open_registry
 from flcav.federation.fleet.keys import request_certificate, take_certificate
 from flcav.federation.fleet.page import make_page
+from flcav.federation.fleet.releases.offer import KeptReport
+from flcav.federation.fleet.status import Followed, FollowedRound, read_status
 from flcav.federation.fleet.traffic import Traffic
 from flcav.federation.fleet.vehicle import VehicleSettings
+from flcav.federation.messages.release_report import ReleaseReport
 
 
 @pytest.fixture
@@ -120,6 +132,68 @@ def test_expired_certificate_of_a_vehicle_on_this_machine(flcav, fleet):
     assert "vehicle.crt: is no certificate (PEM)" in refused(flcav("vehicle", own))
     (own / "vehicle.crt").unlink()
     assert "has no certificate yet" in refused(flcav("vehicle", own))
+
+
+def test_nobody_else_may_write_what_is_made(flcav, tmp_path):
+    """Whatever the umask: a new folder, and one that everybody could write to."""
+    before = os.umask(0)
+    try:
+        (tmp_path / "there").mkdir()
+        for folder in (tmp_path / "deep/fleet", tmp_path / "there"):
+            os.umask(0)
+            assert flcav("init", folder)[0] == 0
+            assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+            modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()}
+            private = {"ca.key", "server.key", "publisher.key"}
+            assert {modes[name] for name in private} == {0o600}
+            assert {mode for name, mode in modes.items() if name not in private} == {0o644}
+        assert stat.S_IMODE((tmp_path / "deep").stat().st_mode) == 0o755
+    finally:
+        os.umask(before)
+
+
+@pytest.mark.parametrize("arguments", [("revoke", "cav-1"), ("register", "vehicle.csr", "--out", "crt")])
+def test_registry_that_another_process_holds(arguments, flcav, fleet, tmp_path, monkeypatch):
+    register(flcav, fleet, tmp_path / "vehicle", "cav-1")
+    request_certificate(tmp_path, "cav-2")
+    monkeypatch.setattr(authority, "open_registry", partial(open_registry, busy_s=0.1))
+    monkeypatch.chdir(tmp_path)
+    with contextlib.closing(sqlite3.connect(fleet / "registry.sqlite", isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        code, _, said = flcav(arguments[0], fleet, *arguments[1:])
+    told = "registry.sqlite: the registry cannot be used (another process holds it; try again)\n"
+    assert (code, said) == (1, f"flcav: {fleet}/{told}")
+    assert not (tmp_path / "crt").exists()
+
+
+def test_escapes_of_vehicles_do_not_reach_the_terminal(flcav, fleet, tmp_path):
+    """Of a signing request, a reason, a refused call, a release report, and of clients that failed or are late."""
+    odd = "\x1b[2J\x1b]0;owned\x07\u202efine\ncav-2: registered\r" + "x" * 3000
+    register(flcav, fleet, tmp_path / "vehicle", "cav-1")
+    assert flcav("revoke", fleet, "cav-1", "--reason", odd)[0] == 0
+    traffic = Traffic()
+    traffic.refuse("cav-1", odd)
+    traffic.save(fleet)
+    KeptReport("cav-1", 0.0, 0, ReleaseReport("objects", 1, 1, odd)).save(fleet)
+    rounds = (FollowedRound(1, 0.0, 2, {"cav": odd}),)
+    Followed("edge", "weather", "wireless", 1.0, 2.0, rounds, {"cav": odd}, {"cav": odd}).save(fleet)
+    key = ec.generate_private_key(ec.SECP384R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, odd[:60])])
+    signed = x509.CertificateSigningRequestBuilder().subject_name(name).sign(key, hashes.SHA384())
+    (tmp_path / "csr").write_bytes(signed.public_bytes(serialization.Encoding.PEM))
+    said = [
+        flcav("status", fleet),
+        flcav("list", fleet, "--audit"),
+        flcav("register", fleet, tmp_path / "csr", "--out", tmp_path / "crt"),
+    ]
+    assert [code for code, _, _ in said] == [0, 0, 2]
+    for _, out, err in said:
+        lines = (out + err).splitlines()
+        assert not [line for line in lines if not line.isprintable() or len(line) > 1300 or line.startswith("cav-2")]
+    assert all("\\x1b[2J" in out + err for _, out, err in said)
+    page = json.dumps(read_status(fleet).as_json(), ensure_ascii=False)
+    assert page.isprintable()
+    assert "x" * 300 not in page
 
 
 def test_page(flcav, fleet):

@@ -25,7 +25,7 @@ from flcav.federation.fleet.keys import (
     requested_name,
     write_private,
 )
-from flcav.federation.fleet.registry import Registry, Vehicle
+from flcav.federation.fleet.registry import BUSY_S, Registry, Vehicle
 from flcav.storage.files import write_bytes
 
 AUTHORITY_KEY, REGISTRY = "ca.key", "registry.sqlite"
@@ -117,6 +117,7 @@ def found_authority(folder: Path, hosts: tuple[str, ...] = ()) -> Authority:
     made = made.add_extension(x509.BasicConstraints(True, 0), critical=True).add_extension(usage, critical=True)
     certificate = made.sign(key, hashes.SHA384())
     folder.mkdir(parents=True, exist_ok=True)
+    folder.chmod(0o700)
     write_private(folder / AUTHORITY_KEY, private_pem(key))
     write_bytes(folder / AUTHORITY, certificate.public_bytes(serialization.Encoding.PEM))
     registry = Registry.create(folder / REGISTRY, certificate.fingerprint(hashes.SHA256()).hex())
@@ -141,9 +142,12 @@ def open_authority(folder: Path) -> Authority:
     return Authority(folder, key, certificate, registry)
 
 
-def open_registry(folder: Path) -> Registry:
-    """Return the registry of the authority in `folder`; raises `InputError` where it is another one's."""
-    return Registry.open(folder / REGISTRY, load_certificate(folder).fingerprint(hashes.SHA256()).hex())
+def open_registry(folder: Path, busy_s: float = BUSY_S) -> Registry:
+    """Return the registry of the authority in `folder`; raises `InputError` where it is another one's.
+
+    busy_s: time that its calls wait for another process.
+    """
+    return Registry.open(folder / REGISTRY, load_certificate(folder).fingerprint(hashes.SHA256()).hex(), busy_s)
 
 
 def load_certificate(folder: Path) -> x509.Certificate:

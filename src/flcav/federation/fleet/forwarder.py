@@ -13,8 +13,24 @@ from starlette.types import Receive, Scope, Send
 from flcav.config import InputError
 from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, KEY, LOOPBACK, LOOPBACK_KEY
 from flcav.federation.fleet.mutual_tls import serve_https
-from flcav.federation.fleet.relay import TIMEOUT, keep_alive, relay
+from flcav.federation.fleet.relay import (
+    CALLS,
+    FLEET,
+    NODE_KEY,
+    SENT,
+    TIMEOUT,
+    Refused,
+    answer,
+    check_headers,
+    choose_headers,
+    keep_alive,
+    largest_body,
+    read_body,
+    relay,
+)
 from flcav.federation.messages.fl_request import PATH, FLRequest
+
+LIMITS = httpx.Limits(max_connections=8)  # to the proxy, which lets a vehicle have twice as many
 
 
 class Forwarder:
@@ -24,12 +40,21 @@ class Forwarder:
         self._client = client
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Forward a call to the proxy."""
+        """Forward a node's call to the proxy."""
         if scope["type"] == "lifespan":
             while not await keep_alive(receive, send):
                 pass
             return
-        await relay(self._client, scope, receive, send)
+        call = scope["path"].removeprefix(FLEET)
+        try:
+            if scope["method"] != "POST" or scope["path"] != FLEET + call or call not in CALLS:
+                raise Refused(403, "no call of a node")
+            headers = choose_headers(check_headers(scope["headers"]), (NODE_KEY, *SENT))
+            body = await read_body(scope, receive, largest_body(call))
+        except Refused as refused:
+            await answer(send, refused.status, refused.why)
+            return
+        await relay(self._client, FLEET + call, headers, body, send)
 
 
 def vehicle_tls(folder: Path) -> ssl.SSLContext:
@@ -43,7 +68,7 @@ def vehicle_tls(folder: Path) -> ssl.SSLContext:
 def run_forwarder(folder: Path, port: int, server: str) -> None:
     """Run the forwarder of the vehicle in `folder` until the process is ended; `server` is host:port of the proxy."""
     client = httpx.AsyncClient(
-        base_url=f"https://{server}", verify=vehicle_tls(folder), timeout=TIMEOUT, trust_env=False
+        base_url=f"https://{server}", verify=vehicle_tls(folder), timeout=TIMEOUT, trust_env=False, limits=LIMITS
     )
     serve_https(Forwarder(client), "127.0.0.1", port, folder / LOOPBACK, folder / LOOPBACK_KEY).run()
 

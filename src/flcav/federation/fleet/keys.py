@@ -16,6 +16,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from flcav.config import InputError
+from flcav.interface.wording import make_printable
 from flcav.storage.files import write_bytes
 
 KEY, FLOWER_KEY, REQUEST, CERTIFICATE, AUTHORITY = "key.pem", "flower.key", "vehicle.csr", "vehicle.crt", "ca.crt"
@@ -28,7 +29,9 @@ LARGEST_REQUEST = 1 << 16  # bytes
 def check_identifier(name: str) -> str:
     """Return a vehicle's identifier; raises `InputError` for one that is none, such as a path."""
     if not IDENTIFIER.fullmatch(name) or ".." in name:
-        raise InputError(f"vehicle '{name[:80]}': an identifier has 1 to 63 of a-z 0-9 . _ - and no other characters")
+        raise InputError(
+            f"vehicle '{make_printable(name, 80)}': an identifier has 1 to 63 of a-z 0-9 . _ - and no other characters"
+        )
     return name
 
 
@@ -66,6 +69,12 @@ def load_key(path: Path) -> ec.EllipticCurvePrivateKey:
 def public_der(key: ec.EllipticCurvePublicKey) -> bytes:
     """Return a public key as DER (SubjectPublicKeyInfo, RFC 5280)."""
     return key.public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+
+
+def public_pem(der: bytes) -> bytes:
+    """Return a public key, given as DER, as PEM, as Flower knows its nodes by it."""
+    pem, spki = serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo
+    return serialization.load_der_public_key(der).public_bytes(pem, spki)
 
 
 def request_certificate(folder: Path, vehicle: str) -> Path:

@@ -10,8 +10,8 @@ import asyncio
 import base64
 import binascii
 import hashlib
-import sqlite3
 import time
+from collections import defaultdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,45 +19,55 @@ from typing import Any
 import httpx
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_public_key
-from starlette.types import Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 
-from flcav.federation.fleet.authority import SERVER, SERVER_KEY, open_registry
+from flcav.config import InputError
+from flcav.federation.fleet.authority import REGISTRY, SERVER, SERVER_KEY, open_registry
 from flcav.federation.fleet.keys import AUTHORITY, public_der
-from flcav.federation.fleet.mutual_tls import CERTIFICATE, CONNECTION, Connection, serve_https
+from flcav.federation.fleet.mutual_tls import CERTIFICATE, CONNECTION, IN_ALL, Connection, serve_https
 from flcav.federation.fleet.registry import Registry, Vehicle
-from flcav.federation.fleet.relay import TIMEOUT, answer, keep_alive, read_body, relay
+from flcav.federation.fleet.relay import (
+    CALLS,
+    FLEET,
+    NODE_KEY,
+    QUIET_S,
+    SIGNED_AT,
+    TIMEOUT,
+    Headers,
+    Refused,
+    Relayed,
+    answer,
+    check_body,
+    check_headers,
+    choose_headers,
+    keep_alive,
+    largest_body,
+    name_key,
+    read_body,
+    relay,
+)
 from flcav.federation.fleet.releases.service import answer_release
 from flcav.federation.fleet.traffic import Traffic, read_traffic
 from flcav.federation.messages.fl_request import LARGEST, check_age, parse_request
 from flcav.federation.messages.fl_request import PATH as REQUEST_PATH
 from flcav.federation.messages.release_report import RELEASES
+from flcav.interface.wording import make_printable
 
-FLEET = "/v1/fleet/"
-CALLS = frozenset(
-    {
-        "activate-node",
-        "deactivate-node",
-        "send-node-heartbeat",
-        "pull-messages",
-        "push-messages",
-        "get-run",
-        "get-fab",
-        "push-object",
-        "pull-object",
-        "confirm-message-received",
-    }
-)  # of a node; registering one is the authority's
-NODE_KEY = b"flwr-public-key"  # header: of the node, PEM in base 64
-SIGNED_AT = b"flwr-timestamp"  # header: when the node signed
 OLDEST_S = 300.0  # of a signature that Flower accepts
 SAVE_S = 0.5  # between savings of what was counted
+BUSY_S = 0.1  # that a call waits for a registry which another process holds
+LIMITS = httpx.Limits(max_connections=IN_ALL, max_keepalive_connections=20)  # to the SuperLink
+AT_ONCE = 2  # objects of one vehicle that are taken at a time, as many as Flower sends
 
 
 class FleetProxy:
     """ASGI app in front of a SuperLink."""
 
-    def __init__(self, registry: Registry, client: httpx.AsyncClient, folder: Path) -> None:
-        self._registry, self._client, self._folder = registry, client, folder
+    def __init__(self, client: httpx.AsyncClient, folder: Path) -> None:
+        self._client, self._folder = client, folder
+        self._registry: Registry | None = None
+        self._file: tuple[int, int] | None = None  # device and number of the registry's file
+        self._objects = defaultdict[str, asyncio.Semaphore](lambda: asyncio.Semaphore(AT_ONCE))
         self._traffic, self._changed = read_traffic(folder), False
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -69,50 +79,102 @@ class FleetProxy:
             saving.cancel()
             self._traffic.save(self._folder)
             return
-        state, path = scope["state"], scope["path"]
-        vehicle = find_caller(self._registry, state[CERTIFICATE])
-        if isinstance(vehicle, str):
-            await self._refuse(send, 401, state[CERTIFICATE], vehicle)
-            return
+        connection: Connection = scope["state"][CONNECTION]
+        certificate: bytes | None = scope["state"][CERTIFICATE]
+        caller: str | bytes | None = certificate
+
+        async def soon(event: Message) -> None:
+            async with asyncio.timeout(QUIET_S):
+                await send(event)
+
+        try:
+            try:
+                vehicle = self.find(certificate)
+                caller = vehicle.name
+                await self._answer(vehicle, scope, receive, soon)
+            except Refused as refused:
+                await self._refuse(soon, refused.status, caller, refused.why)
+        except TimeoutError:  # whoever does not read
+            connection.abort()
+
+    async def _answer(self, vehicle: Vehicle, scope: Scope, receive: Receive, send: Send) -> None:
+        path, headers, came = scope["path"], check_headers(scope["headers"]), time.time()
         if path == REQUEST_PATH and scope["method"] == "POST":
-            await self._take_request(vehicle.name, receive, send)
+            await self._take_request(vehicle.name, scope, receive, send)
             return
         if path.startswith(RELEASES):
             await self._answer_release(vehicle.name, scope, receive, send)
             return
         call = path.removeprefix(FLEET)
         if scope["method"] != "POST" or path != FLEET + call or call not in CALLS:
-            await self._refuse(send, 403, vehicle.name, f"{scope['method']} {path[:100]} is no call of a vehicle's")
-            return
-        if node_key(dict(scope["headers"]).get(NODE_KEY, b"")) != vehicle.public_key:
-            await self._refuse(send, 401, vehicle.name, "the node's key is not the certificate's")
-            return
-        done = await relay(self._client, scope, receive, send)
+            raise Refused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
+        if node_key(headers.get(NODE_KEY, b"")) != vehicle.public_key:
+            raise Refused(401, "the node's key is not the certificate's")
+        passed = [*choose_headers(headers), name_key(vehicle)]
+        if call == "push-object":
+            async with self._objects[vehicle.name]:
+                done = await self._relay(vehicle, call, passed, scope, receive, send)
+        else:
+            done = await self._relay(vehicle, call, passed, scope, receive, send)
         if done.status == httpx.codes.UNAUTHORIZED:
-            self._traffic.refuse(vehicle.name, describe_clock(dict(scope["headers"]).get(SIGNED_AT, b"")))
-        connection: Connection = state[CONNECTION]
+            self._traffic.refuse(vehicle.name, describe_clock(headers.get(SIGNED_AT, b""), came))
+        connection: Connection = scope["state"][CONNECTION]
         self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), done.status)
         self._changed = True
 
-    async def _take_request(self, vehicle: str, receive: Receive, send: Send) -> None:
-        """Keep a vehicle's FL request, or refuse it: 400 for another message, 409 for one that came before."""
+    async def _relay(
+        self, vehicle: Vehicle, call: str, headers: Headers, scope: Scope, receive: Receive, send: Send
+    ) -> Relayed:
+        body = await read_body(scope, receive, largest_body(call))
+        return await relay(self._client, FLEET + call, headers, check_body(call, body, vehicle), send)
+
+    def find(self, certificate: bytes | None) -> Vehicle:
+        """Return the vehicle whose certificate (DER) is in force; raises `Refused` where it is nobody's.
+
+        The registry is opened anew where its file is another one, or it could not be read.
+        """
         try:
-            request = parse_request(content := await read_body(receive, LARGEST))
+            found = (self._folder / REGISTRY).stat()
+            if self._registry is None or self._file != (found.st_dev, found.st_ino):
+                self._close()
+                self._registry = open_registry(self._folder, BUSY_S)
+                self._file = found.st_dev, found.st_ino
+            vehicle = find_caller(self._registry, certificate)
+        except (InputError, OSError, ValueError, TypeError):
+            self._close()
+            raise Refused(503, "the fleet's registry cannot be read") from None
+        if isinstance(vehicle, str):
+            raise Refused(401, vehicle)
+        return vehicle
+
+    def _close(self) -> None:
+        if self._registry is not None:
+            self._registry.close()
+        self._registry = None
+
+    def find_owner(self, certificate: bytes | None) -> str:
+        """Return the vehicle that a connection counts for; all whose certificate is not in force are one."""
+        try:
+            return self.find(certificate).name
+        except Refused:
+            return ""
+
+    async def _take_request(self, vehicle: str, scope: Scope, receive: Receive, send: Send) -> None:
+        """Keep a vehicle's FL request, or refuse it: 400 for another message, 409 for one that came before."""
+        content = await read_body(scope, receive, LARGEST)
+        try:
+            request = parse_request(content)
         except ValueError as error:
-            await self._refuse(send, 400, vehicle, str(error))
-            return
+            raise Refused(400, str(error)) from None
         now = time.time()
         if (odd := check_age(request, now)) is not None:
-            await self._refuse(send, 400, vehicle, odd)
-            return
+            raise Refused(400, odd)
         try:
             why = await asyncio.to_thread(self._keep_request, vehicle, request.nonce, content, now)
-        except sqlite3.Error as error:
-            await self._refuse(send, 503, vehicle, f"the registry cannot be written: {error}")
-            return
+        except (InputError, OSError) as error:
+            raise Refused(503, f"the registry cannot be written: {error}") from None
         if why is not None:
-            await self._refuse(send, 409, vehicle, why)
-            return
+            raise Refused(409, why)
         await answer(send, 200, "the request is taken")
 
     def _keep_request(self, *about: Any) -> str | None:
@@ -130,16 +192,17 @@ class FleetProxy:
             self._changed = True
             return self._traffic.count_release(vehicle, connection.count_bytes())
 
-        refused = await answer_release(self._folder, vehicle, scope, receive, send, count)
-        if refused is not None:
-            await self._refuse(send, refused[0], vehicle, refused[1])
-        count()
+        try:
+            await answer_release(self._folder, vehicle, scope, receive, send, count)
+        finally:
+            count()
 
     async def _refuse(self, send: Send, status: int, who: str | bytes | None, why: str) -> None:
         told = who if isinstance(who, str) else "nobody" if who is None else hashlib.sha256(who).hexdigest()[:16]
-        self._traffic.refuse(told, why)
+        plain = make_printable(why)
+        self._traffic.refuse(told, plain)
         self._changed = True
-        await answer(send, status, why)
+        await answer(send, status, plain)
 
     async def _save(self) -> None:
         while True:
@@ -192,7 +255,8 @@ def node_key(header: bytes) -> bytes:
 def run_proxy(folder: Path, host: str, port: int, superlink: str) -> None:
     """Run the proxy of the fleet in `folder` until the process is ended; `superlink` is host:port of the SuperLink."""
     client = httpx.AsyncClient(
-        base_url=f"https://{superlink}", verify=str(folder / AUTHORITY), timeout=TIMEOUT, trust_env=False
+        base_url=f"https://{superlink}", verify=str(folder / AUTHORITY), timeout=TIMEOUT, trust_env=False, limits=LIMITS
     )
-    app = FleetProxy(open_registry(folder), client, folder)
-    serve_https(app, host, port, folder / SERVER, folder / SERVER_KEY, folder / AUTHORITY).run()
+    app = FleetProxy(client, folder)
+    keys = folder / SERVER, folder / SERVER_KEY, folder / AUTHORITY
+    serve_https(app, host, port, *keys, app.find_owner).run()

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from flcav.config import InputError
 
@@ -57,6 +57,20 @@ WINDOW_S, MOST = 300.0, 60  # requests of one vehicle within such a time
 BUSY_S = 10.0  # that another process may hold the registry
 
 
+class RegistryLost(OSError):
+    """The registry cannot be read or written: another process holds it, its disk is full, or it is damaged."""
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Raise what SQLite raises as `RegistryLost`, in a sentence."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        held = "another process holds it; try again" if "locked" in str(error) else str(error)
+        raise RegistryLost(f"{path}: the registry cannot be used ({held})") from None
+
+
 @dataclass(frozen=True)
 class Vehicle:
     """A vehicle's certificate as it is registered."""
@@ -88,11 +102,15 @@ class AuditEntry:
 
 
 class Registry:
-    """The registry in a file; every call is a transaction of its own, so several processes may use it."""
+    """The registry in a file; every call is a transaction of its own, so several processes may use it.
 
-    def __init__(self, path: Path) -> None:
+    All calls raise `RegistryLost` where the file cannot be used.
+    """
+
+    def __init__(self, path: Path, busy_s: float = BUSY_S) -> None:
         self.path = path
-        self._connection = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+        with _told(path):
+            self._connection = sqlite3.connect(path, timeout=busy_s, isolation_level=None, check_same_thread=False)
 
     @classmethod
     def create(cls, path: Path, authority: str) -> "Registry":
@@ -106,21 +124,34 @@ class Registry:
         return made
 
     @classmethod
-    def open(cls, path: Path, authority: str) -> "Registry":
-        """Return the registry at `path`; raises `InputError` where it is none, or that of another authority."""
+    def open(cls, path: Path, authority: str, busy_s: float = BUSY_S) -> "Registry":
+        """Return the registry at `path`; raises `InputError` where it is none, or that of another authority.
+
+        busy_s: time that its calls wait for another process.
+        """
         if not path.exists():
             raise InputError(f"{path}: no such registry")
-        found = cls(path)
+        found = cls(path, busy_s)
         try:
-            row = found._connection.execute("SELECT fingerprint FROM authority").fetchone()
-        except sqlite3.DatabaseError:
-            raise InputError(f"{path}: is no registry of a fleet") from None
-        if row != (authority,):
-            raise InputError(f"{path}: is the registry of another authority than {path.parent / 'ca.crt'}")
-        known = "SELECT name FROM sqlite_master WHERE name IN ('requests_by_time', 'answered')"
-        if len(found._connection.execute(known).fetchall()) < 2:
-            found._connection.executescript(f"BEGIN; {REQUESTS} COMMIT;")
+            found._check(authority)
+        except BaseException:
+            found.close()
+            raise
         return found
+
+    def _check(self, authority: str) -> None:
+        try:
+            row = self._connection.execute("SELECT fingerprint FROM authority").fetchone()
+        except sqlite3.DatabaseError as error:
+            with _told(self.path):
+                if "locked" in str(error):
+                    raise
+            raise InputError(f"{self.path}: is no registry of a fleet") from None
+        if row != (authority,):
+            raise InputError(f"{self.path}: is the registry of another authority than {self.path.parent / 'ca.crt'}")
+        if len(self._read("SELECT name FROM sqlite_master WHERE name IN ('requests_by_time', 'answered')")) < 2:
+            with _told(self.path):
+                self._connection.executescript(f"BEGIN; {REQUESTS} COMMIT;")
 
     def close(self) -> None:
         """Close the file."""
@@ -203,12 +234,12 @@ class Registry:
     def list_requests(self, most: int) -> list[tuple[str, float, bytes]]:
         """Return vehicle, time of arrival and content of the last requests, the latest last."""
         asked = "SELECT vehicle, time, content FROM requests ORDER BY time DESC LIMIT ?"
-        return [*self._connection.execute(asked, (most,))][::-1]
+        return self._read(asked, (most,))[::-1]
 
     def list_open_requests(self, since: float) -> list[tuple[str, bytes]]:
         """Return vehicle and content of the requests that came after `since` and are not answered, the latest last."""
         asked = "SELECT vehicle, content FROM requests WHERE time > ? AND nonce NOT IN (SELECT nonce FROM answered)"
-        return [*self._connection.execute(f"{asked} ORDER BY time", (since,))]
+        return self._read(f"{asked} ORDER BY time", (since,))
 
     def answer_requests(self, nonces: Iterable[str], now: float) -> None:
         """Note that a group was formed from the requests with these nonces; one that is noted stays as it is."""
@@ -217,34 +248,38 @@ class Registry:
 
     def list_answered(self) -> set[str]:
         """Return the nonces of the requests that a group was formed from."""
-        return {nonce for (nonce,) in self._connection.execute("SELECT nonce FROM answered")}
+        return {nonce for (nonce,) in self._read("SELECT nonce FROM answered")}
 
     def count_changes(self) -> int:
         """Return how many changes the registry has seen."""
-        return self._connection.execute("SELECT coalesce(max(number), 0) FROM audit").fetchone()[0]
+        return self._read("SELECT coalesce(max(number), 0) FROM audit")[0][0]
 
     def list_audit(self, vehicle: str | None = None) -> list[AuditEntry]:
         """Return the audit trail, of one vehicle or of all, the oldest entry first."""
-        rows = self._connection.execute(
-            "SELECT * FROM audit WHERE ?1 IS NULL OR vehicle = ?1 ORDER BY number", (vehicle,)
-        )
+        rows = self._read("SELECT * FROM audit WHERE ?1 IS NULL OR vehicle = ?1 ORDER BY number", (vehicle,))
         return [AuditEntry(*row) for row in rows]
 
     def _select(self, where: str, values: tuple[str, ...] = ()) -> Iterator[Vehicle]:
         columns = "vehicle, fingerprint, public_key, issued, expires, state, node"
-        for *row, node in self._connection.execute(f"SELECT {columns} FROM certificates {where}", values):
+        for *row, node in self._read(f"SELECT {columns} FROM certificates {where}", values):
             yield Vehicle(*row, node=None if node is None else int(node))
+
+    def _read(self, sql: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
+        with _told(self.path):
+            return self._connection.execute(sql, values).fetchall()
 
     @contextmanager
     def _change(self) -> Iterator[sqlite3.Cursor]:
-        cursor = self._connection.cursor()
-        cursor.execute("BEGIN IMMEDIATE")
-        try:
-            yield cursor
-            cursor.execute("COMMIT")
-        except BaseException:
-            cursor.execute("ROLLBACK")
-            raise
+        with _told(self.path):
+            cursor = self._connection.cursor()
+            cursor.execute("BEGIN IMMEDIATE")
+            try:
+                yield cursor
+                cursor.execute("COMMIT")
+            except BaseException:
+                if self._connection.in_transaction:  # SQLite has ended it where the disk is full
+                    cursor.execute("ROLLBACK")
+                raise
 
     def _insert(self, cursor: sqlite3.Cursor, own: Vehicle, action: str) -> None:
         row = (own.fingerprint, own.name, own.public_key, own.issued, own.expires, "registered", None)

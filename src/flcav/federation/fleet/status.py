@@ -5,7 +5,7 @@ import json
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -18,13 +18,17 @@ from flcav.federation.fleet.traffic import Crossed, read_traffic
 from flcav.federation.fleet.up import read_ready
 from flcav.federation.messages.fl_request import FLRequest, parse_request
 from flcav.federation.messages.release_report import ReleaseReport
-from flcav.interface.wording import plural
+from flcav.interface.wording import make_printable, plural
 from flcav.storage.files import write_bytes
 from flcav.storage.records import LEFT_OUT, Record
 
 SHOWN = 20  # of requests and refusals, the latest
 LEAST_ROOM = 1_000_000  # bytes on the fleet's disk below which is said so
 PROGRESS = "federation.json"  # in the fleet's folder, written by the server of a federation
+
+
+def _print_all(words: Mapping[str, str]) -> dict[str, str]:
+    return {make_printable(name): make_printable(why) for name, why in words.items()}
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,7 @@ class Followed(Record):
     left_mb: float
     rounds: tuple[FollowedRound, ...] = ()
     waits: Mapping[str, str] = field(default_factory=dict)  # by client why it is waited for
+    gone: Mapping[str, str] = field(default_factory=dict)  # by client why it is out of the federation
 
     def save(self, folder: Path) -> None:
         """Write it to the fleet's folder."""
@@ -64,7 +69,15 @@ class Followed(Record):
         told += f", {plural(failed, 'failure')}" if failed else ""
         if self.rounds and self.rounds[-1].epsilon is not None:
             told += f", epsilon {self.rounds[-1].epsilon:.3g}"
-        return "; ".join([told, *(f"waits for {client}: {why}" for client, why in self.waits.items())])
+        late = {} if not self.rounds else self.rounds[-1].failed
+        last = [f"round {self.rounds[-1].round} without {name}: {late[name]}" for name in late if name not in self.gone]
+        waits = [f"waits for {name}: {why}" for name, why in self.waits.items()]
+        return "; ".join([told, *last, *(f"without {name}: {why}" for name, why in self.gone.items()), *waits])
+
+    def in_plain_words(self) -> "Followed":
+        """Return it with what vehicles say of themselves fit for a terminal."""
+        rounds = tuple(replace(each, failed=_print_all(each.failed)) for each in self.rounds)
+        return replace(self, rounds=rounds, waits=_print_all(self.waits), gone=_print_all(self.gone))
 
 
 @dataclass(frozen=True)
@@ -137,11 +150,12 @@ def read_status(folder: Path) -> FleetStatus:
         vehicles.append(VehicleStatus(*told, *counted, release))
     try:
         federation = Followed.from_json(json.loads((folder / PROGRESS).read_bytes()), str(folder / PROGRESS))
+        federation = federation.in_plain_words()
     except FileNotFoundError:
         federation = None
     proxy = None if ready is None else ready.proxy
     made = [(vehicle, parse_request(content)) for vehicle, _, content in asked]
     requests = tuple(Asked(vehicle, own, own.nonce in answered) for vehicle, own in made)
-    refused, free = tuple(traffic.refused[-SHOWN:]), shutil.disk_usage(folder).free
+    refused, free = tuple(map(make_printable, traffic.refused[-SHOWN:])), shutil.disk_usage(folder).free
     rest = refused, free, federation, time.time()
     return FleetStatus(proxy, read_processes(folder), tuple(vehicles), requests, *rest)

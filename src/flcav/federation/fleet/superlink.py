@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-from cryptography.hazmat.primitives import serialization
 from flwr.common.constant import SubStatus
 from flwr.common.serde import run_from_proto
 from flwr.proto.control_pb2 import ListNodesRequest, RegisterNodeRequest, StartRunRequest, UnregisterNodeRequest
@@ -38,8 +37,8 @@ from flwr.supercore.task_identity import TaskIdentity
 from flwr.superlink.grid import HttpGrid
 
 from flcav.federation.fleet.bundle import build_bundle, sign_bundle
-from flcav.federation.fleet.keys import AUTHORITY
-from flcav.federation.fleet.registry import Registry, Vehicle
+from flcav.federation.fleet.keys import AUTHORITY, public_pem
+from flcav.federation.fleet.registry import Registry
 
 SECRET, DATABASE = "executor.secret", "superlink.sqlite"  # in the fleet's folder
 ACQUIRE = frozenset({"/flwr.proto.Runtime/AcquireTask"})
@@ -92,7 +91,9 @@ class SuperLink:
                     registry.set_node(own.fingerprint, None)
             for own in wanted.values():
                 if own.node not in there:
-                    answer = control.RegisterNode(RegisterNodeRequest(public_key=_pem(own), name=own.name))
+                    answer = control.RegisterNode(
+                        RegisterNodeRequest(public_key=public_pem(own.public_key), name=own.name)
+                    )
                     registry.set_node(own.fingerprint, answer.node_id)
 
     def list_online(self) -> set[int]:
@@ -171,8 +172,3 @@ def locked(path: Path) -> Iterator[None]:
     with path.open("a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
-
-
-def _pem(own: Vehicle) -> bytes:
-    key = serialization.load_der_public_key(own.public_key)
-    return key.public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)

@@ -76,8 +76,8 @@ def supervise(
     finally:
         _end(all_)
         (folder / PROCESSES).unlink(missing_ok=True)
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, handler in before.items():  # what is pressed again while this process ends changes nothing
+            signal.signal(number, signal.SIG_IGN if ended else handler)
 
 
 def read_processes(folder: Path) -> dict[str, int]:

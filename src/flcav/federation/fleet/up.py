@@ -6,7 +6,6 @@ import gc
 import json
 import os
 import socket
-import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -209,15 +208,13 @@ class _Enrolment:
         if time.monotonic() < self._next:
             return self._seen >= 0
         self._next = time.monotonic() + (CHECK_S if self._seen >= 0 else 0.1)
-        registry = open_registry(self._folder)
         try:
-            if registry.count_changes() != self._seen:
-                link.enrol(registry)
-                self._seen = registry.count_changes()
-        except (*SuperLinkLost, sqlite3.Error) as error:  # not there yet, or not now; or its disk is full
+            with contextlib.closing(open_registry(self._folder)) as registry:
+                if registry.count_changes() != self._seen:
+                    link.enrol(registry)
+                    self._seen = registry.count_changes()
+        except (*SuperLinkLost, InputError, ValueError, TypeError) as error:  # not there yet, or not now; or damaged
             self.wrong = str(error)
-        finally:
-            registry.close()
         return self._seen >= 0
 
 

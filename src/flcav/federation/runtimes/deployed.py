@@ -94,8 +94,9 @@ class Deployment:
             if (self.folder / VEHICLES / vehicle.name).is_dir():  # others have their own client
                 own.save(self.folder / VEHICLES / vehicle.name)
         names = {vehicle.node or 0: name for vehicle, name in zip(vehicles, clients, strict=True)}
-        of_nodes = {vehicle.node or 0: vehicle.name for vehicle in vehicles}
-        grid = DeployedGrid(self.folder, self.link, names, of_nodes, account)
+        of_nodes = {vehicle.node or 0: vehicle for vehicle in vehicles}
+        limit_s = agreed.rules.limits.train_s
+        grid = DeployedGrid(self.folder, self.link, names, of_nodes, account, limit_s)
         try:
             yield grid
         except BaseException:

@@ -3,6 +3,9 @@
 Where the SuperLink was killed, Flower gives the run up; then the server begins another one, and asks those again whose
 answers have not come. A vehicle whose node came back is asked again, too. Since vehicles keep their last answer, the
 weights are those of a federation that nothing happened to.
+
+Where training has a time limit, so have answers: a vehicle that hangs, and cannot keep the limit itself, is given up.
+One whose certificate is no longer in force is neither asked nor waited for.
 """
 
 import contextlib
@@ -15,7 +18,9 @@ from pathlib import Path
 from flwr.app import ConfigRecord, Error, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
-from flcav.federation.fleet.authority import load_certificate
+from flcav.config import InputError
+from flcav.federation.fleet.authority import load_certificate, open_registry
+from flcav.federation.fleet.registry import Vehicle
 from flcav.federation.fleet.status import Followed, FollowedRound
 from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
 from flcav.federation.fleet.traffic import read_traffic
@@ -24,10 +29,15 @@ from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.federation.state import ClientStates, RoundRecord
+from flcav.interface.wording import make_printable
 from flcav.network.ledger import BudgetExceeded
 
 STARTING_S = 120.0  # for a SuperLink to come back
 REJOIN_S = 180.0  # that a vehicle is waited for which the network lost
+ALLOWANCE_S, SLOWEST_MBPS = 60.0, 1.0  # beyond the time to train: for polls and a fork; of the way there and back
+LOOK_S = 0.5  # between looks at the registry
+LONGEST = 500  # characters of a vehicle's words
+BUSY_S = 0.1  # that a look waits for a registry which another process holds
 POLL_S, PAUSE_S = 0.2, 1.0  # between looks for answers; before a vehicle that was not there is asked again
 RAISED = 2  # Flower's error code of an app that raised an exception, whose words are the reason
 FULL = re.compile(rf"\[Errno (?:{errno.ENOSPC}|{errno.EDQUOT}|{errno.EFBIG})\] ([A-Z][A-Za-z ]*)")
@@ -39,14 +49,26 @@ class DeployedGrid(WrappedGrid):
     """Grid of deployed vehicles, which begins another run where Flower has given the one before up."""
 
     def __init__(
-        self, folder: Path, link: SuperLink, names: Mapping[int, str], vehicles: Mapping[int, str], account: Account
+        self,
+        folder: Path,
+        link: SuperLink,
+        names: Mapping[int, str],
+        vehicles: Mapping[int, Vehicle],
+        account: Account,
+        limit_s: float | None = None,
     ) -> None:
-        """Reach nodes of the fleet in `folder` with the clients' `names`, which are `vehicles` of its registry."""
+        """Reach nodes of the fleet in `folder` with the clients' `names`, which are `vehicles` of its registry.
+
+        limit_s: time that a vehicle may train in a round; None: any.
+        """
         self._folder, self._link, self.names, self._vehicles, self._account = folder, link, names, vehicles, account
-        self.authority = load_certificate(folder)
+        self._limit_s, self.authority = limit_s, load_certificate(folder)
         self._largest = 0  # request to train so far [bytes]
         self._rounds: tuple[FollowedRound, ...] = ()
         self._waits: dict[str, str] = {}  # by client why it is waited for
+        self._gone: dict[str, str] = {}  # by client why it is out of the federation
+        self._silent: set[int] = set()  # nodes that were given up, and have not answered since
+        self._look = 0.0  # when the registry is asked next
         self._begin()
 
     def _begin(self) -> None:
@@ -76,7 +98,7 @@ class DeployedGrid(WrappedGrid):
     def _tell(self) -> None:
         account, link = self._account, self._account.link
         used, left = account.ledger.used_mb(link), account.ledger.left_mb(link)
-        told = Followed(account.stage, account.task, link, used, left, self._rounds, dict(self._waits))
+        told = Followed(account.stage, account.task, link, used, left, self._rounds, self._waits, self._gone)
         with contextlib.suppress(OSError):  # the federation goes on where the disk of its display is full
             told.save(self._folder)
 
@@ -115,13 +137,16 @@ class DeployedGrid(WrappedGrid):
         exchange, kept, largest = _Exchange(self._count_losses()), list[int](), 0
         answers: dict[int, Message] = {}
         end = time.monotonic() + (timeout or float("inf"))
+        late_s, self._look = self._limit_answers(asked.values()), 0.0
         for node, message in asked.items():
             while node not in answers:
+                self._strike(asked, answers)
                 try:
                     due = [own for own in asked if own not in answers and exchange.is_due(own)]
                     if due:
                         self._push(exchange, {own: asked[own] for own in due})
                     self._pull(exchange, asked, answers)
+                    self._give_up(exchange, late_s, asked, answers)
                 except SuperLinkLost:
                     self._renew()
                     exchange = _Exchange(self._count_losses(), exchange.granted)
@@ -136,12 +161,13 @@ class DeployedGrid(WrappedGrid):
             if reply.has_error() and reply.error.code == OVER_BUDGET:
                 kept.append(node)
                 continue
-            size = wire_bytes(reply.content) if reply.has_content() else 0
-            if size > exchange.granted[node]:
-                told = f"an answer of {size} bytes, where {exchange.granted[node]} were granted"
-                reply = Message(Error(RAISED, told), reply_to=message)
-            else:
-                largest = max(largest, size)
+            if reply.has_content():
+                size = wire_bytes(reply.content)
+                if size > exchange.granted[node]:
+                    told = f"an answer of {size} bytes, where {exchange.granted[node]} were granted"
+                    reply = Message(Error(RAISED, told), reply_to=message)
+                else:
+                    largest = max(largest, size)
             yield reply
         yield from self._judge(exchange, {own: asked[own] for own in kept}, largest)
 
@@ -168,6 +194,45 @@ class DeployedGrid(WrappedGrid):
         """
         return 4 * self._largest + CLIENT_BYTES * len(self.names) + SPARE_BYTES
 
+    def _limit_answers(self, messages: Iterable[Message]) -> float:
+        """Return the time that answers may take: to train, the allowance, and the way of request and answer [s]."""
+        if self._limit_s is None:
+            return float("inf")
+        contents = {id(message.content): message.content for message in messages}.values()  # many share one
+        size_mb = max(map(wire_bytes, contents), default=0) / 1e6
+        return self._limit_s + ALLOWANCE_S + 2 * 8 * size_mb / SLOWEST_MBPS
+
+    def _strike(self, asked: Mapping[int, Message], answers: dict[int, Message]) -> None:
+        """Answer for the nodes whose certificate is no longer in force, twice a second at most."""
+        if time.monotonic() < self._look:
+            return
+        self._look = time.monotonic() + LOOK_S
+        try:
+            with contextlib.closing(open_registry(self._folder, BUSY_S)) as registry:
+                found = {node: registry.find(own.fingerprint) for node, own in self._vehicles.items()}
+        except (InputError, OSError):  # another process holds it, or it is damaged: its own users say so
+            return
+        for node, own in found.items():
+            state = "not registered" if own is None else own.describe_state()
+            if state == "registered":
+                continue
+            name, why = self.names[node], f"the certificate of {self._vehicles[node].name} is {state}"
+            if node in asked and node not in answers:
+                answers[node] = Message(Error(LOST_BY_NETWORK, why), reply_to=asked[node])
+            if name not in self._gone:
+                self._gone[name] = why
+                self._waits.pop(name, None)
+                self._tell()
+
+    def _give_up(
+        self, exchange: "_Exchange", late_s: float, asked: Mapping[int, Message], answers: dict[int, Message]
+    ) -> None:
+        """Answer for the nodes that have not answered in time."""
+        for node, message in asked.items():
+            if node not in answers and exchange.waited_s(node) > late_s:
+                self._silent.add(node)
+                answers[node] = Message(Error(RAISED, f"it had not answered after {late_s:.0f} s"), reply_to=message)
+
     def _push(self, exchange: "_Exchange", due: Mapping[int, Message]) -> None:
         """Send requests to nodes, with the bytes that their answers may have."""
         left, sent = min(max(0, int(self._account.ledger.left_mb(self._account.link) * 1e6)), 2**62), []
@@ -192,20 +257,27 @@ class DeployedGrid(WrappedGrid):
             if node is None or node in answers:
                 continue
             reason = _excuse(reply)
-            if reason is not None and not exchange.is_late(node):
+            if reason is not None and not exchange.is_late(node) and node not in self._silent:
                 self._wait_for(exchange, node, reason)
             elif reason is not None:
                 answers[node] = Message(Error(LOST_BY_NETWORK, reason), reply_to=asked[node])
-            elif reply.has_error() and reply.error.code != OVER_BUDGET:  # whatever code a vehicle gives it
-                answers[node] = Message(Error(RAISED, str(reply.error.reason)), reply_to=asked[node])
             else:
-                answers[node] = reply
+                self._silent.discard(node)
+                answers[node] = _in_plain_words(reply, asked[node])
 
     def _count_losses(self) -> dict[int, int]:
         """Return how often each node may have lost what it was asked: it came in anew, or the SuperLink failed it."""
         found = read_traffic(self._folder).vehicles
-        there = {node: found[name] for node, name in self._vehicles.items() if name in found}
+        there = {node: found[own.name] for node, own in self._vehicles.items() if own.name in found}
         return {node: own.activations + own.lost for node, own in there.items()}
+
+
+def _in_plain_words(reply: Message, message: Message) -> Message:
+    """Return a reply; its error is the app's, whatever code a vehicle gives it, in words fit for a terminal."""
+    if not reply.has_error():
+        return reply
+    code = OVER_BUDGET if reply.error.code == OVER_BUDGET else RAISED
+    return Message(Error(code, make_printable(str(reply.error.reason), LONGEST)), reply_to=message)
 
 
 def _excuse(reply: Message) -> str | None:
@@ -213,7 +285,7 @@ def _excuse(reply: Message) -> str | None:
     if not reply.has_error():
         return None
     if reply.error.code in TRANSPORT:
-        return str(reply.error.reason)
+        return make_printable(str(reply.error.reason), LONGEST)
     if reply.error.code == RAISED and (full := FULL.search(str(reply.error.reason))):
         return f"no room on the vehicle's disk: {full[1]}"
     return None
@@ -228,6 +300,7 @@ class _Exchange:
         self._losses = dict(losses)
         self._due: dict[int, float] = {}  # of nodes that were asked: when they are to be asked again
         self._lost: dict[int, float] = {}  # since when nodes are not available
+        self._begun: dict[int, float] = {}  # when nodes were asked first
 
     def is_due(self, node: int) -> bool:
         return time.monotonic() >= self._due.get(node, 0.0)
@@ -237,6 +310,10 @@ class _Exchange:
 
     def sent(self, node: int, identifier: str) -> None:
         self.nodes[identifier], self._due[node] = node, float("inf")
+        self._begun.setdefault(node, time.monotonic())
+
+    def waited_s(self, node: int) -> float:
+        return time.monotonic() - self._begun.get(node, float("inf"))
 
     def lost(self, node: int) -> None:
         self._lost.setdefault(node, time.monotonic())

@@ -5,11 +5,12 @@ FLEET/releases/vehicles/NAME.json    the latest report of a vehicle
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flcav.config import read_json
 from flcav.federation.messages.release_report import ReleaseReport
+from flcav.interface.wording import make_printable
 from flcav.storage.files import write_json
 from flcav.storage.records import Record
 
@@ -45,10 +46,11 @@ class KeptReport(Record):
 
 
 def read_reports(fleet: Path) -> dict[str, KeptReport]:
-    """Return the latest report of each vehicle, by name."""
+    """Return the latest report of each vehicle, by name; its words are fit for a terminal."""
     paths = sorted((fleet / REPORTS).glob("[!.]*.json"))
     found = [KeptReport.from_json(read_json(path), str(path)) for path in paths]
-    return {each.vehicle: each for each in found}
+    plain = [replace(each.report, refused=make_printable(each.report.refused)) for each in found]
+    return {each.vehicle: replace(each, report=report) for each, report in zip(found, plain, strict=True)}
 
 
 def find_offered(fleet: Path, asked: str) -> Path | None:
