@@ -14,6 +14,7 @@ from flcav.federation.rules import SecureAggregation
 from flcav.federation.secure.masks import Vector, add_vectors, is_public_key
 from flcav.federation.secure.parties import SEALED_BYTES, PublicKeys, SecureClient, find_liars, unmask_sum
 from flcav.federation.secure.shamir import SHARE_BYTES
+from flcav.federation.trainable import Weights
 
 SURVIVORS, DROPPED, THRESHOLD = "survivors", "dropped", "threshold"  # entries of the server's messages
 SECRETS = "secrets"  # record of a node's state: the client's own part of a round
@@ -33,6 +34,8 @@ class Exchange(Protocol):
 
 class TooFewClients(OSError):
     """Fewer clients are left than secure aggregation needs."""
+
+    reached: Weights | None = None  # after the last round that came to an end; of `federate`
 
 
 def answer_secretly(message: Message, context: Context, name: str, how: SecureAggregation) -> Message:
