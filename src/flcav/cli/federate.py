@@ -77,15 +77,15 @@ def federate(
 
 def _describe(result: "StageResult") -> str:
     """Return a federation in words, with the vehicles that failed or were lost; on a network with its time."""
-    from flcav.federation.state import describe_failures
+    from flcav.federation.state import describe_empty, describe_failures
 
     told = f"{result.task} in {result.region}, {plural(result.rounds, 'round')}"
     told += f", {plural(result.clients, 'vehicle')}, {plural(result.samples, 'sample')}"
     records = result.records or ()
     seconds = [record.seconds for record in records if record.seconds is not None]
     told += f", {sum(seconds):.1f} s on the network" if seconds else ""
-    failures = describe_failures([record.failed for record in records])
-    told = f"{told}, {failures}" if failures else told
+    rest = describe_empty([each.empty for each in records]), describe_failures([each.failed for each in records])
+    told = ", ".join([told, *filter(None, rest)])
     return told if result.group is None else f"{told}; {result.group.describe()}"
 
 

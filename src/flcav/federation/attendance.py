@@ -11,13 +11,15 @@ from flcav.federation.messages.delivery import Lost, TimedOut
 from flcav.federation.rules import Rules
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.strategies import Strategy
-from flcav.federation.strategies.fedavg import RunningMean
+from flcav.federation.strategies.fedavg import NoShares, RunningMean
 from flcav.federation.strategies.strategy import Averages, Robust
-from flcav.federation.trainable import LocalUpdate
+from flcav.federation.trainable import LocalUpdate, Weights
 
 
 class ClientFailed(OSError):
     """Fewer clients sent a usable update in a round than are wanted: a fault of their machines."""
+
+    reached: Weights | None = None  # after the last round that came to an end; of `federate`
 
 
 @dataclass
@@ -29,6 +31,7 @@ class Attendance:
     away: Mapping[str, str] = field(default_factory=dict)  # who takes no part: by client why it is not there at first
     failed: dict[str, str] = field(default_factory=dict)  # by client what was wrong
     lost: set[str] = field(default_factory=set)  # those of them whom the network lost
+    idle: set[str] = field(default_factory=set)  # those of them without samples, or with no weight for the strategy
     shortage: ClientFailed | TooFewClients | None = None  # why there is no update
     few: bool = False  # whether fewer take part than the rules need
     spent: bool = False  # whether a budget kept some from sending, in the last round of buffers
@@ -42,10 +45,12 @@ class Attendance:
             self.lost |= {event.client} if event.by_network else set()
 
     def excuse(self, error: Exception) -> None:
-        """Note why the round has no update; raises `TooFewClients` where neither the network nor the rules are why."""
-        if isinstance(error, TooFewClients) and not (self.lost or self.few):
+        """Note why the round has no update; raises `TooFewClients` where clients failed and nothing else is why."""
+        if isinstance(error, TooFewClients) and not (self.lost or self.few or self.idle):
             raise error
-        self.failed |= {name: str(error) for name in self.chosen if name not in self.failed}
+        without = {name: str(error) for name in self.chosen if name not in self.failed}
+        self.failed |= without
+        self.idle |= without.keys() if isinstance(error, NoShares) else set()
 
     def count(self, rules: Rules) -> None:
         """Note whether too few take part for the rules, by a plan, by chance, or since others are away."""
@@ -62,23 +67,28 @@ class Attendance:
 
         By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
         a norm or a number of samples, and of those who were then to send an update. `all` is of both, too, a number of
-        those who were to send; who was away does not count. Where fewer are left than `strategy` needs, the round has
-        no update, and so where fewer take part than the rules need, unless a client failed.
+        those who were to send; who was away or has no samples does not count. Where fewer are left than `strategy`
+        needs, the round has no update, and so where fewer take part than the rules need, unless a client failed, or
+        where fewer are left than a number of the rules since some have no samples.
         """
         if self.spent:
             return
         reasons = "; ".join(f"{name}: {reason}" for name, reason in self.failed.items())
         if self.few:
-            if self.failed.keys() - self.lost:
+            if self.failed.keys() - self.lost - self.idle:
                 raise ClientFailed(f"round {number}: {self.shortage} ({reasons})")
             return
         least = rules.least_clients
         for clients in [self.chosen] if isinstance(least, int) else [self.asked, self.chosen]:
-            asked = [name for name in clients if name not in (self.lost if least is None else self.away)]
+            excused = self.idle | (self.lost if least is None else self.away.keys())
+            asked = [name for name in clients if name not in excused]
             wanted = len(asked) if least == "all" else -(-len(asked) // 2) if least is None else least
             usable = sum(name not in self.failed for name in asked)
             if usable < wanted:
                 told = f"{usable} of {len(asked)} clients sent an update that can be used, {wanted} are wanted"
+                if isinstance(least, int) and usable + len(self.idle.intersection(clients)) >= wanted:
+                    self.shortage = ClientFailed(told)
+                    continue
                 raise ClientFailed(f"round {number}: {told} ({reasons})")
         if isinstance(strategy, Robust):
             try:

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from flcav.config import InputError
 from flcav.federation.client import check_arguments
 from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
@@ -9,7 +11,7 @@ from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust, needs_known_number
-from flcav.federation.trainable import Counts, Trainable
+from flcav.federation.trainable import Counts, Trainable, Weights
 
 
 def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> None:
@@ -25,6 +27,8 @@ def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules
         check_arguments(clients, ["own", "imitation_steps"], "FedMD")
     if rules.upload.layers:
         check_arguments(clients, ["layers"], f"layers {', '.join(rules.upload.layers)}:")
+    if rules.keep_optimiser:
+        check_arguments(clients, ["optimiser"], "keep_optimiser:")
     if rules.selection.unbiased:
         for name, client in clients.items():
             if not isinstance(client, Counts):
@@ -32,6 +36,20 @@ def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules
                 raise InputError(f"selection: unbiased weights need clients that count their samples, {told}")
     if isinstance(rules.personal, RegionalModels):
         check_arguments(clients, ["proximal", "centre"], "personal:")
+
+
+def check_weights(weights: Weights, told: str) -> None:
+    """Raise `InputError` where weights are not finite arrays of numbers; `told` begins the sentence."""
+    for name, array in weights.items():
+        if not isinstance(array, np.ndarray | np.generic) or array.dtype.kind not in "fiub":
+            kind = f" of {dtype}" if (dtype := getattr(array, "dtype", None)) else ""
+            raise InputError(
+                f"{told}: '{name}' is {type(array).__name__}{kind}, and arrays of NumPy's numbers are wanted"
+            )
+        if not (finite := np.isfinite(array)).all():
+            raise InputError(
+                f"{told}: {np.size(array) - finite.sum()} of {np.size(array)} values of '{name}' are not finite"
+            )
 
 
 def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
@@ -57,6 +75,8 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
             f"privacy: epsilon of {selection.rule} selection rests on secret draws, and rounds without an update for a "
             "number of 'least_clients' would tell of them"
         )
+    if rules.hides_draws and rules.empty_rounds is not None:
+        raise InputError("privacy: epsilon rests on secret draws, and an end after 'empty_rounds' would tell of them")
     if isinstance(strategy, FedMD):
         _check_outputs(rules)
     if isinstance(strategy, FedBuff):
@@ -92,6 +112,8 @@ def _check_outputs(rules: Rules) -> None:
         raise InputError("FedMD's vehicles have networks of their own, which regional models, 'personal', cannot pull")
     if rules.privacy is not None:
         raise InputError("FedMD sends class probabilities, and noise is for changes of weights")
+    if rules.keep_optimiser:
+        raise InputError("FedMD's vehicles train towards two goals in turn; 'keep_optimiser' is for one")
 
 
 def _check_buffers(strategy: FedBuff, rules: Rules, clients: int) -> None:

@@ -37,7 +37,9 @@ from flcav.federation.messages.records import (
     UNMASK,
     VECTOR,
     LocalWork,
+    NoCount,
     read_arrays,
+    refuse,
     reply,
     reply_norm,
     to_arrays,
@@ -69,18 +71,20 @@ from flcav.statistics.streams import derive_seed
 PARTITION = "partition-id"  # key of Flower's simulation in a node's config: place of the client among all
 OWN, RESIDUAL = "own", "residual"  # records of a node's state: what strategy and compression keep between rounds
 OWN_DIGESTS = "own-digests"  # record in the place of `OWN` that stays with the client: of the last two, the last first
+OPTIMISER = "optimiser"  # record of it: the state of the client's optimiser
 KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
 HIDDEN = "hidden"  # an update that was masked, until the sum of its round is unmasked
 
 
 def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
-    """Return the records of a node's state that a checkpoint has: those of strategy and compression, and under clients'
-    own noise or masks what they have answered.
+    """Return the records of a node's state that a checkpoint has: those of strategy and compression, the optimiser's
+    where it is kept, and under clients' own noise or masks what they have answered.
     """
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"
     guards = is_local(rules) or rules.secure is not None
     digests = (OWN_DIGESTS,) if isinstance(strategy, FedMD) else ()
-    return (*((OWN, RESIDUAL) if keeps else ()), *digests, *((ANSWERED,) if guards else ()))
+    optimiser = (OPTIMISER,) if rules.keep_optimiser else ()
+    return (*((OWN, RESIDUAL) if keeps else ()), *digests, *optimiser, *((ANSWERED,) if guards else ()))
 
 
 def client_app(
@@ -104,14 +108,14 @@ def client_app(
 
     What error feedback leaves out, and a strategy's own arrays, are taken over where the server gets the update and can
     use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
-    arrives.
+    arrives, and so optimisers that are kept.
     """
     app, clients, requests = ClientApp(), [*trainables], Requests(rules.privacy)
 
     def admit(message: Message, context: Context, name: str, work: LocalWork) -> str:
         """Return what is asked for; raises `RequestRefused` where the client is not to answer."""
         asked, before = asked_for(message.content), recall_answered(context)
-        repeatable = rules.secure is None and OWN not in context.state and RESIDUAL not in context.state
+        repeatable = rules.secure is None and not {OWN, RESIDUAL, OPTIMISER} & {*context.state}
         digest = requests.digest(message.content, LOST if rules.secure is None else ASK)
         answered = before.admit(work.round, asked, digest, rules, repeatable)
         if (most := requests.affordable) is not None and answered.rounds > most - spent:
@@ -123,6 +127,12 @@ def client_app(
 
     @app.train()
     def train(message: Message, context: Context) -> Message:
+        try:
+            return answer_training(message, context)
+        except NoCount as error:
+            return refuse(message, str(error))
+
+    def answer_training(message: Message, context: Context) -> Message:
         name = clients[int(context.node_config[PARTITION])]
         work = LocalWork.from_record(message.content.config_records[CONFIG])
         asked = admit(message, context, name, work)
@@ -175,7 +185,7 @@ def client_app(
 
     @app.query()
     def query(message: Message, context: Context) -> Message:
-        kept = (OWN, RESIDUAL, ANSWERED)
+        kept = (OWN, RESIDUAL, OPTIMISER, ANSWERED)
         if message.content and (not simulated or context.state or not {*message.content} <= {*kept}):
             raise RequestRefused("a client's state is its own once it has any")
         for key in message.content:
@@ -203,12 +213,18 @@ def client_app(
             if not own and OWN_DIGESTS in context.state:
                 raise InputError("its network of the last round is in the folder of a vehicle")
             how |= {"own": own, "imitation_steps": strategy.steps}
+        if rules.keep_optimiser:
+            how |= {"optimiser": _recorded(context, OPTIMISER)}
         try:
             update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)
         except BudgetExceeded as error:
             if isinstance(trainable, Accounts):
                 raise
             raise RuntimeError(f"no budget is its own: {error}") from None  # which would end the federation
+        if rules.keep_optimiser:
+            if not (state := getattr(update, "optimiser", {})):
+                raise TypeError("keep_optimiser: its update has no 'optimiser' to keep")
+            _record(context, OPTIMISER, state)
         if isinstance(strategy, FedMD):
             _record(context, OWN, getattr(update, "own", {}))
         if not isinstance(strategy, Exchanges):

@@ -49,13 +49,16 @@ class EdgeServer:
         its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are;
         of regional models these are all, and vehicles are pulled to the cloud's from the second cloud round on.
         Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles
-        keep to. Under central noise the region counts by its number of vehicles, whoever took part.
+        keep to. Under central noise the region counts by its number of vehicles, whoever took part; otherwise by the
+        samples of its last edge round that is not empty. Where all are, it has no samples itself, but in the first
+        cloud round one, for its model of stage II.
         """
         start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own
         regional = isinstance(self.rules.personal, RegionalModels)
         centre = weights if regional and self.cloud_rounds_done else None
         done = self.cloud_rounds_done * self.edge_rounds
         schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
+        first, known = self.cloud_rounds_done == 0, len(self.state.records)
         self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
         if self.distiller is not None:
             self.state.server = {}  # the first edge round begins with the outputs of the cloud's network
@@ -79,6 +82,9 @@ class EdgeServer:
         self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
         if self.rules.privacy is not None and not self.rules.privacy.local:  # no noise covers numbers of samples
             return replace(found, samples=len(self.vehicles))
+        if self.state.records and self.state.records[-1].empty:
+            trained = [each.samples for each in self.state.records[known:] if each.samples]
+            return replace(found, samples=trained[-1] if trained else int(first))
         return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody
 
 

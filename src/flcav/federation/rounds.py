@@ -6,6 +6,7 @@ its own strategies sample clients from the global random state, multiply integer
 round where one client fails.
 """
 
+import contextlib
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -19,10 +20,10 @@ from flwr.serverapp import Grid
 from flcav.config import InputError
 from flcav.federation.attendance import Attendance, ClientFailed, Intake
 from flcav.federation.buffered_rounds import Buffering, Buffers, afford_buffers, is_spent, take_turns
-from flcav.federation.checks import check_federation
+from flcav.federation.checks import check_federation, check_weights
 from flcav.federation.client import kept_records
 from flcav.federation.masked_rounds import SecureRound
-from flcav.federation.messages.acceptance import Expected, ReplyRefused, extra_forms, read_norm, read_update
+from flcav.federation.messages.acceptance import Expected, NoSamples, ReplyRefused, extra_forms, read_norm, read_update
 from flcav.federation.messages.delivery import Arrived, list_events
 from flcav.federation.messages.records import (
     ARRAYS,
@@ -52,7 +53,7 @@ from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.secure.parties import SumLost
 from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.strategies import FEDAVG, Strategy
-from flcav.federation.strategies.fedavg import average_inversely
+from flcav.federation.strategies.fedavg import NoShares, average_inversely
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Exchanges, Stateful, find_weigher
@@ -115,7 +116,8 @@ def federate(
     round that `on_round` was given, and the state after it. Noise that is not seeded is drawn by secrets, which are
     kept in `state`: without it no federation can be repeated, nor gone on with to the same weights. Under a privacy
     budget the last rounds are those that it affords; without noise it is that for all of them. Where epsilon rests on
-    secret draws of clients, records and ledger do not name them.
+    secret draws of clients, records and ledger do not name them. A round in which no client has samples leaves the
+    weights as they are and is marked `empty`; `rules.empty_rounds` of them in a row are the last.
 
     Args:
         clients: by name; a client is asked for when it is to train, and of updates no more are in memory than the
@@ -146,8 +148,10 @@ def federate(
 
     Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
     no update, and fewer are left than `rules` ask for (by default half of those asked), `TooFewClients` where fewer are
-    left than secure aggregation needs, though `account` lost none, `InputError` where there are no clients, or `rules`
-    or `strategy` ask for what they cannot do, ValueError where `strategy` changes names, shapes or types of the arrays.
+    left than secure aggregation needs, though `account` lost none and none is without samples; both have the weights
+    after the last round that came to an end, `reached`. Raises `InputError` where there are no clients, `weights` are
+    no finite arrays, `rules` or `strategy` ask for what they cannot do, or `strategy` changes names, shapes or types of
+    the arrays.
 
     >>> import numpy as np
     >>> from flcav import federate
@@ -163,6 +167,7 @@ def federate(
     array([2.5, 2.5])
     """
     check_federation(clients, strategy, rules)
+    check_weights(weights, "weights to begin with")
     state, account, rounds, names = state or FederationState(), account or open_account(), schedule.rounds, [*clients]
     sent = _find_sent(weights, state, distiller)
     rules.upload.check_layers(sent)
@@ -171,13 +176,11 @@ def federate(
         buffers = buffers or take_turns(names, strategy.buffer, rounds)
         buffering = Buffering(strategy, buffers, account)
         rounds = min(rounds, afford_buffers(buffers, rules.privacy))
-        if is_spent(state):
-            return LocalUpdate(weights, 0, 0.0)
     elif rules.privacy is not None:
         privacy = find_noise(rules.privacy, rules.selection, len(names), earlier + rounds)
         rules = rules.model_copy(update={"privacy": privacy})
         rounds = affordable_rounds(privacy, rules.selection, names, rounds, earlier)
-    if rounds <= done:
+    if rounds <= done or _is_over(state, rules):
         return LocalUpdate(weights, 0, 0.0)
     kept, account = kept_records(strategy, rules), replace(account, concealed=rules.hides_draws)
     rules = rules.settle_threshold(names, certified=getattr(runtime, "deployed", False))
@@ -191,21 +194,32 @@ def federate(
         )
         for number in range(done + 1, rounds + 1):
             before_round(number, weights)
-            combined = server.run_round(number, sent)
+            try:
+                combined = server.run_round(number, sent)
+            except (ClientFailed, TooFewClients) as error:
+                error.reached = weights
+                raise
             state.clients = link.read_states(kept) if kept else state.clients
             if distiller is None:
                 weights = combined
-            else:
+            elif not state.records[-1].empty:
                 weights = _imitate(distiller, strategy, weights, combined, schedule.work(number))
                 state.server = {name: np.asarray(array) for name, array in combined.items()}
             link.follow(state.records[-1])
             ask_after(number, weights, link.ask)
             on_round(number, weights, state.records[-1].loss)
             sent = combined
-            if buffering is not None and is_spent(state):
+            if _is_over(state, rules):
                 break
     last = state.records[-1]
     return LocalUpdate(weights, last.samples, last.loss or 0.0)
+
+
+def _is_over(state: FederationState, rules: Rules) -> bool:
+    """Return whether a federation ends before its last round: over a budget, or since too many rounds were empty."""
+    most = rules.empty_rounds
+    empty = most is not None and len(state.records) >= most and all(each.empty for each in state.records[-most:])
+    return empty or is_spent(state)
 
 
 def _find_sent(weights: Weights, state: FederationState, distiller: Distiller | None) -> Weights:
@@ -257,7 +271,8 @@ class Server:
         Where fewer clients are left than the strategy needs, or the network lost clients and fewer are left than secure
         aggregation needs, or where fewer take part than secure aggregation or `least_clients` asks for and none failed,
         or where clients revealed shares that leave no way to the sum, the weights stay as they were, and the record
-        names those who were chosen as failed, with the reason; where nobody was drawn it names nobody. Raises
+        names those who were chosen as failed, with the reason; where nobody was drawn it names nobody. So it is where
+        clients have no samples, or no weight for the strategy, and nobody is left. Raises
         `ClientFailed` where fewer clients than are wanted sent a usable update, or where fewer take part than are
         wanted and clients failed to report, `TooFewClients` where so few are left for secure aggregation, `InputError`
         where the strategy refuses the updates or returns arrays of other names, shapes or types.
@@ -267,7 +282,7 @@ class Server:
         round_.here.check(self.rules, self.strategy, number)  # whether enough is left
         try:
             weights = self._combine(round_, updates)  # how it is combined
-        except (ClientFailed, TooFewClients, SumLost) as error:
+        except (ClientFailed, TooFewClients, SumLost, NoShares) as error:
             round_.here.excuse(error)
             weights, updates = start, Intake()
         self._keep(round_, updates)  # what is kept
@@ -324,7 +339,8 @@ class Server:
         updates = Intake(find_weigher(self.strategy) if plain else None)
         read = lambda _, content: read_update(content, round_.expected)  # noqa: E731
         for name, update in self._ask(here, dict.fromkeys(wanted, request), read):
-            updates.add(name, update)
+            with self._refusing(round_):
+                updates.add(name, update)
         return updates
 
     def _ask(
@@ -350,6 +366,7 @@ class Server:
                 answer = read(event.client, event.content)
             except ReplyRefused as error:
                 here.failed[event.client] = str(error)
+                here.idle |= {event.client} if isinstance(error, NoSamples) else set()
             else:
                 yield event.client, answer
 
@@ -367,18 +384,28 @@ class Server:
         start, updates = round_.start, self._average_first(round_, received)
         if not updates:
             return start
-        name = type(self.strategy).__name__
-        try:
+        with self._refusing(round_):
             if isinstance(self.strategy, Stateful):
                 weights, after = self.strategy.step(start, updates, self.state.server, len(self.names))
                 self.state.server = {name: np.asarray(array) for name, array in after.items()}
             else:
                 weights = self.strategy.combine(start, updates)
-        except ValueError as error:
-            raise InputError(f"strategy {name}, round {round_.work.round}: {error}") from error
+        name = type(self.strategy).__name__
         if forms_of(weights) != forms_of(start):
             raise InputError(f"{name} returned arrays of other names, shapes or types than the round started from")
+        check_weights(weights, f"strategy {name}, round {round_.work.round}")
         return weights
+
+    @contextlib.contextmanager
+    def _refusing(self, round_: Round) -> Iterator[None]:
+        """Raise `InputError` where the strategy cannot combine updates; `NoShares` where it gives none a weight."""
+        try:
+            yield
+        except NoShares:
+            raise
+        except ValueError as error:
+            name = type(self.strategy).__name__
+            raise InputError(f"strategy {name}, round {round_.work.round}: {error}") from error
 
     def _average_first(self, round_: Round, received: Intake) -> list[LocalUpdate]:
         """Return what the strategy combines: the updates or, under masks, central noise or weights, their one mean."""
@@ -412,5 +439,6 @@ class Server:
         record = RoundRecord(number, (), epsilon=epsilon)
         if not self.rules.hides_draws:
             about = (round_.here.failed, epsilon, received.mean_loss(), sum(received.samples.values()))
-            record = RoundRecord(number, tuple(received.samples), *about)
+            empty = bool(round_.here.idle) and not received.samples
+            record = RoundRecord(number, tuple(received.samples), *about, empty=empty)
         self.state.records.append(record)

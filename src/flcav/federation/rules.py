@@ -70,7 +70,13 @@ class Rules(Config):
     secure: SecureAggregation | None = None  # default: the server sees every update
     personal: Patterns | RegionalModels = ()  # what edge servers keep for their regions: arrays, as in `head.*`, or all
     limits: ReplyLimits = ReplyLimits()  # of what is taken from a client
-    least_clients: LeastClients = None  # whose updates a round needs; default: half of those asked whom no network lost
+    least_clients: LeastClients = (
+        None  # whose updates a round needs; default: half of those asked who have samples and whom no network lost
+    )
+    empty_rounds: int | None = Field(
+        default=None, ge=1, le=10**6
+    )  # so many rounds in a row in which no client has samples end a federation; default: it goes on
+    keep_optimiser: bool = False  # clients keep the state of their optimisers between rounds; default: it begins anew
 
     def of_servers(self) -> "Rules":
         """Return the rules among edge servers, which federate with the cloud, where vehicles have these.
@@ -80,7 +86,7 @@ class Rules(Config):
         """
         limits = self.limits.model_copy(update={"samples": MOST_SAMPLES, "train_s": None})
         upload = self.upload.model_copy(update={"kept": self.personal_arrays})
-        return Rules(upload=upload, limits=limits, least_clients="all")
+        return Rules(upload=upload, limits=limits, least_clients="all", empty_rounds=self.empty_rounds)
 
     def tell_shortage(self, clients: int) -> str:
         """Return in words that fewer clients take part in a round than the number `least_clients`, or "" for enough."""

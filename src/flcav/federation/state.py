@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flcav.federation.divergence import RoundDivergence
 from flcav.federation.noise import Secret, draw_secret
 from flcav.interface.wording import make_printable
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import LEFT_OUT, WHERE_TRUE, Record
 
 Arrays = dict[str, NDArray[np.number]]  # by name
 ClientStates = dict[str, dict[str, Arrays]]  # by client and kind
@@ -36,6 +36,14 @@ class RoundRecord(Record):
     loss: float | None = None  # mean training loss, weighted by samples; None: of nobody that is known
     samples: int = 0  # of the clients together
     divergence: Annotated[RoundDivergence | None, LEFT_OUT] = None  # of the regions; None: no cloud round of several
+    empty: Annotated[bool, WHERE_TRUE] = False  # no update, since clients had no samples: the model is that of before
+
+
+def describe_empty(rounds: Sequence[bool]) -> str:
+    """Return how many of some rounds are empty, in words; "" for none. rounds: of each, whether it is."""
+    if not any(rounds):
+        return ""
+    return "an empty round" if len(rounds) == 1 else f"{sum(rounds)} of {len(rounds)} rounds empty"
 
 
 def describe_failures(rounds: Sequence[Mapping[str, str]]) -> str:

@@ -69,6 +69,7 @@ class LocalUpdate:
     gradient: Weights = field(default_factory=dict)  # mean over the local steps, uncorrected; where `shift` was given
     extra: Weights = field(default_factory=dict)  # what else a strategy's clients send: see `Exchanges`
     own: Weights = field(default_factory=dict)  # what a client keeps for the next round, where `own` was given
+    optimiser: Weights = field(default_factory=dict)  # state of the optimiser after the steps, where it was given
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,9 @@ class Trainable(Protocol):
 
     Strategies that correct the clients' gradients need a `train` that takes the arguments of `Correction`, too, and
     federations that exchange named layers alone need one that takes `layers`, patterns of the parameters to train.
-    Clients of FedMD get their mean outputs for weights, `own`, what they kept, and `imitation_steps`.
+    Clients of FedMD get their mean outputs for weights, `own`, what they kept, and `imitation_steps`. Where rules have
+    clients keep their optimisers, `train` takes `optimiser`, the state after their last round, empty at first, and the
+    update has it as `optimiser` after this one.
     """
 
     def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> Update:

@@ -17,6 +17,7 @@ from flcav.network.messages import from_names, pack
 from flcav.perception.images import pack_pictures
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task, find_configuration
 from flcav.perception.training import train_steps
+from flcav.perception.training.adamw import AdamW
 from flcav.perception.weights import from_arrays, to_arrays
 
 ANNOTATED = "annotated"  # kind of labels: the ground truth of the recording
@@ -111,6 +112,7 @@ class TrainedWeights:
     samples: int  # number of distinct samples trained on
     loss: float  # mean over the steps; 0 without steps
     gradient: dict[str, NDArray[np.number]] = field(default_factory=dict)  # mean over the steps, with a `shift`
+    optimiser: dict[str, NDArray[np.number]] = field(default_factory=dict)  # its state, where it was given
 
 
 class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
@@ -153,12 +155,13 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
         shift: Mapping[str, NDArray[np.number]] | None = None,
         layers: Sequence[str] = (),
         centre: Mapping[str, NDArray[np.number]] | None = None,
+        optimiser: Mapping[str, NDArray[np.number]] | None = None,
     ) -> TrainedWeights:
         """Train from given weights at a constant learning rate; deterministic in its arguments.
 
         The gradient of each step is g + proximal (w - centre) + shift, by name of parameter; with a `shift` the result
-        has the mean of g. Raises `InputError` if `weights` do not fit the network, or no parameter is named by
-        `layers`.
+        has the mean of g. Raises `InputError` if `weights` or `optimiser` do not fit the network, or no parameter is
+        named by `layers`.
 
         Args:
             weights: first weights, by name of parameter or buffer.
@@ -169,6 +172,8 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
             shift: added to the gradient, by name of parameter; None: nothing.
             layers: patterns of the names of parameters that are trained; empty: all.
             centre: weights of the proximal term; None: `weights`.
+            optimiser: state of the optimiser after an earlier training, empty for a new one, which the result then has
+                after this one; None: a new one, whose state is not returned.
         """
         use_threads(self.threads)
         network = self.task.build(self.config)
@@ -177,6 +182,9 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
         correction = None
         if proximal or shift is not None:
             correction = GradientCorrection(weights if centre is None else centre, proximal, shift)
+        names, adamw = [name for name, _ in network.named_parameters()], AdamW(network, learning_rate)
+        if optimiser:
+            adamw.restore_arrays(optimiser, names)
         loss = train_steps(
             self.task,
             network,
@@ -186,9 +194,11 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
             learning_rate=learning_rate,
             seed=seed,
             correct=correction,
+            optimizer=adamw,
         )
         gradient = correction.mean() if correction is not None and shift is not None else {}
-        return TrainedWeights(to_arrays(network), self.count_samples(steps), loss, gradient)
+        kept = {} if optimiser is None else adamw.to_arrays(names)
+        return TrainedWeights(to_arrays(network), self.count_samples(steps), loss, gradient, kept)
 
     def count_samples(self, steps: int) -> int:
         """Return the number of distinct samples that `steps` steps train on."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from flcav.config import InputError
+from flcav.federation.runtimes.link import check_deployable
 from flcav.pipeline.engine import Step
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.steps.cloud import cloud_step
@@ -15,8 +16,10 @@ FEDERATING = (edge_step, cloud_step)
 
 
 def check_clients(graph: Graph, arms: Iterable[str], runtime: str) -> None:
-    """Raise `InputError` where an arm's labels cannot be had by clients of a `runtime` elsewhere."""
+    """Raise `InputError` where an arm's labels or optimisers cannot be had by clients of a `runtime` elsewhere."""
     for arm in arms if runtime != "embedded" else ():
+        if runtime == "flower":
+            check_deployable(graph.settings[arm].federation)
         if any(LABEL_SOURCES[kind].averaged for kind in graph.settings[arm].labels.values()):
             raise InputError(
                 "labels 'road-average' are renewed between rounds, and clients elsewhere get them once; "

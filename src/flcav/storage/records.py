@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 Class = Annotated[str, Field(alias="class")]  # a field named "class" in JSON, a reserved word in Python
 LEFT_OUT = Field(exclude_if=lambda value: value is None)  # for `Annotated`: not in the JSON where it is None
+WHERE_TRUE = Field(exclude_if=lambda value: not value)  # for `Annotated`: in the JSON where it is true
 
 RecordT = TypeVar("RecordT")
 

@@ -56,6 +56,49 @@ def account() -> Account:
     return Account(ledger(), "edge", "regression", "wireless")
 
 
+COUNTS, SAMPLES = np.array([10, 1000, 0, 7, 400]), np.array([1, 100, 1, 3, 5])
+COUNTED = {  # what strategies make of integers: their rule for floating arrays, rounded
+    **dict.fromkeys(
+        ("fedavg", "fedprox", "fedavgm", "fedadam", "fedyogi", "fedbuff"), SAMPLES @ COUNTS / SAMPLES.sum()
+    ),
+    **dict.fromkeys(("scaffold", "fedmd"), COUNTS.mean()),
+    **dict.fromkeys(("median", "krum"), np.median(COUNTS)),
+    "trimmed-mean": trim_mean(COUNTS, 0.2),
+}
+MOSTLY = {name for name, count in COUNTED.items() if count > 500}  # the first two clients have most of the samples
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_integers_are_combined_by_one_rule_whatever_the_order_of_the_clients(name: str):
+    strategy, expected = strategy_named(name), round(float(COUNTED[name]))
+    for order in ([0, 1, 2, 3, 4], [4, 2, 0, 1, 3]):
+        updates = [
+            LocalUpdate(
+                {
+                    "w": np.full(2, float(i), np.float16),
+                    "bn.num_batches_tracked": COUNTS[i].astype(np.int64)[()],
+                    "counts": COUNTS[i].astype(np.uint16) * np.ones((2, 1), np.uint16),
+                    "id": np.array([2**63 - 1, -(2**63), 2**60 + 1], np.int64),  # beyond float64
+                    "mask": np.array([True, i < 2, False]),
+                    "none": np.zeros((0, 3), np.float32),
+                },
+                int(SAMPLES[i]),
+                0.0,
+                extra={"w": np.zeros(2, np.float16)},
+            )
+            for i in order
+        ]
+        found = strategy.combine({**updates[0].weights, "w": np.zeros(2, np.float16)}, updates)
+        assert found["bn.num_batches_tracked"] == expected
+        assert (found["counts"] == expected).all()
+        assert found["id"].tolist() == [2**63 - 1, -(2**63), 2**60 + 1]
+        assert found["mask"].tolist() == [True, name in MOSTLY, False]
+        assert {key: (array.shape, array.dtype) for key, array in found.items()} == {
+            key: (np.shape(array), array.dtype) for key, array in updates[0].weights.items()
+        }
+        assert np.isfinite(found["w"]).all()
+
+
 def run(strategy: Any, **how: Any) -> np.ndarray:
     return federate(CLIENTS, FIRST, SCHEDULE, account(), strategy=strategy, **how).weights["w"]
 

@@ -42,10 +42,10 @@ def test_a_federation_is_a_bare_fedavg_loop():
     assert np.linalg.norm(result.weights["w"] - TRUTH) < 0.5 * np.linalg.norm(TRUTH)
 
 
-def test_integer_buffers_are_not_averaged():
-    a, b = {"n": np.array(3), "w": np.array([0.0])}, {"n": np.array(5), "w": np.array([4.0])}
+def test_integer_buffers_are_averaged_and_rounded():
+    a, b = {"n": np.array(3), "w": np.array([0.0])}, {"n": np.array(6), "w": np.array([4.0])}
     combined = average([a, b], [1, 3])
-    assert combined["n"] == 3
+    assert combined["n"] == 5  # of 5.25
     assert combined["n"].dtype == np.array(3).dtype
     np.testing.assert_allclose(combined["w"], [3.0])
 

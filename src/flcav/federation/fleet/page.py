@@ -52,7 +52,8 @@ async function follow() {
     at("state").textContent = s.proxy ? `up at ${s.proxy}` : "not up";
     at("federation").textContent = f ? s.told : "none yet";
     fill(at("rounds"), ["round", "clients", "loss", "epsilon", "failed"], (f ? f.rounds : []).map(r => [
-      cell(r.round, "n"), cell(r.clients, "n"), cell(number(r.loss), "n"), cell(number(r.epsilon), "n"),
+      cell(r.round, "n"), cell(r.empty ? "empty" : r.clients, "n"), cell(number(r.loss), "n"),
+      cell(number(r.epsilon), "n"),
       cell(Object.entries(r.failed).map(([who, why]) => `${who}: ${why}`).join("; "), "bad")]));
     fill(at("vehicles"), ["vehicle", "certificate", "node", "socket up", "socket down", "content up", "content down",
       "network"],

@@ -20,7 +20,7 @@ from flcav.federation.messages.fl_request import FLRequest, parse_request
 from flcav.federation.messages.release_report import ReleaseReport
 from flcav.interface.wording import make_printable, plural
 from flcav.storage.files import write_bytes
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import LEFT_OUT, WHERE_TRUE, Record
 
 SHOWN = 20  # of requests and refusals, the latest
 LEAST_ROOM = 1_000_000  # bytes on the fleet's disk below which is said so
@@ -41,6 +41,7 @@ class FollowedRound(Record):
     failed: Mapping[str, str] = field(default_factory=dict)  # by client what was wrong
     loss: float | None = None
     epsilon: float | None = None  # of all rounds so far
+    empty: Annotated[bool, WHERE_TRUE] = False  # no update, since clients had no samples
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,8 @@ class Followed(Record):
         bytes_ = f"{self.used_mb:.3g} MB on the {self.link} uplink"
         bytes_ += f", {self.left_mb:.3g} MB left" if self.left_mb < 1e9 else ""
         told = f"{self.stage} of {self.task}: {plural(len(self.rounds), 'round')}, {bytes_}"
+        empty = sum(each.empty for each in self.rounds)
+        told += f", {plural(empty, 'empty round')}" if empty else ""
         failed = sum(len(each.failed) for each in self.rounds)
         told += f", {plural(failed, 'failure')}" if failed else ""
         if self.rounds and self.rounds[-1].epsilon is not None:

@@ -40,6 +40,10 @@ class ReplyRefused(ValueError):
     """A reply that does not match its request, or exceeds the limits of the rules."""
 
 
+class NoSamples(ReplyRefused):
+    """A reply of a client without samples, which is no fault."""
+
+
 @dataclass(frozen=True)
 class Expected:
     """The form that updates of a round must have: rules, weights at its start, and arrays beside them."""
@@ -64,6 +68,8 @@ def extra_forms(strategy: Strategy, rules: Rules, start: Weights, sent: Weights)
 def read_update(content: RecordDict, expected: Expected) -> LocalUpdate:
     """Return the update in a reply, with the client's weights for its arrays; raises `ReplyRefused`."""
     rules, start, extra = expected.rules, expected.start, expected.extra
+    if METRICS in content:  # of a client without samples the rest may be missing
+        _read_numbers(content, LOSS, rules)
     _check_records(content, [ARRAYS, METRICS, EXTRA] if extra else [ARRAYS, METRICS])
     samples, loss = _read_numbers(content, LOSS, rules)
     sent = _read_arrays(content, ARRAYS, sent_forms(start, rules))
@@ -132,11 +138,13 @@ def _read_numbers(content: RecordDict, key: str, rules: Rules) -> tuple[int, flo
     if not isinstance(samples, int) or not isinstance(number, int | float):
         raise ReplyRefused(f"{shorten(samples)} samples and a {key} of {shorten(number)}")
     least, most = (0.0, limits.norm) if key == NORM else (-limits.loss, limits.loss)
-    if not (1 <= samples <= limits.samples and least <= number <= most):  # also of what is no number
-        told = f"; {limits.samples} samples are the most, and a {key} of {most:g} the largest"
-        raise ReplyRefused(f"{samples} samples and a {key} of {number}{told}")
     if is_local(rules) and samples != 1:
         raise ReplyRefused(f"{samples} samples, where all clients count the same")
+    if samples == 0:  # the loss is then of nothing
+        raise NoSamples("0 samples to train on: at least 1 is wanted")
+    if not (1 <= samples <= limits.samples and least <= number <= most):  # also of what is no number
+        told = f"1 to {limits.samples} samples are taken, and a {key} from {least:g} to {most:g}"
+        raise ReplyRefused(f"{samples} samples and a {key} of {number}: {told}")
     return samples, float(number)
 
 

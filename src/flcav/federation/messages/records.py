@@ -6,7 +6,7 @@ from functools import lru_cache
 from io import BytesIO
 
 import numpy as np
-from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
+from flwr.app import Array, ArrayRecord, ConfigRecord, Error, Message, MetricRecord, RecordDict
 from flwr.common.constant import SType
 from numpy.typing import NDArray
 
@@ -23,6 +23,7 @@ COUNT = "count"  # ask for the number of samples before training
 LOST = "lost"  # record of a message whose answer will not arrive
 GRANT, GRANTED = "grant", "bytes"  # record of a message and its entry: most bytes that its answer may have
 OVER_BUDGET = 101  # error code in the place of an answer over that
+CLIENT_APP_RAISED = 2  # Flower's error code of an exception in a client app
 LOST_BY_NETWORK = 100  # error code in the place of an answer that does not arrive; Flower's own codes are below
 KEYS, SHARES, MASKED, UNMASK = "keys", "shares", "masked", "unmask"  # ask, in this order, under secure aggregation
 NAMES, CIPHERS, MASKS = "names", "ciphers", "masks"  # entries of its messages; that of shares is `SHARES`
@@ -32,6 +33,10 @@ SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
 NUMBERS = {  # types of arrays in messages, by name
     str(np.dtype(code)): np.dtype(code) for code in (*np.typecodes["AllInteger"], *np.typecodes["AllFloat"], "?")
 }
+
+
+class NoCount(ValueError):
+    """A number of samples that no message can hold."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +143,7 @@ def update_content(update: Update, extra: Weights) -> RecordDict:
 
 
 def to_metrics(update: Update) -> MetricRecord:
-    """Return samples and loss of an update as metrics; raises ValueError for samples that no message can hold."""
+    """Return samples and loss of an update as metrics; raises `NoCount` for samples that no message can hold."""
     return MetricRecord({SAMPLES: _count(update.samples), LOSS: float(update.loss)})
 
 
@@ -153,6 +158,15 @@ def reply_norm(message: Message, norm: float, samples: int) -> Message:
 
 def _count(samples: float) -> int:
     """Return a number of samples as a plain integer."""
-    if not abs(samples) < 2**63 or samples != int(samples):
-        raise ValueError(f"{samples} samples")
-    return int(samples)
+    try:
+        whole = int(samples)
+    except (TypeError, ValueError, OverflowError):  # no number, or none that is finite
+        whole = -1
+    if whole != samples or abs(whole) >= 2**63:
+        raise NoCount(f"{shorten(samples)} samples, and a whole number below 2^63 is wanted")
+    return whole
+
+
+def refuse(message: Message, reason: str) -> Message:
+    """Return the answer of a client that cannot do what is asked, with the reason."""
+    return Message(Error(CLIENT_APP_RAISED, reason), reply_to=message)

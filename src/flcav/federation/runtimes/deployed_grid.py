@@ -91,7 +91,7 @@ class DeployedGrid(WrappedGrid):
 
     def follow(self, record: RoundRecord) -> None:
         """Write a round that has ended to the fleet's folder, where `flcav fleet status` reads it."""
-        about = time.time(), len(record.clients), record.failed, record.loss, record.epsilon
+        about = time.time(), len(record.clients), record.failed, record.loss, record.epsilon, record.empty
         self._rounds, self._waits = (*self._rounds, FollowedRound(record.round, *about)), {}
         self._tell()
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
-from flwr.app import Array, ArrayRecord, ConfigRecord, Context, Error, Message, MetricRecord, RecordDict
+from flwr.app import Array, ArrayRecord, ConfigRecord, Context, Message, MetricRecord, RecordDict
 from flwr.app.user_config import UserConfig
 from flwr.clientapp import ClientApp
 from flwr.common.serde import recorddict_to_proto
@@ -21,13 +21,22 @@ from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.federation.client import PARTITION
 from flcav.federation.messages.encoding import encode
-from flcav.federation.messages.records import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, read_arrays, to_arrays
+from flcav.federation.messages.records import (
+    ARRAYS,
+    EXTRA,
+    LOSS,
+    METRICS,
+    SAMPLES,
+    read_arrays,
+    refuse,
+    to_arrays,
+)
 from flcav.federation.rules import Rules
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 from flcav.federation.upload import Upload
 from flcav.network.ledger import BudgetExceeded
 
-RUN_ID, SERVER_NODE, CLIENT_APP_RAISED = 1, 1, 2  # the last is Flower's error code of an exception in a client app
+RUN_ID, SERVER_NODE = 1, 1
 FIRST_NODE = 2  # id of the first client
 WHOLE = Upload()  # whole updates
 
@@ -182,7 +191,7 @@ class EmbeddedGrid(Grid):
         except BudgetExceeded:
             raise
         except Exception as error:
-            return Message(Error(code=CLIENT_APP_RAISED, reason=repr(error)), reply_to=message)
+            return refuse(message, repr(error))
         finally:
             message.content = shared
             if context.state:

@@ -111,6 +111,7 @@ def open_link(
     elif runtime.deployed is True:
         from flcav.federation.runtimes.deployed import Agreement
 
+        check_deployable(rules)
         opened, far = runtime.open(clients, Agreement(strategy, rules, secrets, spent), states, account), True
     else:
         timing = (lambda each: each) if limit_s is None else (lambda each: TimedClients(each, limit_s))
@@ -121,6 +122,19 @@ def open_link(
         follow = getattr(inner, "follow", lambda _: None)
         ask = partial(_ask_there, inner, inner.names) if far else partial(_ask_here, clients)
         yield Link(metered, inner.names, ask, inner.read_states, follow, getattr(inner, "authority", None))
+
+
+def check_deployable(rules: Rules) -> None:
+    """Raise `InputError` where deployed clients cannot keep to rules.
+
+    The state of an optimiser tells of the gradients on a vehicle's data. To resume, the server's checkpoint would need
+    it, and it is not to leave the vehicle.
+    """
+    if rules.keep_optimiser:
+        raise InputError(
+            "keep_optimiser: the server's checkpoint would need the state of each deployed vehicle's optimiser, which "
+            "tells of its data; leave it out, or train in processes or on Ray"
+        )
 
 
 @contextlib.contextmanager

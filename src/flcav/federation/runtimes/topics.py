@@ -16,14 +16,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from flwr.app import Error, Message, RecordDict
+from flwr.app import Message, RecordDict
 from flwr.clientapp import ClientApp
 from flwr.common.serde import recorddict_from_proto, recorddict_to_proto
 from flwr.proto.recorddict_pb2 import RecordDict as ProtoRecords
 
 from flcav.config import InputError
+from flcav.federation.messages.records import refuse
 from flcav.federation.runtimes.bag import BagWriter
-from flcav.federation.runtimes.embedded import CLIENT_APP_RAISED, EmbeddedGrid
+from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.ros_names import ROS_NAMESPACE, join_names
 from flcav.federation.state import ClientStates
 from flcav.federation.trainable import Trainable
@@ -201,7 +202,7 @@ class TopicGrid(EmbeddedGrid):
             self._bag,
         )
         if label == FAILED:
-            return Message(Error(code=CLIENT_APP_RAISED, reason=data.decode()), reply_to=message)
+            return refuse(message, data.decode())
         return Message(unpack_records(data), reply_to=message)
 
 

@@ -27,6 +27,7 @@ from flcav.federation.secure.certified import Identity, SignedKeys, check_certif
 from flcav.federation.secure.masks import Vector, add_vectors, is_public_key
 from flcav.federation.secure.parties import SEALED_BYTES, PublicKeys, SecureClient, find_liars, unmask_sum
 from flcav.federation.secure.shamir import SHARE_BYTES
+from flcav.federation.trainable import Weights
 
 SURVIVORS, DROPPED, THRESHOLD = "survivors", "dropped", "threshold"  # entries of the server's messages
 SECRETS = "secrets"  # record of a node's state: the client's own part of a round
@@ -46,6 +47,8 @@ class Exchange(Protocol):
 
 class TooFewClients(OSError):
     """Fewer clients are left than secure aggregation needs."""
+
+    reached: Weights | None = None  # after the last round that came to an end; of `federate`
 
 
 def answer_secretly(

@@ -10,20 +10,35 @@ from numpy.typing import NDArray
 from flcav.federation.trainable import Update, Weights, learned_names
 
 NO_MEAN = "clients cannot be averaged by shares of {}: they must be 0 or more, not all 0"
+Floats = NDArray[np.float64]
 
 BLOCK = 1 << 15  # numbers that are added at a time: their products stay in the cache
+
+
+class NoShares(ValueError):
+    """No client has a share in a mean."""
+
+
+def round_mean(mean: Floats, low: NDArray[np.number], high: NDArray[np.number]) -> NDArray[np.number]:
+    """Return a mean or median of integers rounded to the nearest, in their type; it lies between `low` and `high`.
+
+    `low` and `high` are the least and the largest of the integers, so that what all have alike stays exact.
+    """
+    with np.errstate(invalid="ignore"):  # of those outside the type, for which the ends stand
+        inside = np.rint(mean).astype(low.dtype)
+    return np.where(mean >= high, high, np.where(mean <= low, low, inside))
 
 
 class RunningMean:
     """Weighted mean of arrays by name, sum_i share_i w_i / sum_i share_i, to which clients are added one by one.
 
-    Its memory is that of one client in float64, however many there are. Floating arrays are summed; of any other array
-    the first client's is the mean.
+    Its memory is that of one client in float64, however many there are. Means of integers are rounded, see
+    `round_mean`.
     """
 
     def __init__(self) -> None:
         self._form: dict[str, tuple[tuple[int, ...], np.dtype]] = {}  # of the first client
-        self._others: Weights = {}  # its arrays that are not floating
+        self._ends: dict[str, tuple[NDArray[np.number], NDArray[np.number]]] = {}  # of integers, least and largest
         self._sums: dict[str, NDArray[np.float64]] = {}
         self._shares: list[float] = []
         self._products = np.empty(BLOCK)
@@ -38,12 +53,14 @@ class RunningMean:
             raise ValueError(NO_MEAN.format([share]))
         if not self._shares:
             self._form = {name: (array.shape, array.dtype) for name, array in weights.items()}
-            floating = [name for name, array in weights.items() if np.issubdtype(array.dtype, np.floating)]
-            self._others = {name: array for name, array in weights.items() if name not in floating}
-            self._sums = {name: np.zeros(weights[name].shape) for name in floating}
+            self._sums = {name: np.zeros(array.shape) for name, array in weights.items()}
         elif [(name, a.shape) for name, a in weights.items()] != [(name, form[0]) for name, form in self._form.items()]:
             raise ValueError("clients sent arrays of different names or shapes: they train different networks")
         self._shares.append(share)
+        for name, array in weights.items() if share else ():
+            if not np.issubdtype(array.dtype, np.floating):
+                low, high = self._ends.get(name, (array, array))
+                self._ends[name] = np.minimum(low, array), np.maximum(high, array)
         for name, total in self._sums.items():
             values, sums = weights[name].reshape(-1), total.reshape(-1)
             for start in range(0, values.size, BLOCK):
@@ -53,12 +70,13 @@ class RunningMean:
                 )
 
     def mean(self) -> dict[str, NDArray[np.number]]:
-        """Return the mean, in the first client's types; raises ValueError where all shares are 0."""
+        """Return the mean, in the first client's types; raises `NoShares` where all shares are 0."""
         whole = float(np.sum(self._shares))
         if not whole:
-            raise ValueError(NO_MEAN.format(self._shares))
+            raise NoShares(NO_MEAN.format(self._shares))
+        means = {name: np.asarray(total / whole) for name, total in self._sums.items()}
         return {
-            name: self._others[name] if name in self._others else np.asarray(self._sums[name] / whole).astype(dtype)
+            name: round_mean(means[name], *self._ends[name]) if name in self._ends else means[name].astype(dtype)
             for name, (_, dtype) in self._form.items()
         }
 
@@ -66,8 +84,8 @@ class RunningMean:
 def average(weights: Sequence[Weights], shares: Sequence[float]) -> dict[str, NDArray[np.number]]:
     """Return the weighted mean of the clients' arrays, see `RunningMean`; `shares` has one entry per client.
 
-    Raises ValueError where a share is negative or not finite, or all are 0, and where the clients' arrays differ in
-    name, order or shape.
+    Raises ValueError where a share is negative or not finite, `NoShares` where all are 0, ValueError where the clients'
+    arrays differ in name, order or shape.
     """
     mean = RunningMean()
     for each, share in zip(weights, shares, strict=True):

@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from flcav.federation.strategies.fedavg import FedAvg
+from flcav.federation.strategies.fedavg import FedAvg, Floats
 from flcav.federation.trainable import LocalUpdate, Update, Weights, learned_names
-
-Floats = NDArray[np.float64]
 
 
 def move_mean(

@@ -6,19 +6,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.federation.strategies.fedavg import round_mean
 from flcav.federation.trainable import Update, Weights
 
 
 def combine_coordinates(
     models: Sequence[Weights], combined: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> dict[str, NDArray[np.number]]:
-    """Return `combined` of each floating array of all clients, stacked (clients, ...); of others the lower median."""
-    return {
-        name: combined(np.stack([own[name].astype(np.float64) for own in models])).astype(array.dtype)
-        if np.issubdtype(array.dtype, np.floating)
-        else np.sort(np.stack([own[name] for own in models]), axis=0)[(len(models) - 1) // 2]
-        for name, array in models[0].items()
-    }
+    """Return `combined` of each array of all clients, stacked (clients, ...); of integers rounded, see `round_mean`."""
+    found: dict[str, NDArray[np.number]] = {}
+    for name, array in models[0].items():
+        stacked = np.stack([own[name] for own in models])
+        values = np.asarray(combined(stacked.astype(np.float64)))
+        floating = np.issubdtype(array.dtype, np.floating)
+        found[name] = (
+            values.astype(array.dtype) if floating else round_mean(values, stacked.min(axis=0), stacked.max(axis=0))
+        )
+    return found
 
 
 def take_median(models: Sequence[Weights]) -> dict[str, NDArray[np.number]]:

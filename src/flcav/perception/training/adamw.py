@@ -1,10 +1,15 @@
 """AdamW, the optimiser that all tasks are trained with: Adam with decoupled weight decay."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim.adamw import adamw
+
+from flcav.config import InputError
 
 BETAS, EPSILON, WEIGHT_DECAY = (0.9, 0.99), 1e-8, 0.01
 
@@ -38,6 +43,22 @@ class AdamW:
     def state(self) -> dict[str, list[Tensor]]:
         """Return the moments and counts of steps, for a checkpoint; not copied."""
         return {"first": self._first, "second": self._second, "steps": self._steps}
+
+    def to_arrays(self, names: Sequence[str]) -> dict[str, NDArray[np.number]]:
+        """Return a copy of the state as arrays; `names` are those of the parameters, in their order."""
+        held = self.state().items()
+        return {f"{kind}/{name}": each.numpy(force=True).copy() for kind, own in held for name, each in zip(names, own)}
+
+    def restore_arrays(self, arrays: Mapping[str, NDArray[np.number]], names: Sequence[str]) -> None:
+        """Take the state that `to_arrays` returned; raises `InputError` for that of another network."""
+        wanted = [f"{kind}/{name}" for kind in self.state() for name in names]
+        if lacking := {*wanted} ^ arrays.keys():
+            raise InputError(f"state of an optimiser: '{min(lacking)}' is missing or unknown")
+        tensors = {key: torch.from_numpy(np.array(arrays[key])) for key in wanted}
+        try:
+            self.restore({kind: [tensors[f"{kind}/{name}"] for name in names] for kind in self.state()})
+        except ValueError as error:
+            raise InputError(f"state of an optimiser: {error}") from None
 
     def restore(self, state: dict[str, list[Tensor]]) -> None:
         """Take the moments and counts of steps of a checkpoint; raises `ValueError` for those of another network."""

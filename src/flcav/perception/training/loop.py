@@ -102,13 +102,15 @@ def train(
     watch: Watch = _unwatched,
     progress: Report = ignore_progress,
     correct: Correct | None = None,
+    optimizer: AdamW | None = None,
 ) -> TrainingHistory:
     """Train `network` in place for `steps` optimiser steps; hyperparameters default to `task.practice`.
 
     Each epoch goes through the samples in a new random order. With the `patience` of `validation`, training may stop
     early, and the network gets the weights of the best validation. With `checkpointing`, an interrupted run is resumed
     from its file and ends with the same weights. `watch` receives loss, learning rate and validation score; `correct`
-    changes the gradients before they are clipped. A damaged checkpoint is told, and training begins anew. Raises
+    changes the gradients before they are clipped. Training goes on with the moments of an `optimizer` of the network,
+    which it changes; None: they begin at zero. A damaged checkpoint is told, and training begins anew. Raises
     `InputError` without samples, for an unknown schedule, and if the checkpoint is of another run.
     """
     batch = task.practice.batch if batch is None else batch
@@ -119,7 +121,7 @@ def train(
     if schedule not in SCHEDULES:
         raise InputError(f"schedule '{schedule}': choose one of {', '.join(SCHEDULES)}{suggest(schedule, SCHEDULES)}")
     network.train()
-    optimizer = AdamW(network, learning_rate)
+    optimizer = optimizer or AdamW(network, learning_rate)
     waits = None if validation is None else (validation.every, validation.patience)
     settings = [task.name, repr(network.config), steps, batch, learning_rate, schedule, seed, waits]
     identity = f"{json.dumps(settings)} on {len(samples)} samples {checkpointing.of if checkpointing else ''}"
@@ -166,10 +168,11 @@ def train_steps(
     seed: int,
     watch: Watch = _unwatched,
     correct: Correct | None = None,
+    optimizer: AdamW | None = None,
 ) -> float:
     """Train `network` in place at a constant learning rate, as a federated client does.
 
-    Returns the mean loss, 0 for 0 steps; raises as `train` does. `watch` and `correct` are those of `train`.
+    Returns the mean loss, 0 for 0 steps; raises as `train` does. `watch`, `correct` and `optimizer` are as in `train`.
     """
     history = train(
         task,
@@ -182,6 +185,7 @@ def train_steps(
         seed=seed,
         watch=watch,
         correct=correct,
+        optimizer=optimizer,
     )
     return float(history.losses.mean()) if steps else 0.0
 

@@ -10,7 +10,7 @@ from flcav.federation.divergence import RoundDivergence
 from flcav.federation.privacy import SEEDED
 from flcav.pipeline.results.groups import Group
 from flcav.pipeline.results.saved import Saved
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import LEFT_OUT, WHERE_TRUE, Record
 
 DIVERGED = 10.0  # loss of no training that gets anywhere, by this factor above the first, and above 1
 
@@ -69,6 +69,7 @@ class FederatedRound(Record):
     epsilon: float | None  # of differential privacy, of all rounds so far; None: without noise
     seconds: float | None = None  # of the simulated network; None: without one
     divergence: Annotated[RoundDivergence | None, LEFT_OUT] = None  # of the regions; None: no cloud round of several
+    empty: Annotated[bool, WHERE_TRUE] = False  # no update, since clients had no samples: the model is that of before
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from safetensors.numpy import load_file, save
 
 from flcav.config import InputError, Json, read_json
 from flcav.federation.privacy import Privacy
-from flcav.federation.state import FederationState, RoundRecord, describe_failures
+from flcav.federation.state import FederationState, RoundRecord, describe_empty, describe_failures
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Weights
 from flcav.interface.progress import DAMAGED, Report
@@ -143,11 +143,14 @@ class FederationCheckpoints:
         return [PrivacySpent(max(private), self.privacy.delta, self.privacy.seeded).describe()]
 
     def _tell_failures(self) -> list[str]:
-        """Return who failed or was lost since the last note, in words; of stage III in all rounds of edge servers."""
+        """Return which rounds since the last note are empty, and who failed or was lost, in words.
+
+        Those of stage III are all rounds of edge servers.
+        """
         records = [record for name, own in self.states.items() for record in own.records[self._told.get(name, 0) :]]
         self._told = {name: len(own.records) for name, own in self.states.items()}
-        told = describe_failures([record.failed for record in records])
-        return [told] if told else []
+        told = describe_empty([each.empty for each in records]), describe_failures([each.failed for each in records])
+        return [each for each in told if each]
 
     def _write(self, name: str, data: bytes, hashes: dict[str, str]) -> None:
         write_bytes(self.folder / name, data)

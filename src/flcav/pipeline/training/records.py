@@ -29,6 +29,7 @@ SCHEMA = pa.schema(
         ("down_bytes", pa.int64()),
         ("epsilon", pa.float64()),
         ("seconds", pa.float64()),
+        ("empty", pa.bool_()),
     ]
 )
 
@@ -58,7 +59,7 @@ def read_rounds(
             about = (record.clients, record.failed, record.samples, record.loss)
             took = seconds.get(server)
             lasted = took[record.round - 1] if took else None
-            told = (sent["up"], sent["down"], record.epsilon, lasted, record.divergence)
+            told = (sent["up"], sent["down"], record.epsilon, lasted, record.divergence, record.empty)
             found.append(FederatedRound(server, record.round, *about, *told))
     return tuple(found)
 
