@@ -12,7 +12,7 @@ from flcav.world.opendrive.objects.places import read_number
 from flcav.world.opendrive.plan_view import NOTED_M, NOTED_RAD, SHORTEST_M, close_gaps
 from flcav.world.opendrive.reference_line import is_by_length
 
-MOST_TOLD = 5  # changes of a kind that are told one by one
+MOST_TOLD = 10  # changes of a kind that are told one by one
 PROFILES = ("planView", "elevationProfile", "lateralProfile", "lanes")  # children of a <road> with elements along s
 
 
