@@ -24,6 +24,7 @@ from flcav.world.opendrive.objects.signal_heads import find_heads
 from flcav.world.opendrive.objects.signs import find_posts, find_signs
 from flcav.world.opendrive.objects.standing import find_objects
 from flcav.world.opendrive.objects.stop_lines import find_stop_lines
+from flcav.world.opendrive.road_mending import mend_roads
 
 DATA = Path(__file__).parents[1] / "data"
 MAPS = ("cross", "cross_with_objects")
@@ -58,6 +59,7 @@ def place(sloping: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) ->
 
 def _read_whole(path: Path, place: Place) -> None:
     root = read_map(path)
+    mend_roads(root)
     mend_map(root)
     describe_map(root)
     points = sample_heights(root, path).points

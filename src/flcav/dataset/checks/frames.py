@@ -21,6 +21,7 @@ SIGMAS = 4.0  # additional margin in standard deviations of the range noise of r
 INSIDE = 0.95  # share of an actor's returns that must lie in its enlarged box
 LONGEST_SPIN_S = 2 * OFFSET_S
 GAP_DEG = 30.0  # widest azimuth sector without returns in a complete sweep
+STEEP_DEG, SKY_DEG = 8.0, 180.0  # tilt of a vehicle from which on its LiDARs may see the sky alone, in such a sector
 FORCE = 200.0  # limit of the specific force [m/s^2]
 RATE = 20.0  # limit of the angular rate [rad/s]
 FARTHEST = 1e9  # [m], [m/s]: beyond, squares of numbers say nothing
@@ -66,13 +67,17 @@ def check_values(frame: Frame, *, imported: bool = False) -> Iterator[str]:
 
 
 def check_sweeps(frame: Frame) -> Iterator[str]:
-    """Check that each LiDAR's sweep covers all azimuths; LiDARs with a point that is not finite are skipped."""
+    """Check that each LiDAR's sweep covers all azimuths; LiDARs with a point that is not finite are skipped.
+
+    On steep ground a LiDAR looks over the land on one side: there half of the azimuths may be without returns.
+    """
+    steep = frame.world_from_agent[2, 2] < math.cos(math.radians(STEEP_DEG))
     for name, points in frame.lidar.items():
         if not np.isfinite(points).all():
             continue
         azimuth = np.sort(np.degrees(np.arctan2(points[:, 1], points[:, 0])))
         gap = np.diff(azimuth, append=azimuth[:1] + 360.0).max(initial=0.0) if len(points) else 360.0
-        if gap > GAP_DEG:
+        if gap > (SKY_DEG if steep else GAP_DEG):
             yield f"{frame.key}: '{name}' is no whole spin, nothing comes back from a sector of {gap:.0f} degrees"
 
 

@@ -34,6 +34,7 @@ from flcav.world.opendrive.netconvert import run_netconvert
 from flcav.world.opendrive.objects.crossings import take_crosswalks
 from flcav.world.opendrive.objects.crosswalks import Crosswalk, find_crosswalks
 from flcav.world.opendrive.objects.taken import take_objects, tell
+from flcav.world.opendrive.road_mending import mend_roads
 from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 
 WIDEST_M = 5e5  # farthest that a street is from the middle of the town
@@ -176,7 +177,7 @@ def _import(xodr: Path, out: Path) -> ImportedTown:
         raise InputError(f"{beside}: is a file; a town needs a folder")
     root = read_map(xodr)
     document = describe_map(root)
-    notes = [*mend_map(root)]
+    notes = [*mend_roads(root), *mend_map(root)]
     heights = sample_heights(root, xodr)
     if heights.decks:
         notes.append(f"Bridges, on which roads pass above others: {len(heights.decks)}.")

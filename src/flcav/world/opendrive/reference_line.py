@@ -1,7 +1,7 @@
 """Reference lines of OpenDRIVE roads in the plane (OpenDRIVE 1.8, 9): line, arc, spiral, poly3 and paramPoly3."""
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +13,11 @@ Curve = Callable[[Array], tuple[Array, Array, Array]]  # length along it -> u, v
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)  # of the integrals of spirals
 TURN_RAD = 0.5  # by which a spiral turns at most over one interval of integration
 FINE = 400  # points at which a cubic's length is measured
+LENGTH_SHARE, LENGTH_M = 0.01, 0.5  # by which the length of a curve or road may differ from what the map says
 
 
 @dataclass(frozen=True)
-class _Piece:
+class Piece:
     """One <geometry>: a curve from a place in the map."""
 
     s: float  # where it begins along the road [m]
@@ -26,13 +27,19 @@ class _Piece:
     heading: float  # of its start [rad]
     curve: Curve
 
+    def at(self, along: Array) -> Array:
+        """Return x, y [m] and heading [rad] (N, 3) at `along` (N,) [m] from its start, limited to its length."""
+        u, v, turn = self.curve(np.clip(along, 0.0, self.length))
+        cos, sin = np.cos(self.heading), np.sin(self.heading)
+        return np.stack((self.x + cos * u - sin * v, self.y + sin * u + cos * v, self.heading + turn), axis=1)
+
 
 class ReferenceLine:
     """The reference line of one road, by length s along it."""
 
     def __init__(self, road: ElementTree.Element) -> None:
         """Read the geometry of a <road> that keeps to `standard`."""
-        self._pieces = [_piece(row) for row in road.iterfind("planView/geometry")]
+        self._pieces = list_pieces(road.iterfind("planView/geometry"))
         self._starts = np.array([piece.s for piece in self._pieces])
         self.length = float(road.attrib["length"])
 
@@ -42,18 +49,36 @@ class ReferenceLine:
         number = np.clip(np.searchsorted(self._starts, s, side="right") - 1, 0, None)
         for i in np.unique(number).tolist():
             rows, piece = number == i, self._pieces[i]
-            u, v, turn = piece.curve(np.clip(s[rows] - piece.s, 0.0, piece.length))
-            cos, sin = np.cos(piece.heading), np.sin(piece.heading)
-            out[rows] = np.stack(
-                (piece.x + cos * u - sin * v, piece.y + sin * u + cos * v, piece.heading + turn), axis=1
-            )
+            out[rows] = piece.at(s[rows] - piece.s)
         return out
 
 
-def _piece(row: ElementTree.Element) -> _Piece:
+def list_pieces(rows: Iterable[ElementTree.Element]) -> list[Piece]:
+    """Return the curves of <geometry> elements that keep to `standard`."""
+    return [_piece(row) for row in rows]
+
+
+def is_by_length(shape: ElementTree.Element, length: float) -> bool:
+    """Return whether the parameter of a <paramPoly3> goes to `length` [m] rather than to 1.
+
+    That is what its `pRange` says, without one 1, unless the curve has about this length in the other case alone.
+    """
+    said = shape.get("pRange") == "arcLength"
+    polynomials = [np.polynomial.Polynomial([float(shape.attrib[name + axis]) for name in "abcd"]) for axis in "UV"]
+
+    def fits(end: float) -> bool:
+        points = np.array([polynomial(np.linspace(0.0, end, FINE)) for polynomial in polynomials])
+        return abs(float(np.hypot(*np.diff(points)).sum()) - length) <= LENGTH_M + LENGTH_SHARE * length
+
+    with np.errstate(all="ignore"):  # numbers that overflow
+        by_length, by_share = fits(length), fits(1.0)
+    return said if by_length == by_share else by_length
+
+
+def _piece(row: ElementTree.Element) -> Piece:
     s, x, y, heading, length = (float(row.attrib[name]) for name in ("s", "x", "y", "hdg", "length"))
     shape = next(child for child in row if child.tag in CURVES)
-    return _Piece(s, length, x, y, heading, CURVES[shape.tag](shape, length))
+    return Piece(s, length, x, y, heading, CURVES[shape.tag](shape, length))
 
 
 def _line(_shape: ElementTree.Element, _length: float) -> Curve:
@@ -93,7 +118,7 @@ def _poly3(shape: ElementTree.Element, length: float) -> Curve:
 
 def _param_poly3(shape: ElementTree.Element, length: float) -> Curve:
     u, v = ([float(shape.attrib[f"{name}{axis}"]) for name in "abcd"] for axis in "UV")
-    scale = 1.0 if shape.get("pRange") == "arcLength" or not length else 1.0 / length
+    scale = 1.0 if not length or is_by_length(shape, length) else 1.0 / length
     along, across = ([value * scale**i for i, value in enumerate(row)] for row in (u, v))
     return _cubic(tuple(along), tuple(across), length, by_length=False)
 

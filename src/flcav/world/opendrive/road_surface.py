@@ -19,8 +19,8 @@ class Cubics:
 
     def __init__(self, rows: Iterable[ElementTree.Element], start: str = "s") -> None:
         """Read the attributes `start` and a to d of each row."""
-        values = sorted(tuple(float(row.attrib[name]) for name in (start, *"abcd")) for row in rows)
-        self._table = np.array(values, np.float64).reshape(-1, 5)
+        values = [[float(row.attrib[name]) for name in (start, *"abcd")] for row in rows]
+        self._table = np.array(sorted(values, key=lambda row: row[0]), np.float64).reshape(-1, 5)
 
     def __bool__(self) -> bool:
         return bool(self._table[:, 1:].any())

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from flcav.config import InputError, shorten
+from flcav.world.opendrive.plan_view import SHARPEST_RAD, WIDEST_GAP_M, measure_joints, order_geometry
+from flcav.world.opendrive.reference_line import LENGTH_M, LENGTH_SHARE
 
 LINES, ROADS = "9.2", "10.1"  # clauses
 ELEVATIONS, NUMBERS, LANES, WIDTHS, OFFSETS, JUNCTIONS = "10.5", "11.1", "11.3", "11.6", "11.4", "12.2"
@@ -27,8 +29,8 @@ POLYNOMIALS: dict[str, tuple[str, str]] = {  # elements that hold a cubic polyno
 }
 FARTHEST_M = 1e7  # largest coordinate of a map: zones of UTM reach so far from their origin
 WIDEST_M = 100.0  # largest number of a lane's width
+EARLIEST_M = 1.0  # farthest that a road's first lane section begins from its start
 LONGEST_M = 1e6  # of all roads together
-LENGTH_SHARE, LENGTH_M = 0.01, 0.5  # by which the length of a road may differ from that of its geometry
 
 
 class _Broken(ValueError):
@@ -75,32 +77,39 @@ def _check_reference_line(road: ElementTree.Element, name: str) -> None:
     if not rows:
         raise _Broken(f"{name} has no <geometry> (OpenDRIVE 1.8, {LINES})")
     (length,) = _numbers(road, ("length",), name, ROADS)
-    total, before = 0.0, -1.0
     for row in rows:
-        s, x, y, _, own = _numbers(row, ("s", "x", "y", "hdg", "length"), name, LINES)
+        _, x, y, _, own = _numbers(row, ("s", "x", "y", "hdg", "length"), name, LINES)
         shapes = [child for child in row if child.tag in SHAPES]
         if len(shapes) != 1:
             raise _Broken(f"{name}: a <geometry> needs one of {', '.join(SHAPES)} (OpenDRIVE 1.8, {LINES})")
         _numbers(shapes[0], SHAPES[shapes[0].tag], name, LINES)
-        if own < 0 or s <= before:
-            raise _Broken(f"{name}: its <geometry> elements do not follow one another (OpenDRIVE 1.8, {LINES})")
+        if own < 0:
+            raise _Broken(f"{name}: a <geometry> has the length {own:g} m (OpenDRIVE 1.8, {LINES})")
         if max(abs(x), abs(y)) > FARTHEST_M:
             raise _Broken(f"{name} begins more than {FARTHEST_M / 1000:g} km from the origin")
-        total, before = total + own, s
+    kept = order_geometry(road)
+    total = sum(float(row.attrib["length"]) for row in kept)
     if not length > 0 or abs(total - length) > LENGTH_M + LENGTH_SHARE * length:
         raise _Broken(f"{name} is {length:g} m long, and its geometry {total:g} m (OpenDRIVE 1.8, {LINES})")
+    for joint in measure_joints(kept):
+        at = f"{name}: its geometry at s = {joint.s:.6g} m"
+        if not joint.gap_m <= WIDEST_GAP_M:
+            before = "where the one before it ends" if joint.s != float(kept[0].attrib["s"]) else "its beginning"
+            most = f"in plan or along s, at most {WIDEST_GAP_M:g} m"
+            raise _Broken(f"{at} begins {joint.gap_m:.3g} m from {before}, {most} (OpenDRIVE 1.8, {LINES})")
+        if not joint.kink_rad <= SHARPEST_RAD:
+            turn, most = math.degrees(joint.kink_rad), math.degrees(SHARPEST_RAD)
+            raise _Broken(f"{at} turns by {turn:.0f}° at once, at most {most:.0f}° (OpenDRIVE 1.8, {LINES})")
 
 
 def _check_lanes(road: ElementTree.Element, name: str) -> None:
     sections = road.findall("lanes/laneSection")
     if not sections:
         raise _Broken(f"{name} has no <laneSection> (OpenDRIVE 1.8, {LANES})")
-    before = -math.inf
+    starts = [_numbers(section, ("s",), name, LANES)[0] for section in sections]
+    if abs(min(starts)) > EARLIEST_M:
+        raise _Broken(f"{name}: its lane sections begin at s = {min(starts):g} m, not at 0 (OpenDRIVE 1.8, {LANES})")
     for section in sections:
-        (start,) = _numbers(section, ("s",), name, LANES)
-        if start <= before:
-            raise _Broken(f"{name}: its lane sections are not in ascending order (OpenDRIVE 1.8, {LANES})")
-        before = start
         for side, sign in (("left", 1), ("right", -1)):
             numbers = [_lane_number(lane, name) for lane in section.iterfind(f"{side}/lane")]
             if sorted(sign * number for number in numbers) != list(range(1, len(numbers) + 1)):

@@ -145,8 +145,8 @@ def write_demand(
     `traffic`, pedestrians by its `footfall`; CAVs draw the approaches of the candidate poles, if there are any.
 
     Where the net has open ends, so that no tour is long enough, a CAV enters shortly before `from_s` [s] and drives on
-    to beyond `until_s`; another vehicle drives to an exit, and when it has left, the next one enters. Raises
-    `InputError` where no way is long enough for a CAV.
+    to beyond `until_s`, where all ways are short below the limit; another vehicle drives to an exit, and when it has
+    left, the next one enters. Raises `InputError` where no way is long enough for a CAV.
     """
     root = Element("routes")
     for category, shapes in SHAPES.items():
@@ -168,13 +168,14 @@ def write_demand(
     exits = {edge.id for edge, left_s in zip(driven, passages.left_s) if np.isfinite(left_s)}  # none in a closed net
     for i in range(cavs):
         random = stream(seed, "cav", i)
-        weight, depart = watching if watching.any() else traffic, 0.0
-        edges = draw_tour(driven, mid_car, by_car, weight, reach, random)
+        weight, depart, share = watching if watching.any() else traffic, 0.0, None
+        edges = draw_tour(driven, mid_car, by_car, weight, reach, random, anywhere=True)
         if edges[-1] in exits:
             depart = round(max(from_s - (i + 1) * HEADWAY_S, 0.0), 1)
             least_s = until_s - depart
-            edges = [driven[row].id for row in passages.draw(weight, random, least_s=least_s, most_s=least_s)]
-        trips.append((depart, _vehicle(f"cav{i}", CAV_TYPE, depart, edges, entering=depart > 0)))
+            slowed, share = passages.slow_down(least_s)
+            edges = [driven[row].id for row in slowed.draw(weight, random, least_s=least_s, most_s=least_s)]
+        trips.append((depart, _vehicle(f"cav{i}", CAV_TYPE, depart, edges, entering=depart > 0, share=share)))
     categories = list(parameters.mix)
     shares = np.array([parameters.mix[category] for category in categories])
     followers: dict[str, Successor] = {}
@@ -237,12 +238,14 @@ def draw_tour(
     weight: Array,
     length_m: float,
     random: np.random.Generator,
+    *,
+    anywhere: bool = False,
 ) -> list[str]:
     """Return the ids of edges to visit in order, drawn by `weight` (N,), at least `length_m` long as the crow flies.
 
     `middle` (N, 2) are the edges' places [m], see `find_middles`; `reach` (N, N) says which edges can be reached from
-    which. The tour starts where it can go on, if there is such an edge, and ends early where it cannot. Weights that
-    are all zero count as equal.
+    which. The tour starts where it can go on, if there is such an edge, and ends early where it cannot; with `anywhere`
+    it goes on where no weight is, if that leads to a circle. Weights that are all zero count as equal.
     """
     weight = weight if weight.any() else np.ones(len(edges))
     going_on = weight * (reach & (weight > 0)).any(axis=1)
@@ -252,6 +255,8 @@ def draw_tour(
     while done < length_m:
         steps = np.hypot(*(middle - middle[at]).T)
         share = weight * reach[at]
+        if anywhere and not share.any() and (circling := reach[at] & reach.diagonal()).any():
+            share = 1.0 * circling
         if not share.any():
             break
         if not (share * (steps >= NEXT_M)).any():
@@ -270,11 +275,17 @@ def draw_type(category: str, parameters: TownParameters, random: np.random.Gener
     return f"{category}.{SHAPES[category][int(random.choice(len(weights), p=weights))].name}"
 
 
-def _vehicle(name: str, kind: str, depart: float, edges: list[str], *, entering: bool = False) -> Element:
-    """Return SUMO's <trip> of a vehicle along `edges`: from rest somewhere on the first, or `entering` it in motion."""
+def _vehicle(
+    name: str, kind: str, depart: float, edges: list[str], *, entering: bool = False, share: float | None = None
+) -> Element:
+    """Return SUMO's <trip> of a vehicle along `edges`: from rest somewhere on the first, or `entering` it in motion.
+
+    It drives at that `share` of the limits, or one that SUMO draws.
+    """
+    pace = {} if share is None else {"speedFactor": f"{share:.3f}"}
     start = {"departPos": "base", "departSpeed": "max"} if entering else {"departPos": "random_free"}
     row = {"id": name, "type": kind, "depart": f"{depart:.1f}", **start, "departLane": "best"}
-    return Element("trip", row | {"from": edges[0], "to": edges[-1], "via": " ".join(edges[1:-1])})
+    return Element("trip", row | pace | {"from": edges[0], "to": edges[-1], "via": " ".join(edges[1:-1])})
 
 
 def _person(name: str, kind: str, depart: float, edges: list[str]) -> Element:

@@ -1,6 +1,6 @@
 """Passages: routes through a road net with open ends, from where vehicles enter it to where they leave it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import networkx
 import numpy as np
@@ -15,6 +15,10 @@ Array = NDArray[np.float64]
 
 HASTE = 1.2  # highest speed of a car, as a multiple of the limit
 ENTERING_S = 1.0  # a vehicle enters with its whole length on the first edge, and leaves with its front
+SHORT_S = 10.0  # a way that takes less time at the limit is driven more slowly where a drive has to last longer
+SLOWEST = 1.0  # but no more slowly than this [m/s]
+ENTERING_M, LEAVING_S = 6.0, 0.6  # parts of such a way that are not driven: a vehicle's length, and the last moments
+ALIKE = 1.05  # of two ways, whose lengths differ by less than this factor, either may be taken
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,27 @@ class Passages:
     )
     entries: NDArray[np.bool_]  # (N,) whether nothing leads to it
 
+    def slow_down(self, least_s: float) -> tuple["Passages", float | None]:
+        """Return the passages at the speed at which the longest way takes `least_s` [s], and its share of the limit.
+
+        The share is None where the way is long enough for a vehicle of any speed, is no short one, or would be too slow.
+        """
+        longest, enough = float(self.left_s.max(initial=0.0)), HASTE * (least_s + ENTERING_S)
+        share = self._measure_crawl() * SLOWEST / self._limit / (least_s + LEAVING_S)
+        if longest >= min(enough, SHORT_S) or share * self._limit < SLOWEST:
+            return self, None
+        slower = ALIKE * enough / longest
+        return replace(self, time_s=slower * self.time_s, left_s=slower * self.left_s), min(share, 1.0)
+
+    @property
+    def _limit(self) -> float:
+        """Return the limit where the longest way begins [m/s]."""
+        return self.edges[int(self.left_s.argmax())].lanes_of("driving")[0].speed
+
+    def _measure_crawl(self) -> float:
+        """Return the longest time for which a vehicle can drive at `SLOWEST` [s]."""
+        return max(float(self.left_s.max(initial=0.0)) * self._limit - ENTERING_M, 0.0) / SLOWEST
+
     def draw(self, weight: Array, random: np.random.Generator, *, least_s: float, most_s: float) -> list[int]:
         """Return the rows of a route that takes `least_s` [s] even at `HASTE`, and goes on for `most_s` or to an exit.
 
@@ -41,10 +66,12 @@ class Passages:
         if not share.any():
             share = 1.0 * (self.left_s >= left)
         if not share.any():
-            metres = sum(measure_edge(edge) for edge in self.edges)
+            metres, longest = sum(measure_edge(edge) for edge in self.edges), float(self.left_s.max(initial=0.0))
+            slowly = f", and {max(self._measure_crawl() - LEAVING_S, 0.0):.3g} s at {SLOWEST:g} m/s"
             raise InputError(
                 f"a vehicle would have to drive for {least_s:.3g} s, and its longest way out of the {metres:.0f} m "
-                f"of lanes takes {self.left_s.max(initial=0.0) / HASTE:.3g} s: record a shorter time, or fewer vehicles"
+                f"of lanes takes {longest / HASTE:.3g} s{slowly if longest < SHORT_S else ''}: record a shorter time, "
+                "or fewer vehicles"
             )
         at = int(random.choice(len(self.edges), p=share / share.sum()))
         route, driven_s = [at], self.time_s[at]

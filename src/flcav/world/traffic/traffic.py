@@ -169,8 +169,8 @@ def _smooth(raw: Recorded, windows: NDArray[np.int64]) -> Array:
     rows = np.unique(windows)
     dense, windows = _dense(raw, rows), np.searchsorted(rows, windows)
     total, count = np.zeros((len(windows), *dense.shape[1:])), np.zeros((len(windows), dense.shape[1], 1))
-    for column in windows.T:
-        there = ~np.isnan(dense[column, :, :1])
+    for column, opposite in zip(windows.T, windows.T[::-1]):  # both or neither: else who just came would be ahead
+        there = ~np.isnan(dense[column, :, :1] + dense[opposite, :, :1])
         total += np.where(there, dense[column], 0.0)
         count += there
     absent = np.isnan(dense[windows[:, windows.shape[1] // 2], :, :1])

@@ -248,11 +248,51 @@ def test_streets_that_end_at_the_edge_of_a_map_stay_busy(tmp_path: Path) -> None
         simulate(town, seed=1, cavs=1, times_s=np.arange(60.0, 200.0))
 
 
+def test_short_streets_are_driven_slowly(tmp_path: Path) -> None:
+    """One-way streets, on which nobody can turn: at the limit of 50 km/h one of 24 m takes less than two seconds."""
+    imported = import_text(street("", length=24), tmp_path / "short")
+    assert "No vehicles: the map has 24 m of lanes open to cars." in imported.notes
+    for seed in (1, 2):
+        for times_s in (np.array([60.0]), 60.0 + np.arange(10)):
+            trace = simulate(imported.town, seed=seed, cavs=1, times_s=times_s)
+            (cav,) = np.flatnonzero(np.char.startswith(trace.actor, "cav"))
+            assert trace.present[:, cav].all()
+            x = trace.position[:, cav, 0]
+            assert (x > 0).all()
+            assert (x < 24).all()
+            assert (np.diff(x) > 0.5).all()
+    with pytest.raises(InputError, match=r"drive for 32 s, .* of the 24 m of lanes takes 1.44 s, and 17.4 s at 1 m/s"):
+        simulate(imported.town, seed=1, cavs=1, times_s=60.0 + np.arange(31))
+
+
 def test_where_nobody_can_drive_is_told(tmp_path: Path) -> None:
-    imported = import_text(street("", length=14), tmp_path / "short")
-    assert "No vehicles: the map has 14 m of lanes open to cars." in imported.notes
-    with pytest.raises(InputError, match=r"town: a vehicle would have to drive for .* of the 14 m of lanes takes 0.8"):
+    imported = import_text(street("", length=7), tmp_path / "short")
+    with pytest.raises(
+        InputError, match=r"town: a vehicle would have to drive for .* of the 7 m of lanes takes 0.42 s"
+    ):
         simulate(imported.town, seed=1, cavs=1, times_s=np.array([60.0]))
+
+
+def test_who_comes_and_leaves_moves_as_recorded(tmp_path: Path) -> None:
+    town = import_text(street("", length=300), tmp_path / "oneway").town
+    trace = simulate(town, seed=1, cavs=0, times_s=np.round(60 + np.arange(250) / 10, 1))
+    others = np.char.startswith(trace.actor, "veh")
+    assert 0 < trace.present[:, others].any(axis=0).sum() > trace.present[0, others].sum()  # some came later
+    moved = np.diff(trace.position[..., :2], axis=0)
+    expected = (trace.velocity[1:, :, :2] + trace.velocity[:-1, :, :2]) / 2 * 0.1
+    away = np.linalg.norm(moved - expected, axis=2)
+    assert np.nanmax(away[:, others]) < 0.3
+
+
+def test_a_cav_goes_on_where_the_streets_past_poles_end(tmp_path: Path) -> None:
+    """Beyond the only street with a candidate pole is a dead end to turn in."""
+    lanes = '<lane id="-1" type="driving"><width sOffset="0" a="3.5" b="-0.1" c="0" d="0"/></lane>'
+    back = '<left><lane id="1" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></left><center>'
+    text = street("", length=100).replace("<center>", back)
+    old = text[text.index('<lane id="-1"') : text.index("</right>")]
+    town = import_text(text.replace(old, lanes), tmp_path / "narrowing").town
+    trace = simulate(town, seed=1, cavs=1, times_s=60.0 + np.arange(3))
+    assert trace.present[:, trace.actor == "cav0"].all()
 
 
 @pytest.mark.parametrize("name", ["a.b", "my town", "-x", "x" * 65])
@@ -272,8 +312,15 @@ def test_limits_that_are_not_finite_are_left_out() -> None:
 
 
 def test_roads_that_are_linked_across_a_country_are_refused(tmp_path: Path) -> None:
+    one = street("")
+    link = '<link><{} elementType="road" elementId="{}" contactPoint="{}"/></link>'
+    road = one[one.index("<road") : one.index("</OpenDRIVE>")].replace("<lanes>", "{}<lanes>")
+    road = re.sub(r"(<lane id=\"-1\"[^>]*>)", r"\1<link><{} id='-1'/></link>", road).replace("{}<lanes>", "<lanes>")
+    first = road.format("successor").replace("<type", link.format("successor", 301, "start") + "<type")
+    second = road.format("predecessor").replace("<type", link.format("predecessor", 300, "end") + "<type")
+    second = second.replace('id="300"', 'id="301"').replace('x="0"', 'x="100000"')
     path = tmp_path / "map.xodr"
-    path.write_text(CROSS.read_text().replace('y="5428000.0000"', 'y="7"', 1))
+    path.write_text(f"<OpenDRIVE>{first}{second}</OpenDRIVE>")
     with pytest.raises(InputError, match=r"roads that are linked lie apart: .* to join 0\.\d+ km of roads .*10\.3\)"):
         import_town(path, tmp_path / "town")
 
