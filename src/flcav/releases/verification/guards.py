@@ -19,6 +19,7 @@ from flcav.releases.verification.matching import Mask, assign_detections
 
 OVERLAP = 0.5  # IoU in 3D from which a detection finds a target
 SECTORS_DEG = ((-90, -30), (-30, 0), (0, 30), (30, 90))  # of azimuth, counter-clockwise from straight ahead
+LEAST_SIGMAS = 0.05
 PARTS = ("x", "y", "height above ground", "length", "width", "height", "axis")  # of a box, LiDAR frame
 
 
@@ -167,7 +168,7 @@ def _pair(
 
 
 def _sum(frame: NDArray[np.int64], values: Values, frames: int) -> Values:
-    return np.bincount(frame, values, frames)
+    return np.bincount(frame, values, frames).astype(np.float64)
 
 
 def _ratio(above: Values, below: Values) -> Callable[[Times], Values]:
@@ -214,15 +215,15 @@ def _error(part: int) -> Callable[[ClassTable], Terms]:
     return lambda table: _of_right(table, np.abs(table.axis_error[:, part]))
 
 
-def _likelihood(part: int) -> Callable[[ClassTable], Terms]:
-    """Return the negative logarithm of the likelihood of an error, Gaussian, without its constant."""
+def _normalised(part: int) -> Callable[[ClassTable], Terms]:
+    """Return the logarithm of errors in predicted standard deviations, from `LEAST_SIGMAS` on: it has no heavy tail."""
 
-    def likelihood(table: ClassTable) -> Terms:
+    def normalised(table: ClassTable) -> Terms:
         assert table.variance is not None
-        variance = table.variance[:, part]
-        return _of_right(table, (np.log(variance) + table.axis_error[:, part] ** 2 / variance) / 2)
+        sigmas = np.abs(table.axis_error[:, part]) / np.sqrt(table.variance[:, part])
+        return _of_right(table, np.log(np.maximum(sigmas, LEAST_SIGMAS)))
 
-    return likelihood
+    return normalised
 
 
 def _of_right(table: ClassTable, values: Values) -> Terms:
@@ -238,7 +239,8 @@ MEASURES = (
     ClassMeasure("score", "too low", Limit(1, -0.2), _confidence),
     *(ClassMeasure("error", part, Limit(1.5, 0.05, falling=True), _error(number)) for number, part in enumerate(PARTS)),
     *(
-        ClassMeasure("variance", part, Limit(1, 0.5, falling=True), _likelihood(number))
+        ClassMeasure("variance", f"{part} too {side}", limit, _normalised(number))
         for number, part in enumerate(PARTS)
+        for side, limit in (("small", Limit(1, np.log(2), falling=True)), ("large", Limit(1, -np.log(2))))
     ),
 )
