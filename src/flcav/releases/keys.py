@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
@@ -23,9 +24,9 @@ SHORT = 16  # hexadecimal digits of a key's name
 
 @dataclass(frozen=True)
 class PublicKey:
-    """A public key by its encoded point, so that a key has one name whatever file it comes from."""
+    """A public key by its encoded point, so that a key has one name whatever text it comes from."""
 
-    pem: str  # SubjectPublicKeyInfo
+    pem: str  # SubjectPublicKeyInfo, as this module writes it
 
     @property
     def short(self) -> str:
@@ -79,12 +80,17 @@ def read_private_key(path: Path) -> PrivateKey:
 def read_public_key(path: Path) -> PublicKey:
     """Return the public key in a PEM file; raises `InputError` for a file without one, or with one of another curve."""
     check_is_file(path)
+    return parse_public_key(path.read_bytes(), str(path))
+
+
+def parse_public_key(pem: bytes, origin: str) -> PublicKey:
+    """Return the public key in a PEM text, which is written anew from its point; raises as `read_public_key`."""
     try:
-        key = serialization.load_pem_public_key(path.read_bytes())
-    except (ValueError, TypeError):
-        raise InputError(f"{path}: holds no public key (PEM)") from None
+        key = serialization.load_pem_public_key(pem)
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        raise InputError(f"{origin}: holds no public key (PEM)") from None
     if not isinstance(key, ec.EllipticCurvePublicKey) or key.curve.name != "secp256r1":
-        raise InputError(f"{path}: holds a key of another kind, and one of the curve P-256 is wanted")
+        raise InputError(f"{origin}: holds a key of another kind, and one of the curve P-256 is wanted")
     return PublicKey(_pem(key))
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from release_parties import ALL, Parties, write_weights
+from securesystemslib.signer import SSlibKey
 from tuf.api.metadata import Metadata, TargetFile
 
 from flcav.config import InputError
@@ -354,3 +355,25 @@ def test_a_check_keeps_nothing_but_metadata(parties: Parties):
     assert drives(parties) == 1
     assert 0 < checked.metadata_bytes < 50_000
     assert load_targets(parties.director).signed.version == 3
+
+
+def test_one_key_in_two_texts_is_one_owner(parties: Parties, tmp_path: Path):
+    create_repository(tmp_path / "twin", "customer", keys=2, threshold=2)
+    path = tmp_path / "twin" / "repository" / "metadata" / "1.root.json"
+    root = Metadata.from_file(str(path))
+    first, second = root.signed.roles["targets"].keyids
+    key = root.signed.keys[first]
+    twin = SSlibKey("twin", key.keytype, key.scheme, {"public": key.keyval["public"].rstrip("\n") + "\n\n"})
+    for role in ("root", "targets"):
+        root.signed.revoke_key(second, role)
+        root.signed.add_key(twin, role)
+    path.write_bytes(root.to_bytes())
+    with pytest.raises(InputError, match="is given twice among the keys of a root"):
+        trust_roots(tmp_path / "car", read_root(parties.image), read_root(tmp_path / "twin"))
+    with pytest.raises(InputError, match="is given twice among the keys of a root"):
+        publish(tmp_path / "twin")
+    twin.keyval["public"] = "ssh-rsa AAAA"
+    path.write_bytes(root.to_bytes())
+    with pytest.raises(InputError, match="holds no public key"):
+        trust_roots(tmp_path / "car", read_root(parties.image), read_root(tmp_path / "twin"))
+    assert not (tmp_path / "car").exists()

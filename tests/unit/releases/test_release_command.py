@@ -52,7 +52,7 @@ def accept(folder: Path, accepted: bool = True) -> None:
         frames=0,
         scenes=20,
         frames_to_decide=None,
-        whole=Comparison("whole", "AP50", 50, 20, 0.5, 0.51, 0.4, 0.6, -0.01 if accepted else -0.2, 0.03, "kept"),
+        whole=Comparison("whole", "AP50", 50, 20, 0.5, 0.51, 0.4, 0.6, -0.01 if accepted else -0.2, 0.03, None, "kept"),
         guards=(),
         data=(),
         domain=None,
@@ -203,6 +203,14 @@ def enlarge(folder: Path) -> None:
     os.truncate(folder / CANDIDATE, 10**10)  # sparse
 
 
+def add_file(folder: Path) -> None:
+    (folder / ".hidden.py").write_text("import this")
+
+
+def replace_card(folder: Path) -> None:
+    (folder / "card.md").write_text("# other")
+
+
 def repeat_key(folder: Path) -> None:
     path = folder / CANDIDATE
     path.write_text(path.read_text().replace('"release": 2', '"release": 1, "release": 2'))
@@ -220,6 +228,8 @@ def roll_back_to_others(folder: Path) -> None:
         (add_pipe, "no links and no others"),
         (enlarge, "too large"),
         (repeat_key, "every key once"),
+        (add_file, "is no file of a candidate"),
+        (replace_card, "a card of other weights"),
         (roll_back_to_others, "rolls back to 1, which has not its weights here"),
     ],
 )

@@ -21,7 +21,7 @@ from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import CARD, LEDGER, WEIGHTS, DataHash, LedgerSum, read_candidate
 from flcav.releases.verification import verify
-from flcav.releases.verification.comparison import Pair, compare, measure_results, pair_slices
+from flcav.releases.verification.comparison import Limit, Pair, compare, draw_scenes, measure_results, pair_slices
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.files import find_faults, find_overlap
 from flcav.releases.verification.records import OddCoverage, Verification, VerificationData, VerifiedDomain
@@ -139,6 +139,11 @@ def test_the_driving_network_itself_is_accepted():
         "found",
         "measure",
         "condition",
+        "false",
+        "right",
+        "heading",
+        "score",
+        "error",
     }
 
 
@@ -206,13 +211,13 @@ def test_a_class_that_is_never_found_any_more_refuses_however_weak_it_was():
 
 def test_the_page_says_what_was_not_tested_and_not_judged():
     found = judge(run(1))
-    weak = replace(found.guards[0], name="Cyclist", driving=0.01, candidate=0.0, judgement="open")
+    weak = replace(found.guards[0], name="Cyclist", driving=0.01, candidate=0.0, spare=None, judgement="open")
     domain = replace(
         describe(run(1)[PLAIN]),
         odd=OddCoverage("mine", None, ("a", "b"), {"inside": 3}, 0.5, {"gradient": ("[8, 12)",)}),
     )
     text = release_page(read_candidate_like(), replace(found, guards=(*found.guards, weak), domain=domain), {})
-    assert "hardly finds them itself: Cyclist (0.010, now 0.000)" in text
+    assert "hardly finds them itself, or too few scenes have them: Cyclist (0.010, now 0.000)" in text
     assert "gradient [8, 12)" in text
     told = "tested in grid | everyday traffic | clear | mine: frames 3 inside; 50% of its buckets, not gradient [8, 12)"
     assert told in replace(found, domain=domain).lines()
@@ -220,29 +225,53 @@ def test_the_page_says_what_was_not_tested_and_not_judged():
     assert all(f"<b>{party}</b>: not yet" in text for party in ("provider", "customer"))
 
 
-def pair_of(by: str, driving: list[float], candidate: list[float]) -> Pair:
+def pair_of(driving: list[float], candidate: list[float], limit: Limit) -> Pair:
     """A pair whose measures are means of numbers of scenes."""
 
     def mean(values: list[float]):
         return lambda times: times @ np.array(values) / times.sum(axis=1)
 
-    return Pair(by, "x", mean(driving), mean(candidate), np.array(["a", "b", "c"]), 3, 50)
+    return Pair("class", "x", mean(driving), mean(candidate), np.array([*"abcdef"]), 6, 50, limit)
 
 
 @pytest.mark.parametrize(
-    ("by", "driving", "candidate", "judgement"),
+    ("driving", "candidate", "limit", "judgement"),
     [
-        ("class", [0.9, 0.2, 0.1], [0.1, 0.2, 0.1], "doubted"),  # falls in one scene of three: not told at .05
-        ("cell", [0.9, 0.2, 0.1], [0.1, 0.2, 0.1], "open"),
-        ("class", [0.04, 0.01, 0.0], [0.0, 0.01, 0.0], "open"),  # of which the driving network hardly finds any
-        ("class", [0.5, 0.5, 0.5], [0.3, 0.3, 0.3], "lost"),
-        ("class", [0.5, 0.5, 0.5], [0.45, 0.45, 0.45], "kept"),
+        ([0.5] * 6, [0.3] * 6, Limit(0.8), "lost"),
+        ([0.5] * 6, [0.45] * 6, Limit(0.8), "kept"),
+        ([0.9, 0.2, 0.1] * 2, [0.1, 0.2, 0.1] * 2, Limit(0.8), "open"),  # falls in two scenes of six
+        ([0.04] * 6, [0.0] * 6, Limit(0.8), "open"),  # of which the driving network hardly finds any
+        ([0.04] * 6, [0.3] * 6, Limit(2, 0.1, falling=True), "lost"),
+        ([0.04] * 6, [0.15] * 6, Limit(2, 0.1, falling=True), "kept"),
+        ([0.0] * 6, [2.0, *[0.0] * 5], Limit(2, 0.1, falling=True), "open"),  # all of one scene
+        ([0.1] * 6, [-0.3] * 6, Limit(1, -0.2), "lost"),
+        ([0.1] * 6, [0.0] * 6, Limit(1, -0.2), "kept"),
     ],
 )
-def test_a_class_of_which_less_than_half_is_left_is_in_doubt(
-    by: str, driving: list[float], candidate: list[float], judgement: str
+def test_a_guard_is_lost_where_its_bound_is_beyond_the_limit(
+    driving: list[float], candidate: list[float], limit: Limit, judgement: str
 ):
-    assert compare(pair_of(by, driving, candidate))[0].judgement == judgement
+    pair = pair_of(driving, candidate, limit)
+    found, _ = compare(pair, draw_scenes(pair.scene, 200), 100)
+    assert found.judgement == judgement
+    assert (found.spare is not None and found.spare < 0) == (judgement == "lost")
+
+
+def test_a_guard_is_lost_by_chance_in_as_few_families_as_its_level_says():
+    rng, lost = np.random.default_rng(0), 0
+    for _ in range(200):
+        old = rng.normal(0.5, 0.1, 20)
+        pairs = []
+        for _ in range(20):
+            new = 0.8 * old + rng.normal(0, 0.05, 20)  # just at the limit, but for its scenes
+            pairs.append((old, new))
+        times = rng.multinomial(20, np.full(20, 0.05), size=100)
+        every = [
+            Pair("x", "x", lambda t, v=a: t @ v / 20, lambda t, v=b: t @ v / 20, np.arange(20).astype(str), 20, 50)
+            for a, b in pairs
+        ]
+        lost += any(compare(pair, times, len(every))[0].judgement == "lost" for pair in every)
+    assert lost / 200 < 0.1
 
 
 def test_few_scenes_decide_nothing_and_say_how_many_would():

@@ -5,6 +5,7 @@ and `report.html` come with the verification, `acknowledgements` with those who 
 """
 
 import json
+import re
 from hashlib import sha256 as sha256_of
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -22,6 +23,8 @@ LEDGER = "ledger.parquet"
 VERIFICATION = "verification.json"
 REPORT = "report.html"
 ACKNOWLEDGEMENTS = "acknowledgements"
+FILES = (CANDIDATE, WEIGHTS, CARD, RECIPE, LEDGER, VERIFICATION, REPORT)
+SIGNATURE = re.compile(rf"{ACKNOWLEDGEMENTS}/[0-9a-f]+\.sig")
 LARGEST = 1_000_000_000  # bytes of weights
 FORMAT = "flcav-candidate-1"
 CARD_KEY = "flcav.card"  # as in `flcav.perception.card`, which needs torch
@@ -83,7 +86,7 @@ def read_candidate(folder: Path) -> Candidate:
     if path.stat().st_size > MOST_TEXT_BYTES:
         raise InputError(f"{path}: too large for a candidate's file")
     found = parse_candidate(path.read_bytes(), str(path))
-    _check_bundle(folder)
+    _check_kinds(folder)
     return found
 
 
@@ -107,7 +110,7 @@ def _unique(pairs: list[tuple[str, Json]]) -> dict[str, Json]:
     return found
 
 
-def _check_bundle(folder: Path) -> None:
+def _check_kinds(folder: Path) -> None:
     """Raise `InputError` where a candidate's folder has links, special files, or files that are too large to read."""
     for path in folder.rglob("*"):
         name = str(path.relative_to(folder))
@@ -131,6 +134,19 @@ def check_files(folder: Path, candidate: Candidate) -> None:
             raise InputError(f"{path}: has another SHA-256 than the candidate's description says")
     if hash_card(folder / WEIGHTS) != candidate.card:
         raise InputError(f"{folder}: a card of other weights: that in {WEIGHTS} is not the one described")
+
+
+def check_bundle(folder: Path) -> None:
+    """Raise `InputError` where a candidate's folder has files of another name, or another card than its weights."""
+    from flcav.perception.weights import read_card
+
+    for path in sorted(folder.rglob("*")):
+        name = str(path.relative_to(folder))
+        if path.is_file() and not (name in FILES or SIGNATURE.fullmatch(name)):
+            raise InputError(f"{path}: is no file of a candidate; what is signed has no others")
+    card = folder / CARD
+    if not card.is_file() or card.read_bytes() != read_card(folder / WEIGHTS).markdown().encode():
+        raise InputError(f"{card}: is not the card in the weights: a card of other weights")
 
 
 def hash_card(weights: Path) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 from flcav.config import InputError, check_is_file
 from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS, Candidate, parse_candidate
-from flcav.releases.keys import PrivateKey, PublicKey
+from flcav.releases.keys import PrivateKey, PublicKey, check_distinct, parse_public_key
 from flcav.releases.repositories.directive import Directive
 from flcav.storage.files import write_bytes
 
@@ -46,10 +46,15 @@ def read_party(out: Path) -> Party:
 
 
 def load_root(out: Path) -> "Metadata[Root]":
-    """Return the repository's latest root; raises `InputError` where `out` is none of a party."""
+    """Return the repository's latest root.
+
+    Raises `InputError` where `out` is none of a party, and for keys that `root_keys` refuses.
+    """
     read_root(out)
     metadata = out / "repository" / "metadata"
-    return load_metadata(metadata / f"{latest_version(metadata, 'root')}.root.json")
+    found = load_metadata(metadata / f"{latest_version(metadata, 'root')}.root.json")
+    root_keys(found.signed)
+    return found
 
 
 def latest_version(metadata: Path, role: str) -> int:
@@ -135,8 +140,15 @@ def list_releases(targets: Mapping[str, "TargetFile"], task: str) -> list[int]:
 
 
 def root_keys(root: "Root", role: str = "targets") -> list[PublicKey]:
-    """Return the keys of a role by a root."""
-    return [PublicKey(root.keys[name].keyval["public"]) for name in root.roles[role].keyids]
+    """Return the keys of a role by a root.
+
+    Raises `InputError` for a key of another curve than P-256, and for one that the root has under two names or in two
+    texts, which would count one owner's signature as two.
+    """
+    origin = "a root's key"
+    known = {name: parse_public_key(str(key.keyval.get("public")).encode(), origin) for name, key in root.keys.items()}
+    check_distinct([*known.values()], "the keys of a root")
+    return [known[name] for name in root.roles[role].keyids]
 
 
 def target_names(task: str, release: int) -> tuple[str, str]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flcav.config import InputError
-from flcav.releases.candidates.candidate import Candidate, check_files, read_candidate
+from flcav.releases.candidates.candidate import Candidate, check_bundle, check_files, read_candidate
 from flcav.releases.keys import check_distinct, read_private_key
 from flcav.releases.repositories.creation import ONLINE
 from flcav.releases.repositories.directive import Directive
@@ -69,6 +69,7 @@ def stage_release(
 
     candidate = read_candidate(folder)
     check_files(folder, candidate)
+    check_bundle(folder)
     party = read_party(out)
     if (directive is None) != (party == "provider"):
         raise InputError(f"{out}: the customer's repository has a directive, and the provider's has none")

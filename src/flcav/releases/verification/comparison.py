@@ -1,12 +1,13 @@
-"""Paired comparison of two networks over scenes: on the whole, and slice by slice.
+"""Paired comparison of two networks over scenes: on the whole, and guard by guard.
 
 The bootstrap draws whole scenes, the same for both networks. On the whole, non-inferiority is claimed (Piaggio et al.,
-JAMA 308, 2012): the lower bound of the difference at .05, one-sided, lies above minus the margin. Slices are many, so
-that the same claim would refuse good networks by chance: they guard against catastrophes alone. A slice is lost where
-the candidate keeps less than a share of the driving network's measure, and the test says so at .05. One of `FIRST` of
-which it keeps less than half is in doubt even where the test does not say so. Where the driving network itself reaches
-next to nothing, shares of it are lost and won by chance: such a slice is not judged. Average precision ranks, so that
-scores which fall below their use in one slice do not show in it: what is found at that score is guarded, too.
+JAMA 308, 2012): the lower bound of the difference at .05, one-sided, lies above minus the margin. Guards are many, so
+that the same claim would refuse good networks by chance: they are against catastrophes alone, by one rule. Each has a
+`Limit`, and it is lost where the upper bound of the candidate's distance to the limit is below 0. The bound is at .05
+for all guards together (Bonferroni), by Student's t with the bootstrap's standard error. Where the driving network
+itself reaches next to nothing, shares of it are lost and won by chance: such a guard is not judged.
+
+This module has the guards by AP, which rank detections of all scores; `guards` has those of each class.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from flcav.geometry import Boxes
 from flcav.perception.errors import THRESHOLD
@@ -23,19 +25,39 @@ from flcav.perception.objects.evaluate import BORDER_M, OCCLUSIONS
 from flcav.releases.verification.matching import Mask, Overlaps, match_overlaps, measure_overlaps
 from flcav.releases.verification.records import LEAST_MEASURE, Comparison, Judgement
 from flcav.releases.verification.testing import ConditionResults
-from flcav.statistics.bootstrap import REDRAWS, bootstrap_over_scenes
+from flcav.statistics.bootstrap import REDRAWS
 from flcav.statistics.estimates import TAILS
 from flcav.statistics.streams import stream
 
 LEVEL = 0.05  # one-sided
 KEPT = 0.8  # share of the driving network's measure that every slice keeps
-DOUBTED = 0.5  # share below which a slice of `FIRST` is in doubt
-FIRST = ("class", "distance", "weather", "scenario", "town")
 LEAST_TARGETS = 10  # of a slice that is compared
+LEAST_OF_GUARD = 5  # scenes of a guard that is judged
 LEAST_SCENES = 10  # of a verification: the bootstrap of fewer is too sure of itself
 Times = NDArray[np.int64]
 Values = NDArray[np.float64]
 Measure = Callable[[Times], Values]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What the candidate's measure must reach, by the driving network's: `share` of it and `more`.
+
+    With `falling`, lower values are better, and it must not exceed this.
+    """
+
+    share: float = KEPT
+    more: float = 0.0
+    falling: bool = False
+
+    @property
+    def is_share(self) -> bool:
+        """Return whether it is a share of the driving network's measure alone."""
+        return not self.falling and self.more == 0
+
+    def spare(self, driving: Values, candidate: Values) -> Values:
+        """Return by how much the candidate is better than the limit."""
+        return (candidate - self.share * driving - self.more) * (-1 if self.falling else 1)
 
 
 @dataclass(frozen=True)
@@ -49,31 +71,53 @@ class Pair:
     scene: NDArray[np.str_]  # (F,)
     scenes: int  # of the slice
     targets: int
+    limit: Limit = Limit()
 
 
-def compare(pair: Pair, redraws: int = REDRAWS) -> tuple[Comparison, float]:
-    """Return the comparison of a pair and the standard error of the difference over scenes."""
-    rng = stream(0, "release", pair.by, pair.name)
-    drawn: list[Values] = []
+def draw_scenes(scene: NDArray[np.str_], redraws: int = REDRAWS) -> Times:
+    """Return (redraws, F) how often each of F frames is in each bootstrap sample of the scenes (F,)."""
+    names, index = np.unique(scene, return_inverse=True)
+    rng = stream(0, "release", "whole", "AP50")
+    return rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=redraws)[:, index]
 
-    def both(times: Times) -> Values:
-        drawn[:] = [pair.driving(times), pair.candidate(times)]
-        return drawn[1] - drawn[0]
 
+def compare(pair: Pair, times: Times, guards: int = 1) -> tuple[Comparison, float]:
+    """Return the comparison of a pair and the standard error of the difference over scenes.
+
+    times (n, F): bootstrap samples, see `draw_scenes`. guards: number of guards that are judged together, by which the
+    level is divided.
+    """
     once = np.ones((1, len(pair.scene)), np.int64)
-    old, new = float(pair.driving(once)[0]), float(pair.candidate(once)[0])
-    low, high = bootstrap_over_scenes(both, pair.scene, redraws, rng=rng, tails=(LEVEL, 1 - LEVEL))
-    known = np.isfinite(drawn[1] - drawn[0])
-    before, after = drawn[0][known], drawn[1][known]
+    old, new = pair.driving(once), pair.candidate(once)
+    before, after = pair.driving(times), pair.candidate(times)
+    known = np.isfinite(before) & np.isfinite(after)
+    before, after = before[known], after[known]
     judgement: Judgement = "open"
-    if len(after) and old >= LEAST_MEASURE:
-        least, most = np.quantile(after - KEPT * before, (LEVEL, 1 - LEVEL))
-        doubted = pair.by in FIRST and new < DOUBTED * old
-        judgement = "lost" if most < 0 else "kept" if least >= 0 else "doubted" if doubted else "open"
-    own = np.quantile(after, TAILS) if len(after) else (np.nan, np.nan)
-    error = float((after - before).std()) if len(after) else float("nan")
-    bounds = (float(own[0]), float(own[1]), low, high)
-    return Comparison(pair.by, pair.name, pair.targets, pair.scenes, old, new, *bounds, judgement), error
+    spare = None
+    weak = pair.limit.is_share and not old[0] >= LEAST_MEASURE
+    if len(after) and pair.scenes >= LEAST_OF_GUARD and not weak:
+        error, mean = float(pair.limit.spare(before, after).std()), float(pair.limit.spare(old, new)[0])
+        spare = mean + error * float(stdtrit(pair.scenes - 1, 1 - LEVEL / guards))
+        least = mean - error * float(stdtrit(pair.scenes - 1, 1 - LEVEL))
+        judgement = "lost" if spare < 0 else "kept" if least >= 0 else "open"
+    own, change = (np.nan, np.nan), (np.nan, np.nan)
+    if len(after):
+        own, change = np.quantile(after, TAILS), np.quantile(after - before, (LEVEL, 1 - LEVEL))
+    compared = Comparison(
+        by=pair.by,
+        name=pair.name,
+        targets=pair.targets,
+        scenes=pair.scenes,
+        driving=float(old[0]),
+        candidate=float(new[0]),
+        candidate_low=float(own[0]),
+        candidate_high=float(own[1]),
+        low=float(change[0]),
+        high=float(change[1]),
+        spare=spare,
+        judgement=judgement,
+    )
+    return compared, float((after - before).std()) if len(after) else float("nan")
 
 
 @dataclass(frozen=True)
@@ -103,12 +147,11 @@ def pair_slices(driving: Measured, candidate: Measured) -> Iterator[Pair]:
     for label in old:
         sides = [{label: each[label]} for each in (old, new)]
         yield _pair("class", label, sides[0], sides[1], driving)
-        yield _pair("found", label, sides[0], sides[1], driving, measure=_recall)
     for by, name, wanted, within in _ranges(driving.tested):
         sides = [_match(each, 0.5, wanted, within) for each in both]
         yield _pair(by, name, sides[0], sides[1], driving)
         yield _pair("found", name, sides[0], sides[1], driving, measure=_recall)
-    for by, name, frames in _groups(candidate.tested):
+    for by, name, frames in group_frames(candidate.tested):
         yield _pair(by, name, old, new, driving, frames)
         if by != "cell":
             yield _pair("found", name, old, new, driving, frames, _recall)
@@ -128,7 +171,7 @@ def _ranges(tested: ConditionResults) -> Iterator[tuple[str, str, list[Mask], tu
         yield "occlusion", f"{low:.0%}-{min(high, 1):.0%}", [_between(share, low, high) for share in hidden], None
 
 
-def _groups(tested: ConditionResults) -> Iterator[tuple[str, str, NDArray[np.bool_]]]:
+def group_frames(tested: ConditionResults) -> Iterator[tuple[str, str, NDArray[np.bool_]]]:
     """Yield the slices of frames, where there are several of a kind: by, name, which frames (F,)."""
     names = {
         "weather": [truth.weather or "" for truth in tested.truths],

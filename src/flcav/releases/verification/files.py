@@ -11,7 +11,7 @@ from flcav.network.ledger import Ledger
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network, read_card
-from flcav.releases.candidates.candidate import CARD, LEDGER, WEIGHTS, Candidate, check_files
+from flcav.releases.candidates.candidate import LEDGER, WEIGHTS, Candidate, check_bundle, check_files
 from flcav.releases.candidates.proposal import sum_ledger, trace_data
 from flcav.releases.verification.records import VerificationData
 from flcav.storage.files import sha256
@@ -53,8 +53,10 @@ def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Seque
     yield from _compare_interfaces(network, now)
     if below := [name for name, values in network.named_buffers() if "variance" in name and bool((values < 0).any())]:
         yield f"a variance below 0 in '{below[0]}': nothing that the network says is a number"
-    if not (folder / CARD).is_file() or (folder / CARD).read_bytes() != card.markdown().encode():
-        yield f"{CARD} is not the card in the weights: a card of other weights"
+    try:
+        check_bundle(folder)
+    except InputError as error:
+        yield str(error)
     if card.parameters != sum(each.numel() for each in network.parameters()):
         yield "a card of other weights: it names another number of parameters"
     if card.task != candidate.task or card.network != candidate.network or not _fits_name(network, card.network):

@@ -69,19 +69,31 @@ def match_overlaps(
     return Matches(score[order], ~np.isnan(turned[order]), turned[order], frame[order], targets)
 
 
+def assign_detections(each: Overlaps, least: float, inside: Mask, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+    """Return (R,) the target of each of the detections `rows`, -1 for none, greedily by score.
+
+    least: IoU from which a detection finds a target. inside (T,): targets that can be found. rows (R,), rising.
+    """
+    found = np.full(len(rows), -1)
+    free = np.where(inside, each.iou, -1.0)
+    for place, row in enumerate(rows if inside.any() else ()):
+        best = int(free[row].argmax())
+        if free[row, best] >= least:
+            found[place] = best
+            free[:, best] = -1.0
+    return found
+
+
 def _match_frame(
     each: Overlaps, least: float, wanted: Mask | None, kept: Mask | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
     """Return the scores of one frame's detections that count, their heading errors (NaN: false), and its targets."""
     inside = np.ones(len(each.targets), bool) if wanted is None else wanted[each.targets]
     rows = np.arange(len(each.score)) if kept is None else np.flatnonzero(kept[each.detections])
+    found = assign_detections(each, least, inside, rows)
+    hit = found >= 0
     turned = np.full(len(rows), np.nan)
-    free = np.where(inside, each.iou, -1.0)
-    for place, row in enumerate(rows if inside.any() else ()):
-        best = int(free[row].argmax())
-        if free[row, best] >= least:
-            turned[place] = each.turned[row, best]
-            free[:, best] = -1.0
+    turned[hit] = each.turned[rows[hit], found[hit]]
     ignored = each.neutral | each.covered[:, ~inside].any(axis=1)
-    counts = ~np.isnan(turned) | ~ignored[rows]
+    counts = hit | ~ignored[rows]
     return each.score[rows][counts], turned[counts], int(inside.sum())

@@ -8,24 +8,25 @@ from flcav.interface.wording import plural
 from flcav.storage.records import Record
 
 LEAST_MEASURE = 0.05  # of the driving network in a slice that is judged
-Judgement = Literal["kept", "lost", "doubted", "open"]
+Judgement = Literal["kept", "lost", "open"]
 
 
 @dataclass(frozen=True)
 class Comparison:
     """A measure of the driving network and of the candidate on the same frames, and their difference's interval."""
 
-    by: str  # whole, class, distance, occlusion, weather, scenario, town, cell, found, condition, measure
+    by: str  # whole, class, distance, occlusion, weather, scenario, town, cell, condition, measure; of `guards`
     name: str
     targets: int
     scenes: int
-    driving: float  # in [0, 1]
+    driving: float
     candidate: float
     candidate_low: float  # ends of the candidate's 95 % interval over scenes; NaN where the frames give none
     candidate_high: float
     low: float  # ends of the 90 % interval of candidate minus driving: each is a one-sided bound at .05
     high: float
-    judgement: Judgement  # of a guard: kept; lost, which refuses; else the frames do not tell: doubted refuses, too
+    spare: float | None  # of a guard: bound of how much better than its limit the candidate may be; None: not judged
+    judgement: Judgement  # of a guard: lost, which refuses, where `spare` is below 0; kept; or the frames do not tell
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,11 @@ class Verification(Record):
                 f"({each.low:+.3f} to {each.high:+.3f}) over {plural(self.frames, 'frame')} of "
                 f"{plural(self.scenes, 'scene')}; margin {self.margin:g}"
             )
+            kept = [guard for guard in self.guards if guard.judgement == "kept"]
+            lines.append(f"guards kept: {len(kept)} of {len(self.guards)}; the others:")
             for guard in self.guards:
+                if guard.judgement == "kept":
+                    continue
                 lines.append(
                     f"{guard.by:<10}{guard.name:<34}{guard.driving:.3f} -> {guard.candidate:.3f}  "
                     f"({guard.low:+.3f} to {guard.high:+.3f})  {guard.judgement}  (objects: {guard.targets})"

@@ -1,30 +1,31 @@
 """Verification of a candidate: its files, overall non-inferiority, and guards against large losses in slices."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from flcav.config import InputError, read_json
 from flcav.dataset.store import Dataset
+from flcav.geometry import Boxes
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.odd.domain import read_domain
+from flcav.perception.errors import THRESHOLD
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
 from flcav.releases.verification.comparison import (
-    DOUBTED,
-    FIRST,
     KEPT,
     LEAST_SCENES,
     LEAST_TARGETS,
     LEVEL,
     Measured,
     compare,
+    draw_scenes,
+    group_frames,
     measure_results,
     pair_slices,
     pair_whole,
@@ -32,6 +33,7 @@ from flcav.releases.verification.comparison import (
 from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.domain import BY, ODD, describe_domain, find_cells
 from flcav.releases.verification.files import describe_data, find_faults
+from flcav.releases.verification.guards import pair_classes
 from flcav.releases.verification.records import (
     LEAST_MEASURE,
     Comparison,
@@ -44,6 +46,7 @@ from flcav.statistics.power import plan_scenes
 from flcav.storage.files import sha256, write_json
 
 MARGIN, MOST_MARGIN = 0.03, 0.5  # AP50
+LEAST_SEEN = 3  # detections of the driving network in a frame where the candidate finds something, too
 GUARD_REDRAWS = 200  # of the scenes, of each slice
 Results = Mapping[str, ConditionResults]  # by condition
 
@@ -116,16 +119,14 @@ def decide(
     guards: list[Comparison] = []
     if driving is not None and new is not None:
         plain = measure_results(driving[PLAIN]), measure_results(new[PLAIN])
-        whole, error = compare(pair_whole(*plain))
-        for guard, spread in _guard(*plain, driving, new):
+        pair = pair_whole(*plain)
+        whole, error = compare(pair, draw_scenes(pair.scene))
+        for guard in _guard(*plain, driving, new):
             guards.append(guard)
-            fell = f"{guard.by} {guard.name} {{}}: {guard.driving:.3f} -> {guard.candidate:.3f}"
             if guard.judgement == "lost":
-                reasons.append(fell.format("lost"))
-            elif guard.judgement == "doubted":
-                open_reasons.append(fell.format("may be lost"))
-                wanted = max(wanted, _frames(KEPT * guard.driving - guard.candidate, spread, frames, scenes))
-        reasons += _find_silent(driving[PLAIN], new[PLAIN])
+                reasons.append(f"{guard.by} {guard.name} lost: {guard.driving:.3f} -> {guard.candidate:.3f}")
+        broken = (_find_broken(driving[name], tested, name) for name, tested in new.items())
+        reasons += next(filter(None, broken), [])
         for label, count in domain.objects.items() if domain is not None else ():
             if count < LEAST_TARGETS:
                 open_reasons.append(f"{plural(count, 'object')} of the class {label}, and {LEAST_TARGETS} are wanted")
@@ -203,32 +204,54 @@ def _supports_acceptance(found: Verification) -> bool:
 
 
 def _is_kept(guard: Comparison) -> bool:
-    halved = guard.by in FIRST and guard.driving >= LEAST_MEASURE and not guard.candidate >= DOUBTED * guard.driving
-    return guard.judgement in ("kept", "open") and not halved
+    return guard.judgement in ("kept", "open") and not (guard.spare is not None and guard.spare < 0)
 
 
-def _guard(old: Measured, new: Measured, driving: Results, candidate: Results) -> Iterator[tuple[Comparison, float]]:
-    """Yield the comparison of each slice and each condition of the sensor, and its standard error."""
-    conditions = (
-        pair_whole(measure_results(driving[name]), measure_results(candidate[name]), "condition", name)
-        for name in CONDITIONS
-        if name in candidate
-    )
-    for pair in chain(pair_slices(old, new), conditions):
-        if pair.targets >= LEAST_TARGETS:
-            yield compare(pair, GUARD_REDRAWS)
+def _guard(old: Measured, new: Measured, driving: Results, candidate: Results) -> list[Comparison]:
+    """Return the comparisons of all guards, judged together."""
+    groups = [(name, frames) for by, name, frames in group_frames(new.tested) if by != "cell"]
+    pairs = [*pair_slices(old, new), *pair_classes(old, new, groups=groups)]
+    for name in CONDITIONS:
+        if name in candidate:
+            both = measure_results(driving[name]), measure_results(candidate[name])
+            pairs += [pair_whole(*both, "condition", name), *pair_classes(*both, name)]
+    pairs = [pair for pair in pairs if pair.targets >= LEAST_TARGETS]
+    drawn = {len(pair.scene): pair.scene for pair in pairs}  # conditions share their frames, which are fewer
+    times = {frames: draw_scenes(scene, GUARD_REDRAWS) for frames, scene in drawn.items()}
+    found = [compare(pair, times[len(pair.scene)], len(pairs))[0] for pair in pairs]
+    return [each for each in found if np.isfinite([each.driving, each.candidate]).all()]
 
 
-def _find_silent(driving: ConditionResults, candidate: ConditionResults) -> list[str]:
-    """Return a reason for each class that the candidate never finds, rightly or wrongly, and the driving one does."""
+def _find_broken(driving: ConditionResults, candidate: ConditionResults, condition: str) -> list[str]:
+    """Return a reason for boxes that are no numbers, and for classes and frames in which nothing is found any more.
+
+    A class counts where the driving network finds it, rightly or wrongly, and a frame where it finds some at the score
+    of use; the candidate's detections count from the lowest score on.
+    """
+    where = "" if condition == PLAIN else f" ({condition})"
+    reasons = []
+    if spoilt := sum(not _is_finite(boxes) for boxes in candidate.detections):
+        reasons.append(f"boxes that are no numbers in {plural(spoilt, 'frame')}{where}")
     before, after = (
         Counter(str(label) for boxes in tested.detections for label in boxes.label) for tested in (driving, candidate)
     )
-    return [
-        f"class {label} is never found: {plural(count, 'detection')} before, none now"
+    reasons += [
+        f"class {label} is never found{where}: {plural(count, 'detection')} before, none now"
         for label, count in sorted(before.items())
         if not after[label]
     ]
+    used = [0 if boxes.score is None else int((boxes.score >= THRESHOLD).sum()) for boxes in driving.detections]
+    pairs = zip(used, candidate.detections, strict=True)
+    if silent := sum(count >= LEAST_SEEN and not len(boxes) for count, boxes in pairs):
+        reasons.append(
+            f"nothing at all is found in {plural(silent, 'frame')}{where} in which the driving network finds"
+        )
+    return reasons
+
+
+def _is_finite(boxes: Boxes) -> bool:
+    known = (boxes.array(), boxes.score, boxes.variance)
+    return all(np.isfinite(each).all() for each in known if each is not None)
 
 
 def _frames(effect: float, error: float, frames: int, scenes: int) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 from flcav.releases.candidates.acknowledgement import Acknowledgement
 from flcav.releases.candidates.candidate import Candidate
 from flcav.releases.verification.conditions import WORDS
-from flcav.releases.verification.records import LEAST_MEASURE, Comparison, OddCoverage, Verification
+from flcav.releases.verification.records import Comparison, OddCoverage, Verification
 from flcav.report.pages import html
 
 GROUPS = {
@@ -21,11 +21,17 @@ GROUPS = {
     "found": "Found at the score of use",
     "condition": "Conditions of the sensor",
     "measure": "Other measures",
+    "false": "False boxes a frame, from the score of use on",
+    "right": "Share of right boxes, from the score of use on",
+    "heading": "Headings of boxes that find an object: 1 right, 0 reversed",
+    "score": "Scores minus the share of right boxes, from the score of use on",
+    "error": "Mean errors of boxes that find an object [m, rad]",
+    "variance": "Variances: logarithm of these errors in predicted standard deviations",
 }
-WEAK = "not judged"  # of which the driving network reaches next to nothing
+WEAK = "not judged"  # of which the driving network reaches next to nothing, or in too few scenes
 PARTIES = ("provider", "customer")
-MEANINGS = {"kept": "kept", "lost": "lost", "doubted": "in doubt", "open": "not told"}
-STATES = {"kept": "held", "lost": "did-not-hold", "doubted": "did-not-hold", "open": "undecided"}  # classes of style
+MEANINGS = {"kept": "kept", "lost": "lost", "open": "not told"}
+STATES = {"kept": "held", "lost": "did-not-hold", "open": "undecided"}  # classes of style
 
 
 def release_page(
@@ -45,7 +51,7 @@ def release_page(
     }
     whole = None if verification.whole is None else _row(verification.whole)
     every = [row for rows in groups.values() for row in rows]
-    left = [row for row in every if row["judgement"] in ("open", "doubted") and row["word"] != WEAK]
+    left = [row for row in every if row["judgement"] == "open" and row["word"] != WEAK]
     values = {
         "candidate": candidate.model_dump(mode="json"),
         "verification": asdict(verification),
@@ -54,7 +60,7 @@ def release_page(
         "scale": _scale(verification),
         "groups": groups,
         "weak": [row for row in every if row["word"] == WEAK],
-        "left": sorted(left, key=lambda row: row["low"]),
+        "left": sorted(left, key=lambda row: row["spare"]),
         "domain": None if verification.domain is None else _domain(verification),
         "hashes": hashes,
         "acknowledgements": [asdict(each) for each in acknowledgements],
@@ -72,7 +78,7 @@ def _row(each: Comparison) -> dict[str, Any]:
         **asdict(each),
         "name": name,
         "change": change,
-        "word": WEAK if each.driving < LEAST_MEASURE and each.judgement == "open" else MEANINGS[each.judgement],
+        "word": WEAK if each.spare is None else MEANINGS[each.judgement],
         "state": STATES[each.judgement],
     }
 
