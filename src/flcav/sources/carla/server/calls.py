@@ -56,6 +56,10 @@ class Calls:
         """Whether a Traffic Manager of a client runs."""
         return bool(self._managers)
 
+    def discard_files(self) -> None:
+        """Remove the files of maps that were made for this server."""
+        self._maps.discard_files()
+
     # ---- connection
 
     def version(self) -> str:

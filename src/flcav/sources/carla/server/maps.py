@@ -105,6 +105,10 @@ class Maps:
         self._scratch = tempfile.TemporaryDirectory(prefix="flcav-carla-")
         self._sent = 0
 
+    def discard_files(self) -> None:
+        """Remove the files that were made for these maps."""
+        self._scratch.cleanup()
+
     def names(self) -> list[str]:
         """Return the names of the maps that can be loaded."""
         return [*self._files, *(name for name in PACKAGED if name not in self._files)]

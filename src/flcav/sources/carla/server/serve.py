@@ -2,18 +2,24 @@
 
 In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends what sensors measure, in order,
 then the world's state and the answer to its cue, upon which a client goes on, and then the cameras' images, which take
-longest: they are drawn beside the next ticks, and the next images wait for them. A reader who does not keep up is
-waited for, and dropped after `STUCK_S`.
+longest: they are drawn beside the next ticks, and the next images wait for them. Readers who do not keep up are
+waited for, all at once, and dropped after `STUCK_S`.
+
+What strangers may ask for is bounded: a connection with many cues that wait for their ticks is read no further, of
+connections with unfinished calls the largest one is closed, and a full server closes the connection that has been idle
+longest.
 """
 
 import asyncio
 import logging
+import os
 import signal
 import socket
 import struct
+import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 
 from flcav.config import InputError
@@ -29,8 +35,12 @@ PACE_S = 0.008
 LEARNT_S = 3.0  # clients have learnt of a new map by then
 LISTENER_S = 0.3  # a tick waits so long for the connection of a stream whose token a client has just asked for
 MOST_CONNECTIONS = 512
-MOST_CUES = 1000  # whose answers wait for their ticks; clients have one each
-CUES = ("tick_cue",)  # calls that are answered after the next tick in synchronous mode
+IDLE_S = 10.0  # a full server keeps who has sent or got something since
+MOST_CUES, MOST_CUES_IN_ALL = 8, 256  # of a connection that wait for their ticks, and of all; clients have one each
+MOST_UNFINISHED = 64 << 20  # bytes of calls that have not come to their end, of all connections
+UNFINISHED_S = 30.0  # a call has come to its end by then, and the number of a stream
+MOST_UNSENT = 1 << 30  # bytes in the buffers of all connections
+ENDING_S = 3.0  # a server that is terminated ends by then, whatever it is at
 # In asynchronous mode, so that a client has a state with the new actor when it learns of it, as with CARLA, which
 # answers few calls a frame: a walker's AI that a client starts ends where its walker is in no state.
 SPAWNS = ("spawn_actor", "spawn_actor_with_parent")
@@ -47,8 +57,9 @@ class Server:
         """Take the calls to be served."""
         self._calls = calls
         self._streams: dict[int, set[asyncio.StreamWriter]] = {}
-        self._connections: set[asyncio.StreamWriter] = set()
-        self._cue = asyncio.Event()
+        self._active: dict[asyncio.StreamWriter, float] = {}  # connections, and when they last sent or got something
+        self._unfinished: dict[asyncio.StreamWriter, int] = {}  # bytes of calls that have not come to their end
+        self._cue, self._room = asyncio.Event(), asyncio.Event()
         self._refused: set[str] = set()  # told in the log once
         self._worlds: set[int] = set()  # streams of the world's state, of earlier episodes too
         self._published_s = 0.0  # when the world's state was last sent
@@ -67,12 +78,13 @@ class Server:
         finally:
             for server in servers:
                 server.close()
-            for writer in self._connections:
+            for writer in self._active:
                 writer.transport.abort()
-            while self._connections:  # each is forgotten when its reader has come to the end
+            self._room.set()
+            while self._active:  # each is forgotten when its reader has come to the end
                 await asyncio.sleep(0.001)
             if self._drawing is not None:
-                await self._drawing
+                self._drawing.cancel()
             self._calls.episode.close()
 
     # ---- ticks
@@ -104,6 +116,7 @@ class Server:
 
     async def _tick(self) -> None:
         await self._await_listeners()
+        await asyncio.sleep(0)  # calls, and the end, have their turn between two ticks
         try:
             await self._step()
         except Exception:  # a server that fails one tick serves the next
@@ -121,19 +134,20 @@ class Server:
             return
         if self._calls.managed:
             await asyncio.sleep(self._published_s + PACE_S - time.monotonic())
-        self._publish_state(episode)
+        await self._publish_state(episode)
         self._published_s = time.monotonic()
         self._answer_cues(1)
         if images := [each for each in measurements if each.late]:
             if self._drawing is not None:
                 await self._drawing
             self._drawing = asyncio.create_task(self._draw(images, episode))
-        await self._await_readers(self._connections)
+        await self._await_readers(self._active)
 
     async def _draw(self, images: list[Measurement], episode: Episode) -> None:
         try:
             for each in images:
                 await self._measure(each, episode)
+            await self._await_readers(self._active)
         except Exception:  # a server that fails one image draws the next
             log.exception("an image failed")
 
@@ -143,6 +157,7 @@ class Server:
             writer, reply = self._cued.popleft()
             with suppress(ConnectionError, RuntimeError):
                 writer.write(reply)
+        self._room.set()
 
     async def _measure(self, each: Measurement, episode: Episode) -> None:
         """Send what a sensor measures, beside this thread where it casts rays, so that calls are answered meanwhile."""
@@ -150,10 +165,9 @@ class Server:
         if not isinstance(body, bytes):
             body = await asyncio.to_thread(body) if each.rays else body()
         if episode is self._calls.episode:
-            self._publish(each.stream, each.header + body)
-            await self._await_readers(self._streams.get(each.stream, set()))
+            await self._publish(each.stream, each.header + body)
 
-    def _publish_state(self, episode: Episode) -> None:
+    async def _publish_state(self, episode: Episode) -> None:
         """Send the world's state; after a map was loaded, at first only to those who have learnt of it.
 
         A client that loads a map closes the stream of the one before, and crashes if something arrives meanwhile.
@@ -161,7 +175,7 @@ class Server:
         self._worlds = {stream for stream in self._worlds if stream in self._streams}
         for stream in self._worlds:
             if stream == episode.stream or episode.age_s > LEARNT_S:
-                self._publish(stream, self._state)
+                await self._publish(stream, self._state)
 
     def _is_heard(self, stream: int) -> bool:
         return bool(self._streams.get(stream))
@@ -173,20 +187,29 @@ class Server:
             await asyncio.sleep(0.001)
         expected.clear()
 
-    async def _await_readers(self, writers: set[asyncio.StreamWriter]) -> None:
-        for writer in list(writers):
-            if writer.transport.get_write_buffer_size() <= BACKLOG:
-                continue
-            try:
-                await asyncio.wait_for(writer.drain(), STUCK_S)
-            except (TimeoutError, ConnectionError):
+    async def _await_readers(self, writers: Iterable[asyncio.StreamWriter]) -> None:
+        """Wait for all readers who are behind, at once; drop those who read nothing more."""
+        drains = {asyncio.ensure_future(each.drain()): each for each in writers if _unsent(each) > BACKLOG}
+        if not drains:
+            return
+        _, late = await asyncio.wait(drains, timeout=STUCK_S)
+        for drain, writer in drains.items():
+            if drain in late:
+                drain.cancel()
                 log.warning("a client reads no more: its connection is closed")
-                writer.transport.abort()
-                self._forget(writer)
+            if drain in late or drain.exception() is not None:
+                self._drop(writer)
 
-    def _publish(self, stream: int, payload: bytes) -> None:
+    async def _publish(self, stream: int, payload: bytes) -> None:
+        """Send a payload to all who listen to a stream; wait for readers where too much is unsent."""
+        unsent = sum(map(_unsent, self._active))
         for writer in list(self._streams.get(stream, ())):
+            unsent += len(payload)
+            if unsent > MOST_UNSENT:
+                await self._await_readers(self._active)
+                unsent = sum(map(_unsent, self._active)) + len(payload)
             self._send(writer, payload)
+            self._active[writer] = time.monotonic()
 
     @staticmethod
     def _send(writer: asyncio.StreamWriter, payload: bytes) -> None:
@@ -196,16 +219,25 @@ class Server:
     # ---- connections
 
     def _admit(self, writer: asyncio.StreamWriter) -> bool:
-        if len(self._connections) >= MOST_CONNECTIONS:
-            log.warning("more than %d connections: one is refused", MOST_CONNECTIONS)
-            writer.close()
-            return False
-        self._connections.add(writer)
+        if len(self._active) >= MOST_CONNECTIONS:
+            idlest = min(self._active, key=self._active.__getitem__)
+            if time.monotonic() - self._active[idlest] < IDLE_S:
+                self._tell("full", f"one more than {MOST_CONNECTIONS} connections")
+                writer.close()
+                return False
+            self._tell("idle", f"one more than {MOST_CONNECTIONS} connections: the one that was idle longest is closed")
+            self._drop(idlest)
+        self._active[writer] = time.monotonic()
         writer.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # asyncio may not
         return True
 
+    def _drop(self, writer: asyncio.StreamWriter) -> None:
+        writer.transport.abort()
+        self._forget(writer)
+
     def _forget(self, writer: asyncio.StreamWriter) -> None:
-        self._connections.discard(writer)
+        self._active.pop(writer, None)
+        self._unfinished.pop(writer, None)
         for stream in [stream for stream, writers in self._streams.items() if writer in writers]:
             self._streams[stream].discard(writer)
             if not self._streams[stream]:
@@ -215,29 +247,53 @@ class Server:
     async def _serve_calls(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if not self._admit(writer):
             return
-        unpacker = wire.Unpacker()
+        unpacker, until = wire.Unpacker(), None
         try:
-            while data := await reader.read(CHUNK):
+            while data := await _read(reader, until):
                 unpacker.feed(data)
                 for message in unpacker:
-                    call = wire.read_call(message)
-                    response = self._answer(call)
-                    if call.number is None:
-                        continue
-                    reply = wire.pack_reply(call.number, response)
-                    waits = call.method in (CUES if self._calls.settings.synchronous else SPAWNS)
-                    if waits and len(self._cued) < MOST_CUES:
-                        self._cued.append((writer, reply))
-                    else:
-                        writer.write(reply)
-                await self._await_readers({writer})
+                    await self._serve_call(wire.read_call(message), writer)
+                    self._active[writer], until = time.monotonic(), None
+                self._note_unfinished(writer, unpacker.waiting)
+                if not unpacker.waiting:
+                    until = None
+                elif until is None:
+                    until = time.monotonic() + UNFINISHED_S
         except ConnectionError:
             pass
+        except TimeoutError:
+            self._tell("slow", f"a call of which {UNFINISHED_S:g} s bring no end")
         except (ValueError, TypeError, RecursionError, OverflowError, KeyError) as error:
             what = str(error) or type(error).__name__
             log.warning("a connection is closed: %s; clients of CARLA %s are served here", what[:200], wire.VERSION)
         finally:
             self._forget(writer)
+
+    def _note_unfinished(self, writer: asyncio.StreamWriter, size: int) -> None:
+        """Note how many bytes of an unfinished call a connection holds; close the largest where they are too many."""
+        self._unfinished[writer] = size
+        while sum(self._unfinished.values()) > MOST_UNFINISHED:
+            largest = max(self._unfinished, key=self._unfinished.__getitem__)
+            self._tell("unfinished", f"unfinished calls of more than {MOST_UNFINISHED} bytes")
+            self._drop(largest)
+
+    async def _serve_call(self, call: wire.Call, writer: asyncio.StreamWriter) -> None:
+        """Answer a call: at once, or after the tick that it cues."""
+        while len(self._cued) >= MOST_CUES_IN_ALL or sum(each is writer for each, _ in self._cued) >= MOST_CUES:
+            self._room.clear()
+            await self._room.wait()
+        if writer.is_closing():
+            raise ConnectionResetError
+        asked = self._calls.ticks
+        response = self._answer(call)
+        reply = b"" if call.number is None else wire.pack_reply(call.number, response)
+        cues = self._calls.ticks - asked if self._calls.settings.synchronous else call.method in SPAWNS
+        waits = cues > 0 and call.method != "apply_batch"
+        self._cued.extend([(writer, reply if waits else b"")] * cues)
+        if not waits:
+            writer.write(reply)
+        await self._await_readers([writer])
+        await asyncio.sleep(0)  # others have their turn
 
     def _answer(self, call: wire.Call) -> wire.Packed:
         """Return the response to a call."""
@@ -267,7 +323,8 @@ class Server:
         if not self._admit(writer):
             return
         try:
-            (stream,) = struct.unpack("<I", await reader.readexactly(4))
+            async with asyncio.timeout(UNFINISHED_S):
+                (stream,) = struct.unpack("<I", await reader.readexactly(4))
             self._streams.setdefault(stream, set()).add(writer)
             self._calls.expected.discard(stream)
             if stream == self._calls.episode.stream:
@@ -275,10 +332,20 @@ class Server:
                 self._send(writer, self._state or self._calls.episode.describe_world(0.0))
             while await reader.read(1024):
                 pass
-        except (asyncio.IncompleteReadError, ConnectionError):
+        except (asyncio.IncompleteReadError, ConnectionError, TimeoutError):
             pass
         finally:
             self._forget(writer)
+
+
+def _unsent(writer: asyncio.StreamWriter) -> int:
+    return writer.transport.get_write_buffer_size()
+
+
+async def _read(reader: asyncio.StreamReader, until: float | None) -> bytes:
+    """Return what comes next; raises `TimeoutError` where nothing does until then, on the clock."""
+    async with asyncio.timeout_at(until):
+        return await reader.read(CHUNK)
 
 
 def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
@@ -298,10 +365,21 @@ def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
 def serve(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
     """Serve clients until interrupted or terminated (SIGTERM), at the sockets of `open_doors`."""
 
+    def leave() -> None:
+        calls.discard_files()
+        os._exit(0)
+
     async def run() -> None:
-        task = asyncio.current_task()
+        task, loop = asyncio.current_task(), asyncio.get_running_loop()
         assert task is not None
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+
+        def end(*_: object) -> None:
+            last = threading.Timer(ENDING_S, leave)  # a map that is loaded, or an image, may take longer
+            last.daemon = True
+            last.start()
+            loop.call_soon_threadsafe(task.cancel)
+
+        signal.signal(signal.SIGTERM, end)
         await Server(calls).run(doors, ready)
 
     with suppress(asyncio.CancelledError):
