@@ -1,7 +1,8 @@
 """Commands to a live world: what a client does to it between two steps.
 
 World frame: ENU, metres, radians. Where `z` is None an actor stands on the ground; where bridges are, on the level that
-is nearest to `z`. Actors are known by names that the client chooses.
+is nearest to `z`. Who is placed far above it falls, and who is far below it stays there: `dynamics.bodies.ALOFT_M`.
+Actors are known by names that the client chooses.
 """
 
 from dataclasses import dataclass

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, shorten
 from flcav.world import commands
-from flcav.world.actors import NOBODY, Actors, join_actors
+from flcav.world.actors import NOBODY, Actors, join_actors, pick_actors
 from flcav.world.commands import Command, Controls
 from flcav.world.dynamics.blueprints import VEHICLES, blueprint
 from flcav.world.dynamics.bodies import Bodies, Body
@@ -181,6 +181,7 @@ class LiveWorld:
             case commands.Simulate(name, physics, gravity):
                 body = bodies.find(name)
                 body.physics, body.gravity = physics, gravity
+                bodies.land(bodies.row(name))
             case commands.SetLight(junction, state):
                 self.lights.set(junction, state)
             case commands.FreezeLights(frozen):
@@ -221,7 +222,8 @@ class LiveWorld:
         if self._traffic is None:
             return
         while self._traffic.ticks * STEP_S < self._time_s - 1e-6:
-            self._traffic.advance(self.bodies.actors(), self.lights.states(), sorted(self._hit))
+            grounded = pick_actors(self.bodies.actors(), self.bodies.find_grounded())
+            self._traffic.advance(grounded, self.lights.states(), sorted(self._hit))
             self._hit.clear()
         self._flow = self._traffic.at(self._time_s)
 
@@ -243,7 +245,7 @@ class LiveWorld:
         place, velocity, yaw_rate, contacts = resolve(boxes, start, velocity, yaw_rate, mass, inertia)
         bodies.position[:, :2], bodies.yaw = place[:count, :2], place[:count, 2]
         bodies.velocity[:, :2], bodies.yaw_rate = velocity[:count], yaw_rate[:count]
-        bodies.settle()
+        bodies.settle(dt_s)
         self._report(contacts, names, found)
         self._hit.update(names[row] for row in contacts.second.tolist() if flow.start <= row < flow.stop)
 

@@ -256,6 +256,31 @@ def test_a_vehicle_stands_on_slopes():
         assert abs(trace.tilt[0, 0, 0]) > 0.02
 
 
+def test_who_is_placed_above_the_ground_falls_and_who_is_below_it_stays(road: LiveWorld):
+    for name, z in {"up": 50.0, "under": -500.0, "low": 2.0}.items():
+        road.apply(Spawn(name, "car", 0, 0.0, 0.0, 0.0, z))
+    assert road.bodies.find_grounded().tolist() == [False, False, True]  # whom traffic sees
+    snapshot = run(road, 40)
+    fallen = 9.81 * 2.0**2 / 2
+    assert abs(place(snapshot, "up")[2] - (50.0 - fallen)) < 0.05 * 9.81 * 2.0  # a step's worth of speed
+    assert place(snapshot, "under")[2] == -500.0
+    assert place(snapshot, "low")[2] == 0.0
+    road.apply(Remove("low"))
+    snapshot = run(road, 40)
+    assert place(snapshot, "up")[2] == 0.0
+    assert not snapshot.trace.velocity[0, snapshot.row("up")].any()
+
+
+def test_a_hidden_puppet_comes_back_when_it_is_placed_on_the_road(road: LiveWorld):
+    road.apply(Spawn("ego", "car", 0, 0.0, 0.0, 0.0, -500.0))
+    road.apply(Simulate("ego", physics=False))
+    assert place(run(road, 5), "ego")[2] == -500.0
+    road.apply(Simulate("ego"))
+    assert place(run(road, 5), "ego")[2] == -500.0
+    road.apply(Place("ego", 10.0, 0.0, 0.0, 0.3))
+    assert speed(run(road, 20, Controls(throttle=1.0)), "ego") > 3.0
+
+
 def test_a_world_may_have_no_history(small_town: Callable[..., Town]):
     with LiveWorld(small_town(), Settings(remembers=False)) as world:
         world.apply(Spawn("ego", "car", 3, 0.0, 0.0))

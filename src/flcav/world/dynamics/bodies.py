@@ -11,12 +11,16 @@ from flcav.world.actors import Actors
 from flcav.world.commands import Controls
 from flcav.world.dynamics.blueprints import VEHICLES, Blueprint
 from flcav.world.dynamics.standing import Ground
-from flcav.world.dynamics.vehicle import Motion, Pedals, Vehicles, drive, stack_blueprints
+from flcav.world.dynamics.vehicle import GRAVITY_MPS2, Motion, Pedals, Vehicles, drive, stack_blueprints
 
 Array = NDArray[np.float64]
 
 AT_REST = Controls()
+ALOFT_M = 3.0  # who is placed so far above the ground falls, and who is so far below it stays there
 WALK_MPS2 = 10.0  # by which walkers change their velocity, also after they were hit
+
+
+STATE = ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "tilt", "aloft")  # arrays of `Bodies`
 
 
 @dataclass
@@ -46,6 +50,7 @@ class Bodies:
         self.yaw, self.yaw_rate, self.steer = (np.zeros(0) for _ in range(3))
         self.tilt = np.zeros((0, 2))
         self.size = np.zeros((0, 3))
+        self.aloft = np.zeros(0, np.bool_)  # who has physics and gravity, and yet does not stand on the ground
         self._vehicles: Vehicles = stack_blueprints([])
         self._ground = ground
 
@@ -63,43 +68,62 @@ class Bodies:
     def add(self, body: Body, x: float, y: float, yaw: float, z: float | None) -> None:
         """Add a body at rest."""
         self.members.append(body)
-        for name in ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "tilt"):
+        for name in STATE:
             array = getattr(self, name)
-            setattr(self, name, np.concatenate((array, np.zeros((1, *array.shape[1:])))))
+            setattr(self, name, np.concatenate((array, np.zeros((1, *array.shape[1:]), array.dtype))))
         self._recast()
         self.place(len(self.members) - 1, x, y, yaw, z)
 
     def remove(self, row: int) -> None:
         """Remove a body."""
         del self.members[row]
-        for name in ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "tilt"):
+        for name in STATE:
             setattr(self, name, np.delete(getattr(self, name), row, axis=0))
         self._recast()
 
     def place(
         self, row: int, x: float, y: float, yaw: float, z: float | None, pitch: float = 0.0, roll: float = 0.0
     ) -> None:
-        """Move a body to another pose; with physics and gravity it stands on the ground there."""
+        """Move a body to another pose; with physics and gravity it stands on the ground there, if that is near."""
         self.position[row] = x, y, np.nan if z is None else z
         self.yaw[row] = wrap_angle(yaw)
         self.tilt[row] = pitch, roll
-        body = self.members[row]
-        if z is None or (body.physics and body.gravity):
+        self.aloft[row] = False
+        if z is None:
             self._stand(np.array([row]))
+        else:
+            self.land(row)
+
+    def land(self, row: int) -> None:
+        """Let a body with physics and gravity stand on the ground, unless that is too far from it."""
+        body = self.members[row]
+        if body.physics and body.gravity:
+            self.aloft[row] = abs(self._clearance(np.array([row]))[0]) > ALOFT_M
+            if not self.aloft[row]:
+                self._stand(np.array([row]))
 
     def move(self, dt_s: float) -> None:
         """Move all with physics by `dt_s` [s], as if nothing were in their way."""
-        drives = [body.physics and body.category in VEHICLES for body in self.members]
+        on = np.array([body.physics for body in self.members], np.bool_)
+        flies = on & self.aloft
+        self.position[flies] += self.velocity[flies] * dt_s
+        on &= ~self.aloft
+        drives = on & [body.category in VEHICLES for body in self.members]
         if len(rows := np.flatnonzero(drives)):
             self._drive(rows, dt_s)
-        walks = [body.physics and body.category == "pedestrian" for body in self.members]
+        walks = on & [body.category == "pedestrian" for body in self.members]
         if len(rows := np.flatnonzero(walks)):
             self._walk(rows, dt_s)
 
-    def settle(self) -> None:
-        """Let all with physics stand on the ground where they are; they climb with its slope."""
-        stands = np.array([body.physics and body.gravity for body in self.members], np.bool_)
-        if len(rows := np.flatnonzero(stands)):
+    def settle(self, dt_s: float) -> None:
+        """Let all with physics stand on the ground where they are, climbing with its slope, or fall for `dt_s` [s]."""
+        heavy = np.array([body.physics and body.gravity for body in self.members], np.bool_)
+        if len(rows := np.flatnonzero(heavy & self.aloft)):
+            clearance = self._clearance(rows)
+            self.velocity[rows, 2] -= GRAVITY_MPS2 * dt_s
+            self.velocity[rows[clearance < -ALOFT_M]] = 0.0
+            self.aloft[rows] = (clearance > 0) | (clearance < -ALOFT_M)
+        if len(rows := np.flatnonzero(heavy & ~self.aloft)):
             self._stand(rows)
             ahead = (self.velocity[rows, :2] * heading_vectors(self.yaw[rows])).sum(axis=1)
             self.velocity[rows, 2] = -ahead * np.tan(self.tilt[rows, 0])
@@ -111,6 +135,15 @@ class Bodies:
         mass = np.where(held, np.inf, self._vehicles.mass_kg)
         inertia = np.array([body.blueprint.inertia_kgm2 for body in self.members])
         return mass, np.where(held | upright, np.inf, inertia)
+
+    def find_grounded(self) -> NDArray[np.bool_]:
+        """Return who is near the ground (N,): others are in nobody's way there."""
+        return np.abs(self._clearance(np.arange(len(self.members)))) <= ALOFT_M
+
+    def _clearance(self, rows: NDArray[np.int64]) -> Array:
+        """Return the height of bodies above the ground, or a bridge, [m]."""
+        x, y, z = self.position[rows].T
+        return z - self._ground.heights(x, y, z)
 
     def actors(self) -> Actors:
         """Return the bodies as they are now."""

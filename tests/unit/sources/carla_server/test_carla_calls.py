@@ -58,6 +58,22 @@ def test_all_blueprints_of_sensors_are_served_or_refused_by_name(calls):
                 invoke(calls, "spawn_actor", spawn)
 
 
+@pytest.mark.parametrize("kind", ["walker.pedestrian.0001", "vehicle.audi.tt", "static.prop.barrel"])
+@pytest.mark.parametrize("height", [-500.0, -50.0, 50.0, 100.0])
+def test_far_above_and_below_an_actor_there_is_room(height, kind, calls):
+    here = place(calls)
+    invoke(calls, "spawn_actor", (describe("vehicle.tesla.model3"), here))
+    with pytest.raises(Refused, match="because of collision"):
+        invoke(calls, "spawn_actor", (describe(kind), here))
+    here[0][2] += height
+    number = invoke(calls, "spawn_actor", (describe(kind), here)).id
+    assert calls.episode.find(number).transform.location[2] == pytest.approx(here[0][2], abs=1e-6)
+    for _ in range(2):
+        calls.episode.step(0.05)
+    fallen = here[0][2] - calls.episode.find(number).transform.location[2]
+    assert fallen == pytest.approx(0.0 if height < 0 else 9.81 * 0.1**2 / 2, abs=0.03)
+
+
 def test_bodies_of_blueprints_are_shapes_of_the_town():
     for blueprint in list_blueprints().values():
         if blueprint.category in SHAPES:
