@@ -53,6 +53,14 @@ class Drive:
 
 
 @dataclass(frozen=True)
+class Grip:
+    """The tyres of a vehicle hold by this share of the friction of a dry road, until told otherwise."""
+
+    name: str
+    share: float  # 0 to 1
+
+
+@dataclass(frozen=True)
 class Walk:
     """A walker walks at this velocity in the plane, until told otherwise."""
 
@@ -109,4 +117,4 @@ class FreezeLights:
     frozen: bool
 
 
-Command = Spawn | Remove | Drive | Walk | Place | Push | Simulate | SetLight | FreezeLights
+Command = Spawn | Remove | Drive | Grip | Walk | Place | Push | Simulate | SetLight | FreezeLights

@@ -166,6 +166,11 @@ class LiveWorld:
                 _check_numbers(controls.throttle, controls.steer, controls.brake)
                 _check_category(body := bodies.find(name), VEHICLES, "vehicle")
                 body.controls = controls
+            case commands.Grip(name, share):
+                if not 0 <= share <= 1:
+                    raise InputError(f"share = {share}: must be within 0 and 1")
+                _check_category(body := bodies.find(name), VEHICLES, "vehicle")
+                body.grip = share
             case commands.Walk(name, velocity):
                 _check_numbers(*velocity)
                 _check_category(body := bodies.find(name), ("pedestrian",), "walker")

@@ -33,6 +33,7 @@ class Body:
     walk: tuple[float, float] = (0.0, 0.0)  # wanted velocity [m/s]
     physics: bool = True
     gravity: bool = True
+    grip: float = 1.0  # share of the friction of a dry road
 
     @property
     def category(self) -> str:
@@ -177,6 +178,8 @@ class Bodies:
             self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2], self.yaw_rate[rows], self.steer[rows]
         )
         vehicles = Vehicles(*(values[rows] for values in self._vehicles))
+        grip = np.array([self.members[row].grip for row in rows])
+        vehicles = vehicles._replace(grip_mps2=grip * vehicles.grip_mps2, spin_mps2=grip * vehicles.spin_mps2)
         after = drive(motion, vehicles, pedals, self.tilt[rows, 0], dt_s)
         self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2] = after.position, after.yaw, after.velocity
         self.yaw_rate[rows], self.steer[rows] = after.yaw_rate, after.steer

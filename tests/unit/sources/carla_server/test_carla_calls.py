@@ -74,6 +74,48 @@ def test_far_above_and_below_an_actor_there_is_room(height, kind, calls):
     assert fallen == pytest.approx(0.0 if height < 0 else 9.81 * 0.1**2 / 2, abs=0.03)
 
 
+def test_blueprints_that_scripts_ask_for_by_name(calls):
+    """Those of CARLA 0.9.16's documentation; what one does not do is refused when it is used."""
+    props = (
+        "dirtdebris01 dirtdebris02 dirtdebris03 mesh gnome table trashbag streetsign atm haybale foodcart calibrator"
+    )
+    known = list_blueprints()
+    for name in (*(f"static.prop.{prop}" for prop in props.split()), "walker.pedestrian.0052", "util.actor.empty"):
+        here = [[0.0, 0.0, 30.0], [0.0, 0.0, 0.0]]
+        if name == "static.prop.mesh":
+            with pytest.raises(Refused, match=r"static\.prop\.mesh is not served here$"):
+                invoke(calls, "spawn_actor", (describe(name), here))
+        else:
+            invoke(calls, "destroy_actor", (invoke(calls, "spawn_actor", (describe(name), here)).id,))
+    for name in ("sensor.other.v2x", "sensor.other.v2x_custom"):
+        assert {"path_loss_model", "scenario", "transmit_power"} <= {
+            each.id for each in known[name].definition.attributes
+        }
+    assert {"gen_cam_min", "noise_head_bias"} <= known["sensor.other.v2x"].fields.keys()
+
+
+@pytest.mark.parametrize(("friction", "share"), [("0.05", 0.05), ("0.0", 0.0), ("3.5", None)])
+def test_tyres_hold_by_the_friction_of_the_box_that_they_are_in(friction, share, calls):
+    car = invoke(calls, "spawn_actor", (describe("vehicle.tesla.model3"), place(calls))).id
+    calls.episode.step(0.05)
+    here = [list(part) for part in calls.episode.find(car).transform]
+    extents = [(f"extent_{axis}", "5000") for axis in "xyz"]  # 50 m to all sides
+    box = invoke(calls, "spawn_actor", (describe("static.trigger.friction", ("friction", friction), *extents), here)).id
+    ahead = np.array(calls.episode.find(car).pose[:3, 0]) * (1, -1, 1)  # CARLA's y points the other way
+    invoke(calls, "set_actor_target_velocity", (car, (15.0 * ahead).tolist()))
+    brake = [0.0, 0.0, 1.0, False, False, False, 0]
+    invoke(calls, "apply_control_to_vehicle", (car, brake))
+    for _ in range(10):
+        calls.episode.step(0.05)
+    lost = 15.0 - np.linalg.norm(calls.episode.find(car).motion[0])
+    assert lost == pytest.approx(0.5 * (8.0 if share is None else share * 0.9 * 9.81), abs=0.2)
+    invoke(calls, "destroy_actor", (box,))
+    before = np.linalg.norm(calls.episode.find(car).motion[0])
+    for _ in range(10):
+        calls.episode.step(0.05)
+    assert before - np.linalg.norm(calls.episode.find(car).motion[0]) == pytest.approx(0.5 * 8.0, abs=0.2)
+
+
 def test_bodies_of_blueprints_are_shapes_of_the_town():
     for blueprint in list_blueprints().values():
         if blueprint.category in SHAPES:

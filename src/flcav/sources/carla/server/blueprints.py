@@ -64,7 +64,7 @@ def list_blueprints() -> dict[str, Blueprint]:
             size=_full(catalogue.WALKER_SIZES[kind]),
         )
     add("controller.ai.walker", [_free("role_name", STRING, "default")])
-    for name, fields in (catalogue.SENSORS | catalogue.NOT_SERVED).items():
+    for name, fields in (catalogue.SENSORS | catalogue.OTHERS | catalogue.NOT_SERVED).items():
         told = [_free("role_name", STRING, "front"), _free("ros_name", STRING, name)]
         add(name, [*(_free(key, field.type, field.default) for key, field in fields.items()), *told], fields)
     clutter = list(CLUTTER)
@@ -81,7 +81,8 @@ def check(description: wire.Description) -> tuple[Blueprint, wire.Description]:
     if blueprint is None:
         raise Refused(f"no blueprint {shorten(description.id)}{suggest(description.id, known)}")
     if description.id in catalogue.NOT_SERVED:
-        raise Refused(f"{description.id} is not served here; sensors are {', '.join(catalogue.SENSORS)}")
+        served = f"; sensors are {', '.join(catalogue.SENSORS)}" if blueprint.kind == "sensor" else ""
+        raise Refused(f"{description.id} is not served here{served}")
     given = {attribute.id: attribute for attribute in description.attributes}
     whole = []
     for variation in blueprint.definition.attributes:

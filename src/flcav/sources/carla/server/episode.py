@@ -16,7 +16,8 @@ from flcav.sources.carla.frames import from_mount, mirror, mirror_spin, to_vecto
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.actors import WAITING, Actor, list_places
 from flcav.sources.carla.server.blueprints import Blueprint, Refused, check, find_paint, list_blueprints
-from flcav.sources.carla.server.driving import steer_towards
+from flcav.sources.carla.server.catalogue import TRIGGER
+from flcav.sources.carla.server.driving import find_grip, steer_towards
 from flcav.sources.carla.server.lights import Lights, find_approaches
 from flcav.sources.carla.server.maps import ServedMap
 from flcav.sources.carla.server.recorder import Recorder
@@ -26,7 +27,7 @@ from flcav.sources.carla.server.sensing.table import KINDS, Clock
 from flcav.sources.carla.server.weather import to_weather
 from flcav.sources.carla.server.wire import Transform
 from flcav.world import commands
-from flcav.world.commands import Controls, Drive, Push, Remove, Simulate, Spawn, Walk
+from flcav.world.commands import Controls, Drive, Grip, Push, Remove, Simulate, Spawn, Walk
 from flcav.world.live import LiveWorld, Obstructed, Settings
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
@@ -303,6 +304,7 @@ class Episode:
             if actor.ackermann is not None:
                 limit, _ = self.steering(actor)
                 self.drive(actor, steer_towards(actor.ackermann, actor.control, self.speed(actor), limit, dt_s))
+        self._slip()
         snapshot = self.world.step(dt_s=dt_s)
         self.tick += 1
         self.counters.frame += 1
@@ -310,6 +312,17 @@ class Episode:
         self.lights.follow(self.world, dt_s)
         self._follow(snapshot, dt_s)
         self.recorder.add(snapshot)
+
+    def _slip(self) -> None:
+        """Tell the tyres of the vehicles in boxes of friction how they hold there, by the last box that they are in."""
+        boxes = [actor for actor in self.actors.values() if actor.description.id == TRIGGER]
+        for body in self.world.bodies.members:
+            actor = self._bodies.get(body.name)
+            if actor is not None and actor.kind == "vehicle":
+                shares = [share for box in boxes if (share := find_grip(box, actor.pose[:3, 3])) is not None]
+                share = shares[-1] if shares else 1.0
+                if body.grip != share:
+                    self.world.apply(Grip(body.name, share))
 
     def steering(self, actor: Actor) -> tuple[float, float]:
         """Return the greatest steering angle [rad] and the wheelbase [m] of a vehicle."""

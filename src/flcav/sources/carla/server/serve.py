@@ -366,7 +366,7 @@ def serve(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Calla
     """Serve clients until interrupted or terminated (SIGTERM), at the sockets of `open_doors`."""
 
     def leave() -> None:
-        calls.discard_files()
+        calls.maps.discard_files()
         os._exit(0)
 
     async def run() -> None:
