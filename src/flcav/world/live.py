@@ -52,6 +52,7 @@ class Settings:
     pedestrians: int = 0  # of SUMO
     parked: bool = True  # with the vehicles parked along the streets
     dt_s: float = 0.05  # length of a step
+    leans: bool = False  # cars under control pitch and roll on their springs
     remembers: bool = True  # keeps its history, which grows by every step and command
 
 
@@ -89,7 +90,7 @@ class LiveWorld:
         self.settings = settings
         self.history: list[Command | Step] = []
         self.lights = Lights(read_light_programs(town.net), WARM_UP_S)
-        self.bodies = Bodies(ground := Ground(town))
+        self.bodies = Bodies(ground := Ground(town), leans=settings.leans)
         self._ground = ground
         self._parked = stand_parked(town, ground, settings.seed) if settings.parked else NOBODY
         self._obstacles = list_obstacles(town, self._parked)
@@ -181,7 +182,7 @@ class LiveWorld:
             case commands.Push(name, velocity, yaw_rate):
                 row = bodies.row(name)
                 _check_numbers(*velocity, yaw_rate or 0.0)
-                bodies.velocity[row] = velocity
+                bodies.push(row, velocity)
                 bodies.yaw_rate[row] = bodies.yaw_rate[row] if yaw_rate is None else yaw_rate
             case commands.Simulate(name, physics, gravity):
                 body = bodies.find(name)

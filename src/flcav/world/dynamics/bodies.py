@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError, shorten
-from flcav.geometry import heading_vectors, wrap_angle
+from flcav.geometry import heading_vectors, left_vectors, wrap_angle
 from flcav.world.actors import Actors
 from flcav.world.commands import Controls
 from flcav.world.dynamics.blueprints import VEHICLES, Blueprint
@@ -16,7 +16,11 @@ from flcav.world.dynamics.vehicle import GRAVITY_MPS2, Motion, Pedals, Vehicles,
 Array = NDArray[np.float64]
 
 AT_REST = Controls()
+ON_SPRINGS = ("car", "van", "truck", "bus")
 ALOFT_M = 3.0  # who is placed so far above the ground falls, and who is so far below it stays there
+LAUNCH_MPS = 1.0  # who is pushed up by more than it climbs, and by so much, leaves the ground
+PITCH_S2PM, ROLL_S2PM = 0.004, 0.007  # rad by which cars lean on their springs, for each m/s^2 ahead and aside
+MOST_LEAN_MPS2 = 10.0  # accelerations beyond are those of collisions
 WALK_MPS2 = 10.0  # by which walkers change their velocity, also after they were hit
 
 
@@ -44,8 +48,9 @@ class Body:
 class Bodies:
     """N bodies and their motion."""
 
-    def __init__(self, ground: Ground) -> None:
-        """Start without any, on this ground."""
+    def __init__(self, ground: Ground, *, leans: bool = False) -> None:
+        """Start without any, on this ground; `leans`: cars are seen to lean on their springs."""
+        self._leans = leans
         self.members: list[Body] = []
         self.position, self.velocity, self.acceleration = (np.zeros((0, 3)) for _ in range(3))
         self.yaw, self.yaw_rate, self.steer = (np.zeros(0) for _ in range(3))
@@ -103,6 +108,21 @@ class Bodies:
             if not self.aloft[row]:
                 self._stand(np.array([row]))
 
+    def push(self, row: int, velocity: tuple[float, float, float]) -> None:
+        """Give a body another velocity [m/s]: one that is pushed up leaves the ground, and none goes into it."""
+        self.velocity[row] = velocity
+        body = self.members[row]
+        if body.physics and body.gravity and not self.aloft[row]:
+            climb = self._climb(np.array([row]))[0]
+            self.aloft[row] = velocity[2] > climb + LAUNCH_MPS
+            if not self.aloft[row]:
+                self.velocity[row, 2] = climb
+
+    def _climb(self, rows: NDArray[np.int64]) -> Array:
+        """Return the vertical velocities [m/s] by which bodies stay on the slopes that they move on."""
+        ahead = (self.velocity[rows, :2] * heading_vectors(self.yaw[rows])).sum(axis=1)
+        return -ahead * np.tan(self.tilt[rows, 0])
+
     def move(self, dt_s: float) -> None:
         """Move all with physics by `dt_s` [s], as if nothing were in their way."""
         on = np.array([body.physics for body in self.members], np.bool_)
@@ -126,8 +146,7 @@ class Bodies:
             self.aloft[rows] = (clearance > 0) | (clearance < -ALOFT_M)
         if len(rows := np.flatnonzero(heavy & ~self.aloft)):
             self._stand(rows)
-            ahead = (self.velocity[rows, :2] * heading_vectors(self.yaw[rows])).sum(axis=1)
-            self.velocity[rows, 2] = -ahead * np.tan(self.tilt[rows, 0])
+            self.velocity[rows, 2] = self._climb(rows)
 
     def weights(self) -> tuple[Array, Array]:
         """Return the masses (N,) [kg] and moments of inertia (N,) [kg m^2], infinite for what nothing moves."""
@@ -158,8 +177,15 @@ class Bodies:
             velocity=self.velocity.copy(),
             acceleration=self.acceleration.copy(),
             yaw_rate=self.yaw_rate.copy(),
-            tilt=self.tilt.copy(),
+            tilt=self.tilt + self._find_lean() if self._leans else self.tilt.copy(),
         )
+
+    def _find_lean(self) -> Array:
+        """Return pitch and roll (N, 2) [rad] of cars on their springs: down ahead when braking, outwards in a curve."""
+        cars = np.array([body.physics and body.category in ON_SPRINGS for body in self.members], np.bool_)
+        felt = np.clip(self.acceleration[:, :2], -MOST_LEAN_MPS2, MOST_LEAN_MPS2)
+        ahead, aside = ((felt * axis(self.yaw)).sum(axis=1) for axis in (heading_vectors, left_vectors))
+        return np.where((cars & ~self.aloft)[:, None], np.column_stack((-PITCH_S2PM * ahead, ROLL_S2PM * aside)), 0.0)
 
     def _recast(self) -> None:
         self._vehicles = stack_blueprints([body.blueprint for body in self.members])

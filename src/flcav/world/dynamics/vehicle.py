@@ -90,7 +90,9 @@ def drive(motion: Motion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s
     model = speed[:, None] * heading_vectors(yaw) + (turn * vehicles.wheelbase_m / 2)[:, None] * left_vectors(yaw)
     change = model - motion.velocity
     needed = np.linalg.norm(change, axis=1, keepdims=True)
-    velocity = motion.velocity + change * np.minimum(1.0, vehicles.grip_mps2 * dt_s / np.maximum(needed, 1e-12))
+    velocity = motion.velocity + change * np.minimum(
+        1.0, vehicles.grip_mps2[:, None] * dt_s / np.maximum(needed, 1e-12)
+    )
     position = motion.position + (motion.velocity + velocity) / 2 * dt_s
     return Motion(position, wrap_angle(yaw), velocity, yaw_rate, steer)
 

@@ -1,13 +1,12 @@
 """Calls without a network: what is refused, in which words, and the same images from the same seed."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
+from carla_calls import describe, invoke, place
 
 from flcav.config import InputError
-from flcav.sources.carla.server import calls as carla_calls
 from flcav.sources.carla.server import catalogue, wire
 from flcav.sources.carla.server.blueprints import Refused, check, list_blueprints
 from flcav.sources.carla.server.calls import Calls
@@ -16,12 +15,6 @@ from flcav.sources.carla.server.maps import Maps
 from flcav.sources.carla.server.sensing.table import KINDS, Clock
 from flcav.sources.carla.server.weather import to_weather
 from flcav.world.shapes import SHAPES
-
-
-def invoke(calls: Calls, name: str, arguments: tuple[Any, ...]) -> Any:
-    """Return what a call answers, of the type that the test expects."""
-    return carla_calls.invoke(calls, name, arguments)
-
 
 CAMERA = (("image_size_x", "64"), ("image_size_y", "48"))
 
@@ -36,16 +29,6 @@ def calls(maps):
     made = Calls(maps, "suburb", seed=3, traffic=0, port=2000)
     yield made
     made.episode.close()
-
-
-def describe(name, *attributes):
-    known = list_blueprints()[name].definition
-    return [known.uid, name, [[key, 4, value] for key, value in attributes]]
-
-
-def place(calls, number=0, ahead=0.0):
-    location, rotation = calls.episode.served.spawn_points[number]
-    return [[location[0] + ahead, *location[1:]], list(rotation)]
 
 
 def test_all_blueprints_of_sensors_are_served_or_refused_by_name(calls):

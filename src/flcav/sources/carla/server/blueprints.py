@@ -12,6 +12,7 @@ from flcav.world.map.parameters import CLUTTER
 from flcav.world.shapes import SHAPES
 
 COLOURS = ("17,37,103", "107,18,14", "180,180,180", "25,25,25", "230,230,230")
+TRUE = ("true", "1")
 GAMMA = 2.2  # of sRGB, about
 LARGEST_INT = 2**31
 
@@ -104,7 +105,7 @@ def _check_value(name: str, variation: wire.Variation, field: Field | None, valu
             raise Refused(f"{name}: attribute '{variation.id}' = {value} is not within {low:g} and {high:g}")
     elif variation.type == COLOUR and not _is_colour(value):
         raise Refused(f"{name}: attribute '{variation.id}' = {shorten(value)} is no colour, such as 255,0,0")
-    elif variation.type == BOOL and value.lower() not in ("true", "false", "0", "1"):
+    elif variation.type == BOOL and value.lower() not in (*TRUE, "false", "0"):
         raise Refused(f"{name}: attribute '{variation.id}' = {shorten(value)} is neither true nor false")
 
 

@@ -8,8 +8,16 @@ from flcav.sources.carla.server.catalogue import FLOAT
 from flcav.sources.carla.server.wire import AckermannControl, VehicleControl
 
 PULL_MPS2, BRAKE_MPS2 = 4.0, 8.0  # accelerations that full pedals give
+SHIFT_KMH = (20.0, 40.0, 60.0, 85.0, 115.0)  # at which an automatic gearbox takes the next gear
 SETTLE_S = 0.5  # time in which a difference of speed is to be made up
 STOPPED_MPS = 0.05
+
+
+def choose_gear(control: VehicleControl, speed_mps: float) -> int:
+    """Return the gear of a vehicle: the driver's, or that of an automatic gearbox at its speed."""
+    if control.manual:
+        return control.gear
+    return -1 if control.reverse else 1 + int(np.searchsorted(SHIFT_KMH, 3.6 * abs(speed_mps)))
 
 
 def find_grip(box: Actor, point: NDArray[np.float64]) -> float | None:
