@@ -283,7 +283,18 @@ def loading(client: Any) -> None:
     assert client.load_world("suburb").get_map().name.endswith("suburb")
 
 
-SESSIONS = {each.__name__: each for each in (the_world, actors, walkers, sensors, events, traffic, loading)}
+def loading_beside_a_manager(client: Any) -> None:
+    """A Traffic Manager that drives nobody, whose thread goes on while the client loads maps."""
+    manager = client.get_trafficmanager(int(sys.argv[2]) + 9)
+    for town in ("ring", "suburb") * 4:
+        assert client.load_world(town).get_map().name.endswith(town)
+    manager.shut_down()
+
+
+SESSIONS = {
+    each.__name__: each
+    for each in (the_world, actors, walkers, sensors, events, traffic, loading, loading_beside_a_manager)
+}
 
 if __name__ == "__main__":
     genuine = carla.Client("127.0.0.1", int(sys.argv[2]))

@@ -25,7 +25,8 @@ SESSIONS = (
     "events",
     "traffic",
     "loading",
-)  # the last one loads other maps
+    "loading_beside_a_manager",
+)  # the last ones load other maps
 
 
 def _find_port() -> int:

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 import msgpack
 import pytest
 
-from flcav.sources.carla.server import serve, wire
+from flcav.sources.carla.server import connections, serve, wire
 from flcav.sources.carla.server.blueprints import list_blueprints
 from flcav.sources.carla.server.calls import Calls
 from flcav.sources.carla.server.maps import Maps
@@ -85,7 +85,7 @@ def test_who_bursts_cues_is_read_no_further_while_others_are_served(maps):
 
 
 def test_all_who_read_nothing_share_one_deadline(maps, monkeypatch):
-    monkeypatch.setattr(serve, "STUCK_S", 0.5)
+    monkeypatch.setattr(connections, "STUCK_S", 0.5)
     monkeypatch.setitem(KINDS, "sensor.other.gnss", Kind(Stream.GNSS, lambda sight, sensor: bytes(8 << 20)))
 
     async def session():
@@ -117,7 +117,7 @@ def test_all_who_read_nothing_share_one_deadline(maps, monkeypatch):
 
 
 def test_of_many_unfinished_calls_the_largest_are_dropped(maps, monkeypatch):
-    monkeypatch.setattr(serve, "MOST_UNFINISHED", 1_000_000)
+    monkeypatch.setattr(connections, "MOST_UNFINISHED", 1_000_000)
 
     async def session():
         async with serving(maps) as (port, _, _):
@@ -162,8 +162,8 @@ def test_a_call_that_comes_to_no_end_ends_its_connection(maps, monkeypatch):
 
 @pytest.mark.parametrize("idle", [True, False])
 def test_a_full_server_closes_who_was_idle_longest(idle, maps, monkeypatch):
-    monkeypatch.setattr(serve, "MOST_CONNECTIONS", 3)
-    monkeypatch.setattr(serve, "IDLE_S", 0.1 if idle else 60.0)
+    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(connections, "IDLE_S", 0.1 if idle else 60.0)
 
     async def session():
         async with serving(maps) as (port, _, _):
@@ -194,7 +194,7 @@ def test_a_refused_cue_is_answered_at_once(maps):
 
 
 def test_replies_that_nobody_reads_are_not_piled_up(maps, monkeypatch):
-    monkeypatch.setattr(serve, "STUCK_S", 0.2)
+    monkeypatch.setattr(connections, "STUCK_S", 0.2)
 
     async def session():
         async with serving(maps) as (port, _, _):

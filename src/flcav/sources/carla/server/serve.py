@@ -2,12 +2,10 @@
 
 In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends what sensors measure, in order,
 then the world's state and the answer to its cue, upon which a client goes on, and then the cameras' images, which take
-longest: they are drawn beside the next ticks, and the next images wait for them. Readers who do not keep up are
-waited for, all at once, and dropped after `STUCK_S`.
+longest: they are drawn beside the next ticks, and the next images wait for them.
 
-What strangers may ask for is bounded: a connection with many cues that wait for their ticks is read no further, of
-connections with unfinished calls the largest one is closed, and a full server closes the connection that has been idle
-longest.
+What strangers may ask for is bounded: a connection with many cues that wait for their ticks is read no further; other
+bounds are those of `Connections`.
 """
 
 import asyncio
@@ -19,33 +17,32 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 
 from flcav.config import InputError
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.blueprints import Refused
 from flcav.sources.carla.server.calls import Calls, invoke
+from flcav.sources.carla.server.connections import Connections, send, write
 from flcav.sources.carla.server.episode import Episode, Measurement
 
-STUCK_S = 10.0
 # A client's Traffic Manager misses its wake-up, and waits for ever, where the next tick comes before its thread sleeps
 # (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are not closer than this while one runs.
 PACE_S = 0.008
 LEARNT_S = 3.0  # clients have learnt of a new map by then
+# While a client that has loaded a map learns of it by these calls, its Traffic Manager's thread crashes if it goes on:
+# so that thread's calls, which are all others, are answered when the client listens to the new world.
+LEARNING = ("version", "get_episode_info", "get_sensor_token")
+MANAGER_S = 0.1  # a Traffic Manager's thread has made its next call by then
 LISTENER_S = 0.3  # a tick waits so long for the connection of a stream whose token a client has just asked for
-MOST_CONNECTIONS = 512
-IDLE_S = 10.0  # a full server keeps who has sent or got something since
 MOST_CUES, MOST_CUES_IN_ALL = 8, 256  # of a connection that wait for their ticks, and of all; clients have one each
-MOST_UNFINISHED = 64 << 20  # bytes of calls that have not come to their end, of all connections
 UNFINISHED_S = 30.0  # a call has come to its end by then, and the number of a stream
-MOST_UNSENT = 1 << 30  # bytes in the buffers of all connections
 ENDING_S = 3.0  # a server that is terminated ends by then, whatever it is at
 # In asynchronous mode, so that a client has a state with the new actor when it learns of it, as with CARLA, which
 # answers few calls a frame: a walker's AI that a client starts ends where its walker is in no state.
 SPAWNS = ("spawn_actor", "spawn_actor_with_parent")
 CHUNK = 1 << 16
-BACKLOG = 1 << 20  # bytes in a connection's buffer from which its reader is waited for
 
 log = logging.getLogger("flcav.carla")
 
@@ -56,16 +53,14 @@ class Server:
     def __init__(self, calls: Calls) -> None:
         """Take the calls to be served."""
         self._calls = calls
-        self._streams: dict[int, set[asyncio.StreamWriter]] = {}
-        self._active: dict[asyncio.StreamWriter, float] = {}  # connections, and when they last sent or got something
-        self._unfinished: dict[asyncio.StreamWriter, int] = {}  # bytes of calls that have not come to their end
+        self._links = Connections()
         self._cue, self._room = asyncio.Event(), asyncio.Event()
-        self._refused: set[str] = set()  # told in the log once
         self._worlds: set[int] = set()  # streams of the world's state, of earlier episodes too
         self._published_s = 0.0  # when the world's state was last sent
         self._state = b""  # the last one of the world, for clients that come between two ticks
         # A client that has the answer to its cue waits for the state by polling, which takes a core from the sensors.
         self._cued: deque[tuple[asyncio.StreamWriter, bytes]] = deque()  # answers that wait for the next ticks
+        self._held: dict[asyncio.StreamWriter, list[bytes]] = {}  # replies to managers of who learns of a new map
         self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick
 
     async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
@@ -78,11 +73,8 @@ class Server:
         finally:
             for server in servers:
                 server.close()
-            for writer in self._active:
-                writer.transport.abort()
             self._room.set()
-            while self._active:  # each is forgotten when its reader has come to the end
-                await asyncio.sleep(0.001)
+            await self._links.close()
             if self._drawing is not None:
                 self._drawing.cancel()
             self._calls.episode.close()
@@ -126,7 +118,7 @@ class Server:
         episode, dt_s = self._calls.episode, self._calls.dt_s
         episode.step(dt_s)
         self._state = episode.describe_world(dt_s)
-        measurements = list(episode.measure(dt_s, self._is_heard))
+        measurements = list(episode.measure(dt_s, self._links.is_heard))
         for each in measurements:
             if not each.late:
                 await self._measure(each, episode)
@@ -141,13 +133,13 @@ class Server:
             if self._drawing is not None:
                 await self._drawing
             self._drawing = asyncio.create_task(self._draw(images, episode))
-        await self._await_readers(self._active)
+        await self._links.await_readers()
 
     async def _draw(self, images: list[Measurement], episode: Episode) -> None:
         try:
             for each in images:
                 await self._measure(each, episode)
-            await self._await_readers(self._active)
+            await self._links.await_readers()
         except Exception:  # a server that fails one image draws the next
             log.exception("an image failed")
 
@@ -155,8 +147,7 @@ class Server:
         """Answer what waits for the ticks that were made; all that waits, where none is to come."""
         for _ in range(len(self._cued) if most is None else min(most, len(self._cued))):
             writer, reply = self._cued.popleft()
-            with suppress(ConnectionError, RuntimeError):
-                writer.write(reply)
+            write(writer, reply)
         self._room.set()
 
     async def _measure(self, each: Measurement, episode: Episode) -> None:
@@ -165,20 +156,17 @@ class Server:
         if not isinstance(body, bytes):
             body = await asyncio.to_thread(body) if each.rays else body()
         if episode is self._calls.episode:
-            await self._publish(each.stream, each.header + body)
+            await self._links.publish(each.stream, each.header + body)
 
     async def _publish_state(self, episode: Episode) -> None:
         """Send the world's state; after a map was loaded, at first only to those who have learnt of it.
 
         A client that loads a map closes the stream of the one before, and crashes if something arrives meanwhile.
         """
-        self._worlds = {stream for stream in self._worlds if stream in self._streams}
+        self._worlds = {stream for stream in self._worlds if self._links.is_heard(stream)}
         for stream in self._worlds:
             if stream == episode.stream or episode.age_s > LEARNT_S:
-                await self._publish(stream, self._state)
-
-    def _is_heard(self, stream: int) -> bool:
-        return bool(self._streams.get(stream))
+                await self._links.publish(stream, self._state)
 
     async def _await_listeners(self) -> None:
         """Wait for the streams that clients are about to listen to, so that these miss no tick."""
@@ -187,65 +175,10 @@ class Server:
             await asyncio.sleep(0.001)
         expected.clear()
 
-    async def _await_readers(self, writers: Iterable[asyncio.StreamWriter]) -> None:
-        """Wait for all readers who are behind, at once; drop those who read nothing more."""
-        drains = {asyncio.ensure_future(each.drain()): each for each in writers if _unsent(each) > BACKLOG}
-        if not drains:
-            return
-        _, late = await asyncio.wait(drains, timeout=STUCK_S)
-        for drain, writer in drains.items():
-            if drain in late:
-                drain.cancel()
-                log.warning("a client reads no more: its connection is closed")
-            if drain in late or drain.exception() is not None:
-                self._drop(writer)
-
-    async def _publish(self, stream: int, payload: bytes) -> None:
-        """Send a payload to all who listen to a stream; wait for readers where too much is unsent."""
-        unsent = sum(map(_unsent, self._active))
-        for writer in list(self._streams.get(stream, ())):
-            unsent += len(payload)
-            if unsent > MOST_UNSENT:
-                await self._await_readers(self._active)
-                unsent = sum(map(_unsent, self._active)) + len(payload)
-            self._send(writer, payload)
-            self._active[writer] = time.monotonic()
-
-    @staticmethod
-    def _send(writer: asyncio.StreamWriter, payload: bytes) -> None:
-        with suppress(ConnectionError, RuntimeError):
-            writer.write(struct.pack("<I", len(payload)) + payload)
-
     # ---- connections
 
-    def _admit(self, writer: asyncio.StreamWriter) -> bool:
-        if len(self._active) >= MOST_CONNECTIONS:
-            idlest = min(self._active, key=self._active.__getitem__)
-            if time.monotonic() - self._active[idlest] < IDLE_S:
-                self._tell("full", f"one more than {MOST_CONNECTIONS} connections")
-                writer.close()
-                return False
-            self._tell("idle", f"one more than {MOST_CONNECTIONS} connections: the one that was idle longest is closed")
-            self._drop(idlest)
-        self._active[writer] = time.monotonic()
-        writer.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # asyncio may not
-        return True
-
-    def _drop(self, writer: asyncio.StreamWriter) -> None:
-        writer.transport.abort()
-        self._forget(writer)
-
-    def _forget(self, writer: asyncio.StreamWriter) -> None:
-        self._active.pop(writer, None)
-        self._unfinished.pop(writer, None)
-        for stream in [stream for stream, writers in self._streams.items() if writer in writers]:
-            self._streams[stream].discard(writer)
-            if not self._streams[stream]:
-                del self._streams[stream]
-        writer.close()
-
     async def _serve_calls(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if not self._admit(writer):
+        if not self._links.admit(writer):
             return
         unpacker, until = wire.Unpacker(), None
         try:
@@ -253,8 +186,9 @@ class Server:
                 unpacker.feed(data)
                 for message in unpacker:
                     await self._serve_call(wire.read_call(message), writer)
-                    self._active[writer], until = time.monotonic(), None
-                self._note_unfinished(writer, unpacker.waiting)
+                    until = None
+                    self._links.note_active(writer)
+                self._links.note_unfinished(writer, unpacker.waiting)
                 if not unpacker.waiting:
                     until = None
                 elif until is None:
@@ -262,20 +196,12 @@ class Server:
         except ConnectionError:
             pass
         except TimeoutError:
-            self._tell("slow", f"a call of which {UNFINISHED_S:g} s bring no end")
+            self._links.tell("slow", f"a call of which {UNFINISHED_S:g} s bring no end")
         except (ValueError, TypeError, RecursionError, OverflowError, KeyError) as error:
             what = str(error) or type(error).__name__
             log.warning("a connection is closed: %s; clients of CARLA %s are served here", what[:200], wire.VERSION)
         finally:
-            self._forget(writer)
-
-    def _note_unfinished(self, writer: asyncio.StreamWriter, size: int) -> None:
-        """Note how many bytes of an unfinished call a connection holds; close the largest where they are too many."""
-        self._unfinished[writer] = size
-        while sum(self._unfinished.values()) > MOST_UNFINISHED:
-            largest = max(self._unfinished, key=self._unfinished.__getitem__)
-            self._tell("unfinished", f"unfinished calls of more than {MOST_UNFINISHED} bytes")
-            self._drop(largest)
+            self._links.forget(writer)
 
     async def _serve_call(self, call: wire.Call, writer: asyncio.StreamWriter) -> None:
         """Answer a call: at once, or after the tick that it cues."""
@@ -290,10 +216,22 @@ class Server:
         cues = self._calls.ticks - asked if self._calls.settings.synchronous else call.method in SPAWNS
         waits = cues > 0 and call.method != "apply_batch"
         self._cued.extend([(writer, reply if waits else b"")] * cues)
-        if not waits:
+        if call.method == "load_new_episode" and self._calls.managed:
+            await asyncio.sleep(MANAGER_S)
             writer.write(reply)
-        await self._await_readers([writer])
+            self._held[writer] = []
+            asyncio.get_running_loop().call_later(LEARNT_S, self._release, writer)
+        elif writer in self._held and call.method not in LEARNING:
+            self._held[writer].append(reply)
+        elif not waits:
+            writer.write(reply)
+        await self._links.await_readers([writer])
         await asyncio.sleep(0)  # others have their turn
+
+    def _release(self, writer: asyncio.StreamWriter) -> None:
+        """Send the replies that were held for a client that learnt of a new map."""
+        for reply in self._held.pop(writer, []):
+            write(writer, reply)
 
     def _answer(self, call: wire.Call) -> wire.Packed:
         """Return the response to a call."""
@@ -301,7 +239,7 @@ class Server:
         try:
             value = invoke(self._calls, call.method, call.arguments)
         except (Refused, InputError, wire.WireError) as error:
-            self._tell(call.method, str(error))
+            self._links.tell(call.method, str(error))
             return [] if call.method == "apply_batch" else wire.fail(str(error))
         except Exception as error:  # a server that fails one call serves the others
             log.exception("the call %s failed", call.method[:60])
@@ -314,32 +252,25 @@ class Server:
             return value
         return wire.DONE if value is None else wire.succeed(value)
 
-    def _tell(self, method: str, message: str) -> None:
-        if method not in self._refused and len(self._refused) < 1000:
-            self._refused.add(method)
-            log.warning("refused: %s", message[:300])
-
     async def _serve_stream(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if not self._admit(writer):
+        if not self._links.admit(writer):
             return
         try:
             async with asyncio.timeout(UNFINISHED_S):
                 (stream,) = struct.unpack("<I", await reader.readexactly(4))
-            self._streams.setdefault(stream, set()).add(writer)
+            self._links.listen(writer, stream)
             self._calls.expected.discard(stream)
             if stream == self._calls.episode.stream:
                 self._worlds.add(stream)
-                self._send(writer, self._state or self._calls.episode.describe_world(0.0))
+                for loader in list(self._held):
+                    self._release(loader)
+                send(writer, self._state or self._calls.episode.describe_world(0.0))
             while await reader.read(1024):
                 pass
         except (asyncio.IncompleteReadError, ConnectionError, TimeoutError):
             pass
         finally:
-            self._forget(writer)
-
-
-def _unsent(writer: asyncio.StreamWriter) -> int:
-    return writer.transport.get_write_buffer_size()
+            self._links.forget(writer)
 
 
 async def _read(reader: asyncio.StreamReader, until: float | None) -> bytes:
