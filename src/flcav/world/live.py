@@ -31,7 +31,7 @@ from flcav.world.traffic.live import WARM_UP_S, SumoTraffic, stand_parked
 
 Array = NDArray[np.float64]
 
-SUBSTEP_S = 0.05  # longest step of the vehicle model: nobody passes through a box in it
+SUBSTEP_S, SUBSTEP_M = 0.05, 2.0  # longest step and way of the vehicle model: nobody passes through a box in it
 LONGEST_S = 10.0  # of a step
 NEAR_M = 2.0  # obstacles so far from a body are looked at
 RESERVED = ("veh", "ped", "parked")  # begin the names of other actors
@@ -139,7 +139,8 @@ class LiveWorld:
         self._note(Step(dt_s))
         begins, velocity = self._time_s, self.bodies.velocity.copy()
         found: dict[tuple[str, str], Collision] = {}
-        parts = math.ceil(dt_s / SUBSTEP_S - 1e-9)
+        fastest = float(np.abs(velocity).max(initial=0.0))
+        parts = math.ceil(max(dt_s / SUBSTEP_S, dt_s * fastest / SUBSTEP_M) - 1e-9)
         for part in range(1, parts + 1):
             self._time_s = round(begins + dt_s * part / parts, 9)
             self.lights.advance(dt_s / parts)
@@ -249,6 +250,7 @@ class LiveWorld:
         velocity[flow], yaw_rate[flow] = self._flow.velocity[:, :2], self._flow.yaw_rate
         start = np.concatenate((before, boxes.place[count:]))
         place, velocity, yaw_rate, contacts = resolve(boxes, start, velocity, yaw_rate, mass, inertia)
+        bodies.fall(velocity[:count] - now.velocity[:, :2])
         bodies.position[:, :2], bodies.yaw = place[:count, :2], place[:count, 2]
         bodies.velocity[:, :2], bodies.yaw_rate = velocity[:count], yaw_rate[:count]
         bodies.settle(dt_s)

@@ -20,6 +20,8 @@ ON_SPRINGS = ("car", "van", "truck", "bus")
 ALOFT_M = 3.0  # who is placed so far above the ground falls, and who is so far below it stays there
 LAUNCH_MPS = 1.0  # who is pushed up by more than it climbs, and by so much, leaves the ground
 PITCH_S2PM, ROLL_S2PM = 0.004, 0.007  # rad by which cars lean on their springs, for each m/s^2 ahead and aside
+FALL_MPS = 3.0  # change of velocity by a hit that nobody stands
+SLIDE_MPS2 = 0.7 * GRAVITY_MPS2  # deceleration of who lies on the road
 MOST_LEAN_MPS2 = 10.0  # accelerations beyond are those of collisions
 WALK_MPS2 = 10.0  # by which walkers change their velocity, also after they were hit
 
@@ -37,6 +39,7 @@ class Body:
     walk: tuple[float, float] = (0.0, 0.0)  # wanted velocity [m/s]
     physics: bool = True
     gravity: bool = True
+    fallen: bool = False  # of a walker who was hit
     grip: float = 1.0  # share of the friction of a dry road
 
     @property
@@ -94,7 +97,7 @@ class Bodies:
         self.position[row] = x, y, np.nan if z is None else z
         self.yaw[row] = wrap_angle(yaw)
         self.tilt[row] = pitch, roll
-        self.aloft[row] = False
+        self.aloft[row] = self.members[row].fallen = False
         if z is None:
             self._stand(np.array([row]))
         else:
@@ -136,6 +139,14 @@ class Bodies:
         if len(rows := np.flatnonzero(walks)):
             self._walk(rows, dt_s)
 
+    def fall(self, change: Array) -> None:
+        """Let walkers fall whose velocity contacts `change` (N, 2) [m/s] much, in the direction of the hit."""
+        for row in np.flatnonzero(np.linalg.norm(change, axis=1) > FALL_MPS).tolist():
+            body = self.members[row]
+            if body.category == "pedestrian" and body.physics and not body.fallen:
+                body.fallen = True
+                self.yaw[row] = np.arctan2(change[row, 1], change[row, 0])
+
     def settle(self, dt_s: float) -> None:
         """Let all with physics stand on the ground where they are, climbing with its slope, or fall for `dt_s` [s]."""
         heavy = np.array([body.physics and body.gravity for body in self.members], np.bool_)
@@ -172,20 +183,30 @@ class Bodies:
             category=tuple(body.category for body in self.members),
             shape=np.array([body.blueprint.shape for body in self.members], np.int64),
             size=self.size,
-            position=self.position.copy(),
+            position=self.position + np.where(self._lie()[:, None], self.size[:, :1] / 2 * (0.0, 0.0, 1.0), 0.0),
             yaw=self.yaw.copy(),
             velocity=self.velocity.copy(),
             acceleration=self.acceleration.copy(),
             yaw_rate=self.yaw_rate.copy(),
-            tilt=self.tilt + self._find_lean() if self._leans else self.tilt.copy(),
+            tilt=self.tilt + self._find_lean(),
         )
 
     def _find_lean(self) -> Array:
-        """Return pitch and roll (N, 2) [rad] of cars on their springs: down ahead when braking, outwards in a curve."""
+        """Return further pitch and roll (N, 2) [rad]: of who lies, the head ahead, and of cars on their springs.
+
+        These go down ahead when they brake, and outwards in a curve.
+        """
+        lie = np.column_stack((np.pi / 2 * self._lie(), np.zeros(len(self.members))))
+        if not self._leans:
+            return lie
         cars = np.array([body.physics and body.category in ON_SPRINGS for body in self.members], np.bool_)
         felt = np.clip(self.acceleration[:, :2], -MOST_LEAN_MPS2, MOST_LEAN_MPS2)
         ahead, aside = ((felt * axis(self.yaw)).sum(axis=1) for axis in (heading_vectors, left_vectors))
-        return np.where((cars & ~self.aloft)[:, None], np.column_stack((-PITCH_S2PM * ahead, ROLL_S2PM * aside)), 0.0)
+        leans = np.column_stack((-PITCH_S2PM * ahead, ROLL_S2PM * aside))
+        return lie + np.where((cars & ~self.aloft)[:, None], leans, 0.0)
+
+    def _lie(self) -> NDArray[np.bool_]:
+        return np.array([body.fallen for body in self.members], np.bool_)
 
     def _recast(self) -> None:
         self._vehicles = stack_blueprints([body.blueprint for body in self.members])
@@ -211,12 +232,14 @@ class Bodies:
         self.yaw_rate[rows], self.steer[rows] = after.yaw_rate, after.steer
 
     def _walk(self, rows: NDArray[np.int64], dt_s: float) -> None:
-        wanted = np.array([self.members[row].walk for row in rows])
+        fallen = np.array([self.members[row].fallen for row in rows], np.bool_)
+        wanted = np.where(fallen[:, None], 0.0, np.array([self.members[row].walk for row in rows]))
+        able = np.where(fallen, SLIDE_MPS2, WALK_MPS2)[:, None]
         yaw = np.where(wanted.any(axis=1), np.arctan2(wanted[:, 1], wanted[:, 0]), self.yaw[rows])
         self.yaw_rate[rows] = wrap_angle(yaw - self.yaw[rows]) / dt_s
         change = wanted - self.velocity[rows, :2]
         needed = np.linalg.norm(change, axis=1, keepdims=True)
-        velocity = self.velocity[rows, :2] + change * np.minimum(1.0, WALK_MPS2 * dt_s / np.maximum(needed, 1e-12))
+        velocity = self.velocity[rows, :2] + change * np.minimum(1.0, able * dt_s / np.maximum(needed, 1e-12))
         self.position[rows, :2] += velocity * dt_s
         self.velocity[rows, :2], self.yaw[rows] = velocity, yaw
 

@@ -100,10 +100,11 @@ class Actor:
 
     def take(self, place: Place) -> None:
         """Take a place; the origin of a walker is its middle, `lift` above its feet."""
-        x, y, z = place.location
         self.pose, self.motion = place.pose, place.motion
-        self.pose[2, 3] += self.lift
-        self.transform = Transform((x, y, z + self.lift), place.rotation)
+        raised = self.lift * self.pose[:3, 2]
+        self.pose[:3, 3] += raised
+        (x, y, z), (dx, dy, dz) = place.location, mirror(raised).tolist()
+        self.transform = Transform((x + dx, y + dy, z + dz), place.rotation)
 
 
 def list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]:
