@@ -60,7 +60,7 @@ def the_world(client: Any) -> None:
         assert all(town.get_waypoint(point.location, project_to_road=False) for point in points)
         library = world.get_blueprint_library()
         assert len(library.filter("vehicle.*")) == 41
-        assert len(library.filter("walker.*")) == 51
+        assert len(library.filter("walker.*")) == 52
         for weather in (carla.WeatherParameters(80.0, 60.0, fog_density=5.0), carla.WeatherParameters()):
             world.set_weather(weather)
             assert world.get_weather() == weather
@@ -113,7 +113,7 @@ def walkers(client: Any) -> None:
 
 
 def actors(client: Any) -> None:
-    """Vehicles, walkers and props: spawning, driving, batches, lamps and physics."""
+    """Vehicles, walkers and props: spawning, driving, batches, lamps, friction and physics."""
     with synchronous(client) as world:
         library, points = world.get_blueprint_library(), world.get_map().get_spawn_points()
         car = world.spawn_actor(library.find("vehicle.tesla.model3"), points[0])
@@ -136,6 +136,16 @@ def actors(client: Any) -> None:
         for _ in range(80):
             world.tick()
         assert abs(car.get_velocity().length() - 5.0) < 1.0
+        ice = library.find("static.trigger.friction")
+        for name, value in {"friction": 0.1, "extent_x": 1e4, "extent_y": 1e4, "extent_z": 1e4}.items():
+            ice.set_attribute(name, str(value))  # 100 m to all sides
+        for blueprint in (ice, library.find("util.actor.empty")):
+            world.spawn_actor(blueprint, car.get_transform())
+        before = car.get_velocity().length()
+        car.apply_control(carla.VehicleControl(brake=1.0))
+        for _ in range(10):
+            world.tick()
+        assert abs(before - car.get_velocity().length() - 0.5 * 0.1 * 0.9 * 9.81) < 0.1
         walker = world.spawn_actor(library.find("walker.pedestrian.0001"), points[5])
         walker.apply_control(carla.WalkerControl(carla.Vector3D(0, 1, 0), 1.4))
         for _ in range(5):
@@ -273,7 +283,18 @@ def loading(client: Any) -> None:
     assert client.load_world("suburb").get_map().name.endswith("suburb")
 
 
-SESSIONS = {each.__name__: each for each in (the_world, actors, walkers, sensors, events, traffic, loading)}
+def loading_beside_a_manager(client: Any) -> None:
+    """A Traffic Manager that drives nobody, whose thread goes on while the client loads maps."""
+    manager = client.get_trafficmanager(int(sys.argv[2]) + 9)
+    for town in ("ring", "suburb") * 4:
+        assert client.load_world(town).get_map().name.endswith(town)
+    manager.shut_down()
+
+
+SESSIONS = {
+    each.__name__: each
+    for each in (the_world, actors, walkers, sensors, events, traffic, loading, loading_beside_a_manager)
+}
 
 if __name__ == "__main__":
     genuine = carla.Client("127.0.0.1", int(sys.argv[2]))

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import msgpack
@@ -24,7 +25,8 @@ SESSIONS = (
     "events",
     "traffic",
     "loading",
-)  # the last one loads other maps
+    "loading_beside_a_manager",
+)  # the last ones load other maps
 
 
 def _find_port() -> int:
@@ -129,11 +131,16 @@ def test_it_ends_without_a_word_about_its_clients_and_leaves_nothing(how, code, 
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **here) as server:
         assert server.stdout is not None
         assert "ready" in server.stdout.readline()
-        with socket.create_connection(("127.0.0.1", port)), socket.create_connection(("127.0.0.1", port + 1)) as stream:
+        doors = ("127.0.0.1", port), ("127.0.0.1", port + 1)
+        with socket.create_connection(doors[0]) as link, socket.create_connection(doors[1]) as stream:
             stream.sendall(b"\x01\x00\x00\x00")
             stream.recv(1)
+            link.sendall(wire.pack([0, 1, "set_episode_settings", [[False], wire.Settings(synchronous=True).packed()]]))
+            link.sendall(wire.pack([0, 2, "tick_cue", [[False]]]) * 20_000)  # it makes about a thousand ticks a second
             server.send_signal(how)
+            begun = time.monotonic()
             _, errors = server.communicate(timeout=LONGEST_S)
+            assert time.monotonic() < begun + 10.0
     assert (server.returncode, errors) == (code, told)
     assert list(tmp_path.iterdir()) == []
 

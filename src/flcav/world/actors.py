@@ -34,6 +34,16 @@ NOBODY = Actors(
 )
 
 
+def pick_actors(actors: Actors, mask: NDArray[np.bool_]) -> Actors:
+    """Return the actors for which `mask` (N,) is true."""
+    rows = np.flatnonzero(mask).tolist()
+    return Actors(
+        tuple(actors.name[row] for row in rows),
+        tuple(actors.category[row] for row in rows),
+        *(column[mask] for column in actors[2:]),
+    )
+
+
 def join_actors(*parts: Actors) -> Actors:
     """Return the actors of all parts, in order."""
     return Actors(

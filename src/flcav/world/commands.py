@@ -1,7 +1,8 @@
 """Commands to a live world: what a client does to it between two steps.
 
 World frame: ENU, metres, radians. Where `z` is None an actor stands on the ground; where bridges are, on the level that
-is nearest to `z`. Actors are known by names that the client chooses.
+is nearest to `z`. Who is placed far above it falls, and who is far below it stays there: `dynamics.bodies.ALOFT_M`.
+Actors are known by names that the client chooses.
 """
 
 from dataclasses import dataclass
@@ -49,6 +50,14 @@ class Drive:
 
     name: str
     controls: Controls
+
+
+@dataclass(frozen=True)
+class Grip:
+    """The tyres of a vehicle hold by this share of the friction of a dry road, until told otherwise."""
+
+    name: str
+    share: float  # 0 to 1
 
 
 @dataclass(frozen=True)
@@ -108,4 +117,4 @@ class FreezeLights:
     frozen: bool
 
 
-Command = Spawn | Remove | Drive | Walk | Place | Push | Simulate | SetLight | FreezeLights
+Command = Spawn | Remove | Drive | Grip | Walk | Place | Push | Simulate | SetLight | FreezeLights

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, shorten
 from flcav.world import commands
-from flcav.world.actors import NOBODY, Actors, join_actors
+from flcav.world.actors import NOBODY, Actors, join_actors, pick_actors
 from flcav.world.commands import Command, Controls
 from flcav.world.dynamics.blueprints import VEHICLES, blueprint
 from flcav.world.dynamics.bodies import Bodies, Body
@@ -31,7 +31,7 @@ from flcav.world.traffic.live import WARM_UP_S, SumoTraffic, stand_parked
 
 Array = NDArray[np.float64]
 
-SUBSTEP_S = 0.05  # longest step of the vehicle model: nobody passes through a box in it
+SUBSTEP_S, SUBSTEP_M = 0.05, 2.0  # longest step and way of the vehicle model: nobody passes through a box in it
 LONGEST_S = 10.0  # of a step
 NEAR_M = 2.0  # obstacles so far from a body are looked at
 RESERVED = ("veh", "ped", "parked")  # begin the names of other actors
@@ -52,6 +52,7 @@ class Settings:
     pedestrians: int = 0  # of SUMO
     parked: bool = True  # with the vehicles parked along the streets
     dt_s: float = 0.05  # length of a step
+    leans: bool = False  # cars under control pitch and roll on their springs
     remembers: bool = True  # keeps its history, which grows by every step and command
 
 
@@ -89,7 +90,7 @@ class LiveWorld:
         self.settings = settings
         self.history: list[Command | Step] = []
         self.lights = Lights(read_light_programs(town.net), WARM_UP_S)
-        self.bodies = Bodies(ground := Ground(town))
+        self.bodies = Bodies(ground := Ground(town), leans=settings.leans)
         self._ground = ground
         self._parked = stand_parked(town, ground, settings.seed) if settings.parked else NOBODY
         self._obstacles = list_obstacles(town, self._parked)
@@ -138,7 +139,8 @@ class LiveWorld:
         self._note(Step(dt_s))
         begins, velocity = self._time_s, self.bodies.velocity.copy()
         found: dict[tuple[str, str], Collision] = {}
-        parts = math.ceil(dt_s / SUBSTEP_S - 1e-9)
+        fastest = float(np.abs(velocity).max(initial=0.0))
+        parts = math.ceil(max(dt_s / SUBSTEP_S, dt_s * fastest / SUBSTEP_M) - 1e-9)
         for part in range(1, parts + 1):
             self._time_s = round(begins + dt_s * part / parts, 9)
             self.lights.advance(dt_s / parts)
@@ -166,6 +168,11 @@ class LiveWorld:
                 _check_numbers(controls.throttle, controls.steer, controls.brake)
                 _check_category(body := bodies.find(name), VEHICLES, "vehicle")
                 body.controls = controls
+            case commands.Grip(name, share):
+                if not 0 <= share <= 1:
+                    raise InputError(f"share = {share}: must be within 0 and 1")
+                _check_category(body := bodies.find(name), VEHICLES, "vehicle")
+                body.grip = share
             case commands.Walk(name, velocity):
                 _check_numbers(*velocity)
                 _check_category(body := bodies.find(name), ("pedestrian",), "walker")
@@ -176,11 +183,12 @@ class LiveWorld:
             case commands.Push(name, velocity, yaw_rate):
                 row = bodies.row(name)
                 _check_numbers(*velocity, yaw_rate or 0.0)
-                bodies.velocity[row] = velocity
+                bodies.push(row, velocity)
                 bodies.yaw_rate[row] = bodies.yaw_rate[row] if yaw_rate is None else yaw_rate
             case commands.Simulate(name, physics, gravity):
                 body = bodies.find(name)
                 body.physics, body.gravity = physics, gravity
+                bodies.land(bodies.row(name))
             case commands.SetLight(junction, state):
                 self.lights.set(junction, state)
             case commands.FreezeLights(frozen):
@@ -221,7 +229,8 @@ class LiveWorld:
         if self._traffic is None:
             return
         while self._traffic.ticks * STEP_S < self._time_s - 1e-6:
-            self._traffic.advance(self.bodies.actors(), self.lights.states(), sorted(self._hit))
+            grounded = pick_actors(self.bodies.actors(), self.bodies.find_grounded())
+            self._traffic.advance(grounded, self.lights.states(), sorted(self._hit))
             self._hit.clear()
         self._flow = self._traffic.at(self._time_s)
 
@@ -241,9 +250,10 @@ class LiveWorld:
         velocity[flow], yaw_rate[flow] = self._flow.velocity[:, :2], self._flow.yaw_rate
         start = np.concatenate((before, boxes.place[count:]))
         place, velocity, yaw_rate, contacts = resolve(boxes, start, velocity, yaw_rate, mass, inertia)
+        bodies.fall(velocity[:count] - now.velocity[:, :2])
         bodies.position[:, :2], bodies.yaw = place[:count, :2], place[:count, 2]
         bodies.velocity[:, :2], bodies.yaw_rate = velocity[:count], yaw_rate[:count]
-        bodies.settle()
+        bodies.settle(dt_s)
         self._report(contacts, names, found)
         self._hit.update(names[row] for row in contacts.second.tolist() if flow.start <= row < flow.stop)
 

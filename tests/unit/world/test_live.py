@@ -128,6 +128,57 @@ def test_a_car_pushes_another_one(road: LiveWorld):
     assert 2 < speed(road.snapshot, "other") < 6
 
 
+@pytest.mark.parametrize("speed_mps", [5.0, 20.0, 25.0, 50.0, 90.0])
+@pytest.mark.parametrize("aside", [0.0, 1.0])
+def test_fast_cars_do_not_pass_through_each_other(speed_mps: float, aside: float, road: LiveWorld):
+    """Of equal cars that meet head-on the impulse is mass times speed, and a tenth of the speed is left."""
+    gap = 30.0
+    for name, x, y, yaw, way in (("a", 0.0, 0.0, 0.0, 1.0), ("b", gap, aside, np.pi, -1.0)):
+        road.apply(Spawn(name, "car", 3, x, y, yaw, anywhere=True))
+        road.apply(Push(name, (way * speed_mps, 0.0, 0.0)))
+    mass = road.bodies.find("a").blueprint.mass_kg
+    impulse = 0.0
+    for _ in range(int(gap / 2 / speed_mps / 0.05) + 4):
+        snapshot = road.step()
+        impulse += sum(abs(each.impulse[0]) for each in snapshot.collisions)
+    assert place(snapshot, "a")[0] < place(snapshot, "b")[0]
+    met = speed_mps - 0.5 * gap / speed_mps * 0.3  # about; less by drag and rolling
+    if aside == 0:
+        assert impulse == pytest.approx(1.1 * mass * met, rel=0.2)
+        assert speed(snapshot, "a") < 0.2 * speed_mps
+    assert impulse > 0.4 * mass * speed_mps  # they turn where they do not meet in the middle
+
+
+def test_a_car_drives_over_what_is_low(road: LiveWorld):
+    for name, height, stops in (("debris", 0.1, False), ("block", 0.3, True)):
+        road.apply(Spawn(name, "prop", 6, 15.0, 0.0, 0.0, 0.0, (1.6, 1.2, height), anywhere=True))
+        road.apply(Spawn("ego", "car", 3, 0.0, 0.0))
+        road.apply(Push("ego", (10.0, 0.0, 0.0)))
+        snapshot = run(road, 40, Controls(throttle=0.5))
+        assert (place(snapshot, "ego")[0] < 15.0) == stops
+        for each in ("ego", name):
+            road.apply(Remove(each))
+
+
+def test_a_walker_who_is_hit_falls_and_slides_to_rest(road: LiveWorld):
+    road.apply(Spawn("ego", "car", 3, 0.0, 0.0))
+    road.apply(Spawn("walker", "pedestrian", 0, 8.0, 0.0))
+    road.apply(Push("ego", (15.0, 0.0, 0.0)))
+    hit = next(snapshot for snapshot in (road.step() for _ in range(20)) if snapshot.collisions)
+    road.apply(Remove("ego"))
+    thrown, begun = speed(hit, "walker"), place(hit, "walker")[0]
+    assert 10.0 < thrown < 20.0
+    snapshot = run(road, 100)
+    row = snapshot.row("walker")
+    assert speed(snapshot, "walker") == 0.0
+    assert place(snapshot, "walker")[0] - begun == pytest.approx(thrown**2 / 2 / (0.7 * 9.81), rel=0.1)
+    assert snapshot.trace.tilts(0)[row] == pytest.approx((np.pi / 2, 0.0))
+    assert snapshot.trace.yaw[0, row] == pytest.approx(0.0, abs=0.1)
+    assert snapshot.trace.position[0, row, 2] == pytest.approx(snapshot.trace.size[row, 0] / 2)
+    road.apply(Place("walker", 30.0, 0.0, 0.0))
+    assert not run(road, 2).trace.tilts(0)[0].any()
+
+
 def test_walkers_walk_and_turn(road: LiveWorld):
     road.apply(Spawn("walker", "pedestrian", 0, 0.0, 5.0))
     road.apply(Walk("walker", (0.0, 1.5)))
@@ -254,6 +305,31 @@ def test_a_vehicle_stands_on_slopes():
         rise = (town.ground(steep + 1.4, 0) - town.ground(steep - 1.4, 0)) / 2.8
         assert trace.tilt[0, 0, 0] == pytest.approx(-rise, abs=0.01)
         assert abs(trace.tilt[0, 0, 0]) > 0.02
+
+
+def test_who_is_placed_above_the_ground_falls_and_who_is_below_it_stays(road: LiveWorld):
+    for name, z in {"up": 50.0, "under": -500.0, "low": 2.0}.items():
+        road.apply(Spawn(name, "car", 0, 0.0, 0.0, 0.0, z))
+    assert road.bodies.find_grounded().tolist() == [False, False, True]  # whom traffic sees
+    snapshot = run(road, 40)
+    fallen = 9.81 * 2.0**2 / 2
+    assert abs(place(snapshot, "up")[2] - (50.0 - fallen)) < 0.05 * 9.81 * 2.0  # a step's worth of speed
+    assert place(snapshot, "under")[2] == -500.0
+    assert place(snapshot, "low")[2] == 0.0
+    road.apply(Remove("low"))
+    snapshot = run(road, 40)
+    assert place(snapshot, "up")[2] == 0.0
+    assert not snapshot.trace.velocity[0, snapshot.row("up")].any()
+
+
+def test_a_hidden_puppet_comes_back_when_it_is_placed_on_the_road(road: LiveWorld):
+    road.apply(Spawn("ego", "car", 0, 0.0, 0.0, 0.0, -500.0))
+    road.apply(Simulate("ego", physics=False))
+    assert place(run(road, 5), "ego")[2] == -500.0
+    road.apply(Simulate("ego"))
+    assert place(run(road, 5), "ego")[2] == -500.0
+    road.apply(Place("ego", 10.0, 0.0, 0.0, 0.3))
+    assert speed(run(road, 20, Controls(throttle=1.0)), "ego") > 3.0
 
 
 def test_a_world_may_have_no_history(small_town: Callable[..., Town]):

@@ -6,17 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError, shorten
-from flcav.geometry import heading_vectors, wrap_angle
+from flcav.geometry import heading_vectors, left_vectors, wrap_angle
 from flcav.world.actors import Actors
 from flcav.world.commands import Controls
 from flcav.world.dynamics.blueprints import VEHICLES, Blueprint
 from flcav.world.dynamics.standing import Ground
-from flcav.world.dynamics.vehicle import Motion, Pedals, Vehicles, drive, stack_blueprints
+from flcav.world.dynamics.vehicle import GRAVITY_MPS2, Motion, Pedals, Vehicles, drive, stack_blueprints
 
 Array = NDArray[np.float64]
 
 AT_REST = Controls()
+ON_SPRINGS = ("car", "van", "truck", "bus")
+ALOFT_M = 3.0  # who is placed so far above the ground falls, and who is so far below it stays there
+LAUNCH_MPS = 1.0  # who is pushed up by more than it climbs, and by so much, leaves the ground
+PITCH_S2PM, ROLL_S2PM = 0.004, 0.007  # rad by which cars lean on their springs, for each m/s^2 ahead and aside
+FALL_MPS = 3.0  # change of velocity by a hit that nobody stands
+SLIDE_MPS2 = 0.7 * GRAVITY_MPS2  # deceleration of who lies on the road
+MOST_LEAN_MPS2 = 10.0  # accelerations beyond are those of collisions
 WALK_MPS2 = 10.0  # by which walkers change their velocity, also after they were hit
+
+
+STATE = ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "tilt", "aloft")  # arrays of `Bodies`
 
 
 @dataclass
@@ -29,6 +39,8 @@ class Body:
     walk: tuple[float, float] = (0.0, 0.0)  # wanted velocity [m/s]
     physics: bool = True
     gravity: bool = True
+    fallen: bool = False  # of a walker who was hit
+    grip: float = 1.0  # share of the friction of a dry road
 
     @property
     def category(self) -> str:
@@ -39,13 +51,15 @@ class Body:
 class Bodies:
     """N bodies and their motion."""
 
-    def __init__(self, ground: Ground) -> None:
-        """Start without any, on this ground."""
+    def __init__(self, ground: Ground, *, leans: bool = False) -> None:
+        """Start without any, on this ground; `leans`: cars are seen to lean on their springs."""
+        self._leans = leans
         self.members: list[Body] = []
         self.position, self.velocity, self.acceleration = (np.zeros((0, 3)) for _ in range(3))
         self.yaw, self.yaw_rate, self.steer = (np.zeros(0) for _ in range(3))
         self.tilt = np.zeros((0, 2))
         self.size = np.zeros((0, 3))
+        self.aloft = np.zeros(0, np.bool_)  # who has physics and gravity, and yet does not stand on the ground
         self._vehicles: Vehicles = stack_blueprints([])
         self._ground = ground
 
@@ -63,46 +77,87 @@ class Bodies:
     def add(self, body: Body, x: float, y: float, yaw: float, z: float | None) -> None:
         """Add a body at rest."""
         self.members.append(body)
-        for name in ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "tilt"):
+        for name in STATE:
             array = getattr(self, name)
-            setattr(self, name, np.concatenate((array, np.zeros((1, *array.shape[1:])))))
+            setattr(self, name, np.concatenate((array, np.zeros((1, *array.shape[1:]), array.dtype))))
         self._recast()
         self.place(len(self.members) - 1, x, y, yaw, z)
 
     def remove(self, row: int) -> None:
         """Remove a body."""
         del self.members[row]
-        for name in ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "tilt"):
+        for name in STATE:
             setattr(self, name, np.delete(getattr(self, name), row, axis=0))
         self._recast()
 
     def place(
         self, row: int, x: float, y: float, yaw: float, z: float | None, pitch: float = 0.0, roll: float = 0.0
     ) -> None:
-        """Move a body to another pose; with physics and gravity it stands on the ground there."""
+        """Move a body to another pose; with physics and gravity it stands on the ground there, if that is near."""
         self.position[row] = x, y, np.nan if z is None else z
         self.yaw[row] = wrap_angle(yaw)
         self.tilt[row] = pitch, roll
-        body = self.members[row]
-        if z is None or (body.physics and body.gravity):
+        self.aloft[row] = self.members[row].fallen = False
+        if z is None:
             self._stand(np.array([row]))
+        else:
+            self.land(row)
+
+    def land(self, row: int) -> None:
+        """Let a body with physics and gravity stand on the ground, unless that is too far from it."""
+        body = self.members[row]
+        if body.physics and body.gravity:
+            self.aloft[row] = abs(self._clearance(np.array([row]))[0]) > ALOFT_M
+            if not self.aloft[row]:
+                self._stand(np.array([row]))
+
+    def push(self, row: int, velocity: tuple[float, float, float]) -> None:
+        """Give a body another velocity [m/s]: one that is pushed up leaves the ground, and none goes into it."""
+        self.velocity[row] = velocity
+        body = self.members[row]
+        if body.physics and body.gravity and not self.aloft[row]:
+            climb = self._climb(np.array([row]))[0]
+            self.aloft[row] = velocity[2] > climb + LAUNCH_MPS
+            if not self.aloft[row]:
+                self.velocity[row, 2] = climb
+
+    def _climb(self, rows: NDArray[np.int64]) -> Array:
+        """Return the vertical velocities [m/s] by which bodies stay on the slopes that they move on."""
+        ahead = (self.velocity[rows, :2] * heading_vectors(self.yaw[rows])).sum(axis=1)
+        return -ahead * np.tan(self.tilt[rows, 0])
 
     def move(self, dt_s: float) -> None:
         """Move all with physics by `dt_s` [s], as if nothing were in their way."""
-        drives = [body.physics and body.category in VEHICLES for body in self.members]
+        on = np.array([body.physics for body in self.members], np.bool_)
+        flies = on & self.aloft
+        self.position[flies] += self.velocity[flies] * dt_s
+        on &= ~self.aloft
+        drives = on & [body.category in VEHICLES for body in self.members]
         if len(rows := np.flatnonzero(drives)):
             self._drive(rows, dt_s)
-        walks = [body.physics and body.category == "pedestrian" for body in self.members]
+        walks = on & [body.category == "pedestrian" for body in self.members]
         if len(rows := np.flatnonzero(walks)):
             self._walk(rows, dt_s)
 
-    def settle(self) -> None:
-        """Let all with physics stand on the ground where they are; they climb with its slope."""
-        stands = np.array([body.physics and body.gravity for body in self.members], np.bool_)
-        if len(rows := np.flatnonzero(stands)):
+    def fall(self, change: Array) -> None:
+        """Let walkers fall whose velocity contacts `change` (N, 2) [m/s] much, in the direction of the hit."""
+        for row in np.flatnonzero(np.linalg.norm(change, axis=1) > FALL_MPS).tolist():
+            body = self.members[row]
+            if body.category == "pedestrian" and body.physics and not body.fallen:
+                body.fallen = True
+                self.yaw[row] = np.arctan2(change[row, 1], change[row, 0])
+
+    def settle(self, dt_s: float) -> None:
+        """Let all with physics stand on the ground where they are, climbing with its slope, or fall for `dt_s` [s]."""
+        heavy = np.array([body.physics and body.gravity for body in self.members], np.bool_)
+        if len(rows := np.flatnonzero(heavy & self.aloft)):
+            clearance = self._clearance(rows)
+            self.velocity[rows, 2] -= GRAVITY_MPS2 * dt_s
+            self.velocity[rows[clearance < -ALOFT_M]] = 0.0
+            self.aloft[rows] = (clearance > 0) | (clearance < -ALOFT_M)
+        if len(rows := np.flatnonzero(heavy & ~self.aloft)):
             self._stand(rows)
-            ahead = (self.velocity[rows, :2] * heading_vectors(self.yaw[rows])).sum(axis=1)
-            self.velocity[rows, 2] = -ahead * np.tan(self.tilt[rows, 0])
+            self.velocity[rows, 2] = self._climb(rows)
 
     def weights(self) -> tuple[Array, Array]:
         """Return the masses (N,) [kg] and moments of inertia (N,) [kg m^2], infinite for what nothing moves."""
@@ -112,6 +167,15 @@ class Bodies:
         inertia = np.array([body.blueprint.inertia_kgm2 for body in self.members])
         return mass, np.where(held | upright, np.inf, inertia)
 
+    def find_grounded(self) -> NDArray[np.bool_]:
+        """Return who is near the ground (N,): others are in nobody's way there."""
+        return np.abs(self._clearance(np.arange(len(self.members)))) <= ALOFT_M
+
+    def _clearance(self, rows: NDArray[np.int64]) -> Array:
+        """Return the height of bodies above the ground, or a bridge, [m]."""
+        x, y, z = self.position[rows].T
+        return z - self._ground.heights(x, y, z)
+
     def actors(self) -> Actors:
         """Return the bodies as they are now."""
         return Actors(
@@ -119,13 +183,30 @@ class Bodies:
             category=tuple(body.category for body in self.members),
             shape=np.array([body.blueprint.shape for body in self.members], np.int64),
             size=self.size,
-            position=self.position.copy(),
+            position=self.position + np.where(self._lie()[:, None], self.size[:, :1] / 2 * (0.0, 0.0, 1.0), 0.0),
             yaw=self.yaw.copy(),
             velocity=self.velocity.copy(),
             acceleration=self.acceleration.copy(),
             yaw_rate=self.yaw_rate.copy(),
-            tilt=self.tilt.copy(),
+            tilt=self.tilt + self._find_lean(),
         )
+
+    def _find_lean(self) -> Array:
+        """Return further pitch and roll (N, 2) [rad]: of who lies, the head ahead, and of cars on their springs.
+
+        These go down ahead when they brake, and outwards in a curve.
+        """
+        lie = np.column_stack((np.pi / 2 * self._lie(), np.zeros(len(self.members))))
+        if not self._leans:
+            return lie
+        cars = np.array([body.physics and body.category in ON_SPRINGS for body in self.members], np.bool_)
+        felt = np.clip(self.acceleration[:, :2], -MOST_LEAN_MPS2, MOST_LEAN_MPS2)
+        ahead, aside = ((felt * axis(self.yaw)).sum(axis=1) for axis in (heading_vectors, left_vectors))
+        leans = np.column_stack((-PITCH_S2PM * ahead, ROLL_S2PM * aside))
+        return lie + np.where((cars & ~self.aloft)[:, None], leans, 0.0)
+
+    def _lie(self) -> NDArray[np.bool_]:
+        return np.array([body.fallen for body in self.members], np.bool_)
 
     def _recast(self) -> None:
         self._vehicles = stack_blueprints([body.blueprint for body in self.members])
@@ -144,17 +225,21 @@ class Bodies:
             self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2], self.yaw_rate[rows], self.steer[rows]
         )
         vehicles = Vehicles(*(values[rows] for values in self._vehicles))
+        grip = np.array([self.members[row].grip for row in rows])
+        vehicles = vehicles._replace(grip_mps2=grip * vehicles.grip_mps2, spin_mps2=grip * vehicles.spin_mps2)
         after = drive(motion, vehicles, pedals, self.tilt[rows, 0], dt_s)
         self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2] = after.position, after.yaw, after.velocity
         self.yaw_rate[rows], self.steer[rows] = after.yaw_rate, after.steer
 
     def _walk(self, rows: NDArray[np.int64], dt_s: float) -> None:
-        wanted = np.array([self.members[row].walk for row in rows])
+        fallen = np.array([self.members[row].fallen for row in rows], np.bool_)
+        wanted = np.where(fallen[:, None], 0.0, np.array([self.members[row].walk for row in rows]))
+        able = np.where(fallen, SLIDE_MPS2, WALK_MPS2)[:, None]
         yaw = np.where(wanted.any(axis=1), np.arctan2(wanted[:, 1], wanted[:, 0]), self.yaw[rows])
         self.yaw_rate[rows] = wrap_angle(yaw - self.yaw[rows]) / dt_s
         change = wanted - self.velocity[rows, :2]
         needed = np.linalg.norm(change, axis=1, keepdims=True)
-        velocity = self.velocity[rows, :2] + change * np.minimum(1.0, WALK_MPS2 * dt_s / np.maximum(needed, 1e-12))
+        velocity = self.velocity[rows, :2] + change * np.minimum(1.0, able * dt_s / np.maximum(needed, 1e-12))
         self.position[rows, :2] += velocity * dt_s
         self.velocity[rows, :2], self.yaw[rows] = velocity, yaw
 

@@ -16,6 +16,7 @@ from flcav.world.meshes.furniture import MAST_BEHIND_M
 Array = NDArray[np.float64]
 
 LAMP_M, POST_M, MAST_M = 0.08, 0.05, 0.09  # radius of the posts of lamps, of signs and signals, and of sensors
+CLEARANCE_M = 0.15  # what is lower, such as debris, is in nobody's way
 BELOW_M = 1.0  # obstacles reach so far below the ground at their middle, since it may slope
 
 
@@ -50,9 +51,10 @@ def list_obstacles(town: Town, parked: Actors = NOBODY) -> Obstacles:
 
 
 def outline(actors: Actors) -> Footprints:
-    """Return the boxes of actors, upright."""
+    """Return the boxes of actors, upright; those who move begin above what they drive or step over."""
     z = actors.position[:, 2]
-    return Footprints(actors.places, actors.size[:, :2] / 2, np.column_stack((z, z + actors.size[:, 2])))
+    clear = np.where(np.array(actors.category, np.str_) == "prop", 0.0, CLEARANCE_M)
+    return Footprints(actors.places, actors.size[:, :2] / 2, np.column_stack((z + clear, z + actors.size[:, 2])))
 
 
 def join_footprints(*parts: Footprints) -> Footprints:

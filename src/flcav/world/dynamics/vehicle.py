@@ -47,6 +47,7 @@ class Vehicles(NamedTuple):
     brake_mps2: Array
     wheelbase_m: Array
     steer_limit_rad: Array
+    grip_mps2: Array  # (N,) greatest change of the velocity by the tyres
     spin_mps2: Array  # (N,) greatest change of the yaw rate by the tyres [rad/s^2]
 
 
@@ -66,6 +67,7 @@ def stack_blueprints(blueprints: list[Blueprint]) -> Vehicles:
         (
             *(each.mass_kg, each.engine_n, each.power_w, each.drag_area_m2),
             *(each.brake_mps2, each.wheelbase_m, each.steer_limit_rad),
+            GRIP_MPS2,
             GRIP_MPS2 * each.wheelbase_m / 2 * each.mass_kg / each.inertia_kgm2,
         )
         for each in blueprints
@@ -80,7 +82,7 @@ def drive(motion: Motion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s
     wanted = np.clip(pedals.steer, -1, 1) * vehicles.steer_limit_rad
     steer = motion.steer + np.clip(wanted - motion.steer, -STEER_RADPS * dt_s, STEER_RADPS * dt_s)
     speed = _accelerate(speed, vehicles, pedals, pitch, dt_s)
-    limit = GRIP_MPS2 / np.maximum(np.abs(speed), 1e-3)
+    limit = vehicles.grip_mps2 / np.maximum(np.abs(speed), 1e-3)
     turn = np.clip(speed * np.tan(steer) / vehicles.wheelbase_m, -limit, limit)
     spin = vehicles.spin_mps2 * dt_s
     yaw_rate = motion.yaw_rate + np.clip(turn - motion.yaw_rate, -spin, spin)
@@ -88,7 +90,9 @@ def drive(motion: Motion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s
     model = speed[:, None] * heading_vectors(yaw) + (turn * vehicles.wheelbase_m / 2)[:, None] * left_vectors(yaw)
     change = model - motion.velocity
     needed = np.linalg.norm(change, axis=1, keepdims=True)
-    velocity = motion.velocity + change * np.minimum(1.0, GRIP_MPS2 * dt_s / np.maximum(needed, 1e-12))
+    velocity = motion.velocity + change * np.minimum(
+        1.0, vehicles.grip_mps2[:, None] * dt_s / np.maximum(needed, 1e-12)
+    )
     position = motion.position + (motion.velocity + velocity) / 2 * dt_s
     return Motion(position, wrap_angle(yaw), velocity, yaw_rate, steer)
 
@@ -100,5 +104,5 @@ def _accelerate(speed: Array, vehicles: Vehicles, pedals: Pedals, pitch: Array, 
     drag = AIR_KGPM3 / 2 * vehicles.drag_area_m2 * speed * np.abs(speed)
     pulled = speed + ((force - drag) / vehicles.mass_kg + GRAVITY_MPS2 * np.sin(pitch)) * dt_s
     hold = np.clip(pedals.brake, 0, 1) * vehicles.brake_mps2 + pedals.hand_brake * HAND_BRAKE_MPS2 + ROLLING_MPS2
-    hold = np.minimum(hold, GRIP_MPS2)
+    hold = np.minimum(hold, vehicles.grip_mps2)
     return np.sign(pulled) * np.maximum(np.abs(pulled) - hold * dt_s, 0.0)

@@ -1,13 +1,12 @@
 """Calls without a network: what is refused, in which words, and the same images from the same seed."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
+from carla_calls import describe, invoke, place
 
 from flcav.config import InputError
-from flcav.sources.carla.server import calls as carla_calls
 from flcav.sources.carla.server import catalogue, wire
 from flcav.sources.carla.server.blueprints import Refused, check, list_blueprints
 from flcav.sources.carla.server.calls import Calls
@@ -16,12 +15,6 @@ from flcav.sources.carla.server.maps import Maps
 from flcav.sources.carla.server.sensing.table import KINDS, Clock
 from flcav.sources.carla.server.weather import to_weather
 from flcav.world.shapes import SHAPES
-
-
-def invoke(calls: Calls, name: str, arguments: tuple[Any, ...]) -> Any:
-    """Return what a call answers, of the type that the test expects."""
-    return carla_calls.invoke(calls, name, arguments)
-
 
 CAMERA = (("image_size_x", "64"), ("image_size_y", "48"))
 
@@ -38,16 +31,6 @@ def calls(maps):
     made.episode.close()
 
 
-def describe(name, *attributes):
-    known = list_blueprints()[name].definition
-    return [known.uid, name, [[key, 4, value] for key, value in attributes]]
-
-
-def place(calls, number=0, ahead=0.0):
-    location, rotation = calls.episode.served.spawn_points[number]
-    return [[location[0] + ahead, *location[1:]], list(rotation)]
-
-
 def test_all_blueprints_of_sensors_are_served_or_refused_by_name(calls):
     for name in (*catalogue.SENSORS, *catalogue.NOT_SERVED):
         spawn = (describe(name), [[0.0, 0.0, 10.0], [0.0, 0.0, 0.0]])
@@ -56,6 +39,64 @@ def test_all_blueprints_of_sensors_are_served_or_refused_by_name(calls):
         else:
             with pytest.raises(Refused, match=f"{name} is not served"):
                 invoke(calls, "spawn_actor", spawn)
+
+
+@pytest.mark.parametrize("kind", ["walker.pedestrian.0001", "vehicle.audi.tt", "static.prop.barrel"])
+@pytest.mark.parametrize("height", [-500.0, -50.0, 50.0, 100.0])
+def test_far_above_and_below_an_actor_there_is_room(height, kind, calls):
+    here = place(calls)
+    invoke(calls, "spawn_actor", (describe("vehicle.tesla.model3"), here))
+    with pytest.raises(Refused, match="because of collision"):
+        invoke(calls, "spawn_actor", (describe(kind), here))
+    here[0][2] += height
+    number = invoke(calls, "spawn_actor", (describe(kind), here)).id
+    assert calls.episode.find(number).transform.location[2] == pytest.approx(here[0][2], abs=1e-6)
+    for _ in range(2):
+        calls.episode.step(0.05)
+    fallen = here[0][2] - calls.episode.find(number).transform.location[2]
+    assert fallen == pytest.approx(0.0 if height < 0 else 9.81 * 0.1**2 / 2, abs=0.03)
+
+
+def test_blueprints_that_scripts_ask_for_by_name(calls):
+    """Those of CARLA 0.9.16's documentation; what one does not do is refused when it is used."""
+    props = (
+        "dirtdebris01 dirtdebris02 dirtdebris03 mesh gnome table trashbag streetsign atm haybale foodcart calibrator"
+    )
+    known = list_blueprints()
+    for name in (*(f"static.prop.{prop}" for prop in props.split()), "walker.pedestrian.0052", "util.actor.empty"):
+        here = [[0.0, 0.0, 30.0], [0.0, 0.0, 0.0]]
+        if name == "static.prop.mesh":
+            with pytest.raises(Refused, match=r"static\.prop\.mesh is not served here$"):
+                invoke(calls, "spawn_actor", (describe(name), here))
+        else:
+            invoke(calls, "destroy_actor", (invoke(calls, "spawn_actor", (describe(name), here)).id,))
+    for name in ("sensor.other.v2x", "sensor.other.v2x_custom"):
+        assert {"path_loss_model", "scenario", "transmit_power"} <= {
+            each.id for each in known[name].definition.attributes
+        }
+    assert {"gen_cam_min", "noise_head_bias"} <= known["sensor.other.v2x"].fields.keys()
+
+
+@pytest.mark.parametrize(("friction", "share"), [("0.05", 0.05), ("0.0", 0.0), ("3.5", None)])
+def test_tyres_hold_by_the_friction_of_the_box_that_they_are_in(friction, share, calls):
+    car = invoke(calls, "spawn_actor", (describe("vehicle.tesla.model3"), place(calls))).id
+    calls.episode.step(0.05)
+    here = [list(part) for part in calls.episode.find(car).transform]
+    extents = [(f"extent_{axis}", "5000") for axis in "xyz"]  # 50 m to all sides
+    box = invoke(calls, "spawn_actor", (describe("static.trigger.friction", ("friction", friction), *extents), here)).id
+    ahead = np.array(calls.episode.find(car).pose[:3, 0]) * (1, -1, 1)  # CARLA's y points the other way
+    invoke(calls, "set_actor_target_velocity", (car, (15.0 * ahead).tolist()))
+    brake = [0.0, 0.0, 1.0, False, False, False, 0]
+    invoke(calls, "apply_control_to_vehicle", (car, brake))
+    for _ in range(10):
+        calls.episode.step(0.05)
+    lost = 15.0 - np.linalg.norm(calls.episode.find(car).motion[0])
+    assert lost == pytest.approx(0.5 * (8.0 if share is None else share * 0.9 * 9.81), abs=0.2)
+    invoke(calls, "destroy_actor", (box,))
+    before = np.linalg.norm(calls.episode.find(car).motion[0])
+    for _ in range(10):
+        calls.episode.step(0.05)
+    assert before - np.linalg.norm(calls.episode.find(car).motion[0]) == pytest.approx(0.5 * 8.0, abs=0.2)
 
 
 def test_bodies_of_blueprints_are_shapes_of_the_town():

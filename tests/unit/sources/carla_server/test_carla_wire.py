@@ -1,6 +1,7 @@
 """The wire format: golden bytes of every message, and arguments that are refused."""
 
 import struct
+import tracemalloc
 from typing import Any
 
 import msgpack
@@ -122,11 +123,35 @@ def test_other_messages_are_no_calls(message):
         wire.read_call(message)
 
 
-def test_a_call_of_very_many_arrays_is_refused():
+@pytest.mark.parametrize(
+    ("message", "told"),
+    [
+        (
+            b"\x92" + 2 * (b"\xdd" + struct.pack(">I", wire.MOST_ARRAYS // 2) + b"\x90" * (wire.MOST_ARRAYS // 2)),
+            "arrays",
+        ),
+        (b"\xdd" + struct.pack(">I", wire.MOST_ARRAYS + 1) + b"\xc0" * (wire.MOST_ARRAYS + 1), "max_array_len"),
+    ],
+)
+def test_a_call_of_very_many_values_is_refused(message, told):
     unpacker = wire.Unpacker()
-    unpacker.feed(b"\x91" + b"\xdd" + struct.pack(">I", wire.MOST_ARRAYS + 1) + b"\x90" * (wire.MOST_ARRAYS + 1))
-    with pytest.raises(wire.WireError, match="arrays"):
+    unpacker.feed(message)
+    with pytest.raises(ValueError, match=told):
         next(unpacker)
+
+
+def test_of_an_unfinished_call_only_its_bytes_are_kept():
+    """A million empty values would be a list of eight times as many bytes, or of more where they are texts."""
+    unpacker = wire.Unpacker()
+    begun = b"\x94\x00\x01\xa7version\xdd" + struct.pack(">I", 2_000_000)
+    tracemalloc.start()
+    for part in (begun, *[b"\xa2ab" * 10_000] * 100):
+        unpacker.feed(part)
+        assert list(unpacker) == []
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert unpacker.waiting == len(begun) + 3_000_000
+    assert held < 1.5 * unpacker.waiting + 1_000_000
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 NOTHING = (0.0, 0.0, 0.0)
 STILL = (NOTHING, NOTHING, NOTHING)
+FIRST_LIMIT_KMH = 30.0  # CARLA's speed limit of a vehicle that has passed no sign
 STANDING, WAITING = wire.VehicleControl(), wire.WalkerControl()
 
 
@@ -55,6 +56,9 @@ class Actor:
     control: wire.VehicleControl = STANDING
     walk: wire.WalkerControl = WAITING
     ackermann: wire.AckermannControl | None = None
+    sticky: bool = True  # keeps its control; else it has one for a tick alone
+    told: bool = False  # has got a control since the last tick
+    limit_kmh: float = FIRST_LIMIT_KMH  # of speed, by the last sign that it passed
     lamps: int = 0  # flags of a vehicle's lamps
     simulated: bool = True
     falling: bool = True
@@ -96,10 +100,11 @@ class Actor:
 
     def take(self, place: Place) -> None:
         """Take a place; the origin of a walker is its middle, `lift` above its feet."""
-        x, y, z = place.location
         self.pose, self.motion = place.pose, place.motion
-        self.pose[2, 3] += self.lift
-        self.transform = Transform((x, y, z + self.lift), place.rotation)
+        raised = self.lift * self.pose[:3, 2]
+        self.pose[:3, 3] += raised
+        (x, y, z), (dx, dy, dz) = place.location, mirror(raised).tolist()
+        self.transform = Transform((x + dx, y + dy, z + dz), place.rotation)
 
 
 def list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]:

@@ -12,6 +12,7 @@ from flcav.world.map.parameters import CLUTTER
 from flcav.world.shapes import SHAPES
 
 COLOURS = ("17,37,103", "107,18,14", "180,180,180", "25,25,25", "230,230,230")
+TRUE = ("true", "1")
 GAMMA = 2.2  # of sRGB, about
 LARGEST_INT = 2**31
 
@@ -64,7 +65,7 @@ def list_blueprints() -> dict[str, Blueprint]:
             size=_full(catalogue.WALKER_SIZES[kind]),
         )
     add("controller.ai.walker", [_free("role_name", STRING, "default")])
-    for name, fields in (catalogue.SENSORS | catalogue.NOT_SERVED).items():
+    for name, fields in (catalogue.SENSORS | catalogue.OTHERS | catalogue.NOT_SERVED).items():
         told = [_free("role_name", STRING, "front"), _free("ros_name", STRING, name)]
         add(name, [*(_free(key, field.type, field.default) for key, field in fields.items()), *told], fields)
     clutter = list(CLUTTER)
@@ -81,7 +82,8 @@ def check(description: wire.Description) -> tuple[Blueprint, wire.Description]:
     if blueprint is None:
         raise Refused(f"no blueprint {shorten(description.id)}{suggest(description.id, known)}")
     if description.id in catalogue.NOT_SERVED:
-        raise Refused(f"{description.id} is not served here; sensors are {', '.join(catalogue.SENSORS)}")
+        served = f"; sensors are {', '.join(catalogue.SENSORS)}" if blueprint.kind == "sensor" else ""
+        raise Refused(f"{description.id} is not served here{served}")
     given = {attribute.id: attribute for attribute in description.attributes}
     whole = []
     for variation in blueprint.definition.attributes:
@@ -103,7 +105,7 @@ def _check_value(name: str, variation: wire.Variation, field: Field | None, valu
             raise Refused(f"{name}: attribute '{variation.id}' = {value} is not within {low:g} and {high:g}")
     elif variation.type == COLOUR and not _is_colour(value):
         raise Refused(f"{name}: attribute '{variation.id}' = {shorten(value)} is no colour, such as 255,0,0")
-    elif variation.type == BOOL and value.lower() not in ("true", "false", "0", "1"):
+    elif variation.type == BOOL and value.lower() not in (*TRUE, "false", "0"):
         raise Refused(f"{name}: attribute '{variation.id}' = {shorten(value)} is neither true nor false")
 
 

@@ -34,7 +34,7 @@ class Calls:
 
     def __init__(self, maps: Maps, name: str, *, seed: int, traffic: int, port: int) -> None:
         """Load the first map; raises `InputError` where there is none of this name."""
-        self._maps, self._seed, self._traffic, self._port = maps, seed, traffic, port
+        self.maps, self._seed, self._traffic, self._port = maps, seed, traffic, port
         self._counters = Counters()
         self._managers: dict[int, tuple[str, int]] = {}  # Traffic Managers of clients, by port
         self.settings = wire.Settings()
@@ -43,7 +43,7 @@ class Calls:
         self.episode = self._start(name)
 
     def _start(self, name: str) -> Episode:
-        served = self._maps.load(name)
+        served = self.maps.load(name)
         return Episode(served, self._counters, seed=self._seed, traffic=self._traffic, port=self._port + 1)
 
     @property
@@ -103,7 +103,7 @@ class Calls:
 
     def get_available_maps(self) -> wire.Packed:
         """Return the names of the maps."""
-        return [f"/Game/Carla/Maps/{name}" for name in self._maps.names()]
+        return [f"/Game/Carla/Maps/{name}" for name in self.maps.names()]
 
     def load_new_episode(self, name: str, reset: bool, layers: int) -> None:
         """Load a map; an empty name loads the present one again."""
@@ -120,7 +120,7 @@ class Calls:
     def copy_opendrive_to_file(self, text: str, parameters: wire.Packed) -> None:
         """Take the text of a map that is to be loaded next."""
         try:
-            self._maps.receive(text)
+            self.maps.receive(text)
         except InputError as error:
             raise Refused(f"this OpenDRIVE map cannot be driven: {error}") from None
 

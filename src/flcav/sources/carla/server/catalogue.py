@@ -62,7 +62,7 @@ VEHICLES: dict[str, Body] = {
     "yamaha.yzf": Body("motorcycle", "roadster", (1.105, 0.434, 0.80)),
 }
 CHILDREN = frozenset({9, 10, 11, 12, 13, 14, 48, 49})  # numbers of walkers
-WALKERS = 51
+WALKERS = 52
 WALKER_SIZES: dict[str, tuple[float, float, float]] = {  # shape -> half extents [m]
     "tall": (0.188, 0.188, 0.93),
     "child": (0.188, 0.188, 0.65),
@@ -100,6 +100,73 @@ PROPS: dict[str, tuple[str, tuple[float, float, float]]] = {  # clutter of `worl
     "shoppingcart": ("bin", (0.45, 0.30, 0.50)),
     "creasedbox01": ("cabinet", (0.30, 0.25, 0.15)),
     "dirtdebris01": ("cabinet", (0.80, 0.60, 0.05)),
+    "atm": ("cabinet", (0.35, 0.45, 1.05)),
+    "barbeque": ("cabinet", (0.60, 0.35, 0.60)),
+    "bench03": ("planter", (0.80, 0.35, 0.45)),
+    "bike helmet": ("cabinet", (0.14, 0.11, 0.09)),
+    "bikeparking": ("rack", (1.00, 0.30, 0.45)),
+    "brokentile01": ("cabinet", (0.20, 0.20, 0.025)),
+    "brokentile02": ("cabinet", (0.20, 0.20, 0.025)),
+    "brokentile03": ("cabinet", (0.20, 0.20, 0.025)),
+    "brokentile04": ("cabinet", (0.20, 0.20, 0.025)),
+    "busstoplb": ("shelter", (2.00, 0.75, 1.15)),
+    "calibrator": ("cabinet", (0.50, 0.05, 0.50)),
+    "clothcontainer": ("container", (0.60, 0.60, 0.90)),
+    "clothesline": ("railing", (1.50, 0.40, 0.90)),
+    "colacan": ("bin", (0.04, 0.04, 0.07)),
+    "creasedbox02": ("cabinet", (0.30, 0.25, 0.15)),
+    "creasedbox03": ("cabinet", (0.30, 0.25, 0.15)),
+    "dirtdebris02": ("cabinet", (0.80, 0.60, 0.05)),
+    "dirtdebris03": ("cabinet", (0.80, 0.60, 0.05)),
+    "doghouse": ("cabinet", (0.55, 0.45, 0.45)),
+    "foodcart": ("kiosk", (1.20, 0.80, 1.10)),
+    "fountain": ("planter", (2.50, 2.50, 0.90)),
+    "garbage01": ("cabinet", (0.30, 0.30, 0.05)),
+    "garbage02": ("cabinet", (0.30, 0.30, 0.05)),
+    "garbage03": ("cabinet", (0.30, 0.30, 0.05)),
+    "garbage04": ("cabinet", (0.30, 0.30, 0.05)),
+    "garbage05": ("cabinet", (0.30, 0.30, 0.05)),
+    "garbage06": ("cabinet", (0.30, 0.30, 0.05)),
+    "gardenlamp": ("bollard", (0.10, 0.10, 0.40)),
+    "glasscontainer": ("container", (0.75, 0.75, 0.80)),
+    "gnome": ("bollard", (0.12, 0.12, 0.30)),
+    "guitarcase": ("cabinet", (0.55, 0.20, 0.12)),
+    "haybale": ("container", (0.60, 0.60, 0.60)),
+    "haybalelb": ("container", (0.60, 0.60, 0.60)),
+    "maptable": ("cabinet", (0.60, 0.30, 0.55)),
+    "mobile": ("cabinet", (0.07, 0.035, 0.025)),
+    "motorhelmet": ("cabinet", (0.15, 0.13, 0.13)),
+    "omri-0": ("cabinet", (0.30, 0.30, 0.30)),
+    "omri-1": ("cabinet", (0.30, 0.30, 0.30)),
+    "pergola": ("shelter", (2.00, 1.50, 1.25)),
+    "plantpot03": ("planter", (0.40, 0.40, 0.40)),
+    "plantpot04": ("planter", (0.40, 0.40, 0.40)),
+    "plantpot05": ("planter", (0.40, 0.40, 0.40)),
+    "plantpot06": ("planter", (0.40, 0.40, 0.40)),
+    "plantpot07": ("planter", (0.40, 0.40, 0.40)),
+    "plantpot08": ("planter", (0.40, 0.40, 0.40)),
+    "plasticbag": ("cabinet", (0.20, 0.15, 0.20)),
+    "plasticchair": ("cabinet", (0.28, 0.28, 0.45)),
+    "plastictable": ("cabinet", (0.60, 0.45, 0.37)),
+    "platformgarbage01": ("container", (1.50, 1.00, 0.60)),
+    "purse": ("cabinet", (0.15, 0.07, 0.12)),
+    "shop01": ("kiosk", (1.80, 0.90, 1.25)),
+    "shoppingbag": ("cabinet", (0.18, 0.10, 0.20)),
+    "shoppingtrolley": ("cabinet", (0.20, 0.18, 0.50)),
+    "slide": ("cabinet", (1.40, 0.30, 0.90)),
+    "streetfountain": ("bollard", (0.25, 0.25, 0.50)),
+    "streetsign": ("post", (0.10, 0.30, 1.20)),
+    "streetsign01": ("post", (0.10, 0.30, 1.20)),
+    "streetsign04": ("post", (0.10, 0.30, 1.20)),
+    "swing": ("railing", (1.50, 0.80, 1.10)),
+    "swingcouch": ("shelter", (0.90, 0.60, 0.90)),
+    "table": ("cabinet", (0.90, 0.40, 0.40)),
+    "trampoline": ("container", (1.70, 1.70, 0.40)),
+    "trashbag": ("bin", (0.35, 0.35, 0.35)),
+    "trashcan03": ("bin", (0.30, 0.30, 0.55)),
+    "trashcan04": ("bin", (0.30, 0.30, 0.55)),
+    "trashcan05": ("bin", (0.30, 0.30, 0.55)),
+    "wateringcan": ("cabinet", (0.20, 0.10, 0.15)),
 }
 
 BOOL, INT, FLOAT, STRING, COLOUR = 1, 2, 3, 4, 5
@@ -221,12 +288,42 @@ SENSORS: dict[str, dict[str, Field]] = {
         "range": _number(100.0, 0.1, 1e5),
     },
 }
-# Sensors of CARLA that are listed, so that scripts find them, and refused when one is to be spawned.
+_RADIO = {
+    "transmit_power": _number(21.5),
+    "receiver_sensitivity": _number(-99.0),
+    "frequency_ghz": _number(5.9),
+    "noise_seed": _TICK["noise_seed"],
+    "path_loss_exponent": _number(2.7),
+    "d_ref": _number(1.0),
+    "filter_distance": _number(500.0),
+    "combined_antenna_gain": _number(10.0),
+    "use_etsi_fading": Field(BOOL, "true"),
+    "custom_fading_stddev": _number(0.0),
+    "scenario": Field(STRING, "highway"),
+    "path_loss_model": Field(STRING, "geometric"),
+}
+_CAM = (
+    {"gen_cam_min": _number(0.1), "gen_cam_max": _number(1.0), "fixed_rate": Field(BOOL, "false")}
+    | {f"noise_accel_stddev_{axis}": _number(0.0) for axis in "xyz"}
+    | {f"noise_{kind}_{part}": _number(0.0) for kind in ("yawrate", "head") for part in ("stddev", "bias")}
+    | {f"noise_{axis}_{part}": _number(0.0) for axis in ("alt", "lat", "lon") for part in ("stddev", "bias")}
+    | {"noise_vel_stddev_x": _number(0.0)}
+)
+# What is neither a body nor a sensor: an actor that nobody sees, and a box in which tyres hold by another friction.
+TRIGGER = "static.trigger.friction"
+OTHERS: dict[str, dict[str, Field]] = {
+    "util.actor.empty": {},
+    TRIGGER: {f"extent_{axis}": _number(1.0, 0.0, 1e8) for axis in "xyz"}
+    | {"friction": _number(3.5, 0.0, 100.0)},  # [cm]
+}
+# Blueprints of CARLA that are listed, so that scripts find them, and refused when one is to be spawned.
 NOT_SERVED: dict[str, dict[str, Field]] = {
     "sensor.camera.dvs": _LENS,
     "sensor.camera.normals": _LENS,
     "sensor.camera.optical_flow": _LENS,
     "sensor.other.rss": {},
-    "sensor.other.v2x": {},
-    "sensor.other.v2x_custom": {},
+    "sensor.camera.cosmos_visualization": _LENS,
+    "sensor.other.v2x": _RADIO | _CAM | {"sensor_tick": _TICK["sensor_tick"]},
+    "sensor.other.v2x_custom": _RADIO | {"sensor_tick": _TICK["sensor_tick"]},
+    "static.prop.mesh": {"mesh_path": Field(STRING, ""), "scale": _number(1.0), "mass": _number(0.0)},
 }

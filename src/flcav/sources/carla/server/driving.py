@@ -1,10 +1,31 @@
-"""Ackermann control: pedals and steering wheel that bring a vehicle to a steering angle and a speed."""
+"""How vehicles are driven: pedals and steering wheel of Ackermann control, and the friction of the road."""
 
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.sources.carla.server.actors import Actor
+from flcav.sources.carla.server.catalogue import FLOAT
 from flcav.sources.carla.server.wire import AckermannControl, VehicleControl
 
 PULL_MPS2, BRAKE_MPS2 = 4.0, 8.0  # accelerations that full pedals give
+SHIFT_KMH = (20.0, 40.0, 60.0, 85.0, 115.0)  # at which an automatic gearbox takes the next gear
 SETTLE_S = 0.5  # time in which a difference of speed is to be made up
 STOPPED_MPS = 0.05
+
+
+def choose_gear(control: VehicleControl, speed_mps: float) -> int:
+    """Return the gear of a vehicle: the driver's, or that of an automatic gearbox at its speed."""
+    if control.manual:
+        return control.gear
+    return -1 if control.reverse else 1 + int(np.searchsorted(SHIFT_KMH, 3.6 * abs(speed_mps)))
+
+
+def find_grip(box: Actor, point: NDArray[np.float64]) -> float | None:
+    """Return the share of a dry road's friction in a box of friction; None where `point` (3,) is not in the box."""
+    told = {each.id: float(each.value) for each in box.description.attributes if each.type == FLOAT}
+    half = [told[f"extent_{axis}"] / 100 for axis in "xyz"]
+    inside = np.abs(box.pose[:3, :3].T @ (point - box.pose[:3, 3])) <= half
+    return min(told["friction"], 1.0) if inside.all() else None
 
 
 def steer_towards(

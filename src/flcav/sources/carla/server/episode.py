@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from flcav.sources.carla.frames import from_mount, mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.actors import WAITING, Actor, list_places
-from flcav.sources.carla.server.blueprints import Blueprint, Refused, check, find_paint, list_blueprints
-from flcav.sources.carla.server.driving import steer_towards
-from flcav.sources.carla.server.lights import Lights, find_approaches
+from flcav.sources.carla.server.actors import STANDING, WAITING, Actor, list_places
+from flcav.sources.carla.server.blueprints import TRUE, Blueprint, Refused, check, find_paint, list_blueprints
+from flcav.sources.carla.server.catalogue import TRIGGER
+from flcav.sources.carla.server.driving import choose_gear, find_grip, steer_towards
+from flcav.sources.carla.server.lights import Lights, find_approaches, find_limits
 from flcav.sources.carla.server.maps import ServedMap
 from flcav.sources.carla.server.recorder import Recorder
 from flcav.sources.carla.server.sensing.events import describe_thing, find_collisions, find_obstacle
@@ -26,7 +27,7 @@ from flcav.sources.carla.server.sensing.table import KINDS, Clock
 from flcav.sources.carla.server.weather import to_weather
 from flcav.sources.carla.server.wire import Transform
 from flcav.world import commands
-from flcav.world.commands import Controls, Drive, Push, Remove, Simulate, Spawn, Walk
+from flcav.world.commands import Controls, Drive, Grip, Push, Remove, Simulate, Spawn, Walk
 from flcav.world.live import LiveWorld, Obstructed, Settings
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
@@ -84,9 +85,9 @@ class Episode:
         counters.episode += 1
         self.id = counters.episode
         self.stream = counters.next_stream()  # of the world's state
-        self.world = LiveWorld(served.town, Settings(seed=seed, traffic=traffic, remembers=False))
+        self.world = LiveWorld(served.town, Settings(seed=seed, traffic=traffic, leans=True, remembers=False))
         self.weather = wire.WeatherParameters(cloudiness=10.0, sun_azimuth_angle=160.0, sun_altitude_angle=45.0)
-        self.lights = Lights(find_approaches(served))
+        self.lights, self.signs = Lights(find_approaches(served)), find_limits(served)
         self.actors: dict[int, Actor] = {}
         self.tick, self.time_s = 0, 0.0
         self._begun_s = time.monotonic()
@@ -179,6 +180,7 @@ class Episode:
         actor = self._add(description, pose)
         actor.name, actor.category, actor.size = name, blueprint.category, blueprint.size
         actor.parent, actor.paint = parent, find_paint(description)
+        actor.sticky = all(each.id != "sticky_control" or each.value.lower() in TRUE for each in description.attributes)
         self._bodies[name] = actor
         snapshot = self.world.snapshot
         row = snapshot.row(name)
@@ -245,7 +247,7 @@ class Episode:
 
     def drive(self, actor: Actor, control: wire.VehicleControl) -> None:
         """Set a vehicle's pedals and steering wheel."""
-        actor.control = control
+        actor.control, actor.told = control, True
         self.world.apply(
             Drive(
                 actor.name,
@@ -300,16 +302,35 @@ class Episode:
             if not actor.simulated and actor.walk.speed and self.time_s > actor.guided_s + UNGUIDED_S:
                 actor.walk = WAITING
                 self.push(actor, np.zeros(3))
+            if not actor.sticky and not actor.told:
+                actor.ackermann = None
+                self.drive(actor, STANDING)
             if actor.ackermann is not None:
                 limit, _ = self.steering(actor)
                 self.drive(actor, steer_towards(actor.ackermann, actor.control, self.speed(actor), limit, dt_s))
+            actor.told = False
+        self._slip()
         snapshot = self.world.step(dt_s=dt_s)
         self.tick += 1
         self.counters.frame += 1
         self.time_s += dt_s
         self.lights.follow(self.world, dt_s)
         self._follow(snapshot, dt_s)
+        for actor in self._bodies.values():
+            if actor.kind == "vehicle" and (limit := self.signs.find_passed(actor.pose)) is not None:
+                actor.limit_kmh = limit
         self.recorder.add(snapshot)
+
+    def _slip(self) -> None:
+        """Tell the tyres of the vehicles in boxes of friction how they hold there, by the last box that they are in."""
+        boxes = [actor for actor in self.actors.values() if actor.description.id == TRIGGER]
+        for body in self.world.bodies.members:
+            actor = self._bodies.get(body.name)
+            if actor is not None and actor.kind == "vehicle":
+                shares = [share for box in boxes if (share := find_grip(box, actor.pose[:3, 3])) is not None]
+                share = shares[-1] if shares else 1.0
+                if body.grip != share:
+                    self.world.apply(Grip(body.name, share))
 
     def steering(self, actor: Actor) -> tuple[float, float]:
         """Return the greatest steering angle [rad] and the wheelbase [m] of a vehicle."""
@@ -360,32 +381,30 @@ class Episode:
         """Return the payload of the world's state."""
         header = wire.pack_header(wire.Stream.WORLD, self.counters.frame, self.time_s, NOWHERE)
         vehicles = [actor for actor in self.actors.values() if actor.kind == "vehicle"]
-        limits, at = self._look_up(vehicles)
-        states = dict(zip((actor.id for actor in vehicles), zip(limits, at)))
+        states = dict(zip((actor.id for actor in vehicles), self._find_lights(vehicles)))
         rows = [
             wire.pack_actor(actor.id, actor.transform, actor.motion, self._union(actor, states))
             for actor in self.actors.values()
         ]
         return header + wire.pack_world(self.id, time.time(), dt_s, rows)
 
-    def _look_up(self, vehicles: list[Actor]) -> tuple[list[float], list[int]]:
-        """Return the speed limits [km/h], and the rows of the lights at which vehicles stand."""
+    def _find_lights(self, vehicles: list[Actor]) -> list[int]:
+        """Return the rows of the lights at which vehicles stand; -1: none."""
         if not vehicles:
-            return [], []
+            return []
         poses = np.array([actor.pose for actor in vehicles])
         half = np.array([actor.size[0] / 2 for actor in vehicles])
         fronts = poses[:, :2, 3] + half[:, None] * poses[:, :2, 0]
         yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-        limits = self.served.speed_limits_kmh(poses[:, :2, 3])
-        return limits.tolist(), self.lights.find_at(fronts, yaw).tolist()
+        return self.lights.find_at(fronts, yaw).tolist()
 
-    def _union(self, actor: Actor, states: dict[int, tuple[float, int]]) -> bytes:
+    def _union(self, actor: Actor, states: dict[int, int]) -> bytes:
         if actor.kind == "vehicle":
-            limit, row = states[actor.id]
+            row = states[actor.id]
             light = self.lights.state[row] if row >= 0 else 2
             number = self.light_number(row) if row >= 0 else 0
-            gear = actor.control.gear or (-1 if actor.control.reverse else 1)
-            return wire.pack_vehicle(actor.control, gear, limit, light, row >= 0, number)
+            gear = choose_gear(actor.control, self.speed(actor))
+            return wire.pack_vehicle(actor.control, gear, actor.limit_kmh, light, row >= 0, number)
         if actor.kind == "walker":
             return wire.pack_walker(actor.walk)
         if (row := actor.light) is not None:

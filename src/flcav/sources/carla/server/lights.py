@@ -1,4 +1,4 @@
-"""Traffic lights as CARLA's actors: one for each approach to a light, with the volume in which it counts.
+"""Traffic lights as CARLA's actors, one for each approach to a light, and the speed limits of signs.
 
 A light that a client sets keeps its state for the time of that state, then its junction goes on with its program.
 """
@@ -18,6 +18,7 @@ from flcav.world.commands import SetLight
 from flcav.world.live import LiveWorld
 from flcav.world.map.roads import Edge
 from flcav.world.opendrive.exporting import TRAFFIC_LIGHT, list_approaches, name_signal
+from flcav.world.opendrive.objects.signs import read_limit
 from flcav.world.opendrive.reference_line import ReferenceLine
 
 Array = NDArray[np.float64]
@@ -28,6 +29,7 @@ STATES = {letter: state for state, letters in LETTERS_OF.items() for letter in l
 TIMES_S = (10.0, 3.0, 2.0)  # CARLA's of green, yellow and red
 BEFORE_M, BEYOND_M = 8.0, 1.0  # a vehicle is at a light where its front is so near to the stop line
 ALIGNED_RAD = 1.0
+PASSED_M, BESIDE_M = 10.0, 12.0  # a vehicle that is so far beyond a sign, and beside it, has just passed it
 
 
 @dataclass(frozen=True)
@@ -94,17 +96,49 @@ def _read_signs(served: ServedMap) -> dict[str, Array]:
     """Return the places (2,) of the traffic lights of an imported map by their ids; none of a town of flcav."""
     if served.town.parameters.source is None:
         return {}
-    found: dict[str, Array] = {}
+    return {row.get("id", ""): at[:2] for row, at in _list_signals(served) if row.get("type") == TRAFFIC_LIGHT}
+
+
+def _list_signals(served: ServedMap) -> Iterator[tuple[ElementTree.Element, Array]]:
+    """Yield each signal of a map with its place in the town: x, y [m] and the heading of its road [rad] (3,)."""
     for road in ElementTree.fromstring(served.opendrive.encode("utf-8", "surrogateescape")).iterfind("road"):
-        rows = [row for row in road.iterfind("signals/signal") if row.get("type") == TRAFFIC_LIGHT]
-        if not rows:
-            continue
-        line = ReferenceLine(road)
-        for row in rows:
+        rows = road.findall("signals/signal")
+        line = ReferenceLine(road) if rows else None
+        for row in rows if line is not None else ():
             x, y, heading = line.at(np.array([float(row.get("s", "0"))]))[0]
-            left = float(row.get("t", "0")) * np.array((-np.sin(heading), np.cos(heading)))
-            found[row.get("id", "")] = np.array((x, y)) + left + served.frame.offset_m
-    return found
+            t, (dx, dy) = float(row.get("t", "0")), served.frame.offset_m
+            yield row, np.array((x - t * np.sin(heading) + dx, y + t * np.cos(heading) + dy, heading))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The N speed-limit signs of a map."""
+
+    place: Array  # (N, 3) x, y [m], and the direction [rad] of those for whom the sign is
+    kmh: Array  # (N,)
+
+    def find_passed(self, pose: Array) -> float | None:
+        """Return the limit [km/h] of the sign that a vehicle at `pose` (4, 4) has just passed, if any."""
+        if not len(self.kmh):
+            return None
+        off = pose[:2, 3] - self.place[:, :2]
+        ahead = heading_vectors(self.place[:, 2])
+        along, across = (off * ahead).sum(axis=1), ahead[:, 0] * off[:, 1] - ahead[:, 1] * off[:, 0]
+        facing = ahead @ pose[:2, 0] > np.cos(ALIGNED_RAD)
+        passed = np.flatnonzero((along >= 0) & (along < PASSED_M) & (np.abs(across) < BESIDE_M) & facing)
+        return float(self.kmh[passed[along[passed].argmin()]]) if len(passed) else None
+
+
+def find_limits(served: ServedMap) -> Limits:
+    """Return the speed-limit signs of a map; one that is for both directions stands twice."""
+    place, kmh = [np.zeros((0, 3))], []
+    for row, at in _list_signals(served):
+        if (limit := read_limit(row)) is None:
+            continue
+        turns = {"+": (0.0,), "-": (np.pi,)}.get(row.get("orientation", "none"), (0.0, np.pi))
+        place += [np.array([[at[0], at[1], at[2] + turn]]) for turn in turns]
+        kmh += [3.6 * limit] * len(turns)
+    return Limits(np.concatenate(place), np.round(kmh, 1))
 
 
 @dataclass

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from shapely.geometry import LineString
 
 from flcav.config import InputError, shorten
@@ -25,7 +24,17 @@ Array = NDArray[np.float64]
 
 SPAWN_EVERY_M, SPAWN_FROM_END_M = 20.0, 7.0  # between spawn points of a lane, and to its ends
 ABOVE_M = 0.3  # of spawn points above the road
-LANE_STEP_M = 2.0  # between the points at which lanes are looked up
+SPAWN_LEAST_M = 11.0  # between spawn points of a lane, for the longest bus
+SPAWN_POINTS = {  # of CARLA's own maps; where these lie only its engine's files tell
+    "Town01": 255,
+    "Town02": 101,
+    "Town03": 265,
+    "Town04": 372,
+    "Town05": 302,
+    "Town06": 436,
+    "Town07": 116,
+    "Town10HD": 155,
+}
 OPENDRIVE_MAP = "OpenDriveMap"  # CARLA's name of a map that a client sent
 OPTIMISED = "_Opt"  # ending of CARLA's names of layered maps
 
@@ -46,43 +55,31 @@ class ServedMap:
 
     @cached_property
     def spawn_points(self) -> list[Transform]:
-        """Poses on driving lanes."""
-        return [
-            Transform(to_vector(self.frame.to_location(point)), to_vector(to_rotation(np.array((yaw, 0.0, 0.0)))))
-            for lane in _driving_lanes(self.net)
-            for point, yaw in self._places(lane)
-        ]
+        """Poses on driving lanes; on CARLA's own maps as many as CARLA has there."""
+        wanted = SPAWN_POINTS.get(self.name.removesuffix(OPTIMISED))
+        found = list(self._places(SPAWN_EVERY_M))
+        for every in np.arange(SPAWN_EVERY_M, SPAWN_LEAST_M, -0.5) if wanted else ():
+            if len(found := list(self._places(every))) >= wanted:
+                found = [found[row] for row in np.linspace(0, len(found) - 1, wanted).round().astype(int)]
+                break
+        return found
 
-    def _places(self, lane: Lane) -> Iterator[tuple[Array, float]]:
-        line = LineString(lane.shape)
-        room = line.length - 2 * SPAWN_FROM_END_M
-        if room < 0:
-            return
-        for number in range(int(room // SPAWN_EVERY_M) + 1):
-            at = SPAWN_FROM_END_M + number * SPAWN_EVERY_M
-            (x, y), (u, v) = (np.array(line.interpolate(at + ahead).coords[0]) for ahead in (0.0, 0.5))
-            yield np.array((x, y, self.town.ground(x, y) + ABOVE_M)), float(np.arctan2(v - y, u - x))
+    def _places(self, every_m: float) -> Iterator[Transform]:
+        for lane in _driving_lanes(self.net):
+            line = LineString(lane.shape)
+            room = line.length - 2 * SPAWN_FROM_END_M
+            for number in range(int(room // every_m) + 1 if room >= 0 else 0):
+                at = SPAWN_FROM_END_M + number * every_m
+                (x, y), (u, v) = (np.array(line.interpolate(at + ahead).coords[0]) for ahead in (0.0, 0.5))
+                here, there = self.town.ground(x, y), self.town.ground(u, v)
+                angles = np.array((np.arctan2(v - y, u - x), np.arctan2(here - there, np.hypot(u - x, v - y)), 0.0))
+                location = self.frame.to_location(np.array((x, y, here + ABOVE_M)))
+                yield Transform(to_vector(location), to_vector(to_rotation(angles)))
 
     @cached_property
     def mesh(self) -> bytes:
         """The file of the navigation mesh of walkers."""
         return build_navigation_mesh(self.net, self.town, self.frame)
-
-    @cached_property
-    def _limits(self) -> tuple[KDTree, Array]:
-        points, speeds = [], []
-        for edge in self.net.edges.values():
-            for lane in edge.lanes_of("driving"):
-                line = LineString(lane.shape)
-                steps = np.arange(0.0, line.length, LANE_STEP_M)
-                points += [line.interpolate(at).coords[0] for at in steps]
-                speeds += [lane.speed] * len(steps)
-        return KDTree(np.array(points)), np.array(speeds)
-
-    def speed_limits_kmh(self, points: Array) -> Array:
-        """Return the limit (N,) [km/h] of the lane nearest to each of `points` (N, >=2)."""
-        tree, speeds = self._limits
-        return np.round(3.6 * speeds[tree.query(points[:, :2])[1]], 1)
 
 
 def _driving_lanes(net: RoadNet) -> Iterator[Lane]:
@@ -104,6 +101,10 @@ class Maps:
                 raise InputError(f"{files}: has no map (.xodr)")
         self._scratch = tempfile.TemporaryDirectory(prefix="flcav-carla-")
         self._sent = 0
+
+    def discard_files(self) -> None:
+        """Remove the files that were made for these maps."""
+        self._scratch.cleanup()
 
     def names(self) -> list[str]:
         """Return the names of the maps that can be loaded."""

@@ -2,15 +2,19 @@
 
 In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends what sensors measure, in order,
 then the world's state and the answer to its cue, upon which a client goes on, and then the cameras' images, which take
-longest: they are drawn beside the next ticks, and the next images wait for them. A reader who does not keep up is
-waited for, and dropped after `STUCK_S`.
+longest: they are drawn beside the next ticks, and the next images wait for them.
+
+What strangers may ask for is bounded: a connection with many cues that wait for their ticks is read no further; other
+bounds are those of `Connections`.
 """
 
 import asyncio
 import logging
+import os
 import signal
 import socket
 import struct
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -20,22 +24,25 @@ from flcav.config import InputError
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.blueprints import Refused
 from flcav.sources.carla.server.calls import Calls, invoke
+from flcav.sources.carla.server.connections import Connections, send, write
 from flcav.sources.carla.server.episode import Episode, Measurement
 
-STUCK_S = 10.0
 # A client's Traffic Manager misses its wake-up, and waits for ever, where the next tick comes before its thread sleeps
 # (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are not closer than this while one runs.
 PACE_S = 0.008
 LEARNT_S = 3.0  # clients have learnt of a new map by then
+# While a client that has loaded a map learns of it by these calls, its Traffic Manager's thread crashes if it goes on:
+# so that thread's calls, which are all others, are answered when the client listens to the new world.
+LEARNING = ("version", "get_episode_info", "get_sensor_token")
+MANAGER_S = 0.1  # a Traffic Manager's thread has made its next call by then
 LISTENER_S = 0.3  # a tick waits so long for the connection of a stream whose token a client has just asked for
-MOST_CONNECTIONS = 512
-MOST_CUES = 1000  # whose answers wait for their ticks; clients have one each
-CUES = ("tick_cue",)  # calls that are answered after the next tick in synchronous mode
+MOST_CUES, MOST_CUES_IN_ALL = 8, 256  # of a connection that wait for their ticks, and of all; clients have one each
+UNFINISHED_S = 30.0  # a call has come to its end by then, and the number of a stream
+ENDING_S = 3.0  # a server that is terminated ends by then, whatever it is at
 # In asynchronous mode, so that a client has a state with the new actor when it learns of it, as with CARLA, which
 # answers few calls a frame: a walker's AI that a client starts ends where its walker is in no state.
 SPAWNS = ("spawn_actor", "spawn_actor_with_parent")
 CHUNK = 1 << 16
-BACKLOG = 1 << 20  # bytes in a connection's buffer from which its reader is waited for
 
 log = logging.getLogger("flcav.carla")
 
@@ -46,15 +53,14 @@ class Server:
     def __init__(self, calls: Calls) -> None:
         """Take the calls to be served."""
         self._calls = calls
-        self._streams: dict[int, set[asyncio.StreamWriter]] = {}
-        self._connections: set[asyncio.StreamWriter] = set()
-        self._cue = asyncio.Event()
-        self._refused: set[str] = set()  # told in the log once
+        self._links = Connections()
+        self._cue, self._room = asyncio.Event(), asyncio.Event()
         self._worlds: set[int] = set()  # streams of the world's state, of earlier episodes too
         self._published_s = 0.0  # when the world's state was last sent
         self._state = b""  # the last one of the world, for clients that come between two ticks
         # A client that has the answer to its cue waits for the state by polling, which takes a core from the sensors.
         self._cued: deque[tuple[asyncio.StreamWriter, bytes]] = deque()  # answers that wait for the next ticks
+        self._held: dict[asyncio.StreamWriter, list[bytes]] = {}  # replies to managers of who learns of a new map
         self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick
 
     async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
@@ -67,12 +73,10 @@ class Server:
         finally:
             for server in servers:
                 server.close()
-            for writer in self._connections:
-                writer.transport.abort()
-            while self._connections:  # each is forgotten when its reader has come to the end
-                await asyncio.sleep(0.001)
+            self._room.set()
+            await self._links.close()
             if self._drawing is not None:
-                await self._drawing
+                self._drawing.cancel()
             self._calls.episode.close()
 
     # ---- ticks
@@ -104,6 +108,7 @@ class Server:
 
     async def _tick(self) -> None:
         await self._await_listeners()
+        await asyncio.sleep(0)  # calls, and the end, have their turn between two ticks
         try:
             await self._step()
         except Exception:  # a server that fails one tick serves the next
@@ -113,7 +118,7 @@ class Server:
         episode, dt_s = self._calls.episode, self._calls.dt_s
         episode.step(dt_s)
         self._state = episode.describe_world(dt_s)
-        measurements = list(episode.measure(dt_s, self._is_heard))
+        measurements = list(episode.measure(dt_s, self._links.is_heard))
         for each in measurements:
             if not each.late:
                 await self._measure(each, episode)
@@ -121,19 +126,20 @@ class Server:
             return
         if self._calls.managed:
             await asyncio.sleep(self._published_s + PACE_S - time.monotonic())
-        self._publish_state(episode)
+        await self._publish_state(episode)
         self._published_s = time.monotonic()
         self._answer_cues(1)
         if images := [each for each in measurements if each.late]:
             if self._drawing is not None:
                 await self._drawing
             self._drawing = asyncio.create_task(self._draw(images, episode))
-        await self._await_readers(self._connections)
+        await self._links.await_readers()
 
     async def _draw(self, images: list[Measurement], episode: Episode) -> None:
         try:
             for each in images:
                 await self._measure(each, episode)
+            await self._links.await_readers()
         except Exception:  # a server that fails one image draws the next
             log.exception("an image failed")
 
@@ -141,8 +147,8 @@ class Server:
         """Answer what waits for the ticks that were made; all that waits, where none is to come."""
         for _ in range(len(self._cued) if most is None else min(most, len(self._cued))):
             writer, reply = self._cued.popleft()
-            with suppress(ConnectionError, RuntimeError):
-                writer.write(reply)
+            write(writer, reply)
+        self._room.set()
 
     async def _measure(self, each: Measurement, episode: Episode) -> None:
         """Send what a sensor measures, beside this thread where it casts rays, so that calls are answered meanwhile."""
@@ -150,21 +156,17 @@ class Server:
         if not isinstance(body, bytes):
             body = await asyncio.to_thread(body) if each.rays else body()
         if episode is self._calls.episode:
-            self._publish(each.stream, each.header + body)
-            await self._await_readers(self._streams.get(each.stream, set()))
+            await self._links.publish(each.stream, each.header + body)
 
-    def _publish_state(self, episode: Episode) -> None:
+    async def _publish_state(self, episode: Episode) -> None:
         """Send the world's state; after a map was loaded, at first only to those who have learnt of it.
 
         A client that loads a map closes the stream of the one before, and crashes if something arrives meanwhile.
         """
-        self._worlds = {stream for stream in self._worlds if stream in self._streams}
+        self._worlds = {stream for stream in self._worlds if self._links.is_heard(stream)}
         for stream in self._worlds:
             if stream == episode.stream or episode.age_s > LEARNT_S:
-                self._publish(stream, self._state)
-
-    def _is_heard(self, stream: int) -> bool:
-        return bool(self._streams.get(stream))
+                await self._links.publish(stream, self._state)
 
     async def _await_listeners(self) -> None:
         """Wait for the streams that clients are about to listen to, so that these miss no tick."""
@@ -173,71 +175,63 @@ class Server:
             await asyncio.sleep(0.001)
         expected.clear()
 
-    async def _await_readers(self, writers: set[asyncio.StreamWriter]) -> None:
-        for writer in list(writers):
-            if writer.transport.get_write_buffer_size() <= BACKLOG:
-                continue
-            try:
-                await asyncio.wait_for(writer.drain(), STUCK_S)
-            except (TimeoutError, ConnectionError):
-                log.warning("a client reads no more: its connection is closed")
-                writer.transport.abort()
-                self._forget(writer)
-
-    def _publish(self, stream: int, payload: bytes) -> None:
-        for writer in list(self._streams.get(stream, ())):
-            self._send(writer, payload)
-
-    @staticmethod
-    def _send(writer: asyncio.StreamWriter, payload: bytes) -> None:
-        with suppress(ConnectionError, RuntimeError):
-            writer.write(struct.pack("<I", len(payload)) + payload)
-
     # ---- connections
 
-    def _admit(self, writer: asyncio.StreamWriter) -> bool:
-        if len(self._connections) >= MOST_CONNECTIONS:
-            log.warning("more than %d connections: one is refused", MOST_CONNECTIONS)
-            writer.close()
-            return False
-        self._connections.add(writer)
-        writer.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # asyncio may not
-        return True
-
-    def _forget(self, writer: asyncio.StreamWriter) -> None:
-        self._connections.discard(writer)
-        for stream in [stream for stream, writers in self._streams.items() if writer in writers]:
-            self._streams[stream].discard(writer)
-            if not self._streams[stream]:
-                del self._streams[stream]
-        writer.close()
-
     async def _serve_calls(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if not self._admit(writer):
+        if not self._links.admit(writer):
             return
-        unpacker = wire.Unpacker()
+        unpacker, until = wire.Unpacker(), None
         try:
-            while data := await reader.read(CHUNK):
+            while data := await _read(reader, until):
                 unpacker.feed(data)
                 for message in unpacker:
-                    call = wire.read_call(message)
-                    response = self._answer(call)
-                    if call.number is None:
-                        continue
-                    reply = wire.pack_reply(call.number, response)
-                    waits = call.method in (CUES if self._calls.settings.synchronous else SPAWNS)
-                    if waits and len(self._cued) < MOST_CUES:
-                        self._cued.append((writer, reply))
-                    else:
-                        writer.write(reply)
-                await self._await_readers({writer})
+                    await self._serve_call(wire.read_call(message), writer)
+                    until = None
+                    self._links.note_active(writer)
+                self._links.note_unfinished(writer, unpacker.waiting)
+                if not unpacker.waiting:
+                    until = None
+                elif until is None:
+                    until = time.monotonic() + UNFINISHED_S
         except ConnectionError:
             pass
+        except TimeoutError:
+            self._links.tell("slow", f"a call of which {UNFINISHED_S:g} s bring no end")
         except (ValueError, TypeError, RecursionError, OverflowError, KeyError) as error:
             what = str(error) or type(error).__name__
             log.warning("a connection is closed: %s; clients of CARLA %s are served here", what[:200], wire.VERSION)
         finally:
-            self._forget(writer)
+            self._links.forget(writer)
+
+    async def _serve_call(self, call: wire.Call, writer: asyncio.StreamWriter) -> None:
+        """Answer a call: at once, or after the tick that it cues."""
+        while len(self._cued) >= MOST_CUES_IN_ALL or sum(each is writer for each, _ in self._cued) >= MOST_CUES:
+            self._room.clear()
+            await self._room.wait()
+        if writer.is_closing():
+            raise ConnectionResetError
+        asked = self._calls.ticks
+        response = self._answer(call)
+        reply = b"" if call.number is None else wire.pack_reply(call.number, response)
+        cues = self._calls.ticks - asked if self._calls.settings.synchronous else call.method in SPAWNS
+        waits = cues > 0 and call.method != "apply_batch"
+        self._cued.extend([(writer, reply if waits else b"")] * cues)
+        if call.method == "load_new_episode" and self._calls.managed:
+            await asyncio.sleep(MANAGER_S)
+            writer.write(reply)
+            self._held[writer] = []
+            asyncio.get_running_loop().call_later(LEARNT_S, self._release, writer)
+        elif writer in self._held and call.method not in LEARNING:
+            self._held[writer].append(reply)
+        elif not waits:
+            writer.write(reply)
+        await self._links.await_readers([writer])
+        await asyncio.sleep(0)  # others have their turn
+
+    def _release(self, writer: asyncio.StreamWriter) -> None:
+        """Send the replies that were held for a client that learnt of a new map."""
+        for reply in self._held.pop(writer, []):
+            write(writer, reply)
 
     def _answer(self, call: wire.Call) -> wire.Packed:
         """Return the response to a call."""
@@ -245,7 +239,7 @@ class Server:
         try:
             value = invoke(self._calls, call.method, call.arguments)
         except (Refused, InputError, wire.WireError) as error:
-            self._tell(call.method, str(error))
+            self._links.tell(call.method, str(error))
             return [] if call.method == "apply_batch" else wire.fail(str(error))
         except Exception as error:  # a server that fails one call serves the others
             log.exception("the call %s failed", call.method[:60])
@@ -258,27 +252,31 @@ class Server:
             return value
         return wire.DONE if value is None else wire.succeed(value)
 
-    def _tell(self, method: str, message: str) -> None:
-        if method not in self._refused and len(self._refused) < 1000:
-            self._refused.add(method)
-            log.warning("refused: %s", message[:300])
-
     async def _serve_stream(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if not self._admit(writer):
+        if not self._links.admit(writer):
             return
         try:
-            (stream,) = struct.unpack("<I", await reader.readexactly(4))
-            self._streams.setdefault(stream, set()).add(writer)
+            async with asyncio.timeout(UNFINISHED_S):
+                (stream,) = struct.unpack("<I", await reader.readexactly(4))
+            self._links.listen(writer, stream)
             self._calls.expected.discard(stream)
             if stream == self._calls.episode.stream:
                 self._worlds.add(stream)
-                self._send(writer, self._state or self._calls.episode.describe_world(0.0))
+                for loader in list(self._held):
+                    self._release(loader)
+                send(writer, self._state or self._calls.episode.describe_world(0.0))
             while await reader.read(1024):
                 pass
-        except (asyncio.IncompleteReadError, ConnectionError):
+        except (asyncio.IncompleteReadError, ConnectionError, TimeoutError):
             pass
         finally:
-            self._forget(writer)
+            self._links.forget(writer)
+
+
+async def _read(reader: asyncio.StreamReader, until: float | None) -> bytes:
+    """Return what comes next; raises `TimeoutError` where nothing does until then, on the clock."""
+    async with asyncio.timeout_at(until):
+        return await reader.read(CHUNK)
 
 
 def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
@@ -298,10 +296,21 @@ def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
 def serve(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
     """Serve clients until interrupted or terminated (SIGTERM), at the sockets of `open_doors`."""
 
+    def leave() -> None:
+        calls.maps.discard_files()
+        os._exit(0)
+
     async def run() -> None:
-        task = asyncio.current_task()
+        task, loop = asyncio.current_task(), asyncio.get_running_loop()
         assert task is not None
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+
+        def end(*_: object) -> None:
+            last = threading.Timer(ENDING_S, leave)  # a map that is loaded, or an image, may take longer
+            last.daemon = True
+            last.start()
+            loop.call_soon_threadsafe(task.cancel)
+
+        signal.signal(signal.SIGTERM, end)
         await Server(calls).run(doors, ready)
 
     with suppress(asyncio.CancelledError):

@@ -257,39 +257,61 @@ def pack(value: Any) -> bytes:
 class Unpacker:
     """Reads the calls of one connection: feed it bytes, and iterate; `WireError` and `ValueError` end it.
 
-    It bounds the memory that one message takes.
+    Of an unfinished call it keeps the bytes alone; `waiting` tells how many. Values are made of whole calls.
     """
 
     def __init__(self) -> None:
-        self._arrays = 0
-        self._unpacker = msgpack.Unpacker(
-            raw=False,
-            strict_map_key=False,
-            max_buffer_size=LARGEST,
-            max_map_len=0,
-            unicode_errors="surrogateescape",
-            list_hook=self._count,
-        )
+        self._bytes = bytearray()  # of the calls that are not yet read
+        self._begun = 0  # place of the first of them in all that was fed
+        self._skipper = msgpack.Unpacker(max_buffer_size=LARGEST)  # finds where calls end
 
-    def _count(self, values: list[Any]) -> list[Any]:
-        self._arrays += 1
-        if self._arrays > MOST_ARRAYS:
-            raise WireError(f"a call of more than {MOST_ARRAYS} arrays")
-        return values
+    @property
+    def waiting(self) -> int:
+        """The number of bytes that belong to calls which are not yet read."""
+        return len(self._bytes)
 
     def feed(self, data: bytes) -> None:
         """Add bytes; raises `WireError` for a call beyond `LARGEST`."""
-        try:
-            self._unpacker.feed(data)
-        except msgpack.BufferFull:
-            raise WireError(f"a call of more than {LARGEST} bytes") from None
+        if len(self._bytes) + len(data) > LARGEST:
+            raise WireError(f"a call of more than {LARGEST} bytes")
+        self._bytes += data
+        self._skipper.feed(data)
 
     def __iter__(self) -> "Unpacker":
         return self
 
     def __next__(self) -> Any:
-        self._arrays = 0
-        return next(self._unpacker)
+        try:
+            self._skipper.skip()
+        except msgpack.OutOfData:
+            raise StopIteration from None
+        end = self._skipper.tell() - self._begun
+        call = bytes(self._bytes[:end])
+        del self._bytes[:end]
+        self._begun += end
+        return _unpack(call)
+
+
+def _unpack(call: bytes) -> Any:
+    """Return the value of a whole call, within bounds of its memory."""
+    arrays = 0
+
+    def count(values: list[Any]) -> list[Any]:
+        nonlocal arrays
+        arrays += 1
+        if arrays > MOST_ARRAYS:
+            raise WireError(f"a call of more than {MOST_ARRAYS} arrays")
+        return values
+
+    return msgpack.unpackb(
+        call,
+        raw=False,
+        strict_map_key=False,
+        max_array_len=MOST_ARRAYS,
+        max_map_len=0,
+        unicode_errors="surrogateescape",
+        list_hook=count,
+    )
 
 
 def read_call(message: Any) -> Call:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from flcav.geometry import inverse
 from flcav.sensors.frame import SEMANTICS
 from flcav.sources.carla.frames import mirror
 from flcav.sources.carla.server.sensing.sight import Sensor, Sight
@@ -46,8 +47,33 @@ def find_collisions(collisions: Sequence[Collision], describe: Callable[[str], A
     return found
 
 
+def _sweep_actors(sight: Sight, sensor: Sensor) -> tuple[float, str] | None:
+    """Return distance [m] and name of the first vehicle or walker whose box, grown by the radius, the ray ahead meets.
+
+    Parked vehicles, props and the town neither count nor hide what is behind them.
+    """
+    trace, radius, best = sight.scene.trace, sensor.number_of("hit_radius"), None
+    moves = (sight.actors > 0) & (trace.category != "prop") & (trace.actor != sensor.carrier) & trace.present[0]
+    for row in np.flatnonzero(moves).tolist():
+        to_box = inverse(sight.scene.world_from_actor(row)) @ sensor.pose
+        start, way = to_box[:3, 3], to_box[:3, 0]
+        length, width, height = trace.size[row]
+        low = np.array((-length / 2, -width / 2, 0.0)) - radius
+        high = np.array((length / 2, width / 2, height)) + radius
+        with np.errstate(divide="ignore", invalid="ignore"):
+            enter, leave = np.sort(np.stack((low - start, high - start)) / way, axis=0)
+        nearest, farthest = float(np.nanmax(enter)), float(np.nanmin(leave))
+        if nearest <= farthest and farthest >= 0 and max(nearest, 0.0) <= sensor.number_of("distance"):
+            met = max(nearest, 0.0), str(trace.actor[row])
+            best = met if best is None else min(best, met)
+    return best
+
+
 def find_obstacle(sight: Sight, sensor: Sensor, carrier: Actor, describe: Callable[[str], Actor]) -> bytes | None:
     """Return what an obstacle sensor on `carrier` sends: what is nearest ahead of it within its radius, or None."""
+    if sensor.attributes["only_dynamics"].lower() in ("true", "1"):
+        met = _sweep_actors(sight, sensor)
+        return None if met is None else pack_record(Obstacle(carrier, describe(met[1]), met[0]))
     trace = sight.scene.trace
     rows = np.flatnonzero(trace.actor == sensor.carrier)
     hidden = int(rows[0]) if len(rows) else None
@@ -64,7 +90,7 @@ def find_obstacle(sight: Sight, sensor: Sensor, carrier: Actor, describe: Callab
             continue
         if instance == 0:
             tag = int(sight.tags(hits)[0])
-            if sensor.attributes["only_dynamics"].lower() == "true" or TAG_NAMES.get(tag) in ("road", "road_line"):
+            if TAG_NAMES.get(tag) in ("road", "road_line"):
                 continue
             best = distance, f"{TAG_NAMES.get(tag, 'unknown')}:"
         else:

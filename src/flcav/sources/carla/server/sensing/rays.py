@@ -71,14 +71,19 @@ def sense_radar(sight: Sight, sensor: Sensor) -> bytes:
 def _fire(sensor: Sensor) -> tuple[NDArray[np.float32], int]:
     """Return the rays of a sweep (channels * columns, 3), channel after channel, and the number of channels."""
     channels, field = int(sensor.number_of("channels")), sensor.number_of("horizontal_fov")
-    columns = max(1, round(sensor.number_of("points_per_second") * sensor.elapsed_s / channels))
-    columns = min(columns, MOST_RAYS // channels)
+    columns = _count_columns(sensor, channels)
     turn = sensor.number_of("rotation_frequency") * field * sensor.elapsed_s
     azimuth = (sensor.azimuth_deg + np.arange(columns) * turn / columns) % field - field / 2
-    sensor.azimuth_deg = float((sensor.azimuth_deg + turn) % field)
+    sensor.azimuth_deg = round(float(sensor.azimuth_deg + turn), 6) % field
     elevation = np.linspace(sensor.number_of("upper_fov"), sensor.number_of("lower_fov"), channels)
     rays = unit_vectors(-np.radians(azimuth)[None], np.radians(elevation)[:, None])  # it turns to the right
     return rays.reshape(-1, 3).astype(np.float32), channels
+
+
+def _count_columns(sensor: Sensor, channels: int) -> int:
+    """Return the number of rays of each channel in a sweep; halves are rounded up, as CARLA does."""
+    wanted = int(sensor.number_of("points_per_second") * sensor.elapsed_s / channels + 0.5 + 1e-6)
+    return min(max(1, wanted), MOST_RAYS // channels)
 
 
 def _incidence(sight: Sight, sensor: Sensor, directions: NDArray[np.float32], met: Hits) -> NDArray[np.float32]:
@@ -90,7 +95,5 @@ def _incidence(sight: Sight, sensor: Sensor, directions: NDArray[np.float32], me
 
 
 def _pack(sensor: Sensor, channels: int, rays: NDArray[np.int64], points: NDArray) -> bytes:
-    columns = max(1, round(sensor.number_of("points_per_second") * sensor.elapsed_s / channels))
-    columns = min(columns, MOST_RAYS // channels)
-    per_channel = np.bincount(rays // columns, minlength=channels)
+    per_channel = np.bincount(rays // _count_columns(sensor, channels), minlength=channels)
     return pack_sweep(float(np.radians(sensor.azimuth_deg)), per_channel, points)

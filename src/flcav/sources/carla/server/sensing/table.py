@@ -50,7 +50,7 @@ class Clock:
         """
         if self._next_s is not None and time_s < self._next_s - EARLY_S:
             return None
-        elapsed = max(self._tick_s, dt_s) if self._last_s is None else time_s - self._last_s
+        elapsed = max(self._tick_s, dt_s) if self._last_s is None else round(time_s - self._last_s, 9)
         due = time_s if self._next_s is None else self._next_s
         self._next_s = max(due + self._tick_s, time_s) if self._tick_s else time_s
         self._last_s = time_s

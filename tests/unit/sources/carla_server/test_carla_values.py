@@ -1,0 +1,216 @@
+"""What clients read of vehicles, signs and sensors, against CARLA's rules."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from carla_calls import describe, invoke, place
+
+from flcav.sources.carla.server.calls import Calls
+from flcav.sources.carla.server.driving import choose_gear
+from flcav.sources.carla.server.lights import find_limits
+from flcav.sources.carla.server.maps import SPAWN_LEAST_M, SPAWN_POINTS, Maps
+from flcav.sources.carla.server.wire import VehicleControl
+
+DT_S = 0.05
+
+
+@pytest.fixture(scope="module")
+def maps():
+    return Maps()
+
+
+@pytest.fixture
+def calls(maps):
+    made = Calls(maps, "suburb", seed=3, traffic=0, port=2000)
+    yield made
+    made.episode.close()
+
+
+def spawn(calls, name, where, *attributes):
+    return calls.episode.find(invoke(calls, "spawn_actor", (describe(name, *attributes), where)).id)
+
+
+def tick(calls, count=1):
+    for _ in range(count):
+        calls.episode.step(DT_S)
+
+
+def drive(calls, car, **pedals):
+    control = [*VehicleControl(**pedals)]
+    invoke(calls, "apply_control_to_vehicle", (car.id, control))
+
+
+@pytest.mark.parametrize(("sticky", "ticks"), [("True", 60), ("False", 1), ("false", 1), ("0", 1), ("1", 60)])
+def test_a_control_that_does_not_stick_lasts_one_tick(sticky, ticks, calls):
+    car = spawn(calls, "vehicle.tesla.model3", place(calls), ("sticky_control", sticky))
+    drive(calls, car, throttle=1.0)
+    tick(calls)
+    assert car.control.throttle == 1.0
+    pulled = calls.episode.speed(car)
+    tick(calls, 59)
+    assert car.control.throttle == (1.0 if ticks == 60 else 0.0)
+    assert (calls.episode.speed(car) > 3 * pulled) == (ticks == 60)
+
+
+@pytest.mark.parametrize(
+    ("control", "kmh", "gear"),
+    [
+        (VehicleControl(), 0.0, 1),
+        (VehicleControl(throttle=1.0), 30.0, 2),
+        (VehicleControl(throttle=1.0), 90.0, 5),
+        (VehicleControl(reverse=True), 10.0, -1),
+        (VehicleControl(manual=True, gear=3), 90.0, 3),
+    ],
+)
+def test_the_gear_is_the_driver_s_or_that_of_the_speed(control, kmh, gear):
+    assert choose_gear(control, kmh / 3.6) == gear
+
+
+def test_a_fresh_vehicle_has_30_kmh_until_it_passes_a_sign(maps, calls):
+    """CARLA's rule; a sign counts in its own direction alone."""
+    calls.episode.step(DT_S)
+    car = spawn(calls, "vehicle.tesla.model3", place(calls))
+    tick(calls)
+    assert car.limit_kmh == 30.0
+    served = calls.episode.served
+    road = '<road name="r" length="100" id="900001" junction="-1"><planView>'
+    road += '<geometry s="0" x="10" y="20" hdg="0.5" length="100"><line/></geometry></planView><signals>'
+    for s, orientation, kmh in ((40, "+", 60), (60, "-", 90)):
+        road += f'<signal s="{s}" t="-4" id="{s}" orientation="{orientation}" type="274" value="{kmh}"/>'
+    text = served.opendrive.replace("</OpenDRIVE>", f"{road}</signals></road></OpenDRIVE>")
+    limits = find_limits(replace(served, opendrive=text))
+    ahead = np.array((np.cos(0.5), np.sin(0.5)))
+
+    def passed(s, turn=0.0):
+        pose = np.eye(4)
+        pose[:2, 0], pose[:2, 3] = ahead * np.cos(turn), np.array((10.0, 20.0)) + s * ahead
+        return limits.find_passed(pose)
+
+    assert [passed(s) for s in (35.0, 41.0, 49.0, 51.0, 61.0)] == [None, 60.0, 60.0, None, None]
+    assert [passed(s, np.pi) for s in (65.0, 59.0, 41.0)] == [None, 90.0, None]
+    calls.episode.signs = limits
+    x, y = (np.array((10.0, 20.0)) + 42 * ahead).tolist()
+    invoke(calls, "set_actor_transform", (car.id, [[x, -y, 0.0], [0.0, -28.6, 0.0]]))
+    tick(calls)
+    assert car.limit_kmh == 60.0
+    invoke(calls, "set_actor_transform", (car.id, place(calls)))
+    tick(calls, 3)
+    assert car.limit_kmh == 60.0  # until the next sign
+
+
+def obstacles(calls, **told):
+    """Return names and distances of what an obstacle sensor ahead of the first spawn point reports in one tick."""
+    from msgpack import unpackb
+
+    here = place(calls)
+    attributes = [(name, str(value)) for name, value in {"distance": 30, **told}.items()]
+    sensor = spawn(calls, "sensor.other.obstacle", [[*here[0][:2], here[0][2] + 0.7], here[1]], *attributes)
+    tick(calls)
+    sent = [unpackb(each.body, strict_map_key=False) for each in calls.episode.measure(DT_S, lambda _: True)]
+    invoke(calls, "destroy_actor", (sensor.id,))
+    return [(other[2][1], distance) for _, other, distance in sent]
+
+
+def test_obstacles_that_only_move_are_seen_and_nothing_else(calls):
+    here = place(calls)
+    yaw = np.radians(here[1][1])
+    ahead = np.array((np.cos(yaw), np.sin(yaw), 0.0))
+    spawn(calls, "static.prop.container", [(np.array(here[0]) + 8 * ahead).tolist(), here[1]])
+    assert obstacles(calls)[0][0] == "static.prop.container"
+    assert obstacles(calls, only_dynamics="True") == []
+    car = spawn(calls, "vehicle.tesla.model3", [(np.array(here[0]) + 20 * ahead).tolist(), here[1]])
+    radius = 0.5
+    ((name, distance),) = obstacles(calls, only_dynamics="true", hit_radius=radius)
+    assert (name, distance) == (car.description.id, pytest.approx(20.0 - car.size[0] / 2 - radius, abs=0.02))
+    assert obstacles(calls, only_dynamics="1", distance=15) == []
+    invoke(calls, "set_actor_transform", (car.id, [(np.array(here[0]) - 20 * ahead).tolist(), here[1]]))
+    assert obstacles(calls, only_dynamics="True") == []  # behind
+
+
+def test_parked_cars_do_not_move(calls):
+    """No sensor that is for what moves reports something in a town where nothing does."""
+    trace = calls.episode.world.snapshot.trace
+    row = next(row for row, name in enumerate(trace.actor.tolist()) if name.startswith("parked"))
+    x, y, z = (trace.position[0, row] * (1, -1, 1)).tolist()
+    for wanted, reported in (("False", True), ("True", False)):
+        attributes = (("only_dynamics", wanted), ("distance", "20"))
+        sensor = spawn(calls, "sensor.other.obstacle", [[x - 8.0, y, z + 0.7], [0.0, 0.0, 0.0]], *attributes)
+        tick(calls)
+        assert bool(list(calls.episode.measure(DT_S, lambda _: True))) == reported
+        invoke(calls, "destroy_actor", (sensor.id,))
+
+
+def test_half_turns_of_a_still_lidar_are_alike(calls):
+    """56,000 points a second are 87.5 columns a tick for 32 channels: always as many, in spite of rounded times."""
+    here = place(calls)
+    still = {"dropoff_general_rate": 0, "dropoff_intensity_limit": 1, "dropoff_zero_intensity": 0}
+    told = still | {"rotation_frequency": 10, "lower_fov": -80, "upper_fov": -10}
+    attributes = [(name, str(value)) for name, value in told.items()]
+    spawn(calls, "sensor.lidar.ray_cast", [[*here[0][:2], here[0][2] + 2.0], here[1]], *attributes)
+    sweeps = []
+    for _ in range(24):
+        tick(calls)
+        sweeps += [each.body() for each in calls.episode.measure(DT_S, lambda _: True)]
+    assert len({sweep[8 + 4 * 32 :] for sweep in sweeps[::2]}) == 1
+    assert len({sweep[8 + 4 * 32 :] for sweep in sweeps[1::2]}) == 1
+
+
+def test_a_car_leans_on_its_springs(calls):
+    """CARLA's pitch is positive upwards, its roll to the right."""
+    car = spawn(calls, "vehicle.tesla.model3", place(calls))
+    tick(calls)
+    assert car.transform.rotation[::2] == (0.0, 0.0)
+    drive(calls, car, throttle=1.0)
+    tick(calls, 60)
+    assert 0.2 < car.transform.rotation[0] < 3.0
+    drive(calls, car, throttle=1.0, steer=0.1)
+    tick(calls, 10)
+    assert -5.0 < car.transform.rotation[2] < -0.2  # to the left in a curve to the right
+    drive(calls, car, brake=1.0)
+    tick(calls, 3)
+    assert -3.0 < car.transform.rotation[0] < -0.5
+    tick(calls, 100)
+    assert car.transform.rotation[::2] == pytest.approx((0.0, 0.0), abs=1e-3)
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0, -10.0), (0.0, 0.0, 0.5), (3.0, 0.0, -5.0)])
+def test_a_push_into_the_ground_is_no_acceleration(velocity, calls):
+    car = spawn(calls, "vehicle.tesla.model3", place(calls))
+    tick(calls)
+    invoke(calls, "set_actor_target_velocity", (car.id, [*velocity]))
+    tick(calls)
+    assert abs(car.motion[2][2]) < 1e-6
+
+
+def test_a_car_that_is_thrown_up_comes_down(calls):
+    car = spawn(calls, "vehicle.tesla.model3", place(calls))
+    tick(calls)
+    invoke(calls, "set_actor_target_velocity", (car.id, [0.0, 0.0, 9.81]))
+    heights = []
+    for _ in range(45):
+        tick(calls)
+        heights.append(car.pose[2, 3])
+    assert max(heights) == pytest.approx(9.81 / 2, rel=0.1)  # v^2 / 2g
+    assert heights.index(max(heights)) * DT_S == pytest.approx(1.0, abs=0.1)
+    assert heights[-1] == 0.0
+
+
+def test_spawn_points_are_as_many_as_carla_has_and_follow_the_road(maps, monkeypatch):
+    for town, most_deg in (("suburb", 0.0), ("hilly_ring", 10.0)):
+        served = maps.load(town)
+        rotations = np.array([point.rotation for point in served.spawn_points])
+        assert (np.abs(rotations[:, 0]).max() > 0.5) == (most_deg > 0)
+        for point in served.spawn_points[::10]:
+            ahead = np.array((np.cos(np.radians(point.rotation[1])), np.sin(np.radians(point.rotation[1]))))
+            here = np.array(point.location[:2])
+            rise = served.town.ground(*((here + ahead) * (1, -1))) - served.town.ground(*((here - ahead) * (1, -1)))
+            assert point.rotation[0] == pytest.approx(np.degrees(np.arctan2(rise, 2.0)), abs=1.0)  # upwards is positive
+    usual = len(maps.load("suburb").spawn_points)
+    for wanted in (usual - 7, usual + 9):
+        monkeypatch.setitem(SPAWN_POINTS, "suburb", wanted)
+        points = replace(maps.load("suburb")).spawn_points
+        assert len(points) == wanted
+        places = np.array([point.location for point in points])
+        assert len(np.unique(places.round(2), axis=0)) == wanted
+    assert SPAWN_LEAST_M > 2 * 5.136  # of the longest bus
