@@ -191,6 +191,9 @@ OPEN: Mapping[str, Damage] = {  # values that masks would hide, by rules
     "local noise, samples": with_metrics(num_examples=2),
     "secure, masked values": with_array(lambda name, array: {name: array.astype(np.int32)}, VECTOR),
     "secure, fewer values": with_array(lambda name, array: {name: array[:-1]}, VECTOR),
+    "importance, a larger change than it told": lambda content: (
+        with_metrics(norm=0.1)(content) if is_report(content) else None
+    ),
     "importance, negative norm": lambda content: with_metrics(norm=-1.0)(content) if is_report(content) else None,
 }
 

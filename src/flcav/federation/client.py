@@ -229,7 +229,8 @@ def client_app(
             _record(context, OWN, getattr(update, "own", {}))
         if not isinstance(strategy, Exchanges):
             return update, {}, {}
-        gradient = getattr(update, "gradient", {})  # asked for by the correction
+        exchanged, asked = rules.upload.exchanged(start), getattr(update, "gradient", {})  # by the correction
+        gradient = {name: array for name, array in asked.items() if name in exchanged}
         found = LocalUpdate(update.weights, update.samples, update.loss, gradient)
         return update, *strategy.report(found, sent, own)
 

@@ -245,6 +245,7 @@ class Round:
     expected: Expected  # of the updates
     sent: Weights  # a strategy's arrays beside the weights
     shares: dict[str, float] = field(default_factory=dict)  # of unbiased selection: of all samples, by client
+    told: dict[str, float] = field(default_factory=dict)  # norms of updates, by client
     drawn: dict[str, float] = field(default_factory=dict)  # of unbiased selection: probability of the clients drawn
     masked: SecureRound | None = None  # of secure aggregation
 
@@ -337,7 +338,8 @@ class Server:
             return round_.masked.collect()
         plain = self.rules.privacy is None and not selection.weighs
         updates = Intake(find_weigher(self.strategy) if plain else None)
-        read = lambda _, content: read_update(content, round_.expected)  # noqa: E731
+        told = round_.told if selection.rule == "importance" else {}
+        read = lambda name, content: read_update(content, round_.expected, told.get(name))  # noqa: E731
         for name, update in self._ask(here, dict.fromkeys(wanted, request), read):
             with self._refusing(round_):
                 updates.add(name, update)
@@ -373,7 +375,10 @@ class Server:
     def _read_norms(self, round_: Round, clients: list[str], request: RecordDict) -> dict[str, float]:
         """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
         told = dict(self._ask(round_.here, dict.fromkeys(clients, request), lambda _, c: read_norm(c, self.rules)))
-        total = sum(samples for _, samples in told.values())
+        total, round_.told = (
+            sum(samples for _, samples in told.values()),
+            {name: own for name, (own, _) in told.items()},
+        )
         round_.shares = {name: samples / max(total, 1) for name, (_, samples) in told.items()}
         return {name: norm * round_.shares[name] for name, (norm, _) in told.items()}
 

@@ -383,3 +383,27 @@ def test_no_request_gets_an_update_without_its_masks_or_noise(name: str):
             try_all(3)
     assert told
     assert not any(plain in recorddict_to_proto(content).SerializeToString() for content in told)
+
+
+class Whole:
+    """A client that returns all arrays and gradients, whatever layers it is asked to train."""
+
+    def train(self, weights: Weights, **_: Any) -> LocalUpdate:
+        moved = {name: array + np.float32(1) for name, array in weights.items()}
+        return LocalUpdate(moved, 3, 0.1, {name: array + np.float32(2) for name, array in weights.items()})
+
+
+@pytest.mark.parametrize("strategy", [FEDAVG, Scaffold()])
+def test_arrays_that_are_not_sent_stay_with_their_gradients(strategy: Strategy):
+    rules, start = (
+        Rules.model_validate({"upload": {"layers": ["head.*"]}}),
+        {"head.w": np.zeros(3), "body.w": np.zeros(4)},
+    )
+    with EmbeddedGrid(client_app({"cav0": Whole()}, strategy, rules), ["cav0"]) as grid:
+        content = {CONFIG: SCHEDULE.work(1).record(), ARRAYS: to_arrays(start), "extra": to_arrays(start)}
+        told = Server(grid).send(content)
+        for key in told.array_records:
+            assert {*told.array_records[key]} == {"head.w"}
+        assert len([*told.array_records]) == (1 if strategy is FEDAVG else 2)
+        state = grid.read_states(["own", "residual"])
+        assert {name for kinds in state.values() for arrays in kinds.values() for name in arrays} <= {"head.w"}

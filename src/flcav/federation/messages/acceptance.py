@@ -15,7 +15,7 @@ from flwr.app import ArrayRecord, ConfigRecord, MetricRecord, RecordDict
 from numpy.typing import NDArray
 
 from flcav.config import shorten
-from flcav.federation.messages.encoding import count_coordinates, decode, is_local, sent_forms
+from flcav.federation.messages.encoding import count_coordinates, decode, is_changed, is_local, sent_forms
 from flcav.federation.messages.records import (
     ARRAYS,
     ASK,
@@ -29,11 +29,14 @@ from flcav.federation.messages.records import (
     to_numpy,
     type_name,
 )
+from flcav.federation.privacy import change_norm
 from flcav.federation.rules import Rules
 from flcav.federation.strategies.fedavg import BLOCK
 from flcav.federation.strategies.strategy import Exchanges, Strategy
 from flcav.federation.trainable import Forms, LocalUpdate, Weights, forms_of, learned_names
-from flcav.federation.upload import Arrays
+from flcav.federation.upload import Arrays, subtract
+
+SAME = 1e-6  # relative: more than two machines differ in the norm of one change
 
 
 class ReplyRefused(ValueError):
@@ -65,8 +68,11 @@ def extra_forms(strategy: Strategy, rules: Rules, start: Weights, sent: Weights)
     return forms_of(strategy.report(LocalUpdate(start, 1, 0.0, gradient), sent, {})[0])
 
 
-def read_update(content: RecordDict, expected: Expected) -> LocalUpdate:
-    """Return the update in a reply, with the client's weights for its arrays; raises `ReplyRefused`."""
+def read_update(content: RecordDict, expected: Expected, told: float | None = None) -> LocalUpdate:
+    """Return the update in a reply, with the client's weights for its arrays; raises `ReplyRefused`.
+
+    told: norm of its change of learned arrays, which the client has told before, and by which it was drawn.
+    """
     rules, start, extra = expected.rules, expected.start, expected.extra
     if METRICS in content:  # of a client without samples the rest may be missing
         _read_numbers(content, LOSS, rules)
@@ -81,6 +87,11 @@ def read_update(content: RecordDict, expected: Expected) -> LocalUpdate:
         raise ReplyRefused(str(error)) from None
     _check_change({name: update.weights[name] for name in rules.upload.exchanged(start)}, start, rules)
     _check_change(update.extra, {}, rules)
+    if told is not None and not is_changed(rules):  # what is compressed may be longer
+        exchanged = rules.upload.exchanged(start)
+        names = [name for name in learned_names(start) if name in exchanged]
+        if (norm := change_norm(subtract(update.weights, start, names))) > told * (1 + SAME):
+            raise ReplyRefused(f"a change of the norm {norm:.3g}, where the client told {told:.3g}")
     return update
 
 
