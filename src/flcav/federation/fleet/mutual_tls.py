@@ -214,6 +214,7 @@ def serve_https(
         ssl_keyfile=key,
         ssl_ca_certs=None if authority is None else str(authority),
         ssl_cert_reqs=ssl.CERT_NONE if authority is None else ssl.CERT_REQUIRED,
+        timeout_keep_alive=int(HEADER_S),  # longer than httpx keeps a connection, which so ends it first
         timeout_graceful_shutdown=2,
     )
     config.load()
