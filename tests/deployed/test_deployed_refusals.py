@@ -252,12 +252,12 @@ def test_idle_connections_keep_nobody_out(deployment):
     proxy = read_processes(deployment.folder)["proxy"]
     context, before = tls_of(deployment.folder / VEHICLES / "vehicle-002", deployment.folder), resident_mb(proxy)
     with contextlib.ExitStack() as stack:
-        for number in range(250):
+        for number in range(400):
             door = stack.enter_context(socket.create_connection((host, int(port)), 30))
             if number % 5 == 0:
                 with contextlib.suppress(OSError):
                     stack.enter_context(context.wrap_socket(door, server_hostname=host))
-        assert len(list(Path(f"/proc/{proxy}/fd").iterdir())) < 160
+        assert len(list(Path(f"/proc/{proxy}/fd").iterdir())) < 340
         assert resident_mb(proxy) - before < 60
         own = deployment.folder / VEHICLES / "vehicle-001"
         with reach(deployment, own) as client:

@@ -267,6 +267,21 @@ def test_a_body_that_does_not_come(running, monkeypatch):
     assert running.send([running.header(), "content-length: 9"], b"a") == (408, "the message does not come")
 
 
+def test_revoked_while_the_body_comes(running):
+    """A call that was begun before is refused when it is whole."""
+    own, body = running.vehicles["cav-2"], body_of("pull-messages", 22)
+    head = [f"POST {FLEET}pull-messages HTTP/1.1", *REQUIRED, running.header("cav-2"), f"content-length: {len(body)}"]
+    with running.connect("cav-2") as door, sqlite3.connect(running.folder / "registry.sqlite") as registry:
+        door.sendall(("\r\n".join(head) + "\r\n\r\n").encode())
+        time.sleep(0.2)
+        registry.execute("UPDATE certificates SET state = 'revoked' WHERE fingerprint = ?", (own.fingerprint,))
+        registry.commit()
+        door.sendall(body)
+        assert read_answer(door) == (401, "the certificate of cav-2 is revoked")
+        registry.execute("UPDATE certificates SET state = 'registered' WHERE fingerprint = ?", (own.fingerprint,))
+    assert running.reached == []
+
+
 def test_too_many_connections_of_one_vehicle_and_without_a_certificate(running):
     """The oldest give way, and another vehicle is answered at once."""
     with contextlib.ExitStack() as stack:

@@ -10,6 +10,7 @@ whoever has most gives way: so a crowd of idle connections keeps nobody else out
 import asyncio
 import contextlib
 import gc
+import resource
 import socket
 import ssl
 import struct
@@ -26,7 +27,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 CERTIFICATE, CONNECTION = "certificate", "connection"  # keys of the state
 RECEIVED_AT, SENT_AT, INFO_BYTES = 128, 200, 216  # tcpi_bytes_received, tcpi_bytes_sent and _retrans in linux/tcp.h
-HANDSHAKES, OF_EACH, IN_ALL = 64, 16, 768  # connections: before a certificate is known; of one client; all with one
+HANDSHAKES, OF_EACH, IN_ALL = 256, 16, 768  # connections: before a certificate is known; of one client; all with one
+FILES = 4096  # that a server may have open, where the system lets it: those, and as many to where it passes calls on
 BACKLOG = 128  # connections that the kernel keeps until they are accepted
 HANDSHAKE_S, HEADER_S, CLOSE_S = 10.0, 10.0, 2.0  # for TLS's handshake; for each request's header; for TLS's farewell
 LARGEST_HEADER = 8192  # bytes
@@ -196,6 +198,8 @@ def serve_https(
     find_owner: returns whose certificate (DER) one is; an owner may have `OF_EACH` connections.
     """
     sslproto.SSLProtocol.max_size = BUFFER
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(FILES, hard)), hard))
     door = open_door(host, port)
     config = uvicorn.Config(
         app,
@@ -214,6 +218,7 @@ def serve_https(
         ssl_keyfile=key,
         ssl_ca_certs=None if authority is None else str(authority),
         ssl_cert_reqs=ssl.CERT_NONE if authority is None else ssl.CERT_REQUIRED,
+        timeout_keep_alive=int(HEADER_S),  # longer than httpx keeps a connection, which so ends it first
         timeout_graceful_shutdown=2,
     )
     config.load()

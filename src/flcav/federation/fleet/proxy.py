@@ -9,6 +9,7 @@ SuperLink listens on the operator's host alone.
 import asyncio
 import base64
 import binascii
+import contextlib
 import hashlib
 import time
 from collections import defaultdict
@@ -33,9 +34,7 @@ from flcav.federation.fleet.relay import (
     QUIET_S,
     SIGNED_AT,
     TIMEOUT,
-    Headers,
     Refused,
-    Relayed,
     answer,
     check_body,
     check_headers,
@@ -111,22 +110,16 @@ class FleetProxy:
         if node_key(headers.get(NODE_KEY, b"")) != vehicle.public_key:
             raise Refused(401, "the node's key is not the certificate's")
         passed = [*choose_headers(headers), name_key(vehicle)]
-        if call == "push-object":
-            async with self._objects[vehicle.name]:
-                done = await self._relay(vehicle, call, passed, scope, receive, send)
-        else:
-            done = await self._relay(vehicle, call, passed, scope, receive, send)
+        slot = self._objects[vehicle.name] if call == "push-object" else contextlib.nullcontext()
+        async with slot:
+            body = await read_body(scope, receive, largest_body(call))
+            vehicle = self.find(scope["state"][CERTIFICATE])  # which may have been revoked meanwhile
+            done = await relay(self._client, path, passed, check_body(call, body, vehicle), send)
         if done.status == httpx.codes.UNAUTHORIZED:
             self._traffic.refuse(vehicle.name, describe_clock(headers.get(SIGNED_AT, b""), came))
         connection: Connection = scope["state"][CONNECTION]
         self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), done.status)
         self._changed = True
-
-    async def _relay(
-        self, vehicle: Vehicle, call: str, headers: Headers, scope: Scope, receive: Receive, send: Send
-    ) -> Relayed:
-        body = await read_body(scope, receive, largest_body(call))
-        return await relay(self._client, FLEET + call, headers, check_body(call, body, vehicle), send)
 
     def find(self, certificate: bytes | None) -> Vehicle:
         """Return the vehicle whose certificate (DER) is in force; raises `Refused` where it is nobody's.

@@ -116,8 +116,9 @@ class Registry:
     def create(cls, path: Path, authority: str) -> "Registry":
         """Return a new, empty registry of the authority with this fingerprint."""
         made = cls(path)
-        made._connection.execute("PRAGMA journal_mode=WAL")
-        made._connection.executescript(f"BEGIN; {SCHEMA} {REQUESTS} COMMIT;")
+        with _told(path):
+            made._connection.execute("PRAGMA journal_mode=WAL")
+            made._connection.executescript(f"BEGIN; {SCHEMA} {REQUESTS} COMMIT;")
         with made._change() as cursor:
             cursor.execute("INSERT INTO authority VALUES (?)", (authority,))
             made._note(cursor, "found", "", authority, "")
@@ -140,13 +141,13 @@ class Registry:
         return found
 
     def _check(self, authority: str) -> None:
-        try:
-            row = self._connection.execute("SELECT fingerprint FROM authority").fetchone()
-        except sqlite3.DatabaseError as error:
-            with _told(self.path):
+        with _told(self.path):
+            try:
+                row = self._connection.execute("SELECT fingerprint FROM authority").fetchone()
+            except sqlite3.DatabaseError as error:
                 if "locked" in str(error):
                     raise
-            raise InputError(f"{self.path}: is no registry of a fleet") from None
+                raise InputError(f"{self.path}: is no registry of a fleet") from None
         if row != (authority,):
             raise InputError(f"{self.path}: is the registry of another authority than {self.path.parent / 'ca.crt'}")
         if len(self._read("SELECT name FROM sqlite_master WHERE name IN ('requests_by_time', 'answered')")) < 2:
