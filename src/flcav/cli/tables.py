@@ -52,6 +52,8 @@ def numbers(table: pa.Table, columns: Sequence[str], path: Path) -> np.ndarray:
             except (TypeError, ValueError, OverflowError):
                 out[row, i] = np.nan
             if not np.isfinite(out[row, i]):
-                told = "nan" if value is None else shorten(value)
+                if value is None or (isinstance(value, str) and not value.strip()):
+                    raise InputError(f"{path}: row {row + 1}: {column} is empty, and must be a finite number")
+                told = shorten(value)
                 raise InputError(f"{path}: row {row + 1}: {column} = {told} is not a finite number")
     return out

@@ -2,7 +2,8 @@
 
 Tracks come from the tracker of the package, and are kept for `KEPT_S` without a detection. Vehicles that are known for
 two seconds get the single path of the trajectory network, every half second; all others keep their velocity. Who moves
-looks where it goes: a detector often takes the back of a car for its front, and a track keeps the heading of its first.
+looks where it goes, also at speeds at which a track keeps the heading of its first detection: a detector often takes
+the back of a car for its front.
 """
 
 from collections import deque

@@ -13,8 +13,8 @@ from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.tests import Test
 from flcav.pipeline.running import WORK, seed_folders
 from flcav.statistics.estimates import Estimate, combine_spreads, widen
-from flcav.statistics.seeds import MeanOverSeeds, OneTraining, of_one_training
-from flcav.statistics.verdicts import UNDECIDED, Claim, Judged, judge, judge_known
+from flcav.statistics.seeds import LARGEST_SPREAD, MeanOverSeeds, OneTraining, of_one_training
+from flcav.statistics.verdicts import NOT_HELD, UNDECIDED, Claim, Judged, judge, judge_known, tell_loss
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task
 
@@ -39,9 +39,9 @@ def compare(first: Path, second: Path) -> tuple[Compared, ...]:
     """Return the paired difference of every test that both runs made, over the seeds that both have.
 
     Its interval (95 %) for one common seed is over the trainings that both runs have; of one training a bootstrap over
-    scenes, widened by the spread of retraining in both, and where that is not known, one seed decides nothing. For
-    several seeds it is over seeds and scenes, of each seed's mean over its trainings. Raises
-    `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
+    scenes, widened by the spread of retraining in both; where that is not known, one seed decides only a loss that is
+    too large for any spread. For several seeds it is over seeds and scenes, of each seed's mean over its trainings.
+    Raises `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
     """
     folders = [seed_folders(folder) for folder in (first, second)]
     seeds = [seed for seed in folders[0] if seed in folders[1]]
@@ -64,6 +64,7 @@ class _Pair:
     compared: Compared  # of one seed
     folders: tuple[Path, Path]  # of the first training's tests, the second run's and the first's
     estimate: OneTraining | MeanOverSeeds | None  # what is judged; None for one training of unknown spread
+    scenes: int  # of the test
 
 
 def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, _Pair]:
@@ -91,16 +92,26 @@ def _pair(key: Key, before: Test, after: Test, works: tuple[Path, Path], seed: i
         change = over_scenes if spread is None else widen(over_scenes, spread)
         known = None if spread is None else of_one_training(over_scenes, after.result.scenes, spread)
     first, second = measures.mean(axis=1).tolist()
-    return _Pair(Compared(*key, after.result.measure, first, second, change, UNDECIDED), folders[0], known)
+    return _Pair(
+        Compared(*key, after.result.measure, first, second, change, UNDECIDED), folders[0], known, after.result.scenes
+    )
 
 
 def _judge_trainings(pairs: Sequence[_Pair]) -> tuple[Compared, ...]:
-    """Return the differences of one seed with their verdicts, judged together; unknown ones are undecided."""
+    """Return the differences of one seed with their verdicts, judged together; of unknown spread only losses are."""
     judged = judge_known([None if pair.estimate is None else Claim(pair.estimate) for pair in pairs])
     return tuple(
-        pair.compared if one is None else replace(pair.compared, verdict=one.verdict, judged=one)
+        replace(pair.compared, verdict=_judge_unknown(pair, len(pairs)))
+        if one is None
+        else replace(pair.compared, verdict=one.verdict, judged=one)
         for pair, one in zip(pairs, judged, strict=True)
     )
+
+
+def _judge_unknown(pair: _Pair, family: int) -> str:
+    """Return the verdict on one training of unknown spread: a loss too large for the spread of both runs is one."""
+    lost = tell_loss(pair.compared.difference, pair.scenes, family, LARGEST_SPREAD * 2**0.5)
+    return UNDECIDED if lost is None else NOT_HELD
 
 
 def _key(test: Test) -> Key:

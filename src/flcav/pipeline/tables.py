@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 
 from flcav.config import InputError, shorten
 from flcav.pipeline.recipe import find_path
+from flcav.storage.exchange import read_csv
 from flcav.storage.files import atomic_path
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 import io
 from dataclasses import dataclass
-
-import pyarrow.csv
 
 from flcav.optimization.curves.history import History, parse_histories
 
@@ -90,10 +89,7 @@ def read_history(task: str, name: str, beside: Path) -> str:
 
 def parse_history(task: str, text: str, origin: str) -> History:
     """Return the task's points in a history (CSV); raises `InputError`, naming `origin`, where there are none."""
-    try:
-        table = pyarrow.csv.read_csv(io.BytesIO(text.encode()))
-    except pyarrow.ArrowInvalid as error:
-        raise InputError(f"{origin}: not a CSV table ({error})") from None
+    table = read_csv(io.BytesIO(text.encode()), origin=origin)
     found = parse_histories(table.to_pydict(), origin, task)
     if task not in found:
         raise InputError(f"tasks.{task}.history: {origin} has no rows of '{task}', but of {', '.join(found)}")

@@ -20,6 +20,10 @@ from flcav.statistics.estimates import CONFIDENCE, EDGE, TAILS, Estimate, Spread
 
 LEVEL = 1 - CONFIDENCE  # of a test, two-sided
 LEAST_P = 1e-12  # p-values below are 0
+LARGEST_SPREAD = (
+    0.1  # assumed where it is not known: above the standard deviation of any retrainings in `reproductions`
+)
+FEWEST_SCENES = 6  # by which signs alone can decide at `LEVEL`: 2^(1 - 6) = 0.03
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,23 @@ def of_one_training(over_scenes: Estimate, scenes: int, spread: Spread) -> OneTr
     half = mean - low if mean > 0 else high - mean
     shared = SharedScenes(half / float(ndtri(TAILS[1])), scenes)
     return OneTraining(mean, wide.low, wide.high, 1, spread.sd, shared, trainings=spread.trainings)
+
+
+def p_value_of_loss(over_scenes: Estimate, scenes: int, spread: float = LARGEST_SPREAD) -> float | None:
+    """Return the two-sided p-value of a negative difference of one training whose spread of retraining is not known.
+
+    `spread`: the standard deviation that is assumed instead. The interval over scenes, of normal quantiles and of a
+    standard deviation that divides by the number of scenes, is widened for few of them, by Student's t with the degrees
+    of freedom of `standard_error`. None for a difference that is not negative, without an interval, or of fewer than
+    `FEWEST_SCENES`: so few may all be scenes of a collapse.
+    """
+    mean, high = over_scenes.mean, over_scenes.high
+    if high is None or mean >= 0 or scenes < FEWEST_SCENES:
+        return None
+    of_scenes = (high - mean) / float(ndtri(TAILS[1])) * float(np.sqrt(scenes / (scenes - 1)))
+    error = float(np.hypot(of_scenes, spread))
+    freedom = (scenes - 1) * (error / of_scenes) ** 2 if of_scenes > 0 else np.inf
+    return float(2 * stdtr(freedom, mean / error))
 
 
 def mean_over_seeds(

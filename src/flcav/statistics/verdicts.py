@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
+from flcav.statistics.estimates import Estimate
 from flcav.statistics.power import MOST_SEEDS, SampleSize, plan_sample, seeds_to_tell
-from flcav.statistics.seeds import LEVEL, MeanOverSeeds
+from flcav.statistics.seeds import LARGEST_SPREAD, LEVEL, MeanOverSeeds, p_value_of_loss
 from flcav.storage.markdown import format_table
 from flcav.storage.records import LEFT_OUT
 
@@ -163,6 +164,20 @@ def _judged(claim: Claim, p: float, family: int) -> Judged:
         alone = Alone(own, claim.mean.ends(level))
     size = plan_sample(claim.mean, claim.than, level) if said == UNDECIDED else None
     return Judged(said, p, family, seeds_to_tell(claim.mean, claim.than, level), size, alone)
+
+
+def tell_loss(over_scenes: Estimate, scenes: int, family: int, spread: float = LARGEST_SPREAD) -> str | None:
+    """Return why a claim of one training of unknown spread did not hold, in words; None where it is undecided.
+
+    So large a loss is one whatever the spread: its p-value with the largest that is assumed, times the `family`, the
+    number of claims that are made (Bonferroni), is at most `LEVEL`. A gain is never decided so.
+    """
+    p = p_value_of_loss(over_scenes, scenes, spread)
+    if p is None or p * family > LEVEL:
+        return None
+    corrected = f", corrected for {family} claims" if family > 1 else ""
+    told = f"p {format_p(p * family)}{corrected}"
+    return f"a spread of {spread:.2g}, above any measured, would not explain such a loss ({told})"
 
 
 def describe_aims(aims: Mapping[str, Claim]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import pyarrow as pa
 import pyarrow.csv
@@ -19,19 +20,25 @@ def check_ending(path: Path) -> None:
         raise InputError(f"{path}: tables are written as {' or '.join(ENDINGS)}; end the name with one of them")
 
 
-def read_csv(path: Path | str, texts: Sequence[str] = ()) -> pa.Table:
-    """Return the table in the CSV file at `path`, the columns `texts` as text.
+def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str = "") -> pa.Table:
+    """Return the table in the CSV file at `path`, or in an open one called `origin`, the columns `texts` as text.
 
-    Raises `InputError` where it is missing or no table.
+    Only an empty cell is None; "NaN" is a number, "NA" is text. Raises `InputError` where the file is missing or no
+    table, or a column is there twice.
     """
-    written = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()))
+    named = origin or str(path)
+    written = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()), null_values=[""])
     try:
-        return pyarrow.csv.read_csv(path, convert_options=written)
+        table = pyarrow.csv.read_csv(path, convert_options=written)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         said = str(error) if str(error).isprintable() else "its bytes are no text"
-        raise InputError(f"{path}: not a table ({said})") from None
+        raise InputError(f"{named}: not a table ({said})") from None
+    for name in table.column_names:
+        if name and table.column_names.count(name) > 1:
+            raise InputError(f"{named}: column '{name}' is there twice; found {', '.join(table.column_names)}")
+    return table
 
 
 def write_table(table: pa.Table, path: Path) -> None:

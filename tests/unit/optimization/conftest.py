@@ -14,6 +14,7 @@ from flcav.optimization.allocation import allocate as allocation
 from flcav.optimization.allocation import fleet
 from flcav.optimization.allocation.allocate import Allocation
 from flcav.optimization.placement import cheapest, solve
+from flcav.optimization.placement.instance import UNIT
 from flcav.optimization.placement.solve import Candidates
 from flcav.optimization.problem import Problem
 from flcav.optimization.verification.allocation import verify_allocation
@@ -71,7 +72,7 @@ def _verified_placement(name: str, place: Callable[..., Any]) -> Callable[..., A
     def place_and_verify(candidates: Candidates, limit: Any, **how: Any) -> Any:
         found = place(candidates, limit, **how)
         placed, least = found if name == "cover" else (found, None)
-        by_range = candidates.cost.reshape(candidates.poles, candidates.sensors)
+        by_range = np.array([each * UNIT for each in candidates.price]).reshape(candidates.poles, candidates.sensors)
         asked = replace(ASKED[id(candidates.covers)], cost=by_range[:, np.argsort(candidates.order)], **{name: limit})
         checked = verify_placement(asked, json.dumps(asdict(placed)), least)
         assert not checked.faults, (checked, placed)

@@ -199,3 +199,60 @@ def test_what_is_found_everywhere_is_followed_without_a_mistake(monkeypatch):
 def test_frames_too_far_apart_are_refused():
     with pytest.raises(InputError, match="4 s apart"):
         evaluate_tracks(second_tiny(), cast(Dataset, Recording(drive(3), every_s=4.0)))
+
+
+HEADING = 0.3
+
+
+def follow(speeds, reversed_in, *, step_s=0.1, noise_m=0.0, size=(4.2, 1.8, 1.5)):
+    """Return the headings, less the true one [rad], of a track whose detections are reversed in some frames."""
+    tracker, rng, at, off = Tracker(confirm=1), np.random.default_rng(0), 0.0, []
+    for number, speed in enumerate(speeds):
+        at += speed * step_s
+        along = np.array((np.cos(HEADING), np.sin(HEADING))) * at + rng.normal(0, noise_m, 2)
+        box = np.r_[along, 0.8, size, HEADING + np.pi * reversed_in(number)]
+        told = tracker.step(Boxes.from_array(box[None], "Car"), step_s * number)
+        assert told.track.tolist() == [0]
+        off.append(float(told.boxes.yaw[0]) - HEADING)
+    return np.cos(off)
+
+
+EVER, NEVER = (lambda n: True), (lambda n: False)
+
+
+@pytest.mark.parametrize(
+    "reversed_in", [EVER, lambda n: n == 0, lambda n: n % 2 == 0], ids=["ever", "first", "every 2nd"]
+)
+@pytest.mark.parametrize(
+    ("speeds", "within"),
+    [([10.0] * 12, 6), ([2.0] * 60, 45), ([0.0] * 20 + [*np.arange(0, 8, 0.3)] + [8.0] * 10, 44)],
+    ids=["fast", "slow", "late"],
+)
+def test_a_track_heads_where_it_moves(speeds, within, reversed_in):
+    off = follow(speeds, reversed_in)
+    assert off[0] == pytest.approx(-1)  # as first detected
+    assert off[within:] == pytest.approx(np.ones(len(off) - within), abs=1e-3)
+    assert (np.diff(np.sign(off)) != 0).sum() == 1  # turned once
+
+
+@pytest.mark.parametrize("reversed_in", [EVER, NEVER, lambda n: n % 2 == 0], ids=["ever", "never", "every 2nd"])
+def test_a_parked_car_keeps_the_heading_of_its_first_detection(reversed_in):
+    off = follow([0.0] * 200, reversed_in, noise_m=0.1)
+    assert np.sign(off).tolist() == [1 - 2 * reversed_in(0)] * 200
+
+
+@pytest.mark.parametrize(
+    "speeds",
+    [
+        [*np.arange(6, -1.5, -0.4)] + [-1.5] * 40 + [*np.arange(-1.5, 5, 0.4)],
+        [0.0] * 10 + [-1.5] * 35 + [0.0] * 10 + [4.0] * 30,
+        [3.0] * 30 + [-2.5] * 15 + [3.0] * 10 + [-2.5] * 15 + [3.0] * 30,
+    ],
+    ids=["after a drive", "out of a parking space", "in turns"],
+)
+def test_a_vehicle_that_backs_up_for_a_moment_keeps_its_heading(speeds):
+    assert follow(speeds, NEVER, noise_m=0.05).min() > 0.9
+
+
+def test_who_walks_does_not_back_up():
+    assert follow([1.2] * 60, EVER, size=(0.6, 0.6, 1.7))[20:] == pytest.approx(np.ones(40), abs=1e-3)

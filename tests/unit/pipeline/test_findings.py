@@ -99,6 +99,17 @@ def test_without_a_spread_of_retraining_no_claim_has_held() -> None:
     assert "is not known, so the result is inconclusive" in edge.sentence
 
 
+def test_a_collapse_is_a_loss_whatever_the_spread_of_retraining() -> None:
+    collapse = replace(difference(EDGE, (MAIN, PRETRAIN), -0.734, -0.906, -0.547), spread=None)
+    gain = replace(difference(EDGE, (MAIN, PRETRAIN), 0.734, 0.547, 0.906), spread=None)
+    known = difference(EDGE, (MAIN, PRETRAIN), 0.06, 0.022, 0.11)
+    lost, gained, other = told(collapse, gain, known)
+    assert (lost.verdict, gained.verdict) == (NOT_HELD, UNDECIDED)
+    assert "is not known, but a spread of 0.1, above any measured, would not explain such a loss" in lost.sentence
+    assert "(p < 0.001, corrected for 3 claims): the claim did not hold in this run" in lost.sentence
+    assert other == told(known)[0], "claims of known spread are corrected for one another alone"
+
+
 def test_a_run_with_retrainings_is_judged_by_the_mean_of_its_trainings() -> None:
     """The first training alone says the opposite; with as much spread from a table it would decide nothing."""
     values = [-0.01, 0.05, 0.04, 0.06, 0.05, 0.03, 0.04, 0.06]

@@ -1,3 +1,5 @@
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -7,7 +9,7 @@ from scipy.special import expit, logit
 
 from flcav.statistics.estimates import Estimate, Spread
 from flcav.statistics.power import plan_sample, seeds_to_tell
-from flcav.statistics.seeds import SharedScenes, mean_over_seeds, of_one_training
+from flcav.statistics.seeds import LARGEST_SPREAD, SharedScenes, mean_over_seeds, of_one_training
 from flcav.statistics.verdicts import (
     HELD,
     NOT_HELD,
@@ -17,6 +19,7 @@ from flcav.statistics.verdicts import (
     judge,
     judge_known,
     signed,
+    tell_loss,
     verdict,
 )
 
@@ -114,3 +117,51 @@ def test_an_undecided_claim_on_shared_scenes_tells_trainings_and_scenes() -> Non
     assert found.size is not None
     assert found.takes_cell == found.size.describe("seeds")
     assert found.describe("trainings").endswith(f"of this size takes {found.size.describe('trainings')}")
+
+
+def draw_differences(rng: np.random.Generator, times: int, scenes: int, gain: float, spread: float) -> np.ndarray:
+    """Return (times, scenes) differences of an accuracy: of each scene its own, with that of the training."""
+    mean = gain + rng.normal(0, spread, (times, 1))
+    before, after = rng.beta(1, 1, (times, scenes)), rng.beta(1, 1, (times, scenes))
+    frames = 4
+    return rng.binomial(frames, np.clip(after + mean, 0, 1)) / frames - rng.binomial(frames, before) / frames
+
+
+@pytest.mark.parametrize("scenes", [6, 8, 16, 32])
+def test_trainings_without_a_loss_are_rarely_called_one_and_collapses_nearly_always(scenes: int) -> None:
+    """The spread of these trainings is the largest that is assumed; a collapse is from .82 to 0 in every scene."""
+    rng, called = np.random.default_rng(scenes), {}
+    collapsed = -rng.binomial(4, np.clip(rng.normal(0.82, 0.2, (300, scenes)), 0, 1)) / 4
+    for name, drawn in (
+        ("none", draw_differences(rng, 2000, scenes, 0.0, LARGEST_SPREAD)),
+        ("gain", draw_differences(rng, 500, scenes, 0.1, LARGEST_SPREAD)),
+        ("collapse", collapsed),
+    ):
+        times = rng.multinomial(scenes, np.full(scenes, 1 / scenes), size=200)
+        low, high = np.quantile(drawn @ times.T / scenes, [0.025, 0.975], axis=1)
+        found = zip(drawn.mean(axis=1).tolist(), low.tolist(), high.tolist(), strict=True)
+        called[name] = np.mean([tell_loss(Estimate(*each), scenes, 1) is not None for each in found])
+    print(scenes, called)
+    assert called["none"] <= 0.03  # one side of 5 %
+    assert called["gain"] <= 0.01
+    assert called["collapse"] >= 0.99
+
+
+def test_a_paired_interval_far_below_0_is_a_loss_though_the_spread_is_not_known() -> None:
+    collapse = Estimate(-0.734, -0.906, -0.547)
+    for scenes, family in ((6, 4), (8, 8), (32, 20)):
+        assert tell_loss(collapse, scenes, family) is not None
+    assert tell_loss(collapse, 5, 1) is None, "of few scenes all may be those that it fails in"
+    assert tell_loss(Estimate(0.734, 0.547, 0.906), 32, 1) is None, "a gain of one training is not claimed"
+    assert tell_loss(Estimate(-0.15, -0.2, -0.1), 32, 1) is None, "another training may differ by as much"
+    assert tell_loss(Estimate(-0.734, None, None), 32, 1) is None
+
+
+def test_the_spread_that_is_assumed_is_above_all_that_were_measured() -> None:
+    found = []
+    for path in sorted((Path(__file__).parents[3] / "reproductions").rglob("results.json")):
+        for each in json.loads(path.read_text()).get("differences", []):
+            if isinstance(each, dict) and each.get("spread"):
+                found.append(each["spread"]["sd"])
+    assert len(found) > 50
+    assert max(found) < LARGEST_SPREAD

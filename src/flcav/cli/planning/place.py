@@ -197,9 +197,9 @@ def _verify(
 
     from flcav.optimization.verification.placement import PlacementProblem, verify_placement
 
-    cost = given.pole_cost[:, None] + given.sensor_cost
+    cost = given.costs
     if count is not None or not given.priced:
-        cost = np.ones_like(cost)
+        cost = np.ones(cost.shape)
     visible = None if seen is None else seen.toarray() > 0
     places = (given.errors, given.weight, given.poles, given.ranges_m)
     return verify_placement(
@@ -298,7 +298,7 @@ def _note(given: "Given", placed: "Placement") -> list[str]:
         return own if max(len(str(each)) for each in given.ids) <= LONGEST else f"{own} ({pole + 1})"
 
     def cost(chosen: "list[tuple[int, int]]") -> str:
-        own = sum(given.pole_cost[pole] + given.sensor_cost[sensor] for pole, sensor in chosen)
+        own = float(sum(given.costs[pair] for pair in chosen))
         return f", cost {own:.6g}" if given.priced else ""
 
     pairs = list(zip(placed.chosen, placed.sensors, strict=True))

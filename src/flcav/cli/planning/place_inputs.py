@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from flcav.config import InputError, shorten
 from flcav.dataset.store import Dataset
 from flcav.optimization.placement.instance import find_covered
 from flcav.optimization.placement.solve import Candidates, Placement, find_candidates
+from flcav.optimization.verification.record import exact
 from flcav.perception.errors import CLASS
 from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
@@ -47,7 +49,16 @@ class Given:
         """Return what a placement costs; None where nothing has a cost."""
         if not self.priced:
             return None
-        return float(self.pole_cost[list(placed.chosen)].sum() + self.sensor_cost[list(placed.sensors)].sum())
+        pairs = zip(placed.chosen, placed.sensors, strict=True)
+        return float(sum(self.costs[pair] for pair in pairs))
+
+    @property
+    def costs(self) -> NDArray[np.object_]:
+        """Return (P, S) `Fraction`: the cost of each sensor on each pole, of the decimals that were given."""
+        of_pole, of_sensor = (
+            np.array([*map(exact, own.tolist())], dtype=object) for own in (self.pole_cost, self.sensor_cost)
+        )
+        return of_pole[:, None] + of_sensor
 
     def covered_by(self, placed: Placement, visible: csr_array | None) -> NDArray[np.bool_]:
         """Return (E,) which errors a placement covers: within a sensor's range, and `visible` (P, E) from its pole."""
@@ -151,7 +162,7 @@ def _weigh(mistakes: pa.Table, path: Path, class_weights: Sequence[str]) -> Arra
     if len(below := np.argwhere(factor < 0)):
         row, column = below[0]
         raise InputError(f"{path}: row {row + 1}: {given[column]} = {factor[row, column]:g} is below 0")
-    weight = factor.prod(axis=1)
+    weight = np.array([float(prod(map(exact, row))) for row in factor.tolist()])
     factors = _parse_factors(class_weights)
     if not factors:
         return weight
@@ -160,7 +171,8 @@ def _weigh(mistakes: pa.Table, path: Path, class_weights: Sequence[str]) -> Arra
     labels = [str(label) for label in mistakes[CLASS].to_pylist()]
     if unknown := [name for name in factors if name not in labels]:
         raise InputError(f"--class-weight: no error in {path} is of the class {unknown[0]!r}")
-    return weight * np.array([factors.get(label, 1.0) for label in labels])
+    of_class = [factors.get(label, 1.0) for label in labels]
+    return np.array([float(exact(one) * exact(other)) for one, other in zip(weight.tolist(), of_class, strict=True)])
 
 
 def _parse_factors(class_weights: Sequence[str]) -> Mapping[str, float]:

@@ -98,6 +98,10 @@ def parse_histories(columns: Table, origin: str, unnamed: str) -> dict[str, Hist
     for row, stage in enumerate(columns.get("stage", ()), start=1):
         if stage not in STAGES:
             raise InputError(f"{origin}: row {row}: stage = {stage!r} must be one of {', '.join(STAGES)}")
+    for name in ("task", "run", "seed"):
+        for row, value in enumerate(columns.get(name, ()), start=1):
+            if value is None or value != value or not str(value).strip():
+                raise InputError(f"{origin}: row {row}: {name} is empty: a row names its {name}, or the table has none")
     names = [str(name) for name in columns.get("task", [unnamed] * len(accuracy))]
     found = {}
     whole = list(zip(*columns.values(), strict=True))
@@ -153,6 +157,10 @@ def _numbers(columns: Table, name: str, origin: str, most: float = MOST) -> Arra
             values[row] = np.nan
         if not (values[row] == 0 or LEAST <= values[row] <= most):
             wanted = f"must be a number from 0 to {most:g}"
+            if value is None or (isinstance(value, str) and not value.strip()):
+                raise InputError(f"{origin}: row {row + 1}: {name} is empty, and {wanted}")
+            if 0 < values[row] < LEAST:
+                wanted = f"must be 0, or a number from {LEAST:g} to {most:g}"
             if most == 1:
                 wanted += hint_share(values[row])
             if isinstance(value, str):

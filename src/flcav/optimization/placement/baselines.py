@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.optimization.placement.instance import TIE, Array
+from flcav.optimization.placement.instance import TIE, Array, as_float
 from flcav.optimization.placement.solve import Candidates, Placement, describe
 from flcav.statistics.streams import stream
 
@@ -44,12 +44,13 @@ def place_at_random(candidates: Candidates, budget: float, draws: int = DRAWS, s
 
 def _fill(candidates: Candidates, order: NDArray[np.int64], budget: float) -> list[int]:
     """Return the candidates of `order` that still fit when it is their turn, one a pole, ascending."""
-    cheapest, spent, taken = float(candidates.cost.min()), 0.0, {}
+    price, spent, taken = candidates.price.tolist(), 0, {}
+    cheapest = min(price)
     for candidate in order.tolist():
-        if spent + cheapest > budget * (1 + TIE):
+        if as_float(spent + cheapest) > budget:
             break
         pole = candidate // candidates.sensors
-        if pole not in taken and spent + candidates.cost[candidate] <= budget * (1 + TIE):
+        if pole not in taken and as_float(spent + price[candidate]) <= budget:
             taken[pole] = candidate
-            spent += float(candidates.cost[candidate])
+            spent += price[candidate]
     return sorted(taken.values())

@@ -22,10 +22,10 @@ TRIALS = 1000  # exchanges tried at most
 def choose_greedily(instance: CoverageInstance, budget: float) -> list[int]:
     """Return the candidates of greatest gain over cost within `budget`, or the best single one and what fits beside.
 
-    Ascending; among equals the earliest candidate.
+    Ascending; among equals the earliest candidate. Here and below `budget` is a whole number of `UNIT`, or infinite.
     """
     chosen = extend_greedily(instance, budget, ())
-    single = np.where(instance.cost <= budget * (1 + TIE), instance.covers @ instance.weight, 0.0)
+    single = np.where(instance.price <= budget, instance.covers @ instance.weight, 0.0)
     best = int(np.argmax(single))
     if single[best] > instance.value(chosen) * (1 + TIE):
         return extend_greedily(instance, budget, (best,))
@@ -39,27 +39,28 @@ def extend_greedily(
 
     Ends where nothing gains, or where `target` of the weight is covered.
     """
-    kinds, cost = instance.sensors, instance.cost
+    kinds, cost, exact = instance.sensors, instance.cost, instance.price
     on = {candidate // kinds: candidate for candidate in chosen}
     left = np.where(reach(instance.covers, [*on.values()]), 0.0, instance.weight)
     missing = target - (instance.weight.sum() - left.sum())
     held = np.zeros(len(cost) // kinds)  # cost of what each pole carries: taken down, it is saved
     held[[*on]] = cost[[*on.values()]]
-    spent = float(held.sum())
+    spent = instance.cost_of(on.values())
 
-    def price(candidate: int) -> float:
-        return float(cost[candidate] - held[candidate // kinds])
+    def price(candidate: int) -> int:
+        carried = on.get(candidate // kinds)
+        return exact[candidate] - (0 if carried is None else exact[carried])
 
     def fits(candidate: int) -> bool:
-        return spent + price(candidate) <= budget * (1 + TIE)
+        return spent + price(candidate) <= budget
 
     def rate(candidate: int) -> float:
         gain = float(left[instance.covered_by(candidate)].sum())
-        return gain / max(price(candidate), NOTHING)
+        return gain / max(float(cost[candidate] - held[candidate // kinds]), NOTHING)
 
     gains, prices = instance.covers @ left, cost - np.repeat(held, kinds)
     rates = gains / np.maximum(prices, NOTHING)
-    useful = np.flatnonzero((gains > 0) & (spent + prices <= budget * (1 + TIE)))
+    useful = np.array([k for k in np.flatnonzero(gains > 0).tolist() if fits(k)], np.int64)
     heap = list(zip((-rates[useful]).tolist(), useful.tolist(), strict=True))
     heapq.heapify(heap)
     while missing > 0:

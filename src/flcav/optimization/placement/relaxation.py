@@ -11,6 +11,7 @@ sizes of Pock and Chambolle (2011), averages and restarts.
 """
 
 from dataclasses import dataclass
+from math import fsum
 
 import numpy as np
 
@@ -21,6 +22,7 @@ RESTARTS = (200, 400, 800)  # steps after which the average is the new start
 LOOK = 50  # steps between two looks at the bound
 SETTLED = 2e-5  # relative gain in the bound since the last restart below which it has converged
 NOTHING = 1e-12
+EPS = 2.0**-52  # relative rounding of an operation with floats, rounded up
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def bound_by(instance: CoverageInstance, budget: float, u: Array, share: Array) 
     kinds = instance.sensors
     gain, cost = (instance.covers @ u).reshape(-1, kinds), instance.cost.reshape(-1, kinds)
     rows = np.arange(len(gain))
-    free = float((instance.weight - u).sum())
+    free = fsum((instance.weight - u).tolist())
 
     def net_of(price: float) -> Array:
         return gain - price * cost
@@ -87,14 +89,20 @@ def bound_by(instance: CoverageInstance, budget: float, u: Array, share: Array) 
     def spare_of(price: float) -> float:
         return free + float(np.maximum(net_of(price).max(axis=1), 0.0).sum())
 
-    low, high = 0.0, float((gain / np.maximum(cost, NOTHING)).max(initial=0.0))
-    for _ in range(60):  # the derivative by the price is the budget less what the best choice at that price costs
+    low, high = 0.0, float(np.divide(gain, cost, out=np.zeros_like(gain), where=cost > 0).max(initial=0.0))
+    for _ in range(200):  # the derivative by the price is the budget less what the best choice at that price costs
+        if high - low <= EPS * high or high * budget <= EPS * free:
+            break
         middle = (low + high) / 2
         net = net_of(middle)
         best = net.argmax(axis=1)
         bought = float(cost[rows, best][net[rows, best] > 0].sum())
         low, high = (middle, high) if bought > budget else (low, middle)
     price = min((low, high), key=lambda each: spare_of(each) + each * budget)
-    net, spare = net_of(price), spare_of(price)
+    net = net_of(price)
     loss = np.maximum(net.max(axis=1, keepdims=True), 0.0) - net
-    return Relaxation(spare + price * budget, share, loss.ravel(), spare, price, u)
+    above = 1 + EPS * (np.diff(instance.covers.indptr).reshape(-1, kinds) + 4)  # sums are rounded outward from here on
+    worth = (gain * above - price * cost * (1 - 2 * EPS)).max(axis=1)
+    spare = fsum((free, *np.maximum(worth, 0.0).tolist())) * (1 + 4 * EPS) + 4 * EPS * float(instance.weight.sum())
+    bound = (spare + price * budget * (1 + 4 * EPS)) * (1 + 2 * EPS)
+    return Relaxation(bound, share, loss.ravel(), spare, price, u)

@@ -9,6 +9,8 @@ decomposition for very large scale partial set covering and maximal covering loc
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -16,9 +18,23 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, diags_array
 
 from flcav.config import InputError
+from flcav.optimization.placement.enumeration import improve_exactly
 from flcav.optimization.placement.greedy import choose_greedily, exchange, extend_greedily
-from flcav.optimization.placement.instance import TIE, Array, CoverageInstance, find_covered, merge_errors, reach
-from flcav.optimization.placement.program import bound_by_highs, maximise_coverage
+from flcav.optimization.placement.instance import (
+    TIE,
+    UNIT,
+    Array,
+    CoverageInstance,
+    Units,
+    as_float,
+    common_unit,
+    find_covered,
+    in_units,
+    limit_in_units,
+    merge_errors,
+    reach,
+)
+from flcav.optimization.placement.program import bound_by_highs, is_coarse, is_wide, maximise_coverage
 from flcav.optimization.placement.relaxation import Relaxation, bound_by, relax
 
 Method = Literal["exact", "greedy"]
@@ -26,6 +42,7 @@ Method = Literal["exact", "greedy"]
 FARTHEST_M = 1e9  # largest coordinate and range
 WHOLE = 6000  # covered pairs up to which HiGHS solves the whole program
 SEARCHED = 60_000  # covered pairs up to which it searches what remains of a large one
+NEARLY = 1e-6  # relative difference between a choice and HiGHS' bound from which its search has not ended
 SURE = 0.05  # fractional choice from which a candidate is rounded up
 
 
@@ -75,6 +92,12 @@ class Candidates:
     weight: Array  # (E,) of the errors
     cost: Array  # (P * S,)
     order: NDArray[np.int64]  # (S,) numbers of the sensors as they were given, by range
+    price: Units  # (P * S,) the costs, exactly
+
+    @cached_property
+    def worth(self) -> Units:
+        """Return (E,) the exact weights."""
+        return in_units(self.weight)
 
     @property
     def sensors(self) -> int:
@@ -88,13 +111,14 @@ class Candidates:
 
     def at_unit_cost(self) -> "Candidates":
         """Return the same candidates, each of which costs 1."""
-        return replace(self, cost=np.ones(len(self.cost)))
+        ones = np.ones(len(self.cost))
+        return replace(self, cost=ones, price=in_units(ones))
 
     def instance(self, method: Method = "exact") -> CoverageInstance:
         """Return the instance with errors merged that the same candidates cover; greedy, not where it takes longest."""
         if method == "greedy" and self.covers.nnz > SEARCHED:
-            return CoverageInstance(self.covers, self.weight, self.cost, self.sensors)
-        return merge_errors(self.covers, self.weight, self.cost, self.sensors)
+            return CoverageInstance(self.covers, self.weight, self.cost, self.price, self.sensors)
+        return merge_errors(self.covers, self.weight, self.cost, self.sensors, self.price, self.worth)
 
 
 def find_candidates(
@@ -137,7 +161,8 @@ def find_candidates(
     if visible is not None:
         covers = csr_array(covers * visible[np.repeat(np.arange(len(sites)), len(ranges))])
         covers.eliminate_zeros()
-    return Candidates(covers, weights, (of_pole[:, None] + of_sensor[order]).ravel(), order)
+    price = (in_units(of_pole)[:, None] + in_units(of_sensor[order])).ravel()
+    return Candidates(covers, weights, np.array([as_float(each) for each in price.tolist()]), order, price)
 
 
 def place_count(candidates: Candidates, count: int, *, method: Method = "exact") -> Placement:
@@ -149,12 +174,14 @@ def place_count(candidates: Candidates, count: int, *, method: Method = "exact")
     if not 1 <= count <= candidates.poles:
         raise InputError(f"count = {count}: must be from 1 to the number of poles, {candidates.poles}")
     instance = candidates.at_unit_cost().instance(method)
-    found = maximise(instance, float(count), method)
+    found = maximise(instance, limit_in_units(count), method)
     kinds = candidates.sensors
     used = {candidate // kinds for candidate in found.chosen}
     unused = [pole * kinds for pole in range(candidates.poles) if pole not in used]
     chosen = sorted(found.chosen + unused[: count - len(found.chosen)])
-    certificate = certify(candidates, instance, found.root, found.root.bound, found.search)
+    certificate = certify(
+        candidates, instance, found.root, lower_to(instance, found.root.bound, found.chosen), found.search
+    )
     return describe(candidates, _prefer_earlier(instance, chosen), found.bound, certificate)
 
 
@@ -164,13 +191,16 @@ def place_budget(candidates: Candidates, budget: float, *, method: Method = "exa
     Raises `InputError` where the method is invalid, or the budget is below the cheapest candidate.
     """
     _check_method(method)
-    if not budget >= candidates.cost.min() * (1 - TIE):
-        raise InputError(f"budget = {budget:g}: the cheapest sensor on a pole costs {candidates.cost.min():g}")
     if not np.isfinite(budget):
         raise InputError(f"budget = {budget}: must be a finite number")
+    limit = limit_in_units(budget)
+    if limit < min(candidates.price.tolist()):
+        raise InputError(f"budget = {budget:.17g}: the cheapest sensor on a pole costs {candidates.cost.min():.17g}")
     instance = candidates.instance(method)
-    found = maximise(instance, budget, method)
-    certificate = certify(candidates, instance, found.root, found.root.bound, found.search)
+    found = maximise(instance, limit, method)
+    certificate = certify(
+        candidates, instance, found.root, lower_to(instance, found.root.bound, found.chosen), found.search
+    )
     return describe(candidates, found.chosen, found.bound, certificate)
 
 
@@ -184,33 +214,82 @@ class Found:
     search: float | None = None  # bound that a search states above it; None: none was made
 
 
-def maximise(instance: CoverageInstance, budget: float, method: Method) -> Found:
-    """Return the candidates that cover most weight within `budget`, with a proven bound on that weight."""
-    chosen = choose_greedily(instance, budget)
-    value = instance.value(chosen)
-    if instance.covers.nnz <= WHOLE:
-        bound, dual = bound_by_highs(instance, budget)
-        root = bound_by(instance, budget, dual, np.zeros(len(instance.cost)))
-        if method == "greedy" or bound <= value * (1 + TIE):
-            return Found(chosen, bound, root)
-        best, bound = maximise_coverage(instance, budget)
-        return Found(chosen if best is None else best, bound, root, bound)
+def maximise(instance: CoverageInstance, budget: int, method: Method) -> Found:
+    """Return the candidates that cover most weight within the exact `budget`, with a proven bound on that weight."""
+    chosen, limit, small = choose_greedily(instance, budget), as_float(budget), instance.covers.nnz <= WHOLE
     if method == "greedy":
-        root = bound_of_choice(instance, budget, chosen)
-        return Found(chosen, root.bound, root)
-    root = relax(instance, budget, value)
-    chosen = improve(instance, budget, chosen, root)
-    value = instance.value(chosen)
-    rest = keep_candidates(instance, root.bound - root.loss > value * (1 + TIE))
-    if root.bound <= value * (1 + TIE) or rest.covers.nnz > SEARCHED:
-        return Found(chosen, root.bound, root)
-    if not rest.covers.nnz:
+        root = bound_at(instance, limit) if small else bound_of_choice(instance, limit, chosen)
+        if small and root.bound <= instance.value(chosen) * (1 + TIE):
+            return _close(instance, instance, budget, chosen, root, None)
+        return Found(chosen, lower_to(instance, root.bound, chosen), root)
+    if small:
+        root, rest = bound_at(instance, limit), instance
+    else:
+        root = relax(instance, limit, instance.value(chosen))
+        chosen = improve(instance, budget, chosen, root)
+        rest = keep_candidates(instance, root.bound - root.loss > instance.value(chosen) * (1 - TIE))
+        if rest.covers.nnz > SEARCHED:
+            return Found(chosen, lower_to(instance, root.bound, chosen), root)
+        if not rest.covers.nnz:
+            value = as_float(instance.worth_of(chosen))
+            return Found(chosen, value, root, value)
+    wide = is_wide(instance.worth.tolist())
+    if wide or is_wide([each for each in instance.price.tolist() if each <= budget]):
+        chosen, ended = improve_exactly(instance, rest, bound_at(rest, limit), budget, chosen)
+        if ended:
+            value = as_float(instance.worth_of(chosen))
+            return Found(chosen, value, root, None if lower_to(instance, root.bound, chosen) == value else value)
+    claimed = None
+    if root.bound > instance.value(chosen) * (1 + TIE):
+        best, claimed = maximise_coverage(rest, budget, limited=not small)
+        chosen = max((chosen, best or chosen), key=instance.worth_of)
+    found = _close(instance, rest, budget, chosen, root, claimed)
+    return replace(found, bound=root.bound, search=None) if wide and found.search is not None else found
+
+
+def _close(
+    instance: CoverageInstance,
+    rest: CoverageInstance,
+    budget: int,
+    chosen: list[int],
+    root: Relaxation,
+    claimed: float | None,
+) -> Found:
+    """Return `chosen`, or a better choice, with the least bound that is proven.
+
+    `rest`: the candidates of which a better choice is. `claimed`: the bound of HiGHS' search; None: it was not asked.
+    That nothing is better is proven where `root` leaves no sum of weights above the choice's, where HiGHS does and
+    tells such sums from each other, or where the search in whole numbers ends; if none, HiGHS is believed to `TIE`.
+    """
+    worth, value = instance.worth.tolist(), as_float(instance.worth_of(chosen))
+    if claimed is None and lower_to(instance, root.bound, chosen) == value:
+        return Found(chosen, value, root)
+    claimed = root.bound if claimed is None else claimed
+    if is_coarse(worth) and claimed < value + as_float(common_unit(worth)) / 2:
         return Found(chosen, value, root, value)
-    best, bound = maximise_coverage(rest, budget, limited=True)
-    if best is not None and instance.value(best) > value:
-        chosen, value = best, instance.value(best)
-    bound = min(root.bound, max(bound, value))
-    return Found(chosen, bound, root, bound)
+    if claimed <= value * (1 + NEARLY):
+        chosen, ended = improve_exactly(instance, rest, bound_at(rest, as_float(budget)), budget, chosen)
+        value = as_float(instance.worth_of(chosen))
+        if ended:
+            return Found(chosen, value, root, value)
+    bound = min(root.bound, max(claimed, value))
+    return Found(chosen, value if bound <= value * (1 + TIE) else bound, root, bound)
+
+
+def bound_at(instance: CoverageInstance, budget: float) -> Relaxation:
+    """Return the bound that the dual of HiGHS' linear relaxation proves."""
+    return bound_by(instance, budget, bound_by_highs(instance, budget)[1], np.zeros(len(instance.cost)))
+
+
+def lower_to(instance: CoverageInstance, bound: float, chosen: Sequence[int]) -> float:
+    """Return what `chosen` covers where `bound` proves that no sum of weights above that can be covered; else it."""
+    value = instance.value(chosen)
+    if bound > value * (1 + TIE):
+        return bound
+    worth = instance.worth_of(chosen)
+    return (
+        min(bound, as_float(worth)) if Fraction(bound) / UNIT < worth + common_unit(instance.worth.tolist()) else bound
+    )
 
 
 def certify(
@@ -230,14 +309,14 @@ def bound_of_choice(instance: CoverageInstance, budget: float, chosen: Sequence[
     return bound_by(instance, budget, left, np.zeros(len(instance.cost)))
 
 
-def improve(instance: CoverageInstance, budget: float, chosen: Sequence[int], relaxed: Relaxation) -> list[int]:
+def improve(instance: CoverageInstance, budget: int, chosen: Sequence[int], relaxed: Relaxation) -> list[int]:
     """Return the better of `chosen` and the rounded relaxation, improved by exchanges."""
-    kinds, spent, taken = instance.sensors, 0.0, {}
+    kinds, spent, taken = instance.sensors, 0, {}
     for candidate in np.argsort(-relaxed.share, kind="stable").tolist():
-        fits = spent + instance.cost[candidate] <= budget * (1 + TIE)
+        fits = spent + instance.price[candidate] <= budget
         if relaxed.share[candidate] >= SURE and fits and candidate // kinds not in taken:
             taken[candidate // kinds] = candidate
-            spent += instance.cost[candidate]
+            spent += instance.price[candidate]
     rounded = extend_greedily(instance, budget, taken.values())
     best = max((list(chosen), rounded), key=instance.value)
     if relaxed.bound <= instance.value(best) * (1 + TIE):
@@ -249,7 +328,7 @@ def keep_candidates(instance: CoverageInstance, kept: NDArray[np.bool_]) -> Cove
     """Return the instance in which only the candidates `kept` (N,) cover anything, its groups merged again."""
     covers = csr_array(diags_array(kept.astype(np.float64)) @ instance.covers)
     covers.eliminate_zeros()
-    return merge_errors(covers, instance.weight, instance.cost, instance.sensors)
+    return merge_errors(covers, instance.weight, instance.cost, instance.sensors, instance.price, instance.worth)
 
 
 def describe(
@@ -259,10 +338,13 @@ def describe(
     certificate: Certificate | None = None,
     optimal: bool | None = None,
 ) -> Placement:
-    """Return the placement of the `chosen` candidates, with the proven `bound` on the weight that could be covered."""
+    """Return the placement of the `chosen` candidates, with the proven `bound` on the weight that could be covered.
+
+    Cost and weight are exact sums, rounded once. It is optimal where the bound is no more than the weight.
+    """
     times = np.bincount(candidates.covers[np.asarray(chosen, np.int64)].indices, minlength=len(candidates.weight))
-    weight = float(candidates.weight[times > 0].sum())
-    exact = bound <= weight * (1 + TIE) + TIE
+    weight = as_float(sum(in_units(candidates.weight[times > 0]).tolist()))
+    exact = bound <= weight
     once = np.where(times == 1, candidates.weight, 0.0)
     return Placement(
         chosen=tuple(candidate // candidates.sensors for candidate in chosen),
@@ -271,7 +353,7 @@ def describe(
         upper_bound=weight if exact else float(bound),
         optimal=exact if optimal is None else optimal,
         sensors=tuple(int(candidates.order[candidate % candidates.sensors]) for candidate in chosen),
-        cost=float(candidates.cost[np.asarray(chosen, np.int64)].sum()),
+        cost=as_float(sum(candidates.price[[*chosen]].tolist())),
         marginal_gain=tuple((candidates.covers[np.asarray(chosen, np.int64)] @ once).tolist()),
         certificate=certificate,
     )
@@ -296,13 +378,22 @@ def _points(values: ArrayLike, name: str) -> Array:
 
 def _prefer_earlier(instance: CoverageInstance, chosen: Sequence[int]) -> list[int]:
     """Return the choice with each candidate replaced by the earliest one, of a free pole, that loses no weight."""
-    best, kinds = instance.value(chosen), instance.sensors
+    kinds = instance.sensors
     chosen = list(chosen)
     for candidate in sorted(chosen):
         others = [other for other in chosen if other != candidate]
-        covered = reach(instance.covers, others)
-        gain = instance.covers @ np.where(covered, 0.0, instance.weight)
-        equal = np.flatnonzero(instance.weight[covered].sum() + gain >= best * (1 - TIE))
-        taken = {other // kinds for other in others}
-        chosen = sorted([*others, next(int(k) for k in equal if k // kinds not in taken)])
+        left = np.where(reach(instance.covers, others), 0.0, instance.weight)
+        gain, taken = instance.covers @ left, {other // kinds for other in others}
+
+        def gain_of(each: int, left: Array = left) -> int:
+            own = instance.covered_by(each)
+            return (
+                sum(in_units(left[own]).tolist())
+                if instance.summed is None
+                else sum(instance.summed[own[left[own] > 0]])
+            )
+
+        needed = gain_of(candidate)
+        close = np.flatnonzero(gain >= gain[candidate] * (1 - TIE)).tolist()
+        chosen = sorted([*others, next(k for k in close if k // kinds not in taken and gain_of(k) >= needed)])
     return chosen

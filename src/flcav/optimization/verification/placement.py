@@ -6,25 +6,27 @@ within a budget B, at most one sensor a pole, has
     covered weight <= sum_e (w_e - u_e) + l B + sum_poles max(0, max_sensors (sum_covered u_e - l cost)),
 
 so that covering a weight W costs at least (W - all but l B) / l; and at least W / (most weight per cost of a sensor).
-Sums are correctly rounded, then outward; costs are exact, of the decimals that floats are written with, and so are
-distances where they decide.
+Sums of the dual are correctly rounded, then outward. Costs and covered weights are exact, of the decimals that floats
+are written with, and so are distances where they decide; sums of weights, or of costs, differ by a multiple of their
+greatest common divisor, so that a bound less than that above the choice proves it optimal, too.
 """
 
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
-from math import fsum, inf, nextafter
+from math import fsum, gcd, inf, lcm, nextafter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.optimization.verification.record import NEAR, Verification, exact, judge, near
+from flcav.optimization.verification.record import Verification, exact, judge
 
 Array = NDArray[np.float64]
 NOTHING = Fraction(1, 10**300)  # in place of 0, to divide by
+ROUNDING = 1e-14  # relative to the sum: of floats that bounds are stated with
 PLACES = "the positions, weights and ranges, and what each pole sees, where that is given"
-SEARCH = "the search above the dual (HiGHS' word): that nothing better than {:.9g} exists"
+SEARCH = "the search above the dual (the solver's word): that nothing better than {:.9g} exists"
 UPPER = "the linear program's word that this cost covers at most {:.9g}"
 
 
@@ -36,7 +38,7 @@ class PlacementProblem:
     weight: Array  # (E,)
     poles: Array  # (P, 3) [m]
     ranges_m: Array  # (S,)
-    cost: Array  # (P, S) of a sensor and its pole
+    cost: Array | NDArray[np.object_]  # (P, S) of a sensor and its pole: floats, or `Fraction`
     count: int | None = None  # sensors
     budget: float | None = None
     cover: float | None = None  # share of the weight
@@ -50,8 +52,8 @@ def find_reached(asked: PlacementProblem) -> list[list[NDArray[np.intp]]]:
         squared = ((asked.errors - pole) ** 2).sum(axis=1)
         found.append([])
         for range_m in asked.ranges_m.tolist():
-            inside = squared <= range_m**2
-            for error in np.flatnonzero(np.abs(squared - range_m**2) <= 1e-12 * range_m**2).tolist():
+            inside, doubt = squared <= range_m**2, 1e-12 * range_m * (range_m + float(np.abs(pole).max()))
+            for error in np.flatnonzero(np.abs(squared - range_m**2) <= doubt).tolist():
                 apart = (exact(asked.errors[error, axis]) - exact(asked.poles[number, axis]) for axis in range(3))
                 inside[error] = sum(each**2 for each in apart) <= exact(range_m) ** 2
             found[-1].append(np.flatnonzero(inside if asked.visible is None else inside & asked.visible[number]))
@@ -67,41 +69,48 @@ def verify_placement(asked: PlacementProblem, placed_json: str, least: float | N
         exact(proof["price"]),
         [*zip(placed["chosen"], placed["sensors"])],
     )
-    covered = np.unique(np.concatenate([reached[pole][sensor] for pole, sensor in on]))
-    cost, value = sum((exact(float(asked.cost[each])) for each in on), Fraction(0)), fsum(weight[covered])
+    covered = np.unique(np.concatenate([np.zeros(0, np.intp), *(reached[pole][sensor] for pole, sensor in on)]))
+    decimals = [*map(exact, weight.tolist())]
+    prices = asked.cost.tolist()
+    cost = sum((exact(prices[pole][sensor]) for pole, sensor in on), Fraction(0))
+    value = sum((decimals[each] for each in covered), Fraction(0))
     limit = exact(asked.budget) if asked.budget is not None else Fraction(asked.count or 0) or cost
-    spare, densest = _sum_up((*weight, *-u)), Fraction(0)
-    for own, prices in zip(reached, asked.cost.tolist()):
-        paid = [Fraction(1) if asked.count else exact(each) for each in prices]
+    spare, densest = _sum_up((*weight, *-u)) + _sum_up(weight) / 2**52, Fraction(0)
+    for own, row in zip(reached, prices):
+        paid = [Fraction(1) if asked.count else exact(each) for each in row]
         spare += max(Fraction(0), *(_sum_up(u[each]) - price * c for each, c in zip(own, paid)))
         densest = max(densest, *(_sum_up(weight[each]) / max(c, NOTHING) for each, c in zip(own, paid)))
     most, trusted, search = nextafter(float(spare + price * limit), inf), [PLACES], proof["search"]
     claims = {
         "one sensor a pole": len(set(placed["chosen"])) == len(on) and asked.count in (None, len(on)),
-        "the cost": near(float(cost), placed["cost"]),
-        "the limit": bool(asked.count) or cost <= limit * (1 + Fraction(NEAR)),
-        "the errors covered": len(covered) == placed["covered"] and near(value, placed["covered_weight"]),
+        "the cost": abs(placed["cost"] - cost) <= ROUNDING * cost,
+        "the limit": bool(asked.count) or cost <= limit,
+        "the errors covered": len(covered) == placed["covered"] and placed["covered_weight"] == float(value),
         "the dual": bool(price >= 0 and np.all((u >= 0) & (u <= weight))),
     }
     if asked.cover is None:
-        claims["the dual's bound"] = _at_most(most, proof["bound"])
-        claims["the upper bound"] = _at_most(value, upper) and _at_most(
-            most if search is None else min(most, search), upper
+
+        def proves(stated: float) -> bool:
+            above = most <= stated + ROUNDING * fsum(weight)
+            return above or (stated >= float(value) and most < value + _unit(decimals))
+
+        claims["the dual's bound"], proven = proves(proof["bound"]), proves(upper)
+        claims["the upper bound"] = upper >= float(value) and (
+            proven or (search is not None and _at_most(search, upper))
         )
-        claims["whether it is optimal"] = placed["optimal"] == _at_most(upper, value)
-        trusted += [SEARCH.format(upper)] * (not _at_most(most, upper))
-        return judge(value, [cost], most, claims, trusted)
-    target, told = exact(asked.cover) * _sum_up(weight) * (1 - Fraction(NEAR)), inf if least is None else least
-    by_dual = float((target - spare) / max(price, NOTHING))
-    fewest = max(by_dual, float(target / max(densest, NOTHING)), 0.0)
-    claims["the share"] = _at_most(float(target), value)
+        claims["whether it is optimal"] = placed["optimal"] == (upper <= float(value))
+        trusted += [SEARCH.format(upper)] * (not proven)
+        return judge(float(value), [cost], most, claims, trusted)
+    target, told = exact(asked.cover) * sum(decimals, Fraction(0)), inf if least is None else least
+    by_dual = max(float((target - spare) / max(price, NOTHING)) if target > spare else 0.0, 0.0)
+    fewest = max(by_dual, float(target / max(densest, NOTHING)))
+    proven = _at_most(told, fewest) or fewest > cost - _unit(exact(each) for row in prices for each in row)
+    claims["the share"] = value >= target
     claims["the dual's bound"] = _at_most(proof["bound"], by_dual)
-    claims["the bound on the cost"] = _at_most(told, float(cost)) and _at_most(told, max(fewest, search or 0.0))
-    claims["whether it is optimal"] = placed["optimal"] == _at_most(float(cost), told)
-    claims["the upper bound"] = _at_most(value, upper)
-    trusted += [SEARCH.format(told)] * (not _at_most(told, fewest)) + [UPPER.format(upper)] * (
-        not _at_most(most, upper)
-    )
+    claims["the bound on the cost"] = _at_most(told, float(cost)) and (proven or _at_most(told, search or 0.0))
+    claims["whether it is optimal"] = placed["optimal"] == (told >= placed["cost"])
+    claims["the upper bound"] = upper >= float(value)
+    trusted += [SEARCH.format(told)] * (not proven) + [UPPER.format(upper)] * (not _at_most(most, upper))
     return judge(float(cost), [cost], min(fewest, float(cost)), claims, trusted)
 
 
@@ -109,5 +118,12 @@ def _sum_up(values: Iterable[float]) -> Fraction:
     return Fraction(nextafter(fsum(values), inf))
 
 
+def _unit(decimals: Iterable[Fraction]) -> Fraction:
+    """Return the greatest common divisor: sums of the decimals differ by a multiple of it, or not at all."""
+    found = [*decimals]
+    whole = lcm(*(each.denominator for each in found))
+    return Fraction(gcd(*(int(each * whole) for each in found)), whole)
+
+
 def _at_most(one: float, other: float) -> bool:
-    return one <= other + NEAR * (1 + abs(other))
+    return one <= other + ROUNDING * abs(other)

@@ -44,9 +44,9 @@ def judge(
     return Verification(objective, tuple(map(float, cost)), bound, gap, faults, tuple(trusted))
 
 
-def exact(number: float) -> Fraction:
-    """Return the decimal that a float is written with."""
-    return Fraction(repr(float(number)))
+def exact(number: float | Fraction) -> Fraction:
+    """Return the decimal that a float is written with; a fraction is exact already."""
+    return number if isinstance(number, Fraction) else Fraction(repr(float(number)))
 
 
 def near(one: float, other: float) -> bool:

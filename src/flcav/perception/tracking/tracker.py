@@ -9,6 +9,9 @@ Navigation", 2001, eq. 6.3.2-4).
 The cost of a pair of a track and a detection is the negative log-likelihood of the detection under the prediction, and
 pairs outside a gate are excluded (Chiu et al., "Probabilistic 3D Multi-Object Tracking for Autonomous Driving", 2020),
 so that the variances a detector predicts count.
+
+Detectors confuse front and rear, so that a track has the axis of its detections, and the direction of its first one
+until it moves. One that moves backwards is turned by 180 degrees, see `head_with_motion`.
 """
 
 from dataclasses import dataclass
@@ -31,6 +34,10 @@ LEAST_VARIANCE = np.array((0.1, 0.1, 0.1, 0.2, 0.1, 0.1, 0.15)) ** 2  # of a det
 GATE = 9.21  # largest squared Mahalanobis distance in x, y of a pair: 99 % quantile of chi-squared with 2 dof
 FASTEST = 40.0  # [m/s] a pair is at most this speed times the elapsed time, plus `SLACK_M`, apart
 SLACK_M = 2.0
+REVERSING_MPS = 3.0  # no vehicle backs up faster
+REVERSED_M = 6.0  # nor farther, manoeuvring; a vehicle that went so far ahead may back up as far again
+SURE_M = 1.0  # moved backwards, before a speed is believed; nor does who walks or rides a bicycle move so farther
+VEHICLE_M = 2.5  # length from which an object is a vehicle that can back up
 UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of detections without a predicted one
 
 
@@ -86,6 +93,25 @@ def update_state(state: TrackState, box: Array, variance: Array) -> TrackState:
     return TrackState(mean, rest @ state.covariance @ rest.T + gain @ noise @ gain.T)  # Joseph form: stays symmetric
 
 
+def head_with_motion(state: TrackState, ahead_m: float, after_s: float) -> tuple[TrackState, float]:
+    """Return the state, turned by 180 degrees where its motion says that it heads the other way, and how far it went.
+
+    `ahead_m`: how far the object went along its heading [m], less than 0 backwards, without the last `after_s` [s].
+    The heading is wrong once a vehicle has moved backwards farther than it backs up (`REVERSED_M`), or moves so faster
+    than it does (`REVERSING_MPS`, by two standard deviations); one that backs up for a moment keeps it.
+    """
+    heading = np.array((np.cos(state.mean[YAW]), np.sin(state.mean[YAW])))
+    speed = float(heading @ state.mean[MEASURED:])
+    doubt = 2 * float(np.sqrt(heading @ state.covariance[MEASURED:, MEASURED:] @ heading))
+    most_m = REVERSED_M if state.mean[3] >= VEHICLE_M else SURE_M
+    ahead_m = min(ahead_m + speed * after_s, most_m)
+    if ahead_m >= -most_m and (ahead_m >= -SURE_M or speed + doubt >= -REVERSING_MPS):
+        return state, ahead_m
+    turned = state.mean.copy()
+    turned[YAW] = wrap_angle(turned[YAW] + np.pi)
+    return TrackState(turned, state.covariance), min(-ahead_m, most_m)
+
+
 @dataclass(frozen=True)
 class Tracked:
     """The N tracks seen in one frame."""
@@ -102,6 +128,8 @@ class _Track:
     state: TrackState
     scores: list[float]  # of its detections
     missed: int = 0  # frames since its last detection
+    ahead_m: float = 0.0  # gone along its heading, see `head_with_motion`
+    seen_s: float = 0.0  # of its last detection
 
 
 class Tracker:
@@ -141,13 +169,16 @@ class Tracker:
             own = np.flatnonzero(detections.label == label)
             for t, d in assign_detections([track.state for track in tracks], rows[own], variance[own], after_s):
                 track, number = tracks[t], own[d]
-                track.state = update_state(track.state, rows[number], variance[number])
+                state = update_state(track.state, rows[number], variance[number])
+                track.state, track.ahead_m = head_with_motion(state, track.ahead_m, time_s - track.seen_s)
+                track.seen_s = time_s
                 track.scores.append(float(scores[number]))
                 track.missed = 0
                 free[number] = False
         for number in np.flatnonzero(free):
             state = start_state(rows[number], variance[number])
-            self._tracks.append(_Track(self._next, str(detections.label[number]), state, [float(scores[number])]))
+            own = [float(scores[number])]
+            self._tracks.append(_Track(self._next, str(detections.label[number]), state, own, seen_s=time_s))
             self._next += 1
         self._tracks = [track for track in self._tracks if track.missed <= self.patience]
         return self._report(first)

@@ -4,7 +4,7 @@ A claim says that a difference of a measure is positive. Of a run with retrainin
 trainings, which share their test scenes. Of one training the 95 % interval is a paired bootstrap over scenes, widened
 by the spread of retraining, and the p-value is that of this interval. A claim held, or did not hold, if its corrected
 p-value (Holm) is at most 0.05. It is undecided else, and where the spread is not known: another training on the same
-frames might say otherwise.
+frames might say otherwise. Only a loss that is too large for any spread is one without it (`tell_loss`).
 
 A recipe may name its primary claims (`primary_claims`) before it is run. Each is of the mean over the regions that
 federate. They are corrected for one another, and all others, exploratory ones, apart from them. Nobody claims that the
@@ -12,6 +12,7 @@ run beats an upper bound, such as an arm with an ideal road detector: there the 
 lost.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -24,7 +25,17 @@ from flcav.pipeline.recipe import ALL, CENTRAL, CLOUD, EDGE, ELSEWHERE, MAIN, MO
 from flcav.pipeline.results.run import ArmResult
 from flcav.pipeline.results.tests import Difference, RunFinding, Test
 from flcav.statistics.seeds import MeanOverSeeds, of_one_training
-from flcav.statistics.verdicts import ESTIMATE, UNDECIDED, Claim, Judged, explain_verdict, judge_known, signed
+from flcav.statistics.verdicts import (
+    ESTIMATE,
+    NOT_HELD,
+    UNDECIDED,
+    Claim,
+    Judged,
+    explain_verdict,
+    judge_known,
+    signed,
+    tell_loss,
+)
 
 Kind = Literal["claim", "primary", "secondary", "loss"]
 
@@ -164,8 +175,9 @@ def findings(
         None if none_differs else _mean(each, sum(test.result.scenes for test in _after(each, values)))
         for each, none_differs in zip(own, same, strict=True)
     ]
+    families = Counter(about.kind for about in asked)
     return tuple(
-        replace(_finding(each, judged, about, values, none_differs, caveats), kind=about.named)
+        replace(_finding(each, judged, about, values, none_differs, caveats, families[about.kind]), kind=about.named)
         for each, judged, about, none_differs in zip(own, judge_asked(asked, means), asked, same, strict=True)
     )
 
@@ -184,8 +196,9 @@ def _finding(
     values: Mapping[tuple[str, str, str, str], Test],
     same: str | None,
     caveats: Mapping[str, str],
+    family: int,
 ) -> RunFinding:
-    """Return the finding of a difference; `same`: what is said where nothing differs."""
+    """Return the finding of a difference, one of `family` claims; `same`: what is said where nothing differs."""
     tests, measure = _after(each, values), _after(each, values)[0].result.measure
     earlier, later = (float(np.mean([test.estimate.mean for test in own])) for own in (_before(each, values), tests))
     place, question = f"{each.region}, {each.task}", asked.question
@@ -206,6 +219,9 @@ def _finding(
     rests = f" ({caveats[each.task]})" if caveats.get(each.task) else ""
     if each.spread is None or (judged is None and not loss):
         unknown = f"how much another training on the same frames would differ is not known{undecided}"
+        lost = None if loss or each.spread is not None else tell_loss(each.over_scenes, scenes, family)
+        if lost is not None:
+            open_, unknown = NOT_HELD, f"{unknown.removesuffix(undecided)}, but {lost}: {explain_verdict(NOT_HELD)}"
         sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over} alone; {unknown}{rests}."
         return RunFinding(place, question, open_, sentence)
     of = f"{over} and over retraining (standard deviation {each.spread.sd:.3f} of {each.spread.trainings} trainings)"

@@ -276,8 +276,9 @@ def _read_numbers(path: Path, columns: tuple[str, ...]) -> dict[str, Array]:
             found[name] = np.array(table[name].to_pylist(), np.float64)
         except (KeyError, TypeError, ValueError):
             raise InputError(f"{path}: no column '{name}' of numbers") from None
-        if not (np.abs(found[name]) < FARTHEST * 10).all():
-            raise InputError(f"{path}: a value of '{name}' is not finite, or too large")
+        if len(odd := np.flatnonzero(~(np.abs(found[name]) < FARTHEST * 10))):
+            row, value = int(odd[0]), found[name][odd[0]]
+            raise InputError(f"{path}: row {row + 1}: a value of '{name}' is not finite, or too large: {value:g}")
     return found
 
 
