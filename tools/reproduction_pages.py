@@ -21,6 +21,7 @@ from flcav.experiments.asynchrony.tables import asynchrony_tables
 from flcav.experiments.attacks import tables as attack_tables
 from flcav.experiments.attacks.faults import FaultsResult
 from flcav.experiments.attacks.leakage import LeakageResult
+from flcav.experiments.attacks.withstood import WithstoodResult
 from flcav.experiments.corner_cases.run import CornerCaseResult
 from flcav.experiments.corner_cases.tables import corner_case_tables
 from flcav.experiments.distillation import tables as distillation_tables
@@ -98,6 +99,7 @@ TABLES: Mapping[str, Callable[[Json, str], Tables]] = {  # by folder: tables of 
     "groups": _told(GroupsResult, groups_tables),
     "lifelong": _told(LifelongResult, lifelong_tables),
     "leakage": _told(LeakageResult, attack_tables.leakage_tables),
+    "mixing": _told(WithstoodResult, attack_tables.withstood_tables),
     "networks": _told(NetworksResult, networks_tables),
     "placement": _told(PlacementProof, placement_tables.tables),
     "redundant-tasks": _told(RedundantTasksResult, redundant_tasks_tables),

@@ -8,12 +8,30 @@ import torch
 from scipy.stats import mannwhitneyu
 from torch.nn import functional
 
-from flcav.experiments.attacks import faults
+from flcav.experiments.attacks import faults, withstood
 from flcav.experiments.attacks.drives import CLASSES, Drives, Pictures, Vehicle, differentiate, draw_head, find_right
 from flcav.experiments.attacks.faults import LIES, STRATEGIES, Liar, choose_liars, run_federation, summarise
 from flcav.experiments.attacks.inference import invert, membership_advantage, membership_auc, name_nearest
 from flcav.experiments.attacks.leakage import attack, make_level, split_members
-from flcav.experiments.attacks.tables import fault_tables
+from flcav.experiments.attacks.tables import fault_tables, withstood_tables
+from flcav.experiments.attacks.withstood import (
+    ATTACKS,
+    CLIENTS,
+    INNER,
+    LABEL,
+    LITTLE,
+    NOISE,
+    RULES,
+    SIGN,
+    draw_fleet,
+    draw_network,
+    lie,
+    list_worst,
+    make_rules,
+    repeat_withstood,
+    run_rounds,
+    train_clients,
+)
 from flcav.federation.reading import read_round
 from flcav.federation.rounds import Schedule
 from flcav.federation.rules import Rules, SecureAggregation
@@ -119,3 +137,73 @@ def test_an_attack_leaves_the_secure_federation_s_accuracy(drives: Drives):
     assert spread.scenes == 6
     assert level.mean["membership_auc"].shared == OWN_SCENES
     assert make_level(drives.test, "sum", None, [secure], by_sum=True).seeds == (summed,)
+
+
+def test_clients_at_once_take_the_steps_of_autograd():
+    fleet, start = draw_fleet("unlike", 2), draw_network(2)
+    found = train_clients(start, fleet.features, fleet.labels, 0.2, np.random.default_rng(5))
+    own = {name: torch.from_numpy(array.copy()).requires_grad_() for name, array in start.items()}
+    draws = np.random.default_rng(5)
+    for _ in range(withstood.STEPS):
+        places = draws.integers(withstood.SAMPLES, size=(CLIENTS, withstood.BATCH))[3]  # of the fourth client
+        hidden = functional.linear(
+            torch.from_numpy(fleet.features[3, places]), own["layers.9.weight"], own["layers.9.bias"]
+        )
+        logits = functional.linear(hidden.relu(), own["layers.11.weight"], own["layers.11.bias"])
+        slopes = torch.autograd.grad(
+            functional.cross_entropy(logits, torch.from_numpy(fleet.labels[3, places])), list(own.values())
+        )
+        own = {name: (array - 0.2 * s).detach().requires_grad_() for (name, array), s in zip(own.items(), slopes)}
+    for name, array in own.items():
+        np.testing.assert_allclose(found[name][3], array.detach().numpy(), atol=1e-5)
+
+
+def test_colluding_attacks_are_those_of_their_papers():
+    rng = np.random.default_rng(3)
+    start, sent = rng.normal(size=5), rng.normal(size=(7, 5))
+    mean, deviation = np.mean(sent[2:], axis=0), np.sqrt(np.mean((sent[2:] - np.mean(sent[2:], axis=0)) ** 2, axis=0))
+    expected = {LITTLE: mean - 1.5 * deviation, INNER: start - (mean - start), LABEL: None, SIGN: None, NOISE: None}
+    for kind, told in expected.items():
+        found = lie(kind, 2, start, sent, np.random.default_rng(4))
+        np.testing.assert_array_equal(found[2:], sent[2:])
+        if told is not None:
+            np.testing.assert_allclose(found[:2], [told, told])
+    np.testing.assert_allclose(lie(SIGN, 2, start, sent, rng)[0] - start, -4 * (sent[0] - start))
+    np.testing.assert_array_equal(lie(LABEL, 2, start, sent, rng), sent)
+    noise = np.concatenate([lie(NOISE, 2, start, sent, rng)[:2] - start for _ in range(400)])
+    assert np.sqrt((noise**2).sum(axis=1).mean()) == pytest.approx(10 * np.linalg.norm(mean - start), rel=0.05)
+
+
+def test_rules_of_the_study_know_the_attackers_and_mixing_withstands_what_krum_does_not(monkeypatch):
+    monkeypatch.setattr(withstood, "ROUNDS", 8)
+    rules, fleet = make_rules(6), draw_fleet("very unlike", 1)
+    assert (rules["mixing, Krum"].byzantine, rules["mixing, Krum"].mixing) == (6, 6)  # type: ignore[attr-defined]
+    assert rules["multi-Krum"].kept == 14  # type: ignore[attr-defined]
+    reached = {
+        rule: find_right(run_rounds(fleet, rules[rule], SIGN, 6, 1), fleet.test).mean()
+        for rule in ("mean", "Krum", "mixing, Krum")
+    }
+    assert reached["mean"] < 0.25
+    assert reached["mixing, Krum"] > reached["Krum"] + 0.1
+    assert {np.bincount(own, minlength=CLASSES).max() > 30 for own in fleet.labels} == {True, False}
+
+
+def test_the_study_of_what_rules_withstand_at_toy_scale(monkeypatch, tmp_path):
+    monkeypatch.setattr(withstood, "ROUNDS", 2)
+    monkeypatch.setattr(withstood, "UNLIKENESS", {"alike": 1e6})
+    monkeypatch.setattr(withstood, "ATTACKERS", (6,))
+    results, pictures = repeat_withstood(tmp_path, 2)
+    assert len(results.rows) == 1 + len(ATTACKS)
+    assert pictures["withstood.png"].startswith(b"\x89PNG")
+    (first, *_), worst = results.rows, list_worst(results)["alike"]
+    assert first.lost["mean"].mean == 0
+    for rule in RULES:
+        hardest = min(each.accuracy[rule].mean for each in results.attacked)
+        assert worst[rule] == [hardest]
+        lost = first.accuracy["mean"].mean - hardest
+        assert results.worst("alike", 6, rule).lost[rule].mean == pytest.approx(lost)
+    monkeypatch.setattr("flcav.experiments.attacks.tables.UNLIKENESS", ["alike"])
+    monkeypatch.setattr("flcav.experiments.attacks.tables.ATTACKERS", (6,))
+    tables = withstood_tables(results)
+    assert tables["worst"].splitlines()[-1].startswith("| alike | 30 % |")
+    assert len(tables["thirty"].splitlines()) == 2 + 6

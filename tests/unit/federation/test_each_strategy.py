@@ -362,3 +362,60 @@ def test_edge_servers_take_no_local_steps_to_correct():
     after = federate({"grid": server}, FIRST, SCHEDULE, account(), strategy=of_servers(Scaffold()))
     assert len(server.state.records) == 2 * SCHEDULE.rounds
     assert np.linalg.norm(after.weights["w"] - TRUTH) < np.linalg.norm(FIRST["w"] - TRUTH)
+
+
+def mix_by_hand(rows: np.ndarray, byzantine: int) -> np.ndarray:
+    """Return algorithm 2 of Allouah et al., 2023: y_i is the mean of the n - f vectors nearest to x_i, itself one."""
+    mixed = []
+    for x in rows:
+        distances = [float(np.sum((other - x) ** 2)) for other in rows]
+        nearest = sorted(range(len(rows)), key=lambda j: distances[j])[: len(rows) - byzantine]
+        mixed.append(sum(rows[j] for j in nearest) / len(nearest))
+    return np.array(mixed)
+
+
+@pytest.mark.parametrize("byzantine", [1, 2, 3])
+def test_nearest_neighbour_mixing_comes_before_each_robust_rule(byzantine: int):
+    rng = np.random.default_rng(byzantine)
+    rows = np.concatenate([rng.normal(size=(9 - byzantine, 4)), 30 + rng.normal(size=(byzantine, 4))])
+    variances, counts = rng.random((9, 2)) + np.arange(9)[:, None], np.arange(9) ** 2
+    updates = [
+        LocalUpdate(
+            {"a": row[:1], "b": row[1:].reshape(1, 3), "bn.running_var": variance, "n": np.array(count)}, 1 + i, 0.0
+        )
+        for i, (row, variance, count) in enumerate(zip(rows, variances, counts, strict=True))
+    ]
+    mixed = mix_by_hand(rows, byzantine)
+    scores = [np.sort(((mixed - own) ** 2).sum(axis=1))[1 : 9 - byzantine - 1].sum() for own in mixed]
+    nearest = np.argsort(scores, kind="stable")
+    expected = {
+        Median(byzantine): np.median(mixed, axis=0),
+        TrimmedMean(0.25, byzantine): trim_mean(mixed, 0.25),
+        Krum(byzantine, 1, byzantine): mixed[nearest[0]],
+        Krum(byzantine, 4, byzantine): mixed[nearest[:4]].mean(axis=0),
+    }
+    for strategy, learned in expected.items():
+        plain = replace(strategy, mixing=0).combine(updates[0].weights, updates)
+        found = strategy.combine(updates[0].weights, updates)
+        np.testing.assert_allclose(np.concatenate([found["a"], found["b"].ravel()]), learned, rtol=1e-12)
+        assert not np.allclose(found["b"], plain["b"])
+        np.testing.assert_array_equal(found["bn.running_var"], plain["bn.running_var"])  # statistics are not mixed
+        assert found["n"] == plain["n"]
+
+
+def test_mixing_needs_a_majority_of_honest_clients():
+    for strategy in (Median(mixing=2), TrimmedMean(0.2, mixing=2), Krum(0, mixing=2)):
+        strategy.check_clients(5)
+        with pytest.raises(InputError, match="mixing: 5 clients or more are wanted for 2, and there are 4"):
+            strategy.check_clients(4)
+    assert strategy_named({"median": {"mixing": 2}}) == Median(2)
+    with pytest.raises(InputError, match="mixing = -1"):
+        strategy_named({"krum": {"mixing": -1}})
+    state = FederationState()  # a round that is left with too few has no update
+    clients: dict[str, Any] = {
+        name: Regression(each.inputs, each.targets) for name, each in vehicles("grid", 5).items()
+    }
+    clients["grid/cav0"].fail = True
+    found = federate(clients, START, replace(SCHEDULE, rounds=1), account(), strategy=Median(2), state=state)
+    np.testing.assert_array_equal(found.weights["w"], START["w"])
+    assert "mixing: 5 clients or more" in state.records[0].failed["grid/cav1"]

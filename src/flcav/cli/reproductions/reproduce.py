@@ -151,6 +151,8 @@ def _repeat_drives(target: Target, out: Path, seeds: int) -> None:
             from flcav.experiments.attacks.faults import repeat_faults as repeat
         elif target == Target.federation_groups:
             from flcav.experiments.groups.run import compare_groups as repeat
+        elif target == Target.federation_mixing:
+            from flcav.experiments.attacks.withstood import repeat_withstood as repeat
         else:
             from flcav.experiments.attacks.leakage import repeat_leakage as repeat
         results, pictures = repeat(out, seeds, report)

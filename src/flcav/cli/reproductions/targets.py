@@ -25,6 +25,7 @@ class Target(StrEnum):
     federation_faults = "federation-faults"
     federation_groups = "federation-groups"
     federation_leakage = "federation-leakage"
+    federation_mixing = "federation-mixing"
     fig1b = "fig1b"
     fig3a = "fig3a"
     fig3b = "fig3b"
@@ -53,11 +54,12 @@ EXCHANGES: Mapping[str, str] = {  # recipe of each
     Target.federation_exchange: "exchange",
     Target.federation_exchange_objects: "exchange_objects",
 }
-DRIVES = (  # one recording, several seeds
+DRIVES = (  # one recording or none, several seeds
     Target.federation_asynchrony,
     Target.federation_faults,
     Target.federation_groups,
     Target.federation_leakage,
+    Target.federation_mixing,
 )
 
 

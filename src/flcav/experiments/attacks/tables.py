@@ -2,8 +2,19 @@
 
 from flcav.experiments.attacks.faults import LIES, STRATEGIES, FaultsResult
 from flcav.experiments.attacks.leakage import LeakageResult, NoiseLevel
+from flcav.experiments.attacks.withstood import (
+    ATTACKERS,
+    ATTACKS,
+    CLIENTS,
+    NONE,
+    RULES,
+    UNLIKENESS,
+    WithstoodResult,
+)
 from flcav.statistics.verdicts import Claim, judge
 from flcav.storage.markdown import format_table
+
+THIRTY = 6  # attackers of 20, whom one table has in full
 
 
 def fault_tables(results: FaultsResult) -> dict[str, str]:
@@ -44,4 +55,26 @@ def leakage_tables(results: LeakageResult) -> dict[str, str]:
         "secure": format_table(
             ("what the server sees", *names.values()), [[name, *row(each)] for name, each in shown.items()]
         ),
+    }
+
+
+def withstood_tables(results: WithstoodResult) -> dict[str, str]:
+    """Return Markdown by name: not withstood, worst, thirty."""
+    failing, worst, whole = [], [], []
+    for name in UNLIKENESS:
+        for count in ATTACKERS:
+            share = f"{100 * count // CLIENTS} %"
+            own = [each for each in results.attacked if (each.unlikeness, each.attackers) == (name, count)]
+            told = [", ".join(each.attack for each in own if not each.withstands(rule)) or "–" for rule in RULES]
+            failing.append([name, share, *told])
+            hardest = [results.worst(name, count, rule).accuracy[rule].mean for rule in RULES]
+            worst.append([name, share, *(f"{accuracy:.2f}" for accuracy in hardest)])
+        for attack in (NONE, *ATTACKS):
+            (row,) = [each for each in results.rows_of(name, attack) if each.attackers == THIRTY]
+            whole.append([name, attack, *(row.accuracy[rule].describe() for rule in RULES)])
+    counts = ["all", "", *(f"{results.count(rule)} of {len(results.attacked)} withstood" for rule in RULES)]
+    return {
+        "not withstood": format_table(("data", "attackers", *RULES), [*failing, counts]),
+        "worst": format_table(("data", "attackers", *RULES), worst),
+        "thirty": format_table((f"data, {THIRTY} of {CLIENTS} attack", "attack", *RULES), whole),
     }

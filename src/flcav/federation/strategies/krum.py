@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from flcav.config import InputError
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.strategies.median import take_median
+from flcav.federation.strategies.mixing import Mixing, check_mixing, flatten_updates, mix_neighbours
 from flcav.federation.trainable import Update, Weights, learned_names
 
 
@@ -28,6 +28,7 @@ class Krum:
 
     byzantine: Annotated[int, Field(ge=0, le=10**6)] = 1  # clients that it is to withstand
     kept: Annotated[int, Field(ge=1, le=10**6)] = 1
+    mixing: Mixing = 0  # see `mix_neighbours`
 
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
         """Return what the chosen update has learned, or the mean of the chosen ones, and the median of all else.
@@ -36,23 +37,24 @@ class Krum:
         """
         self.check_clients(len(updates))
         names = learned_names(start)
-        flat = np.stack([_flatten(update.weights, names) for update in updates])
+        mixed = mix_neighbours(updates, self.mixing)
+        flat = flatten_updates(mixed, names)
         near = len(updates) - self.byzantine - 2
         scores = [np.sort(((flat - own) ** 2).sum(axis=1))[1 : near + 1].sum() for own in flat]
-        chosen = [updates[i] for i in np.sort(np.argsort(scores, kind="stable")[: self.kept])]
+        chosen = [mixed[i] for i in np.sort(np.argsort(scores, kind="stable")[: self.kept])]
         mean = average([update.weights for update in chosen], [1.0] * len(chosen))
         rest = [name for name in start if name not in names]
         return {**mean, **take_median([{name: update.weights[name] for name in rest} for update in updates])}
 
     def check_clients(self, clients: int) -> None:
-        """Raise `InputError` unless clients > 2 byzantine + 2, as the paper's guarantee asks, and `kept` <= clients."""
+        """Raise `InputError` unless clients > 2 byzantine + 2, as the paper's guarantee asks, and `kept` <= clients.
+
+        Raises as `check_mixing` does, too.
+        """
+        check_mixing(self.mixing, clients)
         least = max(2 * self.byzantine + 3, self.kept)
         if clients < least:
             raise InputError(
                 f"krum: {least} clients or more are wanted for byzantine = {self.byzantine} and kept = {self.kept}, "
                 f"and there are {clients}"
             )
-
-
-def _flatten(weights: Weights, names: Sequence[str]) -> NDArray[np.float64]:
-    return np.concatenate([weights[name].astype(np.float64).ravel() for name in names])

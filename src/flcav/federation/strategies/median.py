@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.federation.strategies.fedavg import round_mean
+from flcav.federation.strategies.mixing import Mixing, check_mixing, mix_neighbours
 from flcav.federation.trainable import Update, Weights
 
 
@@ -34,9 +35,12 @@ def take_median(models: Sequence[Weights]) -> dict[str, NDArray[np.number]]:
 class Median:
     """Coordinate-wise median: withstands arbitrary updates of fewer than half of the clients. Samples do not count."""
 
+    mixing: Mixing = 0  # see `mix_neighbours`
+
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
         """Return the median of the updates' weights, coordinate by coordinate."""
-        return take_median([update.weights for update in updates])
+        return take_median([update.weights for update in mix_neighbours(updates, self.mixing)])
 
     def check_clients(self, clients: int) -> None:
-        """Accept any number of clients: the median of two is their mean."""
+        """Raise as `check_mixing` does; otherwise accept any number of clients: the median of two is their mean."""
+        check_mixing(self.mixing, clients)
