@@ -223,7 +223,9 @@ def test_contact_points_of_connections_follow_from_the_links(tmp_path: Path) -> 
 def test_ids_of_roads_and_junctions_may_be_any_text(tmp_path: Path) -> None:
     text = CROSS.read_text()
     whole = import_text(text, tmp_path / "whole").town
-    named = re.sub(r'(<road [^>]*?\bid|incomingRoad|connectingRoad|"road" elementId)="(\d+)"', r'\1="A&amp;B #\2"', text)
+    named = re.sub(
+        r'(<road [^>]*?\bid|incomingRoad|connectingRoad|"road" elementId)="(\d+)"', r'\1="A&amp;B #\2"', text
+    )
     named = re.sub(r'((?:<junction [^>]*?\bid|junction|"junction" elementId)=)"10"', r'\1"J, 10"', named)
     assert named.count("A&amp;B") > 40
     assert named.count("J, 10") > 10
