@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flcav.dataset.checks.frames import check_sweeps
 from flcav.dataset.checks.scenes import BlockedViews, check_motion
+from flcav.geometry import pose
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import lidar_pole
 from flcav.world.map.town import TOWNS, load_town
@@ -60,3 +62,12 @@ def test_a_sensor_behind_something_is_named(traffic: Trace):
         sight.add(observe(world, lidar_pole(), f"pole{pole}", 0, scene_name="scene", seed=1))
     (problem,) = sight.problems()
     assert problem.startswith("pole1: 'lidar' sees almost nothing but its own mount: ")
+
+
+@pytest.mark.parametrize(("tilt_rad", "missing_deg", "told"), [(0, 60, 1), (0.03, 60, 1), (0.3, 60, 0), (0.3, 200, 1)])
+def test_on_steep_ground_half_of_a_sweep_may_be_sky(traffic: Trace, tilt_rad: float, missing_deg: float, told: int):
+    frame = observe(Scene(load_town("ring"), traffic), lidar_pole(), "pole1", 0, scene_name="scene", seed=1)
+    azimuth = np.radians(np.arange(0.0, 360.0 - missing_deg))
+    sweep = np.stack((np.cos(azimuth), np.sin(azimuth), 0 * azimuth, 0.5 + 0 * azimuth), axis=1).astype(np.float32)
+    seen = replace(frame, lidar={"lidar": sweep}, world_from_agent=pose(1.0, 2.0, 3.0, pitch=tilt_rad))
+    assert len(list(check_sweeps(seen))) == told

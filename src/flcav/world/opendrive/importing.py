@@ -28,7 +28,7 @@ from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.furnishing import furnish
 from flcav.world.opendrive.georeference import locate_origin
 from flcav.world.opendrive.heights import sample_heights
-from flcav.world.opendrive.mending import mend_map
+from flcav.world.opendrive.mending import mend_map, name_safely
 from flcav.world.opendrive.mirror import mirror_map, mirror_parts
 from flcav.world.opendrive.netconvert import run_netconvert
 from flcav.world.opendrive.objects.crossings import take_crosswalks
@@ -176,8 +176,9 @@ def _import(xodr: Path, out: Path) -> ImportedTown:
     if not beside.is_dir():
         raise InputError(f"{beside}: is a file; a town needs a folder")
     root = read_map(xodr)
-    document = describe_map(root)
     notes = [*mend_roads(root), *mend_map(root)]
+    name_safely(root)
+    document = describe_map(root)
     heights = sample_heights(root, xodr)
     if heights.decks:
         notes.append(f"Bridges, on which roads pass above others: {len(heights.decks)}.")

@@ -47,6 +47,8 @@ def rewrite_widths(section: ElementTree.Element, length: float) -> list[Change]:
         edge = [Piece(0.0, ZERO)]  # from the centre line to the outer border of the lane before
         for lane in lanes:
             widths, borders = lane.findall("width"), lane.findall("border")
+            if not bordered and _is_plain(widths):
+                continue
             pieces = _read(widths)
             if borders and not widths:
                 pieces = _add(_add([Piece(0.0, ZERO)], _read(borders), sign), edge, -1.0)
@@ -62,6 +64,12 @@ def rewrite_widths(section: ElementTree.Element, length: float) -> list[Change]:
     return changes
 
 
+def _is_plain(widths: list[ElementTree.Element]) -> bool:
+    """Return whether a lane has one positive width all along, as most have."""
+    own = [[float(row.attrib[name]) for name in ("sOffset", *"abcd")] for row in widths]
+    return len(own) == 1 and own[0][0] == 0.0 and own[0][1] > LEAST_M and not any(own[0][2:])
+
+
 def _cut(pieces: list[Piece], length: float) -> tuple[list[Piece], float, float]:
     """Return the pieces up to `length` [m], zero where they are below it, and the least and the largest value [m].
 
@@ -69,7 +77,9 @@ def _cut(pieces: list[Piece], length: float) -> tuple[list[Piece], float, float]
     """
     parts, ends = [], [*(piece.s for piece in pieces[1:]), length]
     for piece, end in zip(pieces, ends):
-        turns = [turn for turn in _find_roots(piece.value.deriv(), end - piece.s) if piece.value(turn) < NARROW_M]
+        flat = not piece.value.coef[1:].any()
+        turning = [] if flat else _find_roots(piece.value.deriv(), end - piece.s)
+        turns = [turn for turn in turning if piece.value(turn) < NARROW_M]
         cuts = [0.0, *sorted({*_find_roots(piece.value, end - piece.s), *turns}), end - piece.s]
         parts += [(piece.at(piece.s + cut), till - cut) for cut, till in pairwise(cuts) if till > cut]
     values = np.array([piece.value(np.linspace(0.0, span, 3)) for piece, span in parts])

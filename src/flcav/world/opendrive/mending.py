@@ -5,7 +5,14 @@ connection (12.4), and restrictions of access as attributes, as in edition 1.7 (
 """
 
 import math
+import re
 import xml.etree.ElementTree as ElementTree
+
+NAMES = {  # attributes that refer to a road or junction by its id
+    "road": ("incomingRoad", "connectingRoad", "linkedRoad", "high", "low"),
+    "junction": ("junction",),
+}
+UNSAFE = re.compile(r"[^A-Za-z0-9_.-]")  # what ids of SUMO's nodes and edges are without here
 
 SIGNAL = {"type": "-1", "dynamic": "no", "orientation": "none"}  # what a signal is that does not say; -1: of no type
 ENDS = ("predecessor", "successor")
@@ -63,6 +70,23 @@ def mend_map(root: ElementTree.Element) -> tuple[str, ...]:
     if unknown:
         notes.append(f"Lanes without a type, closed to traffic: {unknown}.")
     return tuple(notes)
+
+
+def name_safely(root: ElementTree.Element) -> None:
+    """Replace what SUMO's ids cannot have in the ids of roads and junctions of the map below `root`, in place."""
+    for kind, references in NAMES.items():
+        known = {row.get("id", "") for row in root.iterfind(kind)}
+        safe: dict[str, str] = {}
+        for name in sorted(name for name in known if UNSAFE.search(name)):
+            safe[name] = UNSAFE.sub("_", name)
+            while safe[name] in known:
+                safe[name] += "_"
+            known.add(safe[name])
+        for row in root.iter() if safe else ():
+            own = ("id",) if row.tag == kind else ("elementId",) if row.get("elementType") == kind else ()
+            for attribute in (*own, *references):
+                if row.get(attribute) in safe:
+                    row.set(attribute, safe[row.attrib[attribute]])
 
 
 def _type_lanes(road: ElementTree.Element) -> int:

@@ -28,9 +28,13 @@ class Joint:
 
 
 def order_geometry(road: ElementTree.Element) -> list[ElementTree.Element]:
-    """Return the geometry elements of a <road> in the order of s, without those that have no length."""
-    rows = [row for row in road.iterfind("planView/geometry") if float(row.attrib["length"]) > SHORTEST_M]
-    return sorted(rows, key=lambda row: float(row.attrib["s"]))
+    """Return the geometry elements of a <road> in the order of s, without those that have no length.
+
+    The longest is among them in any case.
+    """
+    lengths = [(float(row.attrib["length"]), row) for row in road.iterfind("planView/geometry")]
+    least = min(SHORTEST_M, max((length for length, _ in lengths), default=0.0))
+    return sorted((row for length, row in lengths if length >= least), key=lambda row: float(row.attrib["s"]))
 
 
 def measure_joints(rows: list[ElementTree.Element]) -> list[Joint]:

@@ -33,6 +33,10 @@ class Piece:
         cos, sin = np.cos(self.heading), np.sin(self.heading)
         return np.stack((self.x + cos * u - sin * v, self.y + sin * u + cos * v, self.heading + turn), axis=1)
 
+    def measure(self) -> float:
+        """Return the length of the curve [m], to some millimetres; a cubic's may differ from what the map says."""
+        return float(np.hypot(*np.diff(self.at(np.linspace(0.0, self.length, FINE))[:, :2], axis=0).T).sum())
+
 
 class ReferenceLine:
     """The reference line of one road, by length s along it."""

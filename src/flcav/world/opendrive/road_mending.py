@@ -9,9 +9,10 @@ from flcav.config import shorten
 from flcav.world.opendrive.document import FASTEST, TO_METRES_PER_SECOND
 from flcav.world.opendrive.lane_widths import rewrite_widths
 from flcav.world.opendrive.objects.places import read_number
-from flcav.world.opendrive.plan_view import NOTED_M, NOTED_RAD, SHORTEST_M, close_gaps
+from flcav.world.opendrive.plan_view import NOTED_M, NOTED_RAD, SHORTEST_M, close_gaps, order_geometry
 from flcav.world.opendrive.reference_line import is_by_length
 
+STRAIGHT = 1e-9  # least curvature, and difference between two [1/m]
 MOST_TOLD = 10  # changes of a kind that are told one by one
 PROFILES = ("planView", "elevationProfile", "lateralProfile", "lanes")  # children of a <road> with elements along s
 
@@ -29,8 +30,9 @@ def mend_roads(root: ElementTree.Element) -> tuple[str, ...]:
         name = f"Road {shorten(road.get('id', ''))}"
         order += [f"{name}{lane}: its <{tag}> elements were not in the order of s." for lane, tag in _sort(road)]
         empty += [f"{name}: left out, the <{tag}> of no length at s = {s:g} m." for tag, s in _drop_empty(road)]
-        _set_ranges(road)
-        for joint in close_gaps(road):
+        road.set("junction", road.get("junction", "-1"))
+        _write_shapes(road)
+        for joint in sorted(close_gaps(road), key=lambda joint: -joint.gap_m):
             here = f"{name}: at s = {joint.s:.6g} m its geometry"
             if joint.gap_m >= NOTED_M:
                 gaps.append(f"{here} begins {joint.gap_m:.2g} m from where the one before it ends: joined.")
@@ -47,7 +49,7 @@ def _shorten_list(notes: list[str]) -> list[str]:
 
 
 def _sort(road: ElementTree.Element) -> list[tuple[str, str]]:
-    """Sort the elements along a road by s, in place, and lanes by their number.
+    """Sort the elements along a road by s, in place, all but lateral shapes, and lanes by their number.
 
     Return the lanes, as ", lane -1" or "" for the road itself, and names of elements that were not in order.
     """
@@ -74,8 +76,9 @@ def _sort(road: ElementTree.Element) -> list[tuple[str, str]]:
 
 def _drop_empty(road: ElementTree.Element) -> Iterator[tuple[str, float]]:
     """Remove geometry and lane sections, in order of s, that have no length; yield the name and s [m] of each."""
+    kept = order_geometry(road)
     for row in road.findall("planView/geometry"):
-        if float(row.attrib["length"]) <= SHORTEST_M:
+        if row not in kept:
             yield "geometry", float(row.attrib["s"])
     lanes, sections = road.find("lanes"), road.findall("lanes/laneSection")
     assert lanes is not None, "a road that keeps to the standard has lanes"
@@ -94,12 +97,22 @@ def _measure(road: ElementTree.Element) -> list[tuple[ElementTree.Element, float
     return [(section, end - start) for section, (start, end) in zip(sections, pairwise(ends))]
 
 
-def _set_ranges(road: ElementTree.Element) -> None:
-    """Write at each <paramPoly3> how far its parameter goes, which netconvert takes at its word."""
+def _write_shapes(road: ElementTree.Element) -> None:
+    """Write at each <paramPoly3> how far its parameter goes, and spirals of one curvature, and arcs of none, as others.
+
+    netconvert takes the one at its word, and divides by zero at the others.
+    """
     for row in road.iterfind("planView/geometry"):
-        for shape in row.iterfind("paramPoly3"):
-            by_length = is_by_length(shape, float(row.attrib["length"]))
-            shape.set("pRange", "arcLength" if by_length else "normalized")
+        for shape in row:
+            if shape.tag == "paramPoly3":
+                by_length = is_by_length(shape, float(row.attrib["length"]))
+                shape.set("pRange", "arcLength" if by_length else "normalized")
+            if shape.tag == "spiral":
+                start, end = (float(shape.attrib[name]) for name in ("curvStart", "curvEnd"))
+                if abs(end - start) < STRAIGHT:
+                    shape.tag, shape.attrib = "arc", {"curvature": repr(start)}
+            if shape.tag == "arc" and abs(float(shape.attrib["curvature"])) < STRAIGHT:
+                shape.tag, shape.attrib = "line", {}
 
 
 def _mend_widths(road: ElementTree.Element) -> Iterator[str]:

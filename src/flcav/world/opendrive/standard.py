@@ -8,9 +8,11 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from flcav.config import InputError, shorten
 from flcav.world.opendrive.plan_view import SHARPEST_RAD, WIDEST_GAP_M, measure_joints, order_geometry
-from flcav.world.opendrive.reference_line import LENGTH_M, LENGTH_SHARE
+from flcav.world.opendrive.reference_line import LENGTH_M, LENGTH_SHARE, list_pieces
 
 LINES, ROADS = "9.2", "10.1"  # clauses
 ELEVATIONS, NUMBERS, LANES, WIDTHS, OFFSETS, JUNCTIONS = "10.5", "11.1", "11.3", "11.6", "11.4", "12.2"
@@ -91,6 +93,13 @@ def _check_reference_line(road: ElementTree.Element, name: str) -> None:
     total = sum(float(row.attrib["length"]) for row in kept)
     if not length > 0 or abs(total - length) > LENGTH_M + LENGTH_SHARE * length:
         raise _Broken(f"{name} is {length:g} m long, and its geometry {total:g} m (OpenDRIVE 1.8, {LINES})")
+    for piece, row in zip(list_pieces(kept), kept):
+        if row.find("paramPoly3") is not None:
+            with np.errstate(all="ignore"):  # numbers that overflow
+                own = piece.measure()
+            if not abs(own - piece.length) <= LENGTH_M + LENGTH_SHARE * piece.length:
+                at = f"{name}: its <paramPoly3> at s = {piece.s:.6g} m"
+                raise _Broken(f"{at} is {own:.4g} m long, and says {piece.length:.4g} m (OpenDRIVE 1.8, {LINES})")
     for joint in measure_joints(kept):
         at = f"{name}: its geometry at s = {joint.s:.6g} m"
         if not joint.gap_m <= WIDEST_GAP_M:

@@ -36,7 +36,8 @@ class Passages:
     def slow_down(self, least_s: float) -> tuple["Passages", float | None]:
         """Return the passages at the speed at which the longest way takes `least_s` [s], and its share of the limit.
 
-        The share is None where the way is long enough for a vehicle of any speed, is no short one, or would be too slow.
+        The share is None where the way is long enough for a vehicle of any speed, or not short, and where that speed
+        would be too low.
         """
         longest, enough = float(self.left_s.max(initial=0.0)), HASTE * (least_s + ENTERING_S)
         share = self._measure_crawl() * SLOWEST / self._limit / (least_s + LEAVING_S)

@@ -220,6 +220,21 @@ def test_contact_points_of_connections_follow_from_the_links(tmp_path: Path) -> 
     assert read_net(whole.net).connections == read_net(mended.net).connections
 
 
+def test_ids_of_roads_and_junctions_may_be_any_text(tmp_path: Path) -> None:
+    text = CROSS.read_text()
+    whole = import_text(text, tmp_path / "whole").town
+    named = re.sub(
+        r'(<road [^>]*?\bid|incomingRoad|connectingRoad|"road" elementId)="(\d+)"', r'\1="A&amp;B #\2"', text
+    )
+    named = re.sub(r'((?:<junction [^>]*?\bid|junction|"junction" elementId)=)"10"', r'\1"J, 10"', named)
+    assert named.count("A&amp;B") > 40
+    assert named.count("J, 10") > 10
+    town = import_text(named, tmp_path / "named").town
+    for kind in ("driving", "sidewalk"):
+        one, other = (lines(read_net(each.net), 1, kind) for each in (whole, town))
+        assert {line.wkt for line in one} == {line.wkt for line in other}
+
+
 def test_lanes_and_direct_junctions_that_lack_something_are_told() -> None:
     lanes = '<lanes><laneSection><left><lane id="1"/></left><center><lane id="0"/></center></laneSection></lanes>'
     junction = '<junction id="5" type="direct"><connection id="0" incomingRoad="1" linkedRoad="2"/></junction>'

@@ -210,6 +210,27 @@ def test_cubics_by_arc_length_and_by_share_are_the_same_curve(tmp_path: Path) ->
         )
 
 
+def test_a_cubic_of_another_length_is_refused(tmp_path: Path) -> None:
+    shape = '<paramPoly3 aU="0" bU="60" cU="0" dU="0" aV="0" bV="0" cV="0" dV="0"/>'
+    with pytest.raises(InputError, match=r"its <paramPoly3> at s = 0 m is 60 m long, and says 100 m .*9\.2"):
+        read(road(geometry(0, 0, 100, shape=shape)), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    ['<arc curvature="0"/>', '<spiral curvStart="0.01" curvEnd="0.01"/>', '<spiral curvStart="0" curvEnd="0"/>'],
+)
+def test_arcs_of_no_curvature_and_spirals_of_one_are_driven(shape: str, tmp_path: Path) -> None:
+    text = road(geometry(0, 0, 90, shape=shape), length=90).replace(' junction="-1"', "")
+    _, net = import_text(text, tmp_path)
+    bend = 0.01 if "0.01" in shape else 0.0
+    middle = integrate(lambda at: bend + 0 * at, np.linspace(0.0, 90.0, 10))
+    driven = [LineString(lane.shape) for edge in net.streets for lane in edge.lanes_of("driving")]
+    assert len(driven) == 2
+    for point in middle[1:-1]:
+        assert [line.distance(Point(point)) for line in driven] == pytest.approx([1.75, 1.75], abs=0.03)
+
+
 def test_a_cubic_by_arc_length_without_a_word_is_driven(tmp_path: Path) -> None:
     length = 60.0
     shape = '<paramPoly3 aU="0" bU="1" cU="0" dU="0" aV="0" bV="0" cV="0" dV="0"/>'
