@@ -15,7 +15,7 @@ from PIL import Image
 
 from flcav.config import InputError, path_within
 from flcav.dataset.formats.layout import describe_numbers, has_kitti_layout
-from flcav.dataset.formats.reading import check_cloud
+from flcav.dataset.formats.reading import LARGEST_M, check_cloud, check_headings, check_rotation
 from flcav.dataset.payloads import open_image
 from flcav.dataset.upright import turn_upright
 from flcav.geometry import Boxes, heading_vectors, inverse, transform_points, wrap_angle
@@ -85,6 +85,11 @@ def read_calibration(path: Path) -> KittiCalibration:
             raise InputError(f"{path}: needs {height * width} numbers after '{name}:'") from None
         if not np.isfinite(matrices[name]).all() or np.linalg.matrix_rank(matrices[name][:, :3]) < 3:
             raise InputError(f"{path}: the numbers after '{name}:' are no projection and no pose")
+    for name in ("R0_rect", "Tr_velo_to_cam"):
+        try:
+            matrices[name][:, :3] = check_rotation(matrices[name][:, :3])
+        except ValueError as error:
+            raise InputError(f"{path}: '{name}' {error}") from None
     rectified, camera = np.eye(4), np.eye(4)
     rectified[:3, :3] = matrices["R0_rect"]
     camera[:3] = matrices["Tr_velo_to_cam"]
@@ -135,6 +140,7 @@ def read_objects(path: Path, calibration: KittiCalibration, *, levels: bool = Fa
     height, width, length, x, y, z, rotation = numbers[:, 7:].T
     lidar_from_camera = inverse(calibration.camera_from_lidar)
     center = transform_points(lidar_from_camera, np.stack((x, y - height / 2, z), axis=1))
+    check_headings(rotation, path)
     cos, sin = heading_vectors(rotation).T
     ahead = np.stack((cos, np.zeros_like(rotation), -sin), axis=1)  # camera frame
     ahead = ahead @ lidar_from_camera[:3, :3].T
@@ -255,6 +261,7 @@ def check_objects(objects: Objects, width: int | None, height: int | None, path:
         inside &= (right < width + MARGIN_PX) & (bottom < height + MARGIN_PX)
     checks = {
         "a size that is not positive": (objects.boxes.size > 0).all(axis=1),
+        f"a side above {LARGEST_M:g} m; sizes are wanted in metres": (objects.boxes.size <= LARGEST_M).all(axis=1),
         f"a rectangle that is not within the image{of}": inside,
         "a truncation outside 0 to 1": (objects.truncation >= 0) & (objects.truncation <= 1),
         "an occlusion that is none of 0, 1, 2, 3": np.isin(objects.occlusion, LEVELS),
