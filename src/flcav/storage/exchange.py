@@ -6,7 +6,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.csv
 
-from flcav.config import InputError
+from flcav.config import InputError, check_is_file
 from flcav.storage.files import atomic_path
 from flcav.storage.parquet import write_parquet
 
@@ -25,10 +25,9 @@ def read_csv(path: Path | str, texts: Sequence[str] = ()) -> pa.Table:
     Raises `InputError` where it is missing or no table.
     """
     written = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()))
+    check_is_file(Path(path))
     try:
         return pyarrow.csv.read_csv(path, convert_options=written)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         said = str(error) if str(error).isprintable() else "its bytes are no text"
         raise InputError(f"{path}: not a table ({said})") from None

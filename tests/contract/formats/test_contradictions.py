@@ -13,6 +13,7 @@ import pytest
 import yaml
 from painted_source import PaintedSource
 
+from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.formats.export import export
 from flcav.dataset.formats.exporter import ExportOptions
@@ -156,8 +157,8 @@ def test_poses_of_4_by_4_numbers_are_those_of_6(
     one, other = Dataset.open(tmp_path / "matrices"), Dataset.open(tmp_path / "numbers")
     for i in range(len(other)):
         for sensor in other.frame(i).agent_from_sensor:
-            mounted = [data.frame(i).world_from_sensor(sensor) for data in (one, other)]
-            np.testing.assert_allclose(*mounted, atol=1e-7)
+            mounted, expected = (data.frame(i).world_from_sensor(sensor) for data in (one, other))
+            np.testing.assert_allclose(mounted, expected, atol=1e-7)
 
 
 NO_ROTATION, NO_POSE = "'lidar_pose' has a matrix that is no rotation", "'lidar_pose' is not of 6 numbers, nor of 4 x 4"
@@ -287,3 +288,26 @@ def test_one_frame_of_two_numbers_is_refused(copied: Callable[[str], Path], tmp_
     path.write_text("\n".join((*lines[:2], re.sub(r"painted-0-00._000._cav0", "painted-0-000_0000_cav0", lines[2]))))
     with pytest.raises(InputError, match=r"frames\.csv: 000001 is the frame 'painted-0-000_0000_cav0', as 000000 is"):
         import_dataset("kitti", folder, tmp_path / "out")
+
+
+def test_what_files_say_does_not_reach_the_terminal_as_commands(
+    copied: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder, name = copied("opv2v"), "\x1b[2J\nflcav: 8 frames, no problems\n" + "x" * 3000
+    lift_opv2v(folder)
+
+    def rename(about: About) -> None:
+        about["vehicles"] = {f"{name}{number}": row for number, row in about["vehicles"].items()}
+
+    change_yaml(folder, rename)
+    run_to_end(["import", "opv2v", str(folder), "--out", str(tmp_path / "out")])
+    run_to_end(["validate", str(tmp_path / "out")])
+    said = capsys.readouterr().out
+    assert "\\x1b[2J" in said
+    assert said.replace("\n", "").isprintable()
+    assert not [line for line in said.splitlines() if line.startswith("flcav") or len(line) > 1010]
+
+
+def run_to_end(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit):
+        run(arguments)

@@ -17,7 +17,7 @@ import pyarrow.feather as feather
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flcav.config import InputError, path_within
+from flcav.config import InputError, check_is_file, path_within
 from flcav.dataset.checks.frames import LONGEST_SPIN_S
 from flcav.dataset.formats.reading import (
     FARTHEST,
@@ -315,8 +315,7 @@ def _read_feather(path: Path, columns: tuple[str, ...], *, key: str | None = Non
 
     Raises `InputError` where it is missing, truncated, lacks one of them, or has two rows with one value of `key`.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; a log of Argoverse 2 has one")
+    check_is_file(path, None)
     try:
         table = feather.read_table(path, memory_map=False)
     except (OSError, pa.ArrowException, ValueError):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, check_is_file
 from flcav.dataset.formats.carlaflcav.labels import Labels, read_labels
 from flcav.dataset.formats.reading import (
     FARTHEST,
@@ -313,6 +313,7 @@ def _read_lens(path: Path) -> Lens:
 
 def _open_array(path: Path) -> NDArray[np.generic]:
     """Return the array of a .npy file, mapped, so that its header's sizes allocate nothing."""
+    check_is_file(path)
     try:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
         if isinstance(found, np.ndarray):

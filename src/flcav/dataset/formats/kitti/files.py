@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flcav.config import InputError, path_within
+from flcav.config import InputError, path_within, read_file
 from flcav.dataset.formats.layout import describe_numbers, has_kitti_layout
 from flcav.dataset.formats.reading import LARGEST_M, check_cloud, check_headings, check_rotation
 from flcav.dataset.payloads import open_image
@@ -48,10 +48,7 @@ def read_points(path: Path) -> NDArray[np.float32]:
     Raises `InputError` where the file is missing, empty, truncated within a point, of another layout by its numbers,
     or holds a number that is not finite or an intensity outside 0 to 1.
     """
-    try:
-        data = path.read_bytes()
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
+    data = read_file(path)
     if not data:
         raise InputError(f"{path}: empty; a point cloud holds {POINT_BYTES} bytes for each point")
     if not has_kitti_layout(data):
@@ -164,9 +161,7 @@ def _read_levels(truncation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
+        return [line for line in read_file(path).decode("utf-8-sig").splitlines() if line.strip()]
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
 
@@ -277,9 +272,7 @@ def read_split(path: Path) -> list[str]:
     Raises `InputError` where one is there twice, or leads out of the folders of frames.
     """
     try:
-        names = path.read_text(encoding="utf-8-sig").split()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such list of frames") from None
+        names = read_file(path).decode("utf-8-sig").split()
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
     if len(set(names)) != len(names):

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flcav.config import InputError, shorten
+from flcav.config import InputError, check_is_file, read_file, shorten
 from flcav.dataset.formats.kitti.files import (
     FOLDERS,
     PICTURES,
@@ -99,7 +99,7 @@ class KittiSource(LogSource):
             calibration = _path(shot, "calib")
             mounted = _calibrate(read_calibration(calibration))
             self._shots[shot.scene].append(shot)
-            text = "" if shot.exported else calibration.read_text()
+            text = "" if shot.exported else read_file(calibration).decode()
             agent = self._agent[shot] = names.of(shot.vehicle, text)
             self._calibration.setdefault(agent, mounted)
         if not any(shot.exported for shot in every):
@@ -221,6 +221,7 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
     if not path.is_file():
         return {}
     found, numbers = {}, dict[str, str]()
+    check_is_file(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             for row in csv.DictReader(file):

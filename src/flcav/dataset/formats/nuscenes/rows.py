@@ -10,7 +10,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from flcav.config import InputError, read_json, shorten
+from flcav.config import InputError, check_is_file, read_json, shorten
 from flcav.dataset.formats.reading import FARTHEST, ROUNDED
 from flcav.interface.wording import plural
 
@@ -140,11 +140,10 @@ def _share(token: object) -> object:
 
 def _stream_list(path: Path) -> Iterator[object]:
     """Yield the elements of the JSON list in a file, one at a time; raises `InputError` where there is none."""
+    check_is_file(path, None)  # it is read in pieces
     try:
         with path.open(encoding="utf-8-sig") as file:
             yield from _decode_list(file, path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
     except JSONDecodeError as error:
         raise InputError(f"{path}: not JSON ({error.msg})") from None
     except InputError:

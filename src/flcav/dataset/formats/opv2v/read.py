@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError, read_yaml
+from flcav.config import InputError, read_file, read_yaml
 from flcav.dataset.formats.kitti.files import read_points
 from flcav.dataset.formats.layout import BRIGHTEST, has_kitti_layout
 from flcav.dataset.formats.opv2v.about import CAMERAS, EGO, RADIANS, About, read_about
@@ -207,7 +207,7 @@ def read_raw_cloud(path: Path) -> NDArray[np.float32]:
 
     Points that are not finite are left out; intensities may reach 255. Raises `InputError` for other files.
     """
-    data = path.read_bytes()
+    data = read_file(path)
     if not data or len(data) % (4 * POINT):
         return read_points(path)  # which says what it is
     rows = np.frombuffer(data, "<f4").reshape(-1, POINT)
