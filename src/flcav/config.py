@@ -4,8 +4,10 @@ Documents from elsewhere may be made to exhaust whoever reads them, and name fil
 aliases stand for are bounded before anything is built of them, and names lead nowhere but into their own folder.
 """
 
+import errno
 import json
 import re
+import stat
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PureWindowsPath
@@ -26,6 +28,7 @@ DEEPEST = 100  # most levels of nesting in a document
 COPIED = 100_000  # most nodes that the aliases of a YAML document stand for
 SCIENTIFIC = re.compile(r"[-+]?[0-9][0-9_]*[eE][-+]?[0-9]+$")  # 1e-5, which YAML 1.1 takes for text, YAML 1.2 not
 SHOWN = 80  # most characters of a wrong value that an error message quotes
+MOST_BYTES = 1 << 28  # of a file that is read as a whole
 
 
 SAFE_LOADER: type[yaml.SafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -166,12 +169,33 @@ def read_yaml(path: Path, loader: type[Loader] = Loader) -> object:
         raise InputError(f"{path}: not a YAML file ({error})") from None
 
 
-def check_is_file(path: Path) -> None:
-    """Raise `InputError` where there is no file at `path`, or a folder."""
-    if not path.exists():  # nor does a link to itself lead anywhere
-        raise InputError(f"{path}: no such file")
-    if path.is_dir():
+def check_is_file(path: Path, most_bytes: int | None = MOST_BYTES) -> None:
+    """Raise `InputError` where there is no regular file at `path`, or one of more than `most_bytes` (None: any size).
+
+    A pipe or a device would be waited for, or read without end; a sparse file is as large as it says, once it is read.
+    """
+    try:
+        found = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENAMETOOLONG):  # a link to itself leads nowhere
+            raise InputError(f"{path}: no such file") from None
+        raise
+    except ValueError:  # NUL in its name
+        raise InputError(f"{shorten(str(path))}: no such file") from None
+    if stat.S_ISDIR(found.st_mode):
         raise InputError(f"{path}: is a folder, and a file is wanted")
+    if not stat.S_ISREG(found.st_mode):
+        raise InputError(f"{path}: is a pipe or a device, and a file is wanted")
+    if most_bytes is not None and found.st_size > most_bytes:
+        raise InputError(f"{path}: has {found.st_size} bytes; files of at most {most_bytes} are read")
+
+
+def read_file(path: Path) -> bytes:
+    """Return the bytes of the file at `path`; raises `InputError` as `check_is_file` does."""
+    check_is_file(path)
+    return path.read_bytes()
 
 
 def _check_yaml(text: str) -> None:
@@ -250,10 +274,9 @@ def read_xml(path: Path, kind: str) -> ElementTree.Element:
 
     Raises `InputError` if it is missing or not XML, so no `kind`.
     """
-    check_is_file(path)
     parser = ElementTree.XMLParser(target=_Shallow())
+    text = read_file(path)
     try:
-        text = path.read_bytes()
         parser.feed(text[max(text.find(b"<?xml "), 0) :])
         return parser.close()
     except (ElementTree.ParseError, IsADirectoryError, LookupError, ValueError) as error:

@@ -17,6 +17,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from bombs import bomb
@@ -214,7 +215,7 @@ def run_case(inputs: Path, number: int, scratch: Path, choices: list[Call], limi
     arguments = call.arguments(scratch / "in", scratch / "out", rng)
     before = _files(scratch)
     held_mb = _peak_mb()
-    code, out, said, slow, trace = _run(arguments, limit_s)
+    code, out, said, slow, trace = run_within(arguments, limit_s)
     broken = trace or ("" if slow else _broken(call, code, out, said, scratch, before))
     if not broken and (taken_mb := _peak_mb() - held_mb) > MOST_MB:
         broken = f"it took {taken_mb} MB of memory"
@@ -289,8 +290,18 @@ def _state(path: Path) -> tuple[int, int]:
     return path.lstat().st_size, path.lstat().st_mtime_ns
 
 
-def _run(arguments: list[str], limit_s: float) -> tuple[int, str, str, bool, str]:
-    """Return exit code, stdout, stderr, whether the time was over, and the traceback of what was not caught."""
+class Ran(NamedTuple):
+    """What came of a command line."""
+
+    code: int
+    out: str  # on stdout
+    said: str  # on stderr
+    slow: bool  # whether the time was over
+    trace: str  # of what was not caught
+
+
+def run_within(arguments: list[str], limit_s: float) -> Ran:
+    """Run a command line for at most so many seconds of computing."""
     code, slow, trace = 1, False, ""
     out = io.StringIO()
     with _stderr() as said, warnings.catch_warnings():
@@ -305,7 +316,7 @@ def _run(arguments: list[str], limit_s: float) -> tuple[int, str, str, bool, str
             slow = True
         except BaseException as error:
             trace = _traceback(error)
-    return code, out.getvalue(), said.getvalue(), slow, trace
+    return Ran(code, out.getvalue(), said.getvalue(), slow, trace)
 
 
 def _traceback(error: BaseException) -> str:

@@ -69,7 +69,7 @@ def test_boxes_of_a_vehicle_on_a_slope_are_tilted_as_it_is(tmp_path: Path):
 def test_a_log_without_annotations_has_no_boxes_and_says_so(tmp_path: Path):
     write_log(tmp_path / "log", annotated=False)
     notes = import_dataset("argoverse2", tmp_path / "log", tmp_path / "out")
-    assert notes == ("no annotations in 1 of 1 logs, so no boxes",)
+    assert notes == ("no annotations in 1 of 1 log, so no boxes: log",)
     with pytest.raises(InputError, match="imported from argoverse2 without labels of objects"):
         Dataset.open(tmp_path / "out").check_labelled("objects")
 
@@ -117,6 +117,7 @@ def test_a_file_of_a_log_names_itself(
     assert not (tmp_path / "out").exists()
 
 
+NO_QUATERNION = "the rotation of row 0 is no quaternion of length 1"
 NO_NUMBER = "the column '{}' has no number in row 0, or one too large"
 
 
@@ -124,7 +125,11 @@ NO_NUMBER = "the column '{}' has no number in row 0, or one too large"
     ("name", "changed", "sentence"),
     [
         ("annotations.feather", {"length_m": -4.0}, "object 1 has a size that is not positive"),
-        ("annotations.feather", {"qw": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0}, "a rotation is a quaternion of length 0"),
+        (
+            "annotations.feather",
+            {"qw": 0.0, "qx": 0.0, "qy": 0.0, "qz": 0.0},
+            NO_QUATERNION,
+        ),
         ("annotations.feather", {"height_m": np.nan}, NO_NUMBER.format("height_m")),
         ("city_SE3_egovehicle.feather", {"tx_m": 1e300}, NO_NUMBER.format("tx_m")),
         ("calibration/intrinsics.feather", {"fx_px": 0.0}, "field 'fx' = 0.0"),
@@ -151,7 +156,7 @@ def test_a_log_that_nothing_is_annotated_in_has_no_boxes(tmp_path: Path):
     far = tmp_path / "log" / "sensors" / "lidar" / f"{10**30}.feather"  # no time in nanoseconds
     far.write_bytes(b"")
     assert import_dataset("argoverse2", tmp_path / "log", tmp_path / "out") == (
-        "no annotations in 1 of 1 logs, so no boxes",
+        "no annotations in 1 of 1 log, so no boxes: log",
     )
     assert len(Dataset.open(tmp_path / "out")) == 2
 
@@ -161,10 +166,12 @@ def test_sweeps_and_pictures_that_are_not_there_are_told(tmp_path: Path):
     write_log(tmp_path / "log")
     (tmp_path / "log" / PICTURE).unlink()
     notes = import_dataset("argoverse2", tmp_path / "log", tmp_path / "dark")
-    assert notes == ("no picture within 50 ms of a sweep, of cameras with others: 1",)
+    (note,) = notes
+    told = r"no picture within 50 ms of a sweep, of cameras with others: 1, as of log/ring_front_center at \d+"
+    assert re.fullmatch(told, note)
     (tmp_path / "log" / SWEEP).unlink()
     notes = import_dataset("argoverse2", tmp_path / "log", tmp_path / "out")
-    assert notes == ("no sweep at 1 annotated times, so no frames there",)
+    assert notes == ("no sweep at 1 annotated time, so no frames there: log/315966265000000000",)
 
 
 def test_points_have_their_times(tmp_path: Path):

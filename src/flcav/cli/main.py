@@ -21,15 +21,16 @@ from flcav.cli.options import escape_markup
 from flcav.cli.perception import errors, evaluate, infer, train
 from flcav.cli.planning import allocate, fit, history, place
 from flcav.cli.reproductions import reproduce
-from flcav.cli.terminal import Interrupted
+from flcav.cli.terminal import Interrupted, echo, one_line
 from flcav.config import InputError
 from flcav.interface.wording import describe_number, suggest
 
 INTERRUPTED = 130
 NO_FOLDER = (errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG)  # a path leads over a file, or a link to itself; no name
-LONGEST = 1000  # characters of a message
 
 atexit.register(gc.freeze)  # searching all modules for garbage would take a second before the process ends
+
+typer.echo = echo  # of all commands: what they print may come from files and from other machines
 
 app = typer.Typer(
     name="flcav",
@@ -94,7 +95,7 @@ def run(arguments: list[str] | None = None) -> None:
         if code == INTERRUPTED:  # typer's exit code for Ctrl-C
             raise KeyboardInterrupt
     except Interrupted as kept:
-        print(f"flcav: interrupted; {kept}", file=sys.stderr)
+        _say(f"interrupted; {kept}")
         code = INTERRUPTED
     except (click.exceptions.Abort, KeyboardInterrupt):
         _say("interrupted")
@@ -135,7 +136,6 @@ def _describe(error: click.ClickException) -> str:
 
 
 def _say(message: str) -> None:
-    """Print a message as one line on stderr, cut to `LONGEST`; an empty one (after the help) is not printed."""
-    line = " ".join(message.split())
-    if line:
-        print(f"flcav: {line if len(line) <= LONGEST else f'{line[:LONGEST]} ...'}", file=sys.stderr)
+    """Print a message as one line on stderr; an empty one (after the help) is not printed."""
+    if line := one_line(message):
+        print(f"flcav: {line}", file=sys.stderr)

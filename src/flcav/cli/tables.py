@@ -5,10 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from flcav.config import InputError, shorten
 from flcav.storage.exchange import read_csv
 from flcav.storage.parquet import read_parquet
+
+CONTROL = r"[\x00-\x1f\x7f-\x{9f}]"
 
 
 def read_table(path: Path, columns: Sequence[str], names: Sequence[str] = ()) -> pa.Table:
@@ -21,6 +24,9 @@ def read_table(path: Path, columns: Sequence[str], names: Sequence[str] = ()) ->
         if table.column_names.count(column) != 1:
             found = "is missing" if column not in table.column_names else "is there twice"
             raise InputError(f"{path}: column '{column}' {found}; found {', '.join(table.column_names)}")
+    for column in table.column_names:
+        if pa.types.is_string(table[column].type) and pc.any(pc.match_substring_regex(table[column], CONTROL)).as_py():
+            raise InputError(f"{path}: column '{column}' has characters that cannot be printed")
     if not table.num_rows:
         raise InputError(f"{path}: has no rows")
     return table

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import click
 import typer
 
 from flcav.config import Json
@@ -16,7 +17,30 @@ from flcav.machine.locks import only_writer
 if TYPE_CHECKING:
     from rich.console import Console
 
+LONGEST = 1000  # characters of a message
 GOES_ON = "the same command goes on where it stopped"
+
+
+def printable(text: str) -> str:
+    """Return a text whose characters can all be seen: others than newlines and tabs are escapes such as \\x1b.
+
+    Names in files, and what other machines say, could else rewrite what a terminal shows.
+    """
+    return "".join(
+        each if each.isprintable() or each in "\n\t" else each.encode("unicode_escape", "surrogatepass").decode()
+        for each in text
+    )
+
+
+def one_line(message: str) -> str:
+    """Return a message as one printable line, cut to `LONGEST`."""
+    line = printable(" ".join(message.split()))
+    return line if len(line) <= LONGEST else f"{line[:LONGEST]} ..."
+
+
+def echo(message: object = "", nl: bool = True, err: bool = False) -> None:
+    """Print a message, made printable, on stdout or stderr: what commands call as `typer.echo`, see `cli.main`."""
+    click.echo(printable(str(message)), nl=nl, err=err)
 
 
 def plain_console() -> "Console":

@@ -16,7 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from PIL import Image
 
-from flcav.config import InputError
+from flcav.config import InputError, check_is_file
 from flcav.dataset.layout import payload_path
 from flcav.dataset.upright import turn_upright
 from flcav.sensors.frame import Frame
@@ -99,6 +99,7 @@ def read_rows(path: Path, suffix: str, expected: int) -> NDArray[np.float32]:
     try:
         if (found := path.stat().st_size) != expected * row_bytes and not path.is_dir():
             raise InputError(f"{path}: {found} bytes where {expected} points take {expected * row_bytes}")
+        check_is_file(path, None)
         return np.fromfile(path, "<f4", expected * COLUMNS[suffix]).reshape(-1, COLUMNS[suffix])
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None
@@ -137,6 +138,8 @@ def read_image(path: Path, dtype: type[np.generic], channels: int = 1) -> NDArra
 
 def open_image(file: Path | io.BytesIO) -> Image.Image:
     """Return a PNG, WebP or JPEG image, not decoded yet; raises `InputError` where a side exceeds LARGEST_PX."""
+    if isinstance(file, Path) and file.exists():
+        check_is_file(file)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # of images that are refused here
         image = Image.open(file, formats=("PNG", "WEBP", "JPEG"))
@@ -153,14 +156,12 @@ def check_image(path: Path) -> None:
     A PNG ends in its chunk IEND (ISO/IEC 15948, 11.2.5), a JPEG in the marker FFD9 (ITU-T T.81, B.1.1.3), after which
     some programs write more; the length of a WebP is in its header (RFC 9649, 2.3).
     """
-    try:
-        with path.open("rb") as file:
-            head = file.read(12)
-            size = file.seek(0, io.SEEK_END)
-            file.seek(max(0, size - TAIL))
-            tail = file.read()
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
+    check_is_file(path)
+    with path.open("rb") as file:
+        head = file.read(12)
+        size = file.seek(0, io.SEEK_END)
+        file.seek(max(0, size - TAIL))
+        tail = file.read()
     if head.startswith(b"\x89PNG"):
         whole = b"IEND" in tail
     elif head.startswith(b"\xff\xd8"):
@@ -176,6 +177,8 @@ def check_image(path: Path) -> None:
 def _read_depth(path: Path) -> NDArray[np.float32]:
     """Return the depths that `encode_depth` wrote; of what unfolds from the file no more is taken than they are."""
     try:
+        if path.exists():
+            check_is_file(path)
         with pa.CompressedInputStream(pa.OSFile(str(path)), "zstd") as stream:
             if (version := np.lib.format.read_magic(stream)) != (1, 0):
                 raise ValueError(f"version {version} of .npy")

@@ -14,9 +14,16 @@ import numpy as np
 from flcav.config import InputError, parse_config, path_within
 from flcav.dataset.checks.calibration import check_calibrations
 from flcav.dataset.checks.copies import find_copies
-from flcav.dataset.checks.frames import check_measurements, check_points, check_sweeps, check_traffic, check_values
+from flcav.dataset.checks.frames import (
+    check_measurements,
+    check_points,
+    check_sweeps,
+    check_traffic,
+    check_triggers,
+    check_values,
+)
 from flcav.dataset.checks.images import check_images
-from flcav.dataset.checks.scenes import BlockedViews, check_motion
+from flcav.dataset.checks.scenes import BlockedViews, EmptyBoxes, check_motion
 from flcav.dataset.layout import MANIFEST, FrameKey, Manifest, navigation_path, read_manifest, trace_path
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import list_files
@@ -55,7 +62,7 @@ def validate(path: Path | str, *, progress: Report = print_progress) -> list[str
     problems += check_calibrations(dataset.calibrations, error)
 
     traces: dict[str, Trace | None] = {}
-    sight = BlockedViews()
+    sight, empty = BlockedViews(), EmptyBoxes()
     for i, key in enumerate(dataset.keys):
         if key.scene not in traces:
             trace = _trace(dataset, key.scene, damaged)
@@ -65,12 +72,13 @@ def validate(path: Path | str, *, progress: Report = print_progress) -> list[str
             frame = dataset.frame(i)
             problems += _frame_problems(frame, traces[key.scene], imported=manifest.imported is not None)
             sight.add(frame)
+            empty.add(frame)
         except InputError as error:  # a file that cannot be read
             if not any(str(error).startswith(str(folder / name)) for name in damaged):
                 problems.append(str(error))
         progress(i + 1, len(dataset), "")
     problems += _log_problems(dataset, damaged)
-    return [*problems, *sight.problems()]
+    return [*problems, *sight.problems(), *empty.problems()]
 
 
 def _log_problems(dataset: Dataset, damaged: Collection[str]) -> Iterator[str]:
@@ -94,6 +102,7 @@ def _log_problems(dataset: Dataset, damaged: Collection[str]) -> Iterator[str]:
 
 def _frame_problems(frame: Frame, trace: Trace | None, *, imported: bool) -> Iterator[str]:
     yield from check_values(frame, imported=imported)
+    yield from check_triggers(frame)
     if not imported:  # KITTI has the camera's view alone of each spin
         yield from check_sweeps(frame)
     yield from check_points(frame, trace, imported=imported)

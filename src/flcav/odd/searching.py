@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flcav.config import InputError, Json
+from flcav.config import InputError, Json, read_file
 from flcav.interface.progress import Report, ignore_progress
 from flcav.odd.failures import (
     CLASSES,
@@ -203,7 +203,7 @@ def _hash_weights(network: Second) -> str:
 def _read(path: Path | None) -> dict[str, tuple[TriedFrame, ...]]:
     """Return the tested frames in a file of kept ones, by key; a last line that was cut off is left out."""
     known = {}
-    for line in path.read_text(encoding="utf-8").splitlines() if path is not None and path.exists() else ():
+    for line in read_file(path).decode().splitlines() if path is not None and path.exists() else ():
         try:
             row = json.loads(line)
         except json.JSONDecodeError:

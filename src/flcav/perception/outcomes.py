@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from flcav.config import InputError
+from flcav.config import InputError, check_is_file
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
@@ -49,6 +49,7 @@ class Outcomes:
     @classmethod
     def load(cls, path: Path) -> "Outcomes":
         """Return the outcomes that `save` wrote; raises `InputError` for any other file."""
+        check_is_file(path)
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}

@@ -135,7 +135,7 @@ def _adapter(task: Task) -> TypeAdapter[Any]:
 
 
 def _opened(path: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
-    check_is_file(path)
+    check_is_file(path, None)  # what it holds is mapped
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping

@@ -7,7 +7,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flcav.config import InputError, shorten
+from flcav.config import InputError, read_file, shorten
 from flcav.pipeline.recipe import find_path
 from flcav.storage.exchange import read_csv
 from flcav.storage.files import atomic_path
@@ -36,7 +36,9 @@ def read_table(field: str, name: str, noun: str, folder: str, beside: Path) -> s
             f"recipe, in {beside.absolute()}"
         )
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return read_file(path).decode("utf-8-sig")
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"{path}: not a CSV table ({error})") from None
 

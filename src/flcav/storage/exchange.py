@@ -7,7 +7,7 @@ from typing import BinaryIO
 import pyarrow as pa
 import pyarrow.csv
 
-from flcav.config import InputError
+from flcav.config import InputError, check_is_file
 from flcav.storage.files import atomic_path
 from flcav.storage.parquet import write_parquet
 
@@ -28,10 +28,10 @@ def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str
     """
     named = origin or str(path)
     written = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()), null_values=[""])
+    if isinstance(path, Path | str):
+        check_is_file(Path(path))
     try:
         table = pyarrow.csv.read_csv(path, convert_options=written)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         said = str(error) if str(error).isprintable() else "its bytes are no text"
         raise InputError(f"{named}: not a table ({said})") from None

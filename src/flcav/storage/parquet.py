@@ -6,7 +6,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from flcav.config import InputError
+from flcav.config import InputError, check_is_file
 from flcav.storage.files import write_bytes
 
 HARMLESS_BYTES = 1 << 28  # that any table may take in memory
@@ -19,14 +19,13 @@ def read_parquet(path: Path) -> pa.Table:
     Raises `InputError` where the file is missing, not Parquet, or damaged, and before it is read where it would unfold
     to far more than tables do.
     """
+    check_is_file(path, None)
     try:
         file = pq.ParquetFile(path)
         if (size := _measure_table(file.metadata)) > max(HARMLESS_BYTES, UNFOLDED * path.stat().st_size):
             raise ValueError(f"it would take {size} bytes of memory")
         table = file.read()
         table.validate(full=True)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
     except (pa.ArrowException, OSError, ValueError, OverflowError, MemoryError) as error:
         raise InputError(f"{path}: not a readable Parquet file ({error})") from None
     return table

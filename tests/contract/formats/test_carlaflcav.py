@@ -207,7 +207,10 @@ def test_frames_that_lack_a_file_are_left_out_and_counted(recorder: Any, tmp_pat
     (root / "vehicle.tesla.model3_1" / "velodyne" / f"{FIRST + 1:010d}.npy").unlink()
     (root / "vehicle.tesla.model3_1" / "image_2" / f"{FIRST + 2:010d}.png").unlink()
     notes = import_dataset("carlaflcav", root, tmp_path / "out")
-    assert notes[0] == "left out 3 of 6 frames: no labels, or not all of a LiDAR"
+    assert notes[0] == (
+        "left out 3 of 6 frames: no labels, or not all of a LiDAR: vehicle.tesla.model3_1/1207, "
+        "vehicle.tesla.model3_1/1208, others.infrastructure_9/1207"
+    )
     data = Dataset.open(tmp_path / "out")
     assert [(key.index, key.agent, key.time_s) for key in data.keys] == [
         (0, "pole0", 0.0), (1, "cav0", 0.1), (1, "pole0", 0.1)

@@ -321,9 +321,16 @@ LEFT_OUT = [  # format, pattern of the files that are lost (the first of them, o
     ("nuscenes", "samples/LIDAR_TOP/*.bin", False, 7, 6, LOST_FILES.format(1, 1)),
     ("nuscenes", "samples/RADAR_FRONT/*.pcd", True, 8, 8, LOST_FILES.format(4, 0)),
     ("nuscenes", "samples/CAM_FRONT/*.png", True, 8, 4, LOST_FILES.format(4, 0)),
-    ("opv2v", "train/*/*/*.pcd", False, 7, 6, "left out 1 of 8 frames: no YAML file or no point cloud"),
+    ("opv2v", "train/*/*/*.pcd", False, 7, 6, "left out 1 of 8 frames: .* no point cloud of painted-0-000/1001/000000"),
     ("opv2v", "train/*/*/000000.yaml", False, 7, 6, "left out 1 of 8 frames: no YAML file or no point cloud"),
-    ("opv2v", "train/*/*/*_camera0.png", False, 8, 7, "no picture of a camera of 1 of 8 frames, so no image there"),
+    (
+        "opv2v",
+        "train/*/*/*_camera0.png",
+        False,
+        8,
+        7,
+        "of 1 of 8 frames, .*: painted-0-000/1001/000000_camera0",
+    ),
 ]
 
 
@@ -390,7 +397,9 @@ def test_files_of_v2x_real_are_read(exported: dict[str, Path], imported: dict[st
             row["obj_type"] = "Pedestrian"
         path.write_text(yaml.dump(about) + "noise: 1e-05\n")
     notes = import_dataset("opv2v", folder, tmp_path / "out")
-    assert notes == ("no picture of a camera of 1 of 8 frames, so no image there",)
+    (note,) = notes
+    told = r"no picture of a camera of 1 of 8 frames, so no image there: painted-0-00\d/1001/00000\d_cam1"
+    assert re.fullmatch(told, note)
     before, after = imported["opv2v"], Dataset.open(tmp_path / "out")
     assert len(after) == len(before)
     for i in range(len(before)):
@@ -488,12 +497,12 @@ def test_kitti_without_labels_and_opv2v_without_pictures_say_so(exported: dict[s
     folder = shutil.copytree(exported["kitti"], tmp_path / "kitti")
     shutil.rmtree(folder / "training" / "label_2")
     notes = import_dataset("kitti", folder, tmp_path / "bare")
-    assert notes == ("no label_2 of 4 of 4 frames, so no boxes there",)
+    assert notes == ("no label_2 of 4 of 4 frames, so no boxes there: 000000, 000001, 000002 and 1 more",)
     folder = shutil.copytree(exported["opv2v"], tmp_path / "opv2v")
     for path in folder.rglob("*_camera3.png"):
         path.unlink()
     assert import_dataset("opv2v", folder, tmp_path / "blind") == (
-        "no pictures of a camera of 1 of 2 agents, so no images of it",
+        "no pictures of a camera of 1 of 2 agents, so no images of it: camera3 of cav0",
     )
     assert set(Dataset.open(tmp_path / "blind").frame(0).images) == {"camera0"}
 

@@ -114,7 +114,7 @@ def test_sweeps_without_labels_are_left_out_and_counted(name: str, folder: Path,
     labels = sorted(folder.rglob("label*/*/*.json"))
     labels[0].unlink()
     notes = import_dataset(name, folder, tmp_path / "out")
-    assert notes == ("left out 1 sweep without labels",)
+    assert notes == (f"left out 1 sweep without labels: {labels[0].stem}.pcd",)
     assert len(Dataset.open(tmp_path / "out").keys) == len(labels) - 1
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import typer
 
 from flcav.cli.options import OWN, join_choices
+from flcav.cli.terminal import one_line
 from flcav.dataset.formats.formats import IMPORTS
 from flcav.interface.wording import plural
 
@@ -48,6 +49,6 @@ def import_(
         f"{plural(counts.annotations, 'object')}, {plural(counts.points, 'point')}, {plural(counts.images, 'image')}"
     )
     for note in notes:
-        typer.echo(f"{folder}: {note}")
+        typer.echo(one_line(f"{folder}: {note}"))
     for leak in find_leaks({str(out): manifest}) + find_copies([out]):
-        typer.echo(leak, err=True)
+        typer.echo(one_line(leak), err=True)

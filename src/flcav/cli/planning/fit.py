@@ -134,7 +134,7 @@ def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:
     from flcav.config import InputError, read_yaml
     from flcav.optimization.allocation.problem_file import read_task_names
 
-    if problem is None or not problem.exists():
+    if problem is None or not (problem.exists() or problem.is_symlink()):
         return None, stem
     if problem.suffix == ".json":
         raise InputError(f"{problem}: --problem writes YAML")

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import is_rigid, points_in_boxes, transform_points, wrap_angle
+from flcav.geometry import inverse, is_rigid, points_in_boxes, transform_points, wrap_angle
 from flcav.sensors.frame import Array, Frame
 from flcav.sensors.lidar.air import rain_range_noise
 from flcav.sensors.lidar.rolling import Motion
@@ -25,6 +25,11 @@ STEEP_DEG, SKY_DEG = 8.0, 180.0  # tilt of a vehicle from which on its LiDARs ma
 FORCE = 200.0  # limit of the specific force [m/s^2]
 RATE = 20.0  # limit of the angular rate [rad/s]
 FARTHEST = 1e9  # [m], [m/s]: beyond, squares of numbers say nothing
+STRAY_M, STRAY_DEG, SPEED_M_S = (
+    5.0,
+    30.0,
+    100.0,
+)  # most that an agent's pose differs at a sensor's trigger, and per second
 EXACT = 1e-6  # tolerance between values that are stored twice [s], [m], [rad], [m/s]
 
 
@@ -64,6 +69,23 @@ def check_values(frame: Frame, *, imported: bool = False) -> Iterator[str]:
         yield f"{frame.key}: the box of '{track}' has no volume"
     for track in truth.track[(truth.returns < 0) | (truth.occlusion < 0) | (truth.occlusion > 1)]:
         yield f"{frame.key}: the annotation of '{track}' has negative returns, or an occlusion outside 0 to 1"
+
+
+def check_triggers(frame: Frame) -> Iterator[str]:
+    """Check that the agent's pose when a sensor triggers is near that at the spin, and rigid."""
+    for name, then in frame.agent_at_trigger.items():
+        if not (is_rigid(then) and is_rigid(frame.world_from_agent)):
+            yield f"{frame.key}: the pose of {frame.agent} when '{name}' triggers is not a rigid transform"
+            continue
+        between = inverse(frame.world_from_agent) @ then
+        metres = float(np.linalg.norm(between[:3, 3]))
+        degrees = float(np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1))))
+        seconds = abs(frame.calibration.offset_ms.get(name, 0.0)) / 1000
+        if metres > STRAY_M + SPEED_M_S * seconds or degrees > STRAY_DEG:
+            yield (
+                f"{frame.key}: the pose of {frame.agent} when '{name}' triggers is {metres:.1f} m and {degrees:.0f} "
+                "degrees from that at the spin"
+            )
 
 
 def check_sweeps(frame: Frame) -> Iterator[str]:

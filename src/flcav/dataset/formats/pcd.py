@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, read_file
 
 DATA = re.compile(rb"^DATA (\w+)\r?\n", re.MULTILINE)  # last line of the header
 TYPES = {"F": "f", "I": "i", "U": "u"}
@@ -22,10 +22,7 @@ def read_pcd(path: Path) -> NDArray[np.void]:
 
     Raises `InputError` where the file is missing, truncated, compressed, or no PCD file with one number in each field.
     """
-    try:
-        data = path.read_bytes()
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
+    data = read_file(path)
     header, kind, body = _split(data)
     if kind == "binary_compressed":
         raise InputError(f"{path}: a compressed PCD file; supported: binary, ascii")

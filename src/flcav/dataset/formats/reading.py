@@ -7,7 +7,7 @@ from tracks, and the rectangles that boxes fill in images.
 import os
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -20,7 +20,8 @@ from flcav.config import InputError, Json, parse_config, shorten
 from flcav.dataset.payloads import open_image, read_image
 from flcav.dataset.store import LazyMapping
 from flcav.dataset.upright import measure_upright
-from flcav.geometry import Boxes, count_points_in_boxes
+from flcav.geometry import Boxes, count_points_in_boxes, inverse, is_rigid
+from flcav.interface.wording import plural
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, Frame, SignViews, Views
 from flcav.sensors.labels.outlines import outline_boxes
 from flcav.sensors.lens import Lens
@@ -29,6 +30,10 @@ Array = NDArray[np.float64]
 
 LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track whose difference is a velocity, as nuscenes-devkit's
 FARTHEST = 1e9  # largest number that a measurement is taken to have
+LARGEST_M, SMALLEST_M = 200.0, 0.01  # longest side of an object, at most and at least
+ROUNDED = 0.01  # error of a rotation by few digits: of its singular values, or of its quaternion's length
+APART_M, APART_DEG = 3.0, 5.0  # difference from which two poses of one instant contradict each other
+NAMED = 3  # most things of a kind that a note names
 
 
 class LogSource(ABC):
@@ -190,9 +195,76 @@ def check_cloud(points: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
 
 
 def check_sizes(size: Array, path: Path) -> None:
-    """Raise `InputError` where the size (M, 3) of an object that the file at `path` labels is not positive."""
+    """Raise `InputError` where the size (M, 3) of an object that the file at `path` labels is not one in metres."""
     if not (size > 0).all():
         raise InputError(f"{path}: object {int((size > 0).all(axis=1).argmin()) + 1} has a size that is not positive")
+    longest = size.max(axis=1)
+    if (odd := (longest > LARGEST_M) | (longest < SMALLEST_M)).any():
+        number = int(odd.argmax())
+        raise InputError(f"{path}: object {number + 1} is {longest[number]:g} m long; sizes are wanted in metres")
+
+
+def check_headings(yaw: Array, path: Path) -> None:
+    """Raise `InputError` where a heading (M,) that the file at `path` labels is more than a whole turn [rad]."""
+    if (odd := np.abs(yaw) > 2 * np.pi + ROUNDED).any():
+        number = int(odd.argmax())
+        raise InputError(f"{path}: object {number + 1} is turned by {yaw[number]:g}; radians within a turn are wanted")
+
+
+def check_rotation(rotation: Array) -> Array:
+    """Return the rotation (3, 3) that a matrix of few digits stands for; one that is exact to 1e-6 is as it was.
+
+    Raises ValueError where it is none: mirrored, scaled, sheared or not finite.
+    """
+    whole = np.eye(4)
+    whole[:3, :3] = rotation
+    if is_rigid(whole):
+        return rotation
+    if not np.isfinite(rotation).all():
+        raise ValueError("has a rotation that is not finite")
+    left, scale, right = np.linalg.svd(rotation)
+    if np.abs(scale - 1).max() > ROUNDED:
+        raise ValueError(
+            f"has a matrix that is no rotation: it scales by {scale[0]:.3g}, {scale[1]:.3g}, {scale[2]:.3g}"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise ValueError("has a matrix that is no rotation: it mirrors")
+    return left @ right
+
+
+def are_unit_quaternions(quaternions: Array) -> NDArray[np.bool_]:
+    """Return (N,) whether quaternions (N, 4) are rotations: of length 1, but for rounding."""
+    return np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= ROUNDED
+
+
+class PosePairs:
+    """Comparison of two poses that each frame of a format has of one body: counts those that contradict each other."""
+
+    def __init__(self, names: str) -> None:
+        """`names` are those of both in a note, such as "'lidar_pose' and 'true_ego_pos'"."""
+        self._names, self._frames, self._apart, self._first = names, 0, 0, ""
+
+    def add(self, one: Array, other: Array, origin: Path, also: str = "") -> None:
+        """Compare two (4, 4) poses of the file `origin`; `also` is a clause on another contradiction of theirs."""
+        between = inverse(one) @ other
+        degrees = float(np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1))))
+        metres = float(np.linalg.norm(between[:3, 3]))
+        self._frames += 1
+        if degrees > APART_DEG or metres > APART_M or also:
+            self._apart += 1
+            apart = f"{degrees:.1f} degrees and {metres:.1f} m apart by the mount in the agent's first frame"
+            self._first = self._first or f"{origin}, where {also or f'they are {apart}'}"
+
+    def notes(self) -> tuple[str, ...]:
+        """Return a sentence on the frames in which they contradict each other; none where there are none."""
+        told = f"{self._names} contradict each other in {self._apart} of {plural(self._frames, 'frame')}"
+        return (f"{told}, first in {self._first}",) if self._apart else ()
+
+
+def name_some(names: Collection[str]) -> str:
+    """Return the first NAMED of several names, and how many others there are."""
+    shown = ", ".join(list(names)[:NAMED])
+    return shown if len(names) <= NAMED else f"{shown} and {len(names) - NAMED} more"
 
 
 def pinhole(intrinsics: Array, width: float, height: float, path: Path) -> Lens:

@@ -17,16 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flcav.config import InputError, read_json
+from flcav.config import InputError, read_json, shorten
 from flcav.dataset.formats.layout import BRIGHTEST
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
     ImportFormat,
     LogSource,
     annotate,
+    are_unit_quaternions,
     check_cloud,
+    check_headings,
     check_sizes,
     choose_split,
+    name_some,
 )
 from flcav.geometry import Boxes, turned_boxes, wrap_angle
 from flcav.interface.wording import plural
@@ -80,7 +83,7 @@ class RoadsideSource(LogSource):
             raise InputError(f"{folder}: no sweep that has labels")
         self.split_of = dict.fromkeys(choose_split(folder, dict.fromkeys(found), split))
         self._sweeps = {scene: sorted(found[scene], key=lambda each: (each.spin, each.pole)) for scene in self.split_of}
-        self.notes = (f"left out {plural(bare, 'sweep')} without labels",) if bare else ()
+        self.notes = tuple(_describe_lacking(bare, self._sweeps))
 
     def frame_count(self, scene: str) -> int:
         """Return the number of sweeps of a scene."""
@@ -105,8 +108,8 @@ class RoadsideSource(LogSource):
             )
 
     @abstractmethod
-    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], int]:
-        """Return the labelled sweeps by scene, and how many have no labels."""
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], list[str]]:
+        """Return the labelled sweeps by scene, and the names of those without labels."""
 
     @abstractmethod
     def _read_labels(self, path: Path) -> Labelled:
@@ -118,15 +121,15 @@ class DairSource(RoadsideSource):
 
     FORMAT = "dair-v2x"
 
-    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], int]:
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], list[str]]:
         about, labels = _read_infos(folder / "data_info.json"), folder / "label" / "virtuallidar"
         places = {place: number for number, place in enumerate(sorted({row.place for row in about.values()} | {""}))}
         scenes: dict[str, list[Sweep]] = {}
-        bare = 0
+        bare = list[str]()
         for cloud in sorted((folder / "velodyne").glob("*.pcd")):
             label, own = labels / f"{cloud.stem}.json", about.get(cloud.stem, Info("", "", 0.0))
             if not label.is_file():
-                bare += 1
+                bare.append(cloud.name)
                 continue
             scene = f"dair-{own.sequence or cloud.stem}"
             scenes.setdefault(scene, []).append(Sweep(cloud, label, f"pole{places[own.place]}", 0, own.time_s))
@@ -147,6 +150,7 @@ class DairSource(RoadsideSource):
         except (KeyError, TypeError, ValueError, AttributeError):
             raise InputError(f"{path}: object {len(track) + 1} is none of DAIR-V2X's labels") from None
         array = _check_numbers(np.array(numbers).reshape(-1, 7), path)
+        check_headings(array[:, 6], path)
         boxes = Boxes(array[:, :3], array[:, 3:6], wrap_angle(array[:, 6]), _name(category))
         return Labelled(tuple(track), boxes, np.array(occlusion))
 
@@ -156,10 +160,10 @@ class TumTrafSource(RoadsideSource):
 
     FORMAT = "tumtraf"
 
-    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], int]:
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], list[str]]:
         roots = [folder] if (folder / "point_clouds").is_dir() else sorted(folder.iterdir())
         scenes: dict[str, list[Sweep]] = {}
-        bare = 0
+        bare = list[str]()
         for root in (each for each in roots if (each / "point_clouds").is_dir()):
             for number, lidar in enumerate(sorted(path for path in (root / "point_clouds").iterdir() if path.is_dir())):
                 for cloud in sorted(lidar.glob("*.pcd")):
@@ -167,7 +171,7 @@ class TumTrafSource(RoadsideSource):
                     stamp = STAMP.match(cloud.stem)
                     time_s = int(stamp[1]) + int(stamp[2]) / 1e9 if stamp else 0.0
                     if not label.is_file():
-                        bare += 1
+                        bare.append(cloud.name)
                         continue
                     sweep = Sweep(cloud, label, f"pole{number}", 0, time_s)
                     scenes.setdefault(root.resolve().name, []).append(sweep)
@@ -188,6 +192,8 @@ class TumTrafSource(RoadsideSource):
         except (KeyError, TypeError, ValueError, AttributeError):
             raise InputError(f"{path}: object {len(track) + 1} is no cuboid of OpenLABEL") from None
         array = _check_numbers(array, path)
+        if not (unit := are_unit_quaternions(array[:, 3:7])).all():
+            raise InputError(f"{path}: the rotation of object {int(unit.argmin()) + 1} is no quaternion of length 1")
         boxes = turned_boxes(array[:, :3], array[:, 7:], turned, _name(category))
         return Labelled(tuple(track), boxes, np.full(len(boxes), np.nan))
 
@@ -225,15 +231,20 @@ def _read_infos(path: Path) -> Mapping[str, Info]:
     if not path.is_file():
         return {}
     rows: Any = read_json(path)
+    found: dict[str, Info] = {}
     try:
-        return {
-            Path(str(row["pointcloud_path"])).stem: Info(
+        for row in rows:
+            name = Path(str(row["pointcloud_path"])).stem
+            own = Info(
                 str(row.get("sequence_id", "")),
                 str(row.get("intersection_loc", "")),
                 float(row.get("pointcloud_timestamp", 0)) / 1e6,
             )
-            for row in rows
-        }
+            if found.setdefault(name, own) != own:
+                raise InputError(f"{path}: two entries of {shorten(name)} differ")
+        return found
+    except InputError:
+        raise
     except (KeyError, TypeError, ValueError, AttributeError):
         raise InputError(f"{path}: not the list of sweeps of DAIR-V2X") from None
 
@@ -246,6 +257,22 @@ def _number(sweeps: Sequence[Sweep]) -> list[Sweep]:
         spins[sweep.pole] = spin + 1
         numbered.append(sweep._replace(spin=spin, time_s=round(sweep.time_s - first, 6)))
     return numbered
+
+
+def _describe_lacking(bare: Sequence[str], scenes: Mapping[str, Sequence[Sweep]]) -> Iterator[str]:
+    """Yield sentences on sweeps without labels, and on those of one LiDAR and scene with one time."""
+    if bare:
+        yield f"left out {plural(len(bare), 'sweep')} without labels: {name_some(bare)}"
+    found: dict[tuple[str, str, float], list[Sweep]] = {}
+    for scene, sweep in ((scene, each) for scene, own in scenes.items() for each in own):
+        found.setdefault((scene, sweep.pole, sweep.time_s), []).append(sweep)
+    if twins := [own for own in found.values() if len(own) > 1]:
+        one, other, *_ = twins[0]
+        equal, whole = (sum(map(len, own)) for own in (twins, found.values()))
+        yield (
+            f"{equal} of {plural(whole, 'sweep')} have the time stamp of another "
+            f"of their LiDAR, as {other.cloud.name} has that of {one.cloud.name}: correct the time stamps"
+        )
 
 
 def _name(category: Sequence[str]) -> NDArray[np.str_]:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, read_file
 from flcav.dataset.formats.kitti.files import read_points
 from flcav.dataset.formats.layout import has_nuscenes_layout
 from flcav.dataset.formats.nuscenes.files import read_lidar
@@ -35,10 +35,7 @@ def read_sweep(path: Path) -> NDArray[np.float32]:
     Files of KITTI and nuScenes are told by their numbers, see `layout`; a PCD file has the fields `FIELDS`. Raises
     `InputError` for other files, and for points that are not finite or have an intensity out of range.
     """
-    try:
-        data = path.read_bytes()
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
+    data = read_file(path)
     for start, name in OTHERS.items():
         if data.startswith(start):
             raise InputError(f"{path}: {name}; supported are point clouds of KITTI (.bin), nuScenes (.pcd.bin) and PCD")

@@ -123,7 +123,10 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
     for frame in frames:
         _check_names(frame, scene)
         if frame.key in written:
-            raise ValueError(f"{frame.key}: the source yields this frame twice")
+            raise ValueError(
+                f"scene '{scene}' has two frames of '{frame.agent}' at spin {frame.index} ({frame.time_s:g} s), the "
+                f"second{_name_files(frame)}; an agent has one frame a spin: correct its time stamp, or remove it"
+            )
         written.add(frame.key)
         links = frame.files if isinstance(frame, LinkedFrame) else {}
         for sensor, target in links.items():
@@ -152,6 +155,12 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
     listing = pa.table(dict(zip(FILES_SCHEMA.names, zip(*files) if files else ([], [], []))), schema=FILES_SCHEMA)
     write_table(listing, part / table_path(FILES))
     write_bytes(part / CALIBRATION, json.dumps(calibrations).encode())
+
+
+def _name_files(frame: Frame) -> str:
+    """Return " of FILE" of a frame that has files; "" of any other."""
+    files = frame.files if isinstance(frame, LinkedFrame) else {}
+    return f" of {next(iter(files.values()))}" if files else ""
 
 
 def _check_names(frame: Frame, scene: str) -> None:

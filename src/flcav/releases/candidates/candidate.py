@@ -152,6 +152,7 @@ def check_bundle(folder: Path) -> None:
 def hash_card(weights: Path) -> str:
     """Return the SHA-256 of the model card in the metadata of a safetensors file; raises `InputError` for none."""
     try:
+        check_is_file(weights, None)
         with weights.open("rb") as file:
             size = int.from_bytes(file.read(8), "little")
             if size > MOST_HEADER_BYTES:

@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from flcav.config import InputError, read_config, shorten
+from flcav.config import InputError, read_config, read_file, shorten
 from flcav.interface.wording import suggest
 from flcav.statistics.streams import stream
 from flcav.world.map import boundaries, imported, street_furniture
@@ -125,7 +125,7 @@ def load_town(name: str | Path, beside: Path | str | None = None) -> Town:
 def _hash_files(folder: Path) -> str:
     """Return a hash of the names and bytes of the files in a folder."""
     files = sorted(path for path in folder.glob("*") if path.is_file())
-    return hashlib.sha256(b"".join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()
+    return hashlib.sha256(b"".join(path.name.encode() + read_file(path) for path in files)).hexdigest()
 
 
 @lru_cache(maxsize=16)

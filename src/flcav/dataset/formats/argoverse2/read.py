@@ -17,7 +17,7 @@ import pyarrow.feather as feather
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flcav.config import InputError, path_within
+from flcav.config import InputError, check_is_file, path_within
 from flcav.dataset.checks.frames import LONGEST_SPIN_S
 from flcav.dataset.formats.reading import (
     FARTHEST,
@@ -26,16 +26,19 @@ from flcav.dataset.formats.reading import (
     LogPicture,
     LogSource,
     annotate,
+    are_unit_quaternions,
     check_sizes,
     choose_split,
     difference_tracks,
     name_folders,
     name_place,
+    name_some,
     pinhole,
     read_pictures,
     view_boxes,
 )
 from flcav.geometry import Boxes, pose, transform_points, turned_boxes
+from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import Lens
 
@@ -76,8 +79,8 @@ class Log(NamedTuple):
     agent: str
     sweeps: tuple[int, ...]  # [ns]
     labelled: bool
-    lost: int  # annotated times without a sweep
-    dark: int  # sweeps without a picture, summed over the cameras that have pictures
+    lost: tuple[str, ...]  # annotated times without a sweep
+    dark: tuple[str, ...]  # sweeps without a picture of a camera that has others
 
 
 class Labels(NamedTuple):
@@ -106,12 +109,15 @@ class Argoverse2Source(LogSource):
             for scene in choose_split(folder, {scene: _split_of(path) for scene, path in found.items()}, split)
         }
         bare = [log.folder.name for log in self._logs.values() if not log.labelled]
-        lost, dark = (sum(column) for column in zip(*((log.lost, log.dark) for log in self._logs.values())))
-        self.notes = (
-            *((f"no annotations in {len(bare)} of {len(self._logs)} logs, so no boxes",) if bare else ()),
-            *((f"no sweep at {lost} annotated times, so no frames there",) if lost else ()),
-            *((f"no picture within {LATE_NS // 10**6} ms of a sweep, of cameras with others: {dark}",) if dark else ()),
-        )
+        lost = [name for log in self._logs.values() for name in log.lost]
+        dark = [name for log in self._logs.values() for name in log.dark]
+        late = f"no picture within {LATE_NS // 10**6} ms of a sweep, of cameras with others: {len(dark)}"
+        told = {
+            f"no annotations in {len(bare)} of {plural(len(self._logs), 'log')}, so no boxes: {name_some(bare)}": bare,
+            f"no sweep at {plural(len(lost), 'annotated time')}, so no frames there: {name_some(lost)}": lost,
+            f"{late}, as of {name_some(dark)}": dark,
+        }
+        self.notes = tuple(note for note, names in told.items() if names)
         self.labelled = not bare
         self.split_of = {scene: log.split for scene, log in self._logs.items()}
 
@@ -216,9 +222,14 @@ def _open_log(folder: Path, names: AgentNames) -> Log:
     annotations = folder / "annotations.feather"
     known = annotations.is_file()
     annotated = _read_feather(annotations, ("timestamp_ns",))["timestamp_ns"].unique().to_pylist() if known else ()
-    lost = len(set(annotated) - set(sweeps.tolist()))
-    times = (_list_times(folder / "sensors" / "cameras" / name, "jpg") for name in lenses)
-    dark = sum(_nearest(own, sweep) is None for own in times if len(own) for sweep in sweeps.tolist())
+    lost = tuple(f"{folder.name}/{time}" for time in sorted(set(annotated) - set(sweeps.tolist())))
+    times = {name: _list_times(folder / "sensors" / "cameras" / name, "jpg") for name in lenses}
+    dark = tuple(
+        f"{folder.name}/{name} at {sweep}"
+        for name, own in times.items()
+        for sweep in (sweeps.tolist() if len(own) else ())
+        if _nearest(own, sweep) is None
+    )
     return Log(
         folder, _split_of(folder), names.of("ego", calibration), tuple(sweeps.tolist()), bool(annotated), lost, dark
     )
@@ -291,8 +302,8 @@ def _transforms(table: pa.Table, path: Path) -> Array:
     """Return (N, 4, 4) transforms of the quaternions and translations in PLACED, which the file at `path` has."""
     w, x, y, z, *translation = (table[name].to_numpy() for name in PLACED)
     transforms = np.tile(np.eye(4), (len(table), 1, 1))
-    if not np.any((w, x, y, z), axis=0).all():
-        raise InputError(f"{path}: a rotation is a quaternion of length 0")
+    if not (unit := are_unit_quaternions(np.column_stack((w, x, y, z)))).all():
+        raise InputError(f"{path}: the rotation of row {int(unit.argmin())} is no quaternion of length 1")
     if len(table):
         transforms[:, :3, :3] = Rotation.from_quat(np.column_stack((x, y, z, w))).as_matrix()
         transforms[:, :3, 3] = np.column_stack(translation)
@@ -304,8 +315,7 @@ def _read_feather(path: Path, columns: tuple[str, ...], *, key: str | None = Non
 
     Raises `InputError` where it is missing, truncated, lacks one of them, or has two rows with one value of `key`.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; a log of Argoverse 2 has one")
+    check_is_file(path, None)
     try:
         table = feather.read_table(path, memory_map=False)
     except (OSError, pa.ArrowException, ValueError):

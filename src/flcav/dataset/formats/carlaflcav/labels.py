@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError, shorten
+from flcav.config import InputError, check_is_file, shorten
 from flcav.dataset.formats.reading import FARTHEST
 from flcav.geometry import pose
 
@@ -72,11 +72,9 @@ Value = int | float | str | Class | Record | tuple[()] | list["Value"] | dict[st
 
 def read_labels(path: Path) -> Labels:
     """Return the labels in a file of the recorder's; raises `InputError` where it is missing or holds anything else."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
+    check_is_file(path)
+    with path.open("rb") as file:
+        data = file.read(MOST_BYTES + 1)
     try:
         if len(data) > MOST_BYTES:
             raise ValueError(f"it has more than {MOST_BYTES} bytes")

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, check_is_file
 from flcav.dataset.formats.carlaflcav.labels import Labels, read_labels
 from flcav.dataset.formats.reading import (
     FARTHEST,
@@ -25,11 +25,13 @@ from flcav.dataset.formats.reading import (
     ImportFormat,
     LogPicture,
     LogSource,
+    PosePairs,
     annotate,
     check_cloud,
     choose_split,
     difference_tracks,
     name_folders,
+    name_some,
     pinhole,
     view_boxes,
 )
@@ -85,6 +87,8 @@ class CarlaFlcavSource(LogSource):
         self.folders = name_folders(found)
         self.split_of = dict.fromkeys(choose_split(folder, dict.fromkeys(self.folders), split))
         self._counts: Counter[str] = Counter()
+        self._lost: list[str] = []  # frames without labels, or not all of a LiDAR
+        self._pairs = PosePairs(f"the poses of the first sensor and '{STATUS}'")
         self._labels = {scene: _list_files(min(path.glob(WORLD)), "pkl") for scene, path in self.folders.items()}
         self._time_s: dict[str, dict[int, float]] = {scene: {} for scene in self.split_of}
         names = AgentNames()
@@ -108,7 +112,12 @@ class CarlaFlcavSource(LogSource):
             for rig in rigs:
                 if tick in rig.ticks:
                     since_s = round(time_s[tick] - time_s[ticks[0]], 6)
-                    yield _read_frame(scene, spin, since_s, rig, tick, labels[tick], velocity[tick])
+                    frame = _read_frame(scene, spin, since_s, rig, tick, labels[tick], velocity[tick])
+                    if rig.vehicle:
+                        file = rig.sensors[rig.anchor].files[tick]
+                        self._pairs.add(frame.world_from_agent, rig.vehicle[tick], file)
+                    yield frame
+        self._note()
 
     def _open(self, scene: str, names: AgentNames) -> list[Rig]:
         """Return the agents of a recording that have frames, its vehicles and posts numbered in order."""
@@ -126,7 +135,8 @@ class CarlaFlcavSource(LogSource):
             rig = _assemble(f"{kind}{number[kind]}", vehicle, sensors, self._labels[scene], names)
             number[kind] += 1
             every = {tick for sensor in sensors.values() for tick in sensor.files}
-            self._counts.update(frame=len(every), lost=len(every) - (len(rig.ticks) if rig else 0))
+            self._counts.update(frame=len(every))
+            self._lost += [f"{path.name}/{tick}" for tick in sorted(every - {*(rig.ticks if rig else ())})]
             if rig:
                 rigs.append(rig)
         return rigs
@@ -148,6 +158,13 @@ class CarlaFlcavSource(LogSource):
         """Return the (4, 4) poses in a table, by tick; keeps the ticks' times."""
         table = _read_numbers(path, POSE)
         ticks = table["frame"].astype(np.int64).tolist()
+        if len({*ticks}) < len(ticks):
+            raise InputError(f"{path}: two rows of the frame {max(ticks, key=ticks.count)}; each frame has one pose")
+        order = np.argsort(table["frame"], kind="stable")
+        if len(back := np.flatnonzero(np.diff(table["timestamp"][order]) <= 0)):
+            raise InputError(
+                f"{path}: the time stamp of the frame {ticks[order[back[0] + 1]]} is not after the one before"
+            )
         self._time_s[scene].update(zip(ticks, table["timestamp"].tolist()))
         placed = np.tile(np.eye(4), (len(ticks), 1, 1))
         placed[:, :3, :3] = rotations(*(np.radians(table[angle]) for angle in ("yaw", "pitch", "roll")))
@@ -162,13 +179,17 @@ class CarlaFlcavSource(LogSource):
     def _note(self) -> None:
         count = self._counts
         told = {
-            f"left out {count['lost']} of {plural(count['frame'], 'frame')}: no labels, or not all of a LiDAR": "lost",
             f"left out {plural(count['semantic'], 'semantic LiDAR')}, which has no intensities": "semantic",
             f"left out {plural(count['radar'], 'radar')}, which has no radar cross-sections": "radar",
             f"left out {plural(count['other camera'], 'camera')} of depths or classes": "other camera",
             f"left out {plural(count['flat'], 'label')} of objects without a volume": "flat",
         }
-        self.notes = tuple(note for note, kind in told.items() if count[kind])
+        lost = f"left out {len(self._lost)} of {plural(count['frame'], 'frame')}: no labels, or not all of a LiDAR"
+        self.notes = (
+            *((f"{lost}: {name_some(self._lost)}",) if self._lost else ()),
+            *(note for note, kind in told.items() if count[kind]),
+            *self._pairs.notes(),
+        )
 
 
 IMPORT = ImportFormat(CarlaFlcavSource, (WORLD, f"*/{WORLD}"))
@@ -293,6 +314,7 @@ def _read_lens(path: Path) -> Lens:
 
 def _open_array(path: Path) -> NDArray[np.generic]:
     """Return the array of a .npy file, mapped, so that its header's sizes allocate nothing."""
+    check_is_file(path)
     try:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
         if isinstance(found, np.ndarray):

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flcav.config import InputError, path_within
+from flcav.config import InputError, path_within, read_file
 from flcav.dataset.formats.layout import describe_numbers, has_kitti_layout
-from flcav.dataset.formats.reading import check_cloud
+from flcav.dataset.formats.reading import LARGEST_M, check_cloud, check_headings, check_rotation
 from flcav.dataset.payloads import open_image
 from flcav.dataset.upright import turn_upright
 from flcav.geometry import Boxes, heading_vectors, inverse, transform_points, wrap_angle
@@ -48,10 +48,7 @@ def read_points(path: Path) -> NDArray[np.float32]:
     Raises `InputError` where the file is missing, empty, truncated within a point, of another layout by its numbers,
     or holds a number that is not finite or an intensity outside 0 to 1.
     """
-    try:
-        data = path.read_bytes()
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
+    data = read_file(path)
     if not data:
         raise InputError(f"{path}: empty; a point cloud holds {POINT_BYTES} bytes for each point")
     if not has_kitti_layout(data):
@@ -85,6 +82,11 @@ def read_calibration(path: Path) -> KittiCalibration:
             raise InputError(f"{path}: needs {height * width} numbers after '{name}:'") from None
         if not np.isfinite(matrices[name]).all() or np.linalg.matrix_rank(matrices[name][:, :3]) < 3:
             raise InputError(f"{path}: the numbers after '{name}:' are no projection and no pose")
+    for name in ("R0_rect", "Tr_velo_to_cam"):
+        try:
+            matrices[name][:, :3] = check_rotation(matrices[name][:, :3])
+        except ValueError as error:
+            raise InputError(f"{path}: '{name}' {error}") from None
     rectified, camera = np.eye(4), np.eye(4)
     rectified[:3, :3] = matrices["R0_rect"]
     camera[:3] = matrices["Tr_velo_to_cam"]
@@ -135,6 +137,7 @@ def read_objects(path: Path, calibration: KittiCalibration, *, levels: bool = Fa
     height, width, length, x, y, z, rotation = numbers[:, 7:].T
     lidar_from_camera = inverse(calibration.camera_from_lidar)
     center = transform_points(lidar_from_camera, np.stack((x, y - height / 2, z), axis=1))
+    check_headings(rotation, path)
     cos, sin = heading_vectors(rotation).T
     ahead = np.stack((cos, np.zeros_like(rotation), -sin), axis=1)  # camera frame
     ahead = ahead @ lidar_from_camera[:3, :3].T
@@ -158,9 +161,7 @@ def _read_levels(truncation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
+        return [line for line in read_file(path).decode("utf-8-sig").splitlines() if line.strip()]
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
 
@@ -255,6 +256,7 @@ def check_objects(objects: Objects, width: int | None, height: int | None, path:
         inside &= (right < width + MARGIN_PX) & (bottom < height + MARGIN_PX)
     checks = {
         "a size that is not positive": (objects.boxes.size > 0).all(axis=1),
+        f"a side above {LARGEST_M:g} m; sizes are wanted in metres": (objects.boxes.size <= LARGEST_M).all(axis=1),
         f"a rectangle that is not within the image{of}": inside,
         "a truncation outside 0 to 1": (objects.truncation >= 0) & (objects.truncation <= 1),
         "an occlusion that is none of 0, 1, 2, 3": np.isin(objects.occlusion, LEVELS),
@@ -270,9 +272,7 @@ def read_split(path: Path) -> list[str]:
     Raises `InputError` where one is there twice, or leads out of the folders of frames.
     """
     try:
-        names = path.read_text(encoding="utf-8-sig").split()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such list of frames") from None
+        names = read_file(path).decode("utf-8-sig").split()
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
     if len(set(names)) != len(names):

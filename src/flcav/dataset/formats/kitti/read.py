@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flcav.config import InputError
+from flcav.config import InputError, check_is_file, read_file, shorten
 from flcav.dataset.formats.kitti.files import (
     FOLDERS,
     PICTURES,
@@ -40,6 +40,7 @@ from flcav.dataset.formats.reading import (
     assign_split,
     choose_split,
     measure_picture,
+    name_some,
     read_pictures,
     unseen_views,
 )
@@ -98,16 +99,21 @@ class KittiSource(LogSource):
             calibration = _path(shot, "calib")
             mounted = _calibrate(read_calibration(calibration))
             self._shots[shot.scene].append(shot)
-            text = "" if shot.exported else calibration.read_text()
+            text = "" if shot.exported else read_file(calibration).decode()
             agent = self._agent[shot] = names.of(shot.vehicle, text)
             self._calibration.setdefault(agent, mounted)
         if not any(shot.exported for shot in every):
             self.beams, self.range_m = BEAMS, RANGE_M
-        bare = sum(not _path(shot, "label_2").is_file() for shot in every)
-        self.labelled = not bare
-        self.notes = (f"no label_2 of {bare} of {plural(len(every), 'frame')}, so no boxes there",) if bare else ()
-        if blind := sum(not _path(shot, CAMERA).is_file() for shot in every):
-            self.notes += (f"no {CAMERA} of {blind} of {plural(len(every), 'frame')}, so LiDAR alone there",)
+        lost = {
+            kind: [shot.number for shot in every if not _path(shot, kind).is_file()] for kind in ("label_2", CAMERA)
+        }
+        self.labelled = not lost["label_2"]
+        told = {"label_2": "so no boxes there", CAMERA: "so LiDAR alone there"}
+        self.notes = tuple(
+            f"no {kind} of {len(own)} of {plural(len(every), 'frame')}, {told[kind]}: {name_some(own)}"
+            for kind, own in lost.items()
+            if own
+        )
 
     def frame_count(self, scene: str) -> int:
         """Return the number of frames of a scene."""
@@ -214,12 +220,17 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
     """Return number -> scene, spin, agent and time [s] from the list of an export, empty where there is none."""
     if not path.is_file():
         return {}
-    found = {}
+    found, numbers = {}, dict[str, str]()
+    check_is_file(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             for row in csv.DictReader(file):
                 scene, index, _ = row["frame"].removesuffix(row["agent"]).rsplit("_", 2)
                 found[row["number"]] = scene, int(index), row["agent"], float(row["time_s"])
+                if (one := numbers.setdefault(row["frame"], row["number"])) != row["number"]:
+                    raise InputError(f"{path}: {row['number']} is the frame {shorten(row['frame'])}, as {one} is")
+    except InputError:
+        raise
     except (KeyError, ValueError, TypeError, AttributeError, csv.Error):
         raise InputError(
             f"{path}: not the list of frames of an export; without it the folder can be read, too"

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from flcav.config import InputError
+from flcav.config import InputError, read_file
 from flcav.dataset.formats.layout import BRIGHTEST
 from flcav.dataset.formats.reading import check_cloud
 from flcav.sensors.radar.radar import compute_echo_directions
@@ -45,10 +45,7 @@ def read_lidar(path: Path) -> NDArray[np.float32]:
 
     Raises `InputError` where it is missing, truncated, or has a point that is not finite or an intensity out of range.
     """
-    try:
-        data = path.read_bytes()
-    except (FileNotFoundError, IsADirectoryError):
-        raise InputError(f"{path}: no such file") from None
+    data = read_file(path)
     if not data or len(data) % POINT_BYTES:
         raise InputError(f"{path}: truncated; {len(data)} bytes are no whole points of {POINT_BYTES} bytes")
     right, ahead, up, intensity, _ = np.frombuffer(data, "<f4").reshape(-1, 5).T

@@ -7,6 +7,7 @@ are in its devkit's code and not in its files; an export of flcav's has them, an
 from array import array
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError, path_within, read_json, shorten
 from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, decode_radar, read_lidar
-from flcav.dataset.formats.nuscenes.rows import COLUMNS, Row, read_table, stream_table
+from flcav.dataset.formats.nuscenes.rows import COLUMNS, References, Row, read_table, stream_table
 from flcav.dataset.formats.nuscenes.tables import VERSION
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
@@ -86,20 +87,31 @@ class NuscenesSource(LogSource):
         self._tables = _find_tables(folder)
         self._root = self._tables.parent
         table = {name: read_table(self._tables, name) for name in SMALL}
+        self._references = References()
+        for _ in self._references.check_links(table["sample"].values(), "sample", self._tables / "sample.json"):
+            pass
         self._data: dict[str, dict[str, Row]] = defaultdict(dict)  # sample -> channel -> row of sample_data
         self._mounted, self._channel = table["calibrated_sensor"], table["sensor"]
         self._lost: dict[str, set[str]] = defaultdict(set)  # sample -> channels whose file is not there
         listed, first_lost = self._tables / "sample_data.json", None
-        for row in stream_table(self._tables, "sample_data", lambda row: row["is_key_frame"]):
+        for row in self._stream("sample_data"):
+            if not row["is_key_frame"]:
+                continue
+            if row["sample_token"] not in table["sample"]:
+                self._references.miss("sample_data", "sample_token", row["sample_token"])
+                continue
             path_within(self._root, row["filename"], listed)
-            mounted = self._at(self._mounted, row["calibrated_sensor_token"])
-            channel, own = self._at(self._channel, mounted["sensor_token"])["channel"], self._data[row["sample_token"]]
+            mounted = self._at(self._mounted, row, "calibrated_sensor_token")
+            channel, own = self._at(self._channel, mounted, "sensor_token")["channel"], self._data[row["sample_token"]]
             if not (file := self._root / row["filename"]).is_file():  # a device, too, would be read without end
                 first_lost = first_lost or file
                 self._lost[row["sample_token"]].add(channel)
                 continue
-            if own.setdefault(channel, row) is not row:
-                raise InputError(f"{listed}: {shorten(row['filename'])} is a second one of {channel}")
+            if (one := own.setdefault(channel, row)) is not row:
+                raise InputError(
+                    f"{listed}: {shorten(row['filename'])} is a second one of {channel} at {row['timestamp']} of a "
+                    f"sample, beside {shorten(one['filename'])}"
+                )
         used = {row["ego_pose_token"] for rows in self._data.values() for row in rows.values()}
         self._pose = read_table(self._tables, "ego_pose", lambda row: row["token"] in used)
         self._calibration: dict[str, Calibration] = {}  # by agent
@@ -112,6 +124,7 @@ class NuscenesSource(LogSource):
             self.beams, self.range_m = BEAMS, RANGE_M
         self.labelled = bool(self._notes)
         self.notes = () if self.labelled else ("no annotations in its tables, so no boxes",)
+        self.notes += tuple(self._references.notes())
         if lost := sum(map(len, self._lost.values())):
             whole = sum(TOP not in own for own in self._lost.values())
             self.notes += (
@@ -119,19 +132,26 @@ class NuscenesSource(LogSource):
                 f"{len(self._lost) - whole} of {len(table['sample'])} key frames, which lack {TOP}",
             )
 
-    def _at(self, table: Mapping[str, Row], token: str) -> Row:
-        if token not in table:
-            raise self._unknown(token)
-        return table[token]
+    def _at(self, table: Mapping[str, Row], row: Row, column: str) -> Row:
+        """Return the row that a column of another one refers to; raises `InputError` where there is none."""
+        if row[column] not in table:
+            raise self._unknown(row, column)
+        return table[row[column]]
 
-    def _unknown(self, token: str) -> InputError:
-        return InputError(f"{self._tables}: its tables do not fit together, nothing has the token '{token}'")
+    def _stream(self, name: str) -> Iterator[Row]:
+        """Yield the rows of a table, and check where they lead."""
+        return self._references.check_links(stream_table(self._tables, name), name, self._tables / f"{name}.json")
+
+    def _unknown(self, row: Row, column: str) -> InputError:
+        return InputError(
+            f"{self._tables}: its tables do not fit together, nothing has the token '{row[column]}', which is the "
+            f"{column} of '{row['token']}'"
+        )
 
     def _kind(self, row: Row) -> str:
         """Return the modality of a row of sample_data: "lidar", "camera" or "radar"."""
-        return self._at(self._channel, self._at(self._mounted, row["calibrated_sensor_token"])["sensor_token"])[
-            "modality"
-        ]
+        mounted = self._at(self._mounted, row, "calibrated_sensor_token")
+        return self._at(self._channel, mounted, "sensor_token")["modality"]
 
     def _pixels(self, row: Row) -> tuple[int, int]:
         """Return width and height of a picture, of its row of sample_data."""
@@ -140,13 +160,13 @@ class NuscenesSource(LogSource):
         return row["width"], row["height"]
 
     def _fingerprint(self, data: Mapping[str, Row]) -> tuple[str, ...]:
-        mounted = {channel: self._at(self._mounted, row["calibrated_sensor_token"]) for channel, row in data.items()}
+        mounted = {channel: self._at(self._mounted, row, "calibrated_sensor_token") for channel, row in data.items()}
         names = ("translation", "rotation", "camera_intrinsic")
         return tuple(f"{channel} {[mounted[channel][name] for name in names]}" for channel in sorted(mounted))
 
     def _calibrate(self, data: Mapping[str, Row], spin: int) -> Calibration:
         """Return the calibration of an agent from its first row for each channel; trigger times are those of `spin`."""
-        mounted = {channel: self._at(self._mounted, row["calibrated_sensor_token"]) for channel, row in data.items()}
+        mounted = {channel: self._at(self._mounted, row, "calibrated_sensor_token") for channel, row in data.items()}
         ours = {channel: inverse(OURS_FROM_LIDAR) for channel, row in data.items() if self._kind(row) == "lidar"}
         cameras = [channel for channel, row in data.items() if self._kind(row) == "camera"]
         return Calibration(
@@ -170,10 +190,14 @@ class NuscenesSource(LogSource):
         of_scene: dict[str, list[str]] = defaultdict(list)
         for token, row in samples.items():
             of_scene[row["scene_token"]].append(token)
+            if row["scene_token"] not in scenes:
+                self._references.miss("sample", "scene_token", row["scene_token"])
         times: dict[str, list[tuple[float, str, str]]] = defaultdict(list)
         split_of: dict[str, str | None] = {}
         for token, scene in scenes.items():
-            log, name = self._at(logs, scene["log_token"]), scene["name"]
+            log, name = self._at(logs, scene, "log_token"), scene["name"]
+            if of_scene[token] and scene["first_sample_token"] not in samples:
+                self._references.miss("scene", "first_sample_token", scene["first_sample_token"])
             of_scene[token] = [sample for sample in of_scene[token] if TOP not in self._lost.get(sample, ())]
             for sample in of_scene[token]:
                 if TOP not in self._data[sample]:
@@ -200,25 +224,35 @@ class NuscenesSource(LogSource):
         for scene, found in times.items():
             rank = {time: index for index, time in enumerate(sorted({time for time, _, _ in found}))}
             spins[scene] = [Spin(sample, agent, rank[time], time) for time, agent, sample in sorted(found)]
+            for one, other in pairwise(spins[scene]):
+                if (one.time_s, one.agent) == (other.time_s, other.agent):
+                    raise InputError(
+                        f"{self._tables / 'sample.json'}: the samples '{one.sample}' and '{other.sample}' of the scene "
+                        f"'{scene}' have one time stamp, {one.time_s:.6f} s; correct it, or remove one of them"
+                    )
         return spins, split_of
 
     def _read_notes(self, table: Mapping[str, Mapping[str, Row]]) -> None:
         """Keep the annotations: boxes in the global frame by sample, with velocities by their instances."""
         category = {
-            token: self._at(table["category"], row["category_token"])["name"]
+            token: self._at(table["category"], row, "category_token")["name"]
             for token, row in table["instance"].items()
         }
         attribute = {token: row["name"] for token, row in table["attribute"].items()}
         track, time_s, label, occlusion, numbers = [], array("d"), [], array("d"), array("d")
         self._notes: dict[str, list[int]] = defaultdict(list)  # sample -> places of its annotations
-        for number, row in enumerate(stream_table(self._tables, "sample_annotation")):
+        for number, row in enumerate(self._stream("sample_annotation")):
             self._notes[row["sample_token"]].append(number)
             track.append(row["instance_token"])
-            time_s.append(self._at(table["sample"], row["sample_token"])["timestamp"] / 1e6)
+            time_s.append(self._at(table["sample"], row, "sample_token")["timestamp"] / 1e6)
             numbers.extend((*row["translation"], *row["size"], *row["rotation"]))
             if (name := category.get(row["instance_token"])) is None:
-                raise self._unknown(row["instance_token"])
+                raise self._unknown(row, "instance_token")
             ridden = RIDER in (attribute.get(token) for token in row.get("attribute_tokens", ()))
+            for unknown in (token for token in row.get("attribute_tokens", ()) if token not in attribute):
+                self._references.miss("sample_annotation", "attribute_tokens", unknown)
+            if (level := row.get("visibility_token")) and level not in OCCLUSION:
+                self._references.miss("sample_annotation", "visibility_token", level)
             label.append(RIDDEN.get(name, name) if ridden else CATEGORIES.get(name, name))
             occlusion.append(OCCLUSION.get(row.get("visibility_token", ""), np.nan))
         center, size, quaternion = np.split(np.reshape(numbers, (-1, 10)), (3, 6), axis=1)
@@ -241,7 +275,7 @@ class NuscenesSource(LogSource):
         data = self._data[spin.sample]
         calibration = self._calibration[spin.agent]
         mounts, kind = calibration.agent_from_sensor, {name: self._kind(row) for name, row in data.items()}
-        poses = {name: _placed(self._at(self._pose, row["ego_pose_token"])) for name, row in data.items()}
+        poses = {name: _placed(self._at(self._pose, row, "ego_pose_token")) for name, row in data.items()}
         cameras = [name for name in data if kind[name] == "camera"]
         path = {name: self._root / row["filename"] for name, row in data.items()}
         ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)

@@ -1,13 +1,18 @@
 """nuScenes' tables as streams of rows: a table of gigabytes is never in memory as a whole."""
 
+import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from json import JSONDecodeError, JSONDecoder
 from pathlib import Path
 from typing import Any, TextIO
 
-from flcav.config import InputError, read_json, shorten
-from flcav.dataset.formats.reading import FARTHEST
+import numpy as np
+
+from flcav.config import InputError, check_is_file, read_json, shorten
+from flcav.dataset.formats.reading import FARTHEST, ROUNDED
+from flcav.interface.wording import plural
 
 Row = Mapping[str, Any]  # column -> value
 
@@ -32,10 +37,66 @@ COLUMNS = {  # what is read of each table
     "instance": ("category_token",),
     "sample_annotation": ("sample_token", "instance_token", "translation", "size", "rotation"),
 }
-OPTIONAL = {"sample_data": ("width", "height"), "sample_annotation": ("attribute_tokens", "visibility_token")}
+LINKS = ("prev", "next")  # columns with the token of another row of the table, "" for none
+OPTIONAL = {
+    "sample": LINKS,
+    "sample_data": ("width", "height", *LINKS),
+    "sample_annotation": ("attribute_tokens", "visibility_token", *LINKS),
+}
 NUMBERS = {"translation": 3, "size": 3, "rotation": 4}  # columns of so many numbers
 MODALITIES = ("lidar", "camera", "radar")
 BLANKS = " \t\n\r"
+
+
+class References:
+    """References of rows to rows that are not there: counted by table and column, with the first of each.
+
+    Of LINKS only hashes are kept, eight bytes each, since tables have millions of rows.
+    """
+
+    def __init__(self) -> None:
+        self._lost: dict[tuple[str, str], list[str]] = {}  # table and column -> first token, and one for each other
+
+    def check_links(self, rows: Iterable[Row], name: str, path: Path) -> Iterator[Row]:
+        """Yield the rows of a table without their LINKS; then count those that lead to no row, or back in time.
+
+        Raises `InputError` where two rows have one token.
+        """
+        token, time = array("q"), array("q")
+        links = {link: array("q") for link in LINKS}
+        for row in rows:
+            token.append(hash(row["token"]))
+            time.append(row.get("timestamp", 0))
+            for link, own in links.items():
+                own.append(hash(row[link]) if row.get(link) else 0)
+            yield {column: value for column, value in row.items() if column not in LINKS}
+        known, times = np.array(token), np.array(time)
+        order = np.argsort(known, kind="stable")
+        if len(twins := np.flatnonzero(np.diff(known[order]) == 0)):
+            one, other = order[twins[0] : twins[0] + 2].tolist()
+            raise InputError(f"{path}: the rows {one} and {other} have one token; each row has its own")
+        for link, own in links.items():
+            linked = np.flatnonzero(np.array(own))
+            wanted = np.array(own)[linked]
+            at = order[np.minimum(np.searchsorted(known[order], wanted), len(known) - 1)]
+            there = known[at] == wanted
+            self._lost.setdefault((name, link), []).extend(f"of row {row}" for row in linked[~there].tolist())
+            back = (times[at] - times[linked]) * (1 if link == "next" else -1) < 0
+            self._lost.setdefault((name, f"{link} timestamp"), []).extend(
+                f"of row {row}" for row in linked[there & back].tolist()
+            )
+
+    def miss(self, name: str, column: str, token: str) -> None:
+        """Count a reference of a table's row to no row."""
+        self._lost.setdefault((name, column), []).append(shorten(token))
+
+    def notes(self) -> Iterator[str]:
+        """Yield a sentence for each table and column with such references."""
+        for (name, column), lost in self._lost.items():
+            link, _, timed = column.partition(" ")
+            what = "leads back in time" if timed else "is the token of no row"
+            if lost:
+                yield f"{name}.json: '{link}' of {plural(len(lost), 'row')} {what}, first {lost[0]}"
 
 
 def keep_all(_row: Row) -> bool:
@@ -79,11 +140,10 @@ def _share(token: object) -> object:
 
 def _stream_list(path: Path) -> Iterator[object]:
     """Yield the elements of the JSON list in a file, one at a time; raises `InputError` where there is none."""
+    check_is_file(path, None)  # it is read in pieces
     try:
         with path.open(encoding="utf-8-sig") as file:
             yield from _decode_list(file, path)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
     except JSONDecodeError as error:
         raise InputError(f"{path}: not JSON ({error.msg})") from None
     except InputError:
@@ -135,7 +195,7 @@ def _skip(text: str, at: int) -> int:
 def _fits(column: str, value: object) -> bool:
     """Return whether a value can be one of a column of COLUMNS or OPTIONAL."""
     if column in NUMBERS:
-        return _are_numbers(value, NUMBERS[column]) and (column != "rotation" or any(value))  # type: ignore[arg-type]
+        return _are_numbers(value, NUMBERS[column]) and (column != "rotation" or _has_length_1(value))
     if column == "camera_intrinsic":
         return value == [] or (isinstance(value, list) and len(value) == 3 and all(_are_numbers(r, 3) for r in value))
     if column == "modality":
@@ -147,6 +207,10 @@ def _fits(column: str, value: object) -> bool:
     if column == "attribute_tokens":
         return isinstance(value, list) and all(isinstance(token, str) for token in value)
     return isinstance(value, bool if column == "is_key_frame" else str)
+
+
+def _has_length_1(quaternion: Any) -> bool:
+    return abs(math.hypot(*quaternion) - 1) <= ROUNDED
 
 
 def _are_numbers(values: object, count: int) -> bool:

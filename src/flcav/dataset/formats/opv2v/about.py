@@ -10,14 +10,20 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from flcav.config import InputError, Loader, read_yaml
-from flcav.dataset.formats.reading import FARTHEST
+from flcav.dataset.formats.opv2v.write import from_carla
+from flcav.dataset.formats.reading import FARTHEST, check_rotation
+from flcav.geometry import wrap_angle
 
-About = Mapping[str, Any]  # content of the file of a frame
+About = Mapping[str, Any]  # content of the file of a frame, its poses as (4, 4) `world_from_body`
 
 CAMERAS = ("camera0", "camera1", "camera2", "camera3", "cam1", "cam2", "cam3", "cam4")  # of OPV2V, of V2X-Real
 EGO = ("true_ego_pos", "true_ego_pose")  # likewise
+RADIANS = "radians"  # whether the angles of one of the poses are those of the other in radians
+SAME_RAD, OTHER_DEG = 0.02, 2.0  # yaws that are equal, and that differ
+EXACT = 1e-6  # rounding of a matrix's last row
 TAG = "tag:yaml.org,2002:"
 CODES = {"f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"}
 
@@ -40,13 +46,14 @@ def read_about(stem: Path) -> About:
             if not isinstance(row.get("obj_type", ""), str):
                 raise ValueError("a class is no name")
         about[EGO[0]] = about[EGO[0]] if EGO[0] in about else about.get(EGO[1], about["lidar_pose"])
-        for name in ("lidar_pose", EGO[0]):
-            _check_numbers(about[name], 6)
+        pair = about["lidar_pose"], about[EGO[0]]
+        about["lidar_pose"], about[EGO[0]] = map(_read_pose, pair, ("lidar_pose", EGO[0]))
+        about[RADIANS] = _differ_as_radians(*pair)
         for name in CAMERAS:
             if name in about and "cords" not in about[name]:
                 del about[name]  # a pose that is not in OPV2V's terms
             elif name in about:
-                _check_numbers(about[name]["cords"], 6)
+                about[name]["cords"] = _read_pose(about[name]["cords"], f"'cords' of {name}")
                 _check_numbers(np.ravel(about[name]["intrinsic"]), 9)
     except KeyError as lost:
         raise InputError(f"{path}: not a frame of OPV2V, it has no {lost}") from None
@@ -62,6 +69,35 @@ def _check_numbers(values: Any, *shape: int) -> None:
     numbers = np.array(values)
     if numbers.shape != shape or numbers.dtype.kind not in "iuf" or not (np.abs(numbers) < FARTHEST).all():
         raise ValueError(f"{shape[0]} numbers are wanted" if shape else "a number is wanted")
+
+
+def _read_pose(values: Any, name: str) -> NDArray[np.float64]:
+    """Return the (4, 4) `world_from_body` of a pose: x, y, z, roll, yaw, pitch, or a matrix in CARLA's frame."""
+    matrix = np.shape(values) == (4, 4)
+    try:
+        _check_numbers(values, *((4, 4) if matrix else (6,)))
+    except ValueError:
+        raise ValueError(f"'{name}' is not of 6 numbers, nor of 4 x 4") from None
+    placed = from_carla(values)
+    if matrix and np.abs(placed[3] - (0, 0, 0, 1)).max() > EXACT:
+        raise ValueError(f"the last row of '{name}' is not 0, 0, 0, 1")
+    try:
+        placed[:3, :3] = check_rotation(placed[:3, :3])
+    except ValueError as error:
+        raise ValueError(f"'{name}' {error}") from None
+    placed[3] = 0, 0, 0, 1
+    return placed
+
+
+def _differ_as_radians(one: Any, other: Any) -> bool:
+    """Return whether of two poses of 6 numbers the yaw of one is that of the other in radians."""
+    if np.shape(one) != (6,) or np.shape(other) != (6,):
+        return False
+    yaws = float(one[4]), float(other[4])
+    return any(
+        abs(wrap_angle(np.radians(degrees) - radians)) < SAME_RAD and abs(degrees - radians) > OTHER_DEG
+        for radians, degrees in (yaws, yaws[::-1])
+    )
 
 
 def _read_parts(loader: Any, node: yaml.Node) -> list[Any]:

@@ -8,16 +8,17 @@ frame.
 
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError, read_yaml
+from flcav.config import InputError, read_file, read_yaml
 from flcav.dataset.formats.kitti.files import read_points
 from flcav.dataset.formats.layout import BRIGHTEST, has_kitti_layout
-from flcav.dataset.formats.opv2v.about import CAMERAS, EGO, About, read_about
+from flcav.dataset.formats.opv2v.about import CAMERAS, EGO, RADIANS, About, read_about
 from flcav.dataset.formats.opv2v.write import FOLDERS, KMH, from_carla
 from flcav.dataset.formats.pcd import read_pcd
 from flcav.dataset.formats.reading import (
@@ -25,6 +26,7 @@ from flcav.dataset.formats.reading import (
     ImportFormat,
     LogPicture,
     LogSource,
+    PosePairs,
     annotate,
     check_cloud,
     check_sizes,
@@ -32,6 +34,7 @@ from flcav.dataset.formats.reading import (
     measure_picture,
     name_folders,
     name_place,
+    name_some,
     pinhole,
     read_pictures,
     view_boxes,
@@ -75,23 +78,29 @@ class Opv2vSource(LogSource):
         self._calibration: dict[str, Calibration] = {}
         self._track: dict[str, dict[str, str]] = {}
         names = AgentNames()
-        self._blind: set[str] = set()  # agents with a camera of which there is no picture
-        self._frames = self._lost = self._unseen = 0  # frames in the folder, without a file, without a picture
+        self._blind: dict[str, list[str]] = {}  # agent -> its cameras of which there is no picture
+        self._frames = 0  # in the folder
+        self._lost, self._unseen = list[str](), list[str]()  # frames without a file, pictures that are not there
+        self._pairs = PosePairs(f"'lidar_pose' and '{EGO[0]}'")
         self._shots = {scene: self._open(scene, found[scene], names) for scene in self.split_of}
-        blind, agents, frames = len(self._blind), len(self._calibration), plural(self._frames, "frame")
-        if not agents:
+        agents, frames = plural(len(self._calibration), "agent"), plural(self._frames, "frame")
+        if not self._calibration:
             raise InputError(f"{folder}: none of {frames} has both a YAML file and a point cloud")
+        blind, dark = len(self._blind), len({path.rpartition("_")[0] for path in self._unseen})
+        cameras = name_some([f"{camera} of {agent}" for agent, own in self._blind.items() for camera in own])
         told = {
-            f"no pictures of a camera of {blind} of {plural(agents, 'agent')}, so no images of it": blind,
-            f"left out {self._lost} of {frames}: no YAML file or no point cloud": self._lost,
-            f"no picture of a camera of {self._unseen} of {frames}, so no image there": self._unseen,
+            f"no pictures of a camera of {blind} of {agents}, so no images of it: {cameras}": blind,
+            f"left out {len(self._lost)} of {frames}: no YAML file or no point cloud of {name_some(self._lost)}": len(
+                self._lost
+            ),
+            f"no picture of a camera of {dark} of {frames}, so no image there: {name_some(self._unseen)}": dark,
         }
-        self.notes = tuple(note for note, count in told.items() if count)
+        self._lacking = self.notes = tuple(note for note, count in told.items() if count)
 
     def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Opv2vShot]:
         known = self._track[scene] = _read_names(folder / PROTOCOL)
         found = {path: self._list_stamps(path) for path in sorted(folder.iterdir()) if path.is_dir()}
-        rank = {stamp: number for number, stamp in enumerate(sorted({s for own, _ in found.values() for s in own}))}
+        rank = {spin: number for number, spin in enumerate(sorted({int(s) for own, _ in found.values() for s in own}))}
         shots = []
         for path, (own, pictured) in found.items():
             if own:
@@ -101,27 +110,32 @@ class Opv2vSource(LogSource):
                 lidar, cameras = calibration.agent_from_sensor[LIDAR] + 0.0, calibration.intrinsics  # no -0.0
                 agent = names.of(vehicle, (lidar.tobytes(), *((name, cameras[name].tobytes()) for name in cameras)))
                 self._calibration.setdefault(agent, calibration)
-                if not cameras.keys() <= pictured:
-                    self._blind.add(agent)
-                shots += [Opv2vShot(path / stamp, agent, int(stamp), rank[stamp] * PERIOD_S) for stamp in own]
+                if lacking := sorted(cameras.keys() - pictured):
+                    self._blind[agent] = lacking
+                shots += [Opv2vShot(path / stamp, agent, int(stamp), rank[int(stamp)] * PERIOD_S) for stamp in own]
         return sorted(shots, key=lambda shot: (shot.spin, shot.agent))
 
     def _list_stamps(self, folder: Path) -> tuple[list[str], set[str]]:
         """Return the times of an agent's whole frames, in order, and its cameras that the folder has pictures of.
 
-        A whole frame has a YAML file and a point cloud; others are counted, and so are those without a picture.
+        A whole frame has a YAML file and a point cloud; others are noted, and so are pictures that are not there.
+        Raises `InputError` where two frames have one number.
         """
         names = {path.name for path in folder.iterdir()}
         stems = {re.split(r"[_.]", name, maxsplit=1)[0] for name in names}
-        stamps = sorted(stem for stem in stems if stem.isdecimal())
+        stamps = sorted((stem for stem in stems if stem.isdecimal()), key=lambda stem: (int(stem), stem))
+        for one, other in pairwise(stamps):
+            if int(one) == int(other):
+                raise InputError(f"{folder / other}.yaml: is frame {int(other)}, as {one}.yaml is; keep one of them")
         whole = [
             stamp for stamp in stamps if f"{stamp}.yaml" in names and any(f"{stamp}{end}" in names for end in CLOUDS)
         ]
-        pictured = {camera: sum(_picture(folder / stamp, camera) is not None for stamp in whole) for camera in CAMERAS}
-        cameras = {camera for camera, count in pictured.items() if count}
+        pictured = {camera: {s for s in whole if _picture(folder / s, camera) is not None} for camera in CAMERAS}
+        cameras = {camera for camera, own in pictured.items() if own}
+        place = "/".join((folder.parent.name, folder.name))
         self._frames += len(stamps)
-        self._lost += len(stamps) - len(whole)
-        self._unseen += len(whole) - min((pictured[camera] for camera in cameras), default=len(whole))
+        self._lost += [f"{place}/{stamp}" for stamp in stamps if stamp not in whole]
+        self._unseen += [f"{place}/{s}_{name}" for s in whole for name in sorted(cameras) if s not in pictured[name]]
         return whole, cameras
 
     def frame_count(self, scene: str) -> int:
@@ -132,17 +146,20 @@ class Opv2vSource(LogSource):
         """Yield the frames of a scenario; raises `InputError` where a file is missing, truncated or malformed."""
         for shot in self._shots[scene]:
             yield self._frame(scene, shot)
+            self.notes = (*self._lacking, *self._pairs.notes())
 
     def _frame(self, scene: str, shot: Opv2vShot) -> LinkedFrame:
         calibration, about = self._calibration[shot.agent], read_about(shot.stem)
         mounts = calibration.agent_from_sensor
-        world_from_lidar = from_carla(about["lidar_pose"])
+        world_from_lidar = about["lidar_pose"]
         world_from_agent = world_from_lidar @ inverse(mounts[LIDAR])
+        also = "the angles of one are those of the other in radians" if about[RADIANS] else ""
+        self._pairs.add(world_from_agent, about[EGO[0]], shot.stem.with_suffix(".yaml"), also)
         boxes, velocity = _read_vehicles(about)
         check_sizes(boxes.size, shot.stem.with_suffix(".yaml"))
         points = _read_points(shot.stem)
         files = {name: file for name in mounts if name in about and (file := _picture(shot.stem, name)) is not None}
-        placed = {name: from_carla(about[name]["cords"]) @ BODY_FROM_OPTICAL for name in files}
+        placed = {name: about[name]["cords"] @ BODY_FROM_OPTICAL for name in files}
         pictures = {
             name: LogPicture(
                 file,
@@ -190,7 +207,7 @@ def read_raw_cloud(path: Path) -> NDArray[np.float32]:
 
     Points that are not finite are left out; intensities may reach 255. Raises `InputError` for other files.
     """
-    data = path.read_bytes()
+    data = read_file(path)
     if not data or len(data) % (4 * POINT):
         return read_points(path)  # which says what it is
     rows = np.frombuffer(data, "<f4").reshape(-1, POINT)
@@ -216,10 +233,10 @@ def read_cloud(path: Path) -> NDArray[np.float32]:
 def _calibrate(stem: Path) -> Calibration:
     """Return the calibration of an agent by its first frame: poses of sensors in its frame."""
     about = read_about(stem)
-    agent_from_world = inverse(from_carla(about[EGO[0]]))
+    agent_from_world = inverse(about[EGO[0]])
     cameras = [name for name in CAMERAS if name in about]
-    mounts = {LIDAR: agent_from_world @ from_carla(about["lidar_pose"])}
-    mounts |= {name: agent_from_world @ from_carla(about[name]["cords"]) @ BODY_FROM_OPTICAL for name in cameras}
+    mounts = {LIDAR: agent_from_world @ about["lidar_pose"]}
+    mounts |= {name: agent_from_world @ about[name]["cords"] @ BODY_FROM_OPTICAL for name in cameras}
     return Calibration(
         {name: np.round(mount, DIGITS) for name, mount in mounts.items()},
         intrinsics={name: np.array(about[name]["intrinsic"], np.float64).reshape(3, 3) for name in cameras},

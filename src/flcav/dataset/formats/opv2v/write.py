@@ -5,13 +5,12 @@ vehicles are numbered in one list. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `tran
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from flcav.dataset.formats.exporter import (
     Exported,
@@ -47,6 +46,7 @@ CAMERAS = {  # yaw, counter-clockwise from ahead [rad]
 }
 FIRST_CAR, FIRST_POLE, FIRST_TRACK = 1001, 2001, 10001  # OpenCOOD takes the agent whose number sorts first as the ego
 KMH = 3.6
+MIRRORED = np.diag((*MIRROR, 1.0))
 FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built without libyaml has only the slow one
 
 
@@ -135,9 +135,15 @@ def carla_pose(world_from_body: Array) -> list[float]:
     return [*location, roll, yaw, pitch]
 
 
-def from_carla(values: Sequence[float]) -> Array:
-    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`."""
-    x, y, z, roll, yaw, pitch = values
+def from_carla(values: ArrayLike) -> Array:
+    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`.
+
+    `values` may also be the (4, 4) matrix of that pose in CARLA's frame, OpenCOOD's `x_to_world`.
+    """
+    numbers = np.asarray(values, np.float64)
+    if numbers.shape == (4, 4):
+        return MIRRORED @ numbers @ MIRRORED
+    x, y, z, roll, yaw, pitch = numbers.tolist()
     return MapFrame().from_transform((x, y, z), (pitch, yaw, roll))
 
 
@@ -151,14 +157,13 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], 
     mounts = frame.calibration.agent_from_sensor
     cameras = assign_channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
     about: dict[str, Any] = {}
-    mirrored = np.diag((*MIRROR, 1.0))
     for name, camera in sorted(cameras.items(), key=lambda pair: pair[1]):
         check_rectified(frame, name, "OPV2V")
         (folder / f"{time}_{camera}.png").write_bytes(encode_png(frame.images[name].rgb))
         world_from_camera = frame.world_from_sensor(name) @ BODY_FROM_OPTICAL.T
         about[camera] = {
             "cords": carla_pose(world_from_camera),
-            "extrinsic": (mirrored @ np.linalg.inv(world_from_camera) @ world_from_lidar @ mirrored).tolist(),
+            "extrinsic": (MIRRORED @ np.linalg.inv(world_from_camera) @ world_from_lidar @ MIRRORED).tolist(),
             "intrinsic": frame.calibration.intrinsics[name].tolist(),
         }
     ego = carla_pose(frame.world_from_agent)
