@@ -114,6 +114,14 @@ def test_a_plan_that_was_tampered_with_is_refused(tamper: Callable[[Data, Data],
     assert named in verify_allocation(json.dumps(problem), json.dumps(plan)).faults
 
 
+def test_a_plan_a_billionth_beyond_a_budget_is_refused() -> None:
+    problem, plan = made_plan()
+    for share, faults in ((1.0, ()), (1 - 1e-10, ("the budgets",))):
+        problem["budgets_mb"] |= {"wireless": plan["used_mb"]["wireless_mb"] * share}
+        found = verify_allocation(json.dumps(problem), json.dumps(plan)).faults
+        assert ("the budgets" in found) == bool(faults)
+
+
 def test_a_negative_multiplier_proves_nothing() -> None:
     problem, plan = made_plan()
     plan["certificate"][0]["multipliers"] = [-1.0, 0.0]

@@ -6,7 +6,6 @@ or accuracy are paid once with the first cloud round, plans without and with one
 
 import json
 from collections.abc import Sequence
-from fractions import Fraction
 from math import fsum
 
 import numpy as np
@@ -55,7 +54,7 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
             not own.calls or each["called"] in own.calls for own, each in zip(asked, plan["tasks"])
         ),
         "the limits": all(a <= n <= b for task, own in zip(tasks, counts) for n, (a, b) in zip(own, task.limits)),
-        "the budgets": bool(np.all(spent <= budgets * (1 + Fraction(NEAR)))),
+        "the budgets": bool(np.all(spent <= budgets)),
         "the megabytes": all(near(float(a), b) for own, said in zip([spent, *costs], told) for a, b in zip(own, said)),
         "the objective": near(value, plan["objective"]),
     }
