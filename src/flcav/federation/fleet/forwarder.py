@@ -29,6 +29,7 @@ from flcav.federation.fleet.relay import (
     relay,
 )
 from flcav.federation.messages.fl_request import PATH, FLRequest
+from flcav.interface.wording import make_printable
 
 LIMITS = httpx.Limits(max_connections=8)  # to the proxy, which lets a vehicle have twice as many
 
@@ -79,7 +80,7 @@ def send_request(folder: Path, server: str, request: FLRequest) -> None:
     Raises `InputError` where it is refused, `OSError` where nobody is there.
     """
     try:
-        answer = httpx.post(
+        told = httpx.post(
             f"https://{server}{PATH}",
             content=request.as_bytes(),
             verify=vehicle_tls(folder),
@@ -88,5 +89,5 @@ def send_request(folder: Path, server: str, request: FLRequest) -> None:
         )
     except httpx.HTTPError as error:
         raise OSError(f"{server}: the fleet cannot be reached: {error}") from None
-    if answer.status_code != httpx.codes.OK:
-        raise InputError(f"{server}: the request is refused: {answer.text[:200]}")
+    if told.status_code != httpx.codes.OK:
+        raise InputError(f"{server}: the request is refused: {make_printable(told.text)}")
