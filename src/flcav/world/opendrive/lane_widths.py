@@ -92,7 +92,7 @@ def _cut(pieces: list[Piece], length: float) -> tuple[list[Piece], float, float]
 
 def _find_roots(value: Polynomial, span: float) -> list[float]:
     """Return where a polynomial is zero, above 0 and below `span`."""
-    if not value.coef[1:].any():
+    if not value.coef[1:].any() or not np.isfinite(value.coef).all():
         return []
     roots = value.trim(1e-12).roots()
     return [float(root.real) for root in roots if abs(root.imag) < 1e-9 and 1e-6 < root.real < span - 1e-6]

@@ -5,6 +5,8 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from itertools import pairwise
 
+import numpy as np
+
 from flcav.config import shorten
 from flcav.world.opendrive.document import FASTEST, TO_METRES_PER_SECOND
 from flcav.world.opendrive.lane_widths import rewrite_widths
@@ -57,7 +59,8 @@ def _sort(road: ElementTree.Element) -> list[tuple[str, str]]:
     parents = [("", parent) for tag in PROFILES for parent in road.iterfind(tag)]
     for section in road.iterfind("lanes/laneSection"):
         for side in section:
-            side[:] = sorted(side, key=lambda lane: -int(lane.get("id", "0")) if lane.tag == "lane" else 0)
+            if side.tag in ("left", "right"):
+                side[:] = sorted(side, key=lambda lane: -int(lane.attrib["id"]) if lane.tag == "lane" else 0)
             parents += [(f", lane {lane.get('id')}", lane) for lane in side.iterfind("lane")]
     for where, parent in [("", road), *parents]:
         starts = {
@@ -120,7 +123,9 @@ def _mend_widths(road: ElementTree.Element) -> Iterator[str]:
     several = len(road.findall("lanes/laneSection")) > 1
     for section, length in _measure(road):
         kinds = {lane.get("id"): lane.get("type") or "none" for lane in section.iterfind("*/lane")}
-        for lane, least_m in rewrite_widths(section, length):
+        with np.errstate(all="ignore"):  # numbers that overflow
+            changes = rewrite_widths(section, length)
+        for lane, least_m in changes:
             where = f"lane {lane}" + (f" from s = {float(section.attrib['s']):g} m on" if several else "")
             if least_m:
                 yield f"{where}: its width falls to {least_m:.2g} m: cut at zero."
