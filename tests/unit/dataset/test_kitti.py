@@ -62,7 +62,7 @@ def test_what_is_no_point_cloud(tmp_path: Path, data: bytes, message: str):
 def test_a_missing_point_cloud(tmp_path: Path):
     with pytest.raises(InputError, match="no such file"):
         read_points(tmp_path / "a.bin")
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="is a folder, and a file is wanted"):
         read_points(tmp_path)
 
 
@@ -174,7 +174,7 @@ def _replace(part: str, old: str, new: str) -> Callable[[Path], None]:
         (lambda root: shutil.rmtree(root / "training"), "no KITTI folder; it holds no 'training'"),
         (lambda root: (root / "training" / "calib" / "000001.txt").unlink(), r"calib/000001\.txt: missing"),
         (lambda root: (root / "ImageSets" / "val.txt").unlink(), r"val\.txt: no such list"),
-        (_replace("ImageSets/val.txt", "000001", "000001\n000001"), "names a frame twice"),
+        (_replace("ImageSets/val.txt", "000001", "000001\n000001"), "names the frame 000001 twice"),
         (_replace("ImageSets/val.txt", "000001", "000007"), r"calib/000007\.txt: missing"),
         (_replace("training/label_2/000001.txt", "Car", "Lorry"), "unknown class 'Lorry'; KITTI has Car"),
         (_replace("training/label_2/000001.txt", " 50 60", " 150 60"), "object 1 has a rectangle .* of 100 x 80"),

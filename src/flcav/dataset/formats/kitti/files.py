@@ -272,11 +272,13 @@ def read_split(path: Path) -> list[str]:
     Raises `InputError` where one is there twice, or leads out of the folders of frames.
     """
     try:
-        names = read_file(path).decode("utf-8-sig").split()
+        names = read_file(path).decode("utf-8-sig").split() if path.exists() else None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
+    if names is None:
+        raise InputError(f"{path}: no such list of frames")
     if len(set(names)) != len(names):
-        raise InputError(f"{path}: names a frame twice")
+        raise InputError(f"{path}: names the frame {max(names, key=names.count)} twice")
     for name in names:
         path_within(path.parents[1], name, path)
     return names
