@@ -13,6 +13,7 @@ import numpy as np
 from cpu_time import cpu_ms
 
 from flcav.optimization.placement.cheapest import cover_share
+from flcav.optimization.placement.instance import limit_in_units
 from flcav.optimization.placement.program import maximise_coverage
 from flcav.optimization.placement.solve import Candidates, Placement, find_candidates, place_budget, place_count
 
@@ -66,9 +67,10 @@ def main() -> None:
     errors, poles, budget = REFERENCED
     small = candidates_of(errors, poles, arguments.seed)
     ours_ms, highs_ms = cpu_ms(
-        (lambda: place_budget(small, budget), lambda: maximise_coverage(small.instance(), budget)), repeats=1
+        (lambda: place_budget(small, budget), lambda: maximise_coverage(small.instance(), limit_in_units(budget))),
+        repeats=1,
     )
-    found, (_, reference) = place_budget(small, budget), maximise_coverage(small.instance(), budget)
+    found, (_, reference) = place_budget(small, budget), maximise_coverage(small.instance(), limit_in_units(budget))
     figures = {
         "referenced": {
             "ours_ms": ours_ms,
