@@ -196,7 +196,7 @@ def test_a_vehicle_alone_ends_nothing_by_a_claim_either(folder: Path):
 
 def test_a_vehicle_s_word_that_the_network_lost_it_does_not_excuse_it(folder: Path):
     """Two of three that were lost would leave a round of one; two that fail are too many."""
-    lies = dict.fromkeys((FIRST, FIRST + 1), with_code(LOST_BY_NETWORK))
+    lies: dict[int, Lie] = dict.fromkeys((FIRST, FIRST + 1), with_code(LOST_BY_NETWORK))
     with pytest.raises(ClientFailed, match="1 of 3 clients sent an update that can be used, 2 are wanted"):
         run(folder, lies)
 
