@@ -196,6 +196,13 @@ def test_a_vehicle_alone_ends_nothing_by_a_claim_either(folder: Path):
         run(folder, {FIRST: with_code(OVER_BUDGET), **others})
 
 
+def test_a_vehicle_s_word_that_the_network_lost_it_does_not_excuse_it(folder: Path):
+    """Two of three that were lost would leave a round of one; two that fail are too many."""
+    lies: dict[int, Lie] = dict.fromkeys((FIRST, FIRST + 1), with_code(LOST_BY_NETWORK))
+    with pytest.raises(ClientFailed, match="1 of 3 clients sent an update that can be used, 2 are wanted"):
+        run(folder, lies)
+
+
 def test_a_vehicle_that_claims_does_not_end_questions(folder: Path):
     clients, account = (
         {f"cav{i}": Vehicle() for i in range(2)},

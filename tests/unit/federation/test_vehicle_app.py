@@ -2,7 +2,9 @@
 
 import os
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,7 @@ from flcav.federation.noise import draw_secret
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import keep_identity, wire_bytes
 from flcav.federation.runtimes.vehicle_app import Assignment, VehicleApp, load_assignment, load_identity
+from flcav.federation.secure import certified
 from flcav.federation.secure.certified import Identity
 from flcav.federation.secure.parties import SecureClient
 from flcav.federation.strategies import strategy_named
@@ -326,6 +329,15 @@ def test_a_vehicle_shares_masks_with_vehicles_that_the_authority_certified_alone
     Assignment("none", "a", Counting(), strategy_named("fedavg"), Rules.model_validate(NOISY)).save(tmp_path)
     with pytest.raises(InputError, match="has no certificate yet"):
         keys_of(tmp_path)
+
+
+def test_a_certificate_that_is_not_in_force_is_no_peer_s(masked, monkeypatch: pytest.MonkeyPatch):
+    keys = {name: keys_of(own) for name, own in masked.items()}
+    for days in (-1, 400):
+        later = SimpleNamespace(now=lambda zone, days=days: datetime.now(zone) + timedelta(days=days))
+        monkeypatch.setattr(certified, "datetime", later)
+        with pytest.raises(ValueError, match="the certificate is not in force"):
+            answer(masked["town/cav1"], roster(keys))
 
 
 def mask_all(masked: dict[str, Path], seed: int = 7, round_: int = 1) -> dict[str, np.ndarray]:
