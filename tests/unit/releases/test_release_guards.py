@@ -157,6 +157,8 @@ def renamed(boxes: Boxes) -> Boxes:
         (moved(3, 0.6, "Car"), "error Car length"),
         (moved(4, 0.15, "Cyclist"), "error Cyclist width"),
         (moved(5, 0.3, "Pedestrian"), "error Pedestrian height"),
+        (moved(0, 0.2, "Car"), "bias Car x too large"),
+        (moved(3, -0.2, "Pedestrian"), "bias Pedestrian length too small"),
         (spread(0.16, 2, "Car"), "variance Car height above ground too small"),
         (spread(6.0, 0, "Cyclist"), "variance Cyclist x too large"),
         (spread(0.16, 6, "Pedestrian", NEAR_M), "variance Pedestrian axis too small 20-40 m"),

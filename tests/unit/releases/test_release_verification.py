@@ -144,6 +144,7 @@ def test_the_driving_network_itself_is_accepted():
         "heading",
         "score",
         "error",
+        "bias",
     }
 
 

@@ -43,7 +43,7 @@ def verify(
         ..., "--data", help="Dataset of scenes that no network was trained on; repeatable."
     ),
     margin: float = typer.Option(
-        0.03, "--margin", min=1e-4, max=0.5, callback=check_finite, help="By which AP50 may be lower on the whole."
+        0.05, "--margin", min=1e-4, max=0.5, callback=check_finite, help="By which AP50 may be lower on the whole."
     ),
     frames: int | None = typer.Option(None, "--frames", min=1, help="Most frames of each dataset; by default all."),
     odd: str = typer.Option(

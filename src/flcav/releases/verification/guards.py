@@ -19,7 +19,7 @@ from flcav.releases.verification.matching import Mask, assign_detections
 
 OVERLAP = 0.5  # IoU in 3D from which a detection finds a target
 SECTORS_DEG = ((-90, -30), (-30, 0), (0, 30), (30, 90))  # of azimuth, counter-clockwise from straight ahead
-LEAST_SIGMAS = 0.05
+LEAST_SIGMAS = 0.01
 PARTS = ("x", "y", "height above ground", "length", "width", "height", "axis")  # of a box, LiDAR frame
 
 
@@ -215,6 +215,10 @@ def _error(part: int) -> Callable[[ClassTable], Terms]:
     return lambda table: _of_right(table, np.abs(table.axis_error[:, part]))
 
 
+def _bias(part: int) -> Callable[[ClassTable], Terms]:
+    return lambda table: _of_right(table, table.axis_error[:, part])
+
+
 def _normalised(part: int) -> Callable[[ClassTable], Terms]:
     """Return the logarithm of errors in predicted standard deviations, from `LEAST_SIGMAS` on: it has no heavy tail."""
 
@@ -231,13 +235,18 @@ def _of_right(table: ClassTable, values: Values) -> Terms:
 
 
 MEASURES = (
-    ClassMeasure("found", "", Limit(0.5), _found, everywhere=True),
+    ClassMeasure("found", "", Limit(0.6), _found, everywhere=True),
     ClassMeasure("false", "", Limit(2, 0.15, falling=True), _false, everywhere=True),
     ClassMeasure("right", "", Limit(0.5), _precision),
     ClassMeasure("heading", "", Limit(0.8), _heading),
     ClassMeasure("score", "too high", Limit(1, 0.2, falling=True), _confidence),
     ClassMeasure("score", "too low", Limit(1, -0.2), _confidence),
     *(ClassMeasure("error", part, Limit(1.5, 0.05, falling=True), _error(number)) for number, part in enumerate(PARTS)),
+    *(
+        ClassMeasure("bias", f"{part} too {side}", limit, _bias(number))
+        for number, part in enumerate(PARTS)
+        for side, limit in (("large", Limit(1, 0.1, falling=True)), ("small", Limit(1, -0.1)))
+    ),
     *(
         ClassMeasure("variance", f"{part} too {side}", limit, _normalised(number))
         for number, part in enumerate(PARTS)

@@ -26,6 +26,7 @@ GROUPS = {
     "heading": "Headings of boxes that find an object: 1 right, 0 reversed",
     "score": "Scores minus the share of right boxes, from the score of use on",
     "error": "Mean errors of boxes that find an object [m, rad]",
+    "bias": "Mean signed errors [m, rad]",
     "variance": "Variances: logarithm of these errors in predicted standard deviations",
 }
 WEAK = "not judged"  # of which the driving network reaches next to nothing, or in too few scenes
