@@ -78,6 +78,11 @@ class Scene:
         self._hidden: int | None = None
         self._place()
 
+    @property
+    def town_solid(self) -> Solid:
+        """The acceleration structure of the town, which all scenes of the town share."""
+        return self._town_model.solid
+
     @cached_property
     def things(self) -> SignsAndSignals:
         """The town's signs and signal heads."""

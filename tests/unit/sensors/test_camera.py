@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 from flcav.geometry import inverse, pose, transform_points
-from flcav.sensors.camera.camera import Camera, Exposure, photograph
+from flcav.sensors.camera.camera import Camera, Exposure, label, photograph
 from flcav.sensors.camera.infrared import Infrared, render_thermal
 from flcav.sensors.frame import SEMANTICS
 from flcav.sensors.lens import BODY_FROM_OPTICAL, compute_pixel_rays, project
@@ -52,6 +52,15 @@ def test_an_instance_lies_within_the_hull_of_its_mesh(street: Scene):
     assert (Delaunay(project(camera, vertices)).find_simplex(np.c_[columns, rows]) >= 0).all()
     assert set(np.unique(picture.semantic[picture.instance == 1])) == {SEMANTICS["car"]}
     assert (picture.semantic[np.isinf(picture.depth_m)] == SEMANTICS["sky"]).all()
+
+
+@pytest.mark.parametrize("hidden", [None, 0])
+def test_labels_alone_are_those_of_the_photograph(street: Scene, hidden: int | None):
+    camera = Camera(width=320, height=192, noise=0)
+    semantic, instance = label(street, AHEAD, camera, hidden=hidden, threads=2)
+    picture = photograph(street, AHEAD, camera, CLEAR, np.random.default_rng(0), hidden=hidden)
+    np.testing.assert_array_equal(semantic, picture.semantic)
+    np.testing.assert_array_equal(instance, picture.instance)
 
 
 def test_same_arguments_same_bytes(street: Scene):

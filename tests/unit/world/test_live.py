@@ -137,7 +137,7 @@ def test_fast_cars_do_not_pass_through_each_other(speed_mps: float, aside: float
         road.apply(Spawn(name, "car", 3, x, y, yaw, anywhere=True))
         road.apply(Push(name, (way * speed_mps, 0.0, 0.0)))
     mass = road.bodies.find("a").blueprint.mass_kg
-    impulse = 0.0
+    impulse, snapshot = 0.0, road.snapshot
     for _ in range(int(gap / 2 / speed_mps / 0.05) + 4):
         snapshot = road.step()
         impulse += sum(abs(each.impulse[0]) for each in snapshot.collisions)

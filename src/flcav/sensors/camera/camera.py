@@ -10,8 +10,10 @@ from flcav.machine.compiled import kernel
 from flcav.sensors.camera.tone import GRAINS, develop, grain
 from flcav.sensors.frame import SEMANTICS
 from flcav.sensors.lens import Lens, compute_pixel_rays
+from flcav.sensors.rendering.appearance import Appearance
+from flcav.sensors.rendering.gbuffer import GBuffer
 from flcav.sensors.rendering.rain import add_drops
-from flcav.sensors.rendering.render import RadianceImage, render
+from flcav.sensors.rendering.render import render, survey
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 
@@ -57,15 +59,24 @@ def photograph(
     rgb = np.empty((*shape, 3), np.uint8)
     shift = int(rng.integers(GRAINS))
     develop(picture.radiance, picture.exposure, grain(), shift, np.float32(camera.noise), rgb.reshape(-1, 3))
-    semantic, instance = _labels(picture)
+    semantic, instance = _labels(picture.seen, picture.painted, picture.appearance)
     depth = picture.seen.distance * compute_pixel_rays(camera)[:, 2]
     return Exposure(rgb, depth.reshape(shape), semantic.reshape(shape), instance.reshape(shape))
 
 
-def _labels(picture: RadianceImage) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
-    semantic, instance = np.empty(len(picture.seen), np.uint8), np.empty(len(picture.seen), np.int32)
-    sky, line = SEMANTICS["sky"], SEMANTICS["road_line"]
-    _label(picture.seen, picture.appearance, picture.painted, sky, line, semantic, instance)
+def label(
+    scene: Scene, world_from_camera: NDArray[np.float64], lens: Lens, *, hidden: int | None = None, threads: int = 1
+) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    """Return the semantic and the instance image (H, W) of `photograph`, without its colours, which takes longest."""
+    semantic, instance = _labels(*survey(scene, world_from_camera, lens, hidden=hidden, threads=threads))
+    return semantic.reshape(lens.height, lens.width), instance.reshape(lens.height, lens.width)
+
+
+def _labels(
+    seen: GBuffer, painted: NDArray[np.bool_], appearance: Appearance
+) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    semantic, instance = np.empty(len(seen), np.uint8), np.empty(len(seen), np.int32)
+    _label(seen, appearance, painted, SEMANTICS["sky"], SEMANTICS["road_line"], semantic, instance)
     return semantic, instance
 
 

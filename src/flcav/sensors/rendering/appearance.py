@@ -30,6 +30,7 @@ from flcav.world.materials import (
     Material,
 )
 from flcav.world.meshes import actor_mesh
+from flcav.world.rays.embree import Solid
 from flcav.world.scene import Scene, Surfaces
 from flcav.world.static import TownPart, build_static_world
 
@@ -81,7 +82,7 @@ class Appearance(NamedTuple):
 
 _AS = {"van": "car", "prop": "static"}  # categories without a class of their own
 _KNOWN: WeakKeyDictionary[Scene, tuple[Surfaces, Appearance]] = WeakKeyDictionary()
-_TOWNS: WeakKeyDictionary[Scene, "_OfTown"] = WeakKeyDictionary()
+_TOWNS: WeakKeyDictionary[Solid, "_OfTown"] = WeakKeyDictionary()
 
 
 class _OfTown(NamedTuple):
@@ -99,9 +100,9 @@ class _OfTown(NamedTuple):
 def build_appearance(scene: Scene) -> Appearance:
     """Return the appearance tables of `scene`: cached, the same for all instants with the same actors."""
     if scene not in _KNOWN or _KNOWN[scene][0] is not scene.surfaces:
-        if scene not in _TOWNS:
-            _TOWNS[scene] = _of_town(scene)
-        _KNOWN[scene] = scene.surfaces, _appearance(scene, _TOWNS[scene])
+        if scene.town_solid not in _TOWNS:
+            _TOWNS[scene.town_solid] = _of_town(scene)
+        _KNOWN[scene] = scene.surfaces, _appearance(scene, _TOWNS[scene.town_solid])
     return _KNOWN[scene][1]
 
 

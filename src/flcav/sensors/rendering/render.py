@@ -18,7 +18,7 @@ from flcav.sensors.rendering.gbuffer import GBuffer, fill_gbuffer
 from flcav.sensors.rendering.glare import add_glare, add_sun_glare
 from flcav.sensors.rendering.light import Illumination, compute_lamplight, compute_light, compute_sun_visibility, soften
 from flcav.sensors.rendering.state import Lamps, LampState, collect_lamps, compute_lamp_state, no_lamps
-from flcav.sensors.rendering.surface import shade
+from flcav.sensors.rendering.surface import mark_paint, shade
 from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
@@ -89,6 +89,18 @@ def render(
         add_glare(image, scene, state, light, world_from_camera, lens, hidden)
     add_sun_glare(image, scene, light, world_from_camera, lens, hidden)
     return RadianceImage(radiance, light.exposure, seen, painted, appearance)
+
+
+def survey(
+    scene: Scene, world_from_camera: NDArray[np.float64], lens: Lens, *, hidden: int | None, threads: int = 1
+) -> tuple[GBuffer, NDArray[np.bool_], Appearance]:
+    """Return what the rays through the pixels' centres meet, and where that is paint (N,), as `render` does."""
+    rays, appearance = compute_pixel_rays(lens), build_appearance(scene)
+    hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden, threads=threads)
+    seen = fill_gbuffer(scene, appearance, world_from_camera, rays, hits)
+    painted = np.empty(len(seen), np.bool_)
+    mark_paint(seen, appearance, np.float32(1 / lens.intrinsics()[0, 0]), painted)
+    return seen, painted, appearance
 
 
 def _meet(

@@ -30,6 +30,24 @@ ROAD_LINE = 0.5  # painted share of a pixel above which its class is road markin
 
 
 @kernel
+def mark_paint(survey, appearance, pixel_angle, painted):
+    """Write whether each of the N hits of a G-buffer is `painted` (N,) road, as `shade` does."""
+    for ray in range(len(painted)):
+        row = survey.row[ray]
+        painted[ray] = False
+        if row < 0 or appearance.material[row] != ROAD:
+            continue
+        dx, dy, dz = survey.ray[ray, 0], survey.ray[ray, 1], survey.ray[ray, 2]
+        nx, ny, nz = survey.normal[ray, 0], survey.normal[ray, 1], survey.normal[ray, 2]
+        facing = max(-(dx * nx + dy * ny + dz * nz), np.float32(0.02))
+        across = np.float32(survey.distance[ray] * pixel_angle)
+        level = max(np.sqrt(dx * dx + dy * dy), np.float32(1e-6))
+        x, y, slant = survey.position[ray, 0], survey.position[ray, 1], across / facing
+        share, _ = find_paint(x, y, dx / level, dy / level, across, slant, appearance.markings)
+        painted[ray] = share > ROAD_LINE
+
+
+@kernel
 def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angle, radiance, painted):
     """Shade the N hits of a G-buffer: write their `radiance` (N, 3), and whether they are `painted` (N,) road.
 

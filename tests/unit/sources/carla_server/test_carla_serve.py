@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import struct
 import time
 from contextlib import asynccontextmanager, suppress
 
@@ -209,5 +210,50 @@ def test_replies_that_nobody_reads_are_not_piled_up(maps, monkeypatch):
                 while data := await asyncio.wait_for(greedy.reader.read(1 << 20), 5.0):
                     got += len(data)
             assert 100_000 < got < 100_000_000
+
+    asyncio.run(session())
+
+
+async def listen(client, streams, sensor):
+    """Return the reader of what a sensor sends, which a client has spawned."""
+    token = (await client.call("spawn_actor", describe(sensor), [[0.0, 0.0, 20.0], [0.0, 0.0, 0.0]]))[5]
+    reader, writer = await asyncio.open_connection("127.0.0.1", streams)
+    writer.write(token[:4])
+    await asyncio.sleep(0.05)
+    return reader, writer
+
+
+async def read_frame(reader):
+    """Return the frame of the next payload."""
+    (size,) = struct.unpack("<I", await reader.readexactly(4))
+    return struct.unpack_from("<Q", await reader.readexactly(size), 8)[0]
+
+
+@pytest.mark.parametrize("bound_s", [60.0, 0.2])
+def test_a_tick_is_answered_when_its_images_are_delivered(bound_s, maps, monkeypatch):
+    """But after a while without them: then the next tick waits, so that every image comes, and in order."""
+    drawing_s = 0.6
+    monkeypatch.setattr(serve, "DELIVERY_S", bound_s)
+    camera = Kind(Stream.DEPTH, lambda sight, sensor: time.sleep(drawing_s) or b"image", True, True)
+    monkeypatch.setitem(KINDS, "sensor.camera.depth", camera)
+
+    async def session():
+        async with serving(maps) as (port, streams, calls):
+            calls.episode.prepare()
+            client = await Client().connect(port)
+            await client.call("set_episode_settings", SYNCHRONOUS)
+            reader, writer = await listen(client, streams, "sensor.camera.depth")
+            frames, waits = [], []
+            for _ in range(3):
+                begun = time.monotonic()
+                frames.append(await client.call("tick_cue"))
+                waits.append(time.monotonic() - begun)
+                if bound_s > drawing_s:
+                    assert await asyncio.wait_for(read_frame(reader), 0.1) == frames[-1]
+            if bound_s < drawing_s:
+                assert waits[0] < drawing_s
+                assert [await asyncio.wait_for(read_frame(reader), 5.0) for _ in frames] == frames
+            assert sum(waits) > 2 * drawing_s - 0.1
+            writer.close()
 
     asyncio.run(session())

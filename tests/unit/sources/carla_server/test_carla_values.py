@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from carla_calls import describe, invoke, place
 
+from flcav.sensors.frame import SEMANTICS
 from flcav.sources.carla.server.calls import Calls
 from flcav.sources.carla.server.driving import choose_gear
 from flcav.sources.carla.server.lights import find_limits
@@ -214,3 +215,16 @@ def test_spawn_points_are_as_many_as_carla_has_and_follow_the_road(maps, monkeyp
         places = np.array([point.location for point in points])
         assert len(np.unique(places.round(2), axis=0)) == wanted
     assert SPAWN_LEAST_M > 2 * 5.136  # of the longest bus
+
+
+def test_tags_alone_are_those_of_the_colour_image(calls):
+    here = place(calls)
+    above = [[*here[0][:2], here[0][2] + 2.4], here[1]]
+    size = (("image_size_x", "320"), ("image_size_y", "240"))
+    camera = spawn(calls, "sensor.camera.semantic_segmentation", above, *size).sensor
+    sight = calls.episode.look("images")()
+    tags, instance = sight.label(camera)
+    picture = sight.photograph(camera)
+    assert (tags == SEMANTICS["road_line"]).sum() > 20
+    np.testing.assert_array_equal(tags, picture.semantic)
+    np.testing.assert_array_equal(instance, picture.instance)

@@ -3,6 +3,7 @@
 Every tick the world makes a step; then all actors take their places, and the sensors measure.
 """
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -12,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sources.carla.frames import from_mount, mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.actors import STANDING, WAITING, Actor, list_places
@@ -93,6 +95,7 @@ class Episode:
         self._begun_s = time.monotonic()
         self._bodies: dict[str, Actor] = {}  # by name in the live world
         self._scenes: dict[str, Scene] = {}  # one for each of the threads that look at the town at once
+        self._building = threading.Lock()  # of the scenes
         self.recorder = Recorder()
         self._spawned = 0
         self.spectator = self._add(wire.Description(0, "spectator", ()), np.eye(4))
@@ -111,8 +114,16 @@ class Episode:
         with LiveWorld(self.served.town, Settings(parked=False)) as world:
             world.apply(Spawn("car", "car", 0, *self.spectator.pose[:2, 3].tolist(), anywhere=True))
             world.step({"car": Controls(throttle=1.0)})
+        self.prepare()
         told = {"image_size_x": "32", "image_size_y": "32", "fov": "90"}
-        self.look("images")().photograph(Sensor("sensor.camera.rgb", told, 0, self.spectator.pose))
+        camera, sight = Sensor("sensor.camera.rgb", told, 0, self.spectator.pose), self.look("images")()
+        sight.label(camera)
+        sight.photograph(camera)
+
+    def prepare(self) -> None:
+        """Build the scenes in which sensors look, so that the first of them need not wait."""
+        for scene in ("images", "rays"):
+            build_appearance(self.look(scene)().scene)
 
     @property
     def age_s(self) -> float:
@@ -466,11 +477,12 @@ class Episode:
         return self._follow_with("calls", self.world.snapshot.trace)
 
     def _follow_with(self, name: str, trace: Trace) -> Scene:
-        if name not in self._scenes:
-            self._scenes[name] = Scene(self.served.town, trace)
-        scene = self._scenes[name]
-        scene.paints = {own: actor.paint for own, actor in list(self._bodies.items()) if actor.paint is not None}
-        scene.follow(trace)
+        with self._building:
+            if name not in self._scenes:
+                self._scenes[name] = Scene(self.served.town, trace)
+            scene = self._scenes[name]
+            scene.paints = {own: actor.paint for own, actor in list(self._bodies.items()) if actor.paint is not None}
+            scene.follow(trace)
         return scene
 
 

@@ -1,8 +1,9 @@
 """The server: remote procedure calls at one port, streams at the next, one loop.
 
 In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends what sensors measure, in order,
-then the world's state and the answer to its cue, upon which a client goes on, and then the cameras' images, which take
-longest: they are drawn beside the next ticks, and the next images wait for them.
+then the world's state, then the cameras' images, which take longest, and the answer to its cue, upon which a client
+goes on. The answer waits for the images no longer than `DELIVERY_S`; they are then drawn beside the next ticks, as they
+are when ticks follow the clock, and the next images wait for them.
 
 What strangers may ask for is bounded: a connection with many cues that wait for their ticks is read no further; other
 bounds are those of `Connections`.
@@ -30,6 +31,7 @@ from flcav.sources.carla.server.episode import Episode, Measurement
 # A client's Traffic Manager misses its wake-up, and waits for ever, where the next tick comes before its thread sleeps
 # (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are not closer than this while one runs.
 PACE_S = 0.008
+DELIVERY_S = 1.5  # clients give a tick 2 s at least
 LEARNT_S = 3.0  # clients have learnt of a new map by then
 # While a client that has loaded a map learns of it by these calls, its Traffic Manager's thread crashes if it goes on:
 # so that thread's calls, which are all others, are answered when the client listens to the new world.
@@ -60,6 +62,7 @@ class Server:
         self._state = b""  # the last one of the world, for clients that come between two ticks
         # A client that has the answer to its cue waits for the state by polling, which takes a core from the sensors.
         self._cued: deque[tuple[asyncio.StreamWriter, bytes]] = deque()  # answers that wait for the next ticks
+        self._preparing: asyncio.Task[None] | None = None  # the scenes of a map that was loaded
         self._held: dict[asyncio.StreamWriter, list[bytes]] = {}  # replies to managers of who learns of a new map
         self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick
 
@@ -115,7 +118,7 @@ class Server:
             log.exception("a tick failed")
 
     async def _step(self) -> None:
-        episode, dt_s = self._calls.episode, self._calls.dt_s
+        episode, dt_s, begun_s = self._calls.episode, self._calls.dt_s, time.monotonic()
         episode.step(dt_s)
         self._state = episode.describe_world(dt_s)
         measurements = list(episode.measure(dt_s, self._links.is_heard))
@@ -128,11 +131,13 @@ class Server:
             await asyncio.sleep(self._published_s + PACE_S - time.monotonic())
         await self._publish_state(episode)
         self._published_s = time.monotonic()
-        self._answer_cues(1)
         if images := [each for each in measurements if each.late]:
             if self._drawing is not None:
                 await self._drawing
             self._drawing = asyncio.create_task(self._draw(images, episode))
+            if self._calls.settings.synchronous:
+                await asyncio.wait({self._drawing}, timeout=max(begun_s + DELIVERY_S - time.monotonic(), 0.0))
+        self._answer_cues(1)
         await self._links.await_readers()
 
     async def _draw(self, images: list[Measurement], episode: Episode) -> None:
@@ -246,6 +251,7 @@ class Server:
             return wire.fail(f"{call.method[:60]} failed on the server: {type(error).__name__}")
         if call.method == "load_new_episode":
             self._state = self._calls.episode.describe_world(0.0)
+            self._preparing = asyncio.create_task(asyncio.to_thread(self._calls.episode.prepare))
         if self._calls.ticks or call.method in ("set_episode_settings", "load_new_episode"):
             self._cue.set()
         if call.method == "apply_batch":

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sensors.frame import SEMANTICS
-from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays
-from flcav.sources.carla.server.sensing.sight import Sensor, Sight
+from flcav.sensors.lens import BODY_FROM_OPTICAL, compute_pixel_rays
+from flcav.sources.carla.server.sensing.sight import THREADS, Sensor, Sight, lens_of
 from flcav.sources.carla.server.wire import pack_image
 
 FAR_M = 1000.0
@@ -24,10 +24,10 @@ def sense_rgb(sight: Sight, sensor: Sensor) -> bytes:
 
 def sense_depth(sight: Sight, sensor: Sensor) -> bytes:
     """Return a depth image."""
-    lens = _lens(sensor)
+    lens = lens_of(sensor)
     rays = compute_pixel_rays(lens)
     pose = sensor.pose @ BODY_FROM_OPTICAL
-    hits = sight.scene.cast(pose, rays, far_m=FAR_M, hidden=sight.find_inside(sensor))
+    hits = sight.scene.cast(pose, rays, far_m=FAR_M, hidden=sight.find_inside(sensor), threads=THREADS)
     depth = np.minimum(hits.distance * rays[:, 2] / np.float32(FAR_M), np.float32(1))
     code = (depth.astype(np.float64) * DEPTH_STEPS).astype(np.uint32).reshape(lens.height, lens.width)
     return _pack(sensor, code >> 16 & 255, code >> 8 & 255, code & 255)
@@ -35,21 +35,16 @@ def sense_depth(sight: Sight, sensor: Sensor) -> bytes:
 
 def sense_semantic(sight: Sight, sensor: Sensor) -> bytes:
     """Return an image of semantic tags."""
-    tags = sight.photograph(sensor).semantic
+    tags, _ = sight.label(sensor)
     return _pack(sensor, 0, 0, tags)
 
 
 def sense_instance(sight: Sight, sensor: Sensor) -> bytes:
     """Return an image of semantic tags and actors."""
-    picture = sight.photograph(sensor)
-    number = np.append(np.uint32(0), sight.actors)[np.maximum(picture.instance, 0)]
-    number = np.where(picture.semantic == SEMANTICS["sky"], 0, number)
-    return _pack(sensor, number >> 8 & 255, number & 255, picture.semantic)
-
-
-def _lens(sensor: Sensor) -> Lens:
-    width, height = (int(sensor.number_of(f"image_size_{axis}")) for axis in "xy")
-    return Lens(width=width, height=height, fov_deg=sensor.number_of("fov"))
+    tags, instance = sight.label(sensor)
+    number = np.append(np.uint32(0), sight.actors)[np.maximum(instance, 0)]
+    number = np.where(tags == SEMANTICS["sky"], 0, number)
+    return _pack(sensor, number >> 8 & 255, number & 255, tags)
 
 
 def _pack(sensor: Sensor, blue: NDArray | int, green: NDArray | int, red: NDArray) -> bytes:

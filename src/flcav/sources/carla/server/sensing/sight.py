@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import inverse
-from flcav.sensors.camera.camera import Camera, Exposure, photograph
-from flcav.sensors.lens import BODY_FROM_OPTICAL
+from flcav.sensors.camera.camera import Camera, Exposure, label, photograph
+from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
 from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sources.carla.frames import MapFrame
 from flcav.statistics.streams import stream
@@ -42,6 +42,16 @@ class Sensor:
         return float(self.attributes[attribute])
 
 
+def lens_of(sensor: Sensor) -> Lens:
+    """Return the lens of a camera."""
+    width, height = (int(sensor.number_of(f"image_size_{axis}")) for axis in "xy")
+    return Lens(width=width, height=height, fov_deg=sensor.number_of("fov"))
+
+
+def _key(sensor: Sensor) -> tuple[bytes, Lens]:
+    return sensor.pose.tobytes(), lens_of(sensor)
+
+
 @dataclass
 class Sight:
     """The town at one tick, as all its sensors see it."""
@@ -52,7 +62,7 @@ class Sight:
     seed: int
     tick: int  # since the map was loaded
     actors: NDArray[np.uint32]  # (A,) the number that clients know each of the trace's actors by; 0 for parked ones
-    _exposures: dict[tuple[bytes, int, int, float], Exposure] = field(default_factory=dict)
+    _exposures: dict[tuple[bytes, Lens], Exposure] = field(default_factory=dict)
 
     def draw(self, sensor: Sensor) -> np.random.Generator:
         """Return the random stream of a sensor at this tick."""
@@ -83,12 +93,18 @@ class Sight:
         """Return the number of the actor of each hit, as clients know it; 0 for the town."""
         return np.append(np.uint32(0), self.actors)[np.maximum(hits.instance, 0)]
 
+    def label(self, sensor: Sensor) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+        """Return the semantic and the instance image of a camera: those of its colour image, if there is one."""
+        if (known := self._exposures.get(_key(sensor))) is not None:
+            return known.semantic, known.instance
+        pose, hidden = sensor.pose @ BODY_FROM_OPTICAL, self.find_inside(sensor)
+        return label(self.scene, pose, lens_of(sensor), hidden=hidden, threads=THREADS)
+
     def photograph(self, sensor: Sensor) -> Exposure:
         """Return the image of a camera, taken once for all cameras of one pose and lens."""
-        width, height = (int(sensor.number_of(f"image_size_{axis}")) for axis in "xy")
-        key = (sensor.pose.tobytes(), width, height, sensor.number_of("fov"))
+        key = _key(sensor)
         if key not in self._exposures:
-            camera = Camera(width=width, height=height, fov_deg=key[3], noise=0.0)
+            camera = Camera(**lens_of(sensor).model_dump(), noise=0.0)
             pose, hidden = sensor.pose @ BODY_FROM_OPTICAL, self.find_inside(sensor)
             rng = stream(self.seed, "carla", "camera", self.tick)
             self._exposures[key] = photograph(
