@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from flcav.geometry import Boxes, heading_vectors, wrap_angle
+from flcav.geometry import Boxes, wrap_angle
 
 Array = NDArray[np.float64]
 
 YAW = 6  # column of a box and of its variance
 GATE = 18.4  # largest squared Mahalanobis distance in x, y of a box from its object: 99.99 % of chi-squared, 2 dof
 FAR = 1e6  # cost of a pair outside the gate
-REVERSING_MPS = 3.0  # no vehicle backs up faster
 SPEED_MPS = 8.0  # standard deviation of an object's velocity, before it is observed
 LEAST_VARIANCE = np.array((0.05, 0.05, 0.05, 0.1, 0.05, 0.05, 0.03)) ** 2  # of a box, whatever its detector says
 UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of boxes without a predicted one
@@ -69,12 +68,9 @@ def average_boxes(told: Sequence[BoxReport], at_s: float) -> RoadAverage:
 
     lines = _Lines(count)
     lines.add(flat, rows[:, :2], variance[:, :2], since)
-    _, velocity, (_, _, doubt) = lines.solve(count)
+    velocity = lines.solve(count)[1]
     rows[:, :2] -= velocity[flat] * since[:, None]
     axis = _mean_heading(flat, rows[:, YAW], variance[:, YAW], count)
-    along = heading_vectors(axis)
-    speed = (along * velocity).sum(axis=1) + 2 * np.sqrt((along**2 * doubt).sum(axis=1))
-    axis = np.asarray(wrap_angle(axis + np.pi * (speed < -REVERSING_MPS)))  # who moves so fast does not back up
     rows[:, YAW] = (rows[:, YAW] - axis[flat] + np.pi / 2) % np.pi - np.pi / 2
 
     pair, row = np.unique(flat * max(len(names), 1) + agent, return_inverse=True)

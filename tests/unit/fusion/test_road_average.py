@@ -39,12 +39,6 @@ def test_repeating_a_box_makes_it_no_surer() -> None:
     np.testing.assert_allclose(variance[0, 2:], np.maximum(VARIANCE, LEAST_VARIANCE)[2:])
 
 
-@pytest.mark.parametrize(("speed", "heads"), [(10.0, 0.0), (-10.0, np.pi), (-1.5, 0.0), (0.0, 0.0)])
-def test_what_moves_faster_than_vehicles_back_up_heads_where_it_moves(speed: float, heads: float) -> None:
-    found = average_boxes([BoxReport("a", 0.2 * n, box(0.2 * speed * n, 0.0)) for n in range(6)], 0.5)
-    np.testing.assert_allclose(np.cos(found.boxes.yaw), np.cos(heads))
-
-
 def test_a_moving_object_is_one_and_is_moved_to_the_time_asked_for() -> None:
     told = [BoxReport(agent, 0.5 * n, box(5.0 * n, -1.0)) for n in range(4) for agent in ("a", "b")]  # 10 m/s
     found = average_boxes(told, 2.0)
