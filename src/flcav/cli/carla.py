@@ -6,6 +6,8 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.terminal import echo
+
 carla = typer.Typer(help="CARLA: serve its clients from a town, without a GPU.", no_args_is_help=True)
 
 
@@ -37,12 +39,12 @@ def serve(
 
     logging.basicConfig(format="flcav: %(message)s", level=logging.WARNING)
     if not _is_loopback(host):
-        typer.echo(f"flcav: {host} is open to the network, and CARLA's protocol asks nobody for a password", err=True)
+        echo(f"flcav: {host} is open to the network, and CARLA's protocol asks nobody for a password", err=True)
     doors = open_doors(host, port)
     calls = Calls(Maps(maps), town, seed=seed, traffic=traffic, port=port)
     calls.episode.warm_up()
     name = calls.episode.served.name
-    serve_calls(calls, doors, lambda: typer.echo(f"{name}: ready for clients of CARLA {VERSION} at {host}:{port}"))
+    serve_calls(calls, doors, lambda: echo(f"{name}: ready for clients of CARLA {VERSION} at {host}:{port}"))
 
 
 def _is_loopback(host: str) -> bool:

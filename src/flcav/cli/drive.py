@@ -6,7 +6,7 @@ import typer
 
 from flcav.cli.importance import ERRORS, FIRST_SEED, Perceives, read_model
 from flcav.cli.options import JOBS, check_finite, refuse_unused
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import echo, print_json
 from flcav.interface.wording import plural
 
 
@@ -77,7 +77,7 @@ def drive(
         with show_progress("measure") as report:
             found = measure_errors(chosen, numbers, loop, jobs, report)
         write_json(measure, found.as_json())
-        typer.echo(f"{measure}: errors of the networks in {plural(found.frames, 'frame')}")
+        echo(f"{measure}: errors of the networks in {plural(found.frames, 'frame')}")
         return
     if pole:
         with show_progress("drive") as report:
@@ -85,7 +85,7 @@ def drive(
         if as_json:
             print_json(gain.as_json())
         else:
-            typer.echo("\n".join(gain.lines()))
+            echo("\n".join(gain.lines()))
         return
     with show_progress("drive") as report:
         tasks = [Job(each, seed, loop=loop) for each in chosen for seed in numbers]
@@ -94,6 +94,6 @@ def drive(
         print_json({"drives": [own.as_json() for own in drives]})
         return
     for own in drives:
-        typer.echo(own.line())
+        echo(own.line())
     faults, hits = sum(own.faults for own in drives), sum(len(own.hits) for own in drives)
-    typer.echo(f"{len(drives)} drives: {faults} collisions at fault, {hits - faults} others")
+    echo(f"{len(drives)} drives: {faults} collisions at fault, {hits - faults} others")

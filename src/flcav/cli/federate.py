@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import FLEET, STALE, Runtime, Stale, refuse_unused
-from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
+from flcav.cli.terminal import echo, only_writer_of, print_json, when_interrupted
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
 
@@ -66,13 +66,13 @@ def federate(
         print_json(results.as_json() | times.as_json())
         return
     for each in results.federations:
-        typer.echo(f"{out / each.weights}: {_describe(each.result)}")
+        echo(f"{out / each.weights}: {_describe(each.result)}")
     for task, seconds in times.train_s.items():
-        typer.echo(f"{task}: train_s {seconds:.3g}, the median CPU time of a vehicle's training in a round [s]")
+        echo(f"{task}: train_s {seconds:.3g}, the median CPU time of a vehicle's training in a round [s]")
     if results.privacy is not None:
-        typer.echo(f"{TOGETHER}: {results.privacy.describe()}")
-    typer.echo(f"{out / TRAIN_TIMES}: times and speeds of each vehicle")
-    typer.echo(f"{out / name_results(arm)}: all rounds")
+        echo(f"{TOGETHER}: {results.privacy.describe()}")
+    echo(f"{out / TRAIN_TIMES}: times and speeds of each vehicle")
+    echo(f"{out / name_results(arm)}: all rounds")
 
 
 def _describe(result: "StageResult") -> str:
@@ -97,6 +97,6 @@ def _telling(notify: "Notify") -> "Notify":
         of_round = tells_of_round(step, note)
         notify(step, done, total, "" if of_round else note)
         if of_round:
-            typer.echo(f"{step}, round {done} of {total}: {note}")
+            echo(f"{step}, round {done} of {total}: {note}")
 
     return tell

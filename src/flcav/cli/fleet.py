@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import check_finite
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import echo, print_json
 from flcav.interface.wording import make_printable, plural
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def init(
 
     found_authority(folder, tuple(host))
     make_publisher(folder)
-    typer.echo(f"{folder}: authority, registry, and the key that apps are signed by")
+    echo(f"{folder}: authority, registry, and the key that apps are signed by")
 
 
 @fleet.command()
@@ -62,7 +62,7 @@ def key(
     """On a vehicle: make its key, which never leaves the folder, and the signing request that goes to the authority."""
     from flcav.federation.fleet.keys import request_certificate
 
-    typer.echo(f"{request_certificate(folder, vehicle)}: signing request of {vehicle}")
+    echo(f"{request_certificate(folder, vehicle)}: signing request of {vehicle}")
 
 
 @fleet.command("register")
@@ -76,7 +76,7 @@ def register_vehicle(
     authority = open_authority(folder)
     certificate = authority.register(request, days)
     write_bytes(out, certificate)
-    typer.echo(f"{out}: {_describe_new(authority.registry, certificate)}")
+    echo(f"{out}: {_describe_new(authority.registry, certificate)}")
 
 
 @fleet.command()
@@ -88,7 +88,7 @@ def rotate(folder: Path = FLEET, request: Path = REQUEST, out: Path = CERTIFICAT
     authority = open_authority(folder)
     certificate = authority.rotate(request, days)
     write_bytes(out, certificate)
-    typer.echo(f"{out}: {_describe_new(authority.registry, certificate)}")
+    echo(f"{out}: {_describe_new(authority.registry, certificate)}")
 
 
 @fleet.command()
@@ -108,7 +108,7 @@ def install(
     from flcav.federation.fleet.install import install_vehicle
 
     install_vehicle(folder, certificate, authority, trusted, server, client)
-    typer.echo(f"{folder}: ready; flcav fleet vehicle {folder} runs it")
+    echo(f"{folder}: ready; flcav fleet vehicle {folder} runs it")
 
 
 @fleet.command()
@@ -121,7 +121,7 @@ def revoke(
     from flcav.federation.fleet.authority import open_registry
 
     open_registry(folder).revoke(vehicle, reason)
-    typer.echo(f"{vehicle}: revoked")
+    echo(f"{vehicle}: revoked")
 
 
 @fleet.command("list")
@@ -143,7 +143,7 @@ def list_vehicles(
             return
         for each in entries:
             told = f"{_date(each.time)} {each.action} {each.vehicle} {each.fingerprint[:16]} {each.reason}"
-            typer.echo(make_printable(told.rstrip(), 600))
+            echo(make_printable(told.rstrip(), 600))
         return
     found = registry.list_vehicles()
     if as_json:
@@ -161,8 +161,8 @@ def list_vehicles(
         print_json({"vehicles": rows})
         return
     for own in found:
-        typer.echo(_describe(own))
-    typer.echo(plural(len(found), "vehicle"))
+        echo(_describe(own))
+    echo(plural(len(found), "vehicle"))
 
 
 @fleet.command()
@@ -179,29 +179,29 @@ def status(
     if page is not None:
         from flcav.federation.fleet.page import serve_page
 
-        serve_page(folder, page, typer.echo)
+        serve_page(folder, page, echo)
         return
     found = read_status(folder)
     if as_json:
         print_json(found.as_json())
         return
-    typer.echo("not up" if found.proxy is None else f"up at {found.proxy}, processes: {len(found.processes)}")
+    echo("not up" if found.proxy is None else f"up at {found.proxy}, processes: {len(found.processes)}")
     for own in found.vehicles:
         there = "online" if own.online else "offline"
-        typer.echo(
+        echo(
             f"{own.name}: {own.state}, {there}; {own.socket_up} bytes up and {own.socket_down} down crossed its "
             f"sockets, {own.content_up} and {own.content_down} of them content"
         )
         if own.release is not None:
-            typer.echo(f"    {own.release.describe()}")
+            echo(f"    {own.release.describe()}")
     if found.federation is not None:
-        typer.echo(found.federation.describe())
+        echo(found.federation.describe())
     for asked in found.requests:
-        typer.echo(asked.describe())
+        echo(asked.describe())
     for each in found.refused:
-        typer.echo(f"refused: {each}")
+        echo(f"refused: {each}")
     if found.free < LEAST_ROOM:
-        typer.echo(f"{folder}: no room on its disk, {found.free} bytes are free")
+        echo(f"{folder}: no room on its disk, {found.free} bytes are free")
 
 
 @fleet.command()
@@ -221,7 +221,7 @@ def request(
 
     made = make_request(task, loss, frames, at)
     send_request(folder, load_settings(folder).server, made)
-    typer.echo(f"{folder}: the request {made.nonce} is taken")
+    echo(f"{folder}: the request {made.nonce} is taken")
 
 
 @fleet.command()
@@ -237,7 +237,7 @@ def up(
     from flcav.federation.fleet.up import run_fleet
     from flcav.federation.runtimes.vehicle_app import prepare
 
-    run_fleet(folder, host, port, vehicles or 0, prepare, typer.echo, _updater())
+    run_fleet(folder, host, port, vehicles or 0, prepare, echo, _updater())
 
 
 @fleet.command("vehicle")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import JOBS, check_finite
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import echo, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -105,7 +105,7 @@ def importance(
     if as_json:
         print_json(found.as_json())
         return
-    typer.echo("\n".join(found.lines()))
+    echo("\n".join(found.lines()))
 
 
 def read_model(perception: Perceives, errors: Path | None):

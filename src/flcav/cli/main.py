@@ -30,8 +30,6 @@ NO_FOLDER = (errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG)  # a path leads ove
 
 atexit.register(gc.freeze)  # searching all modules for garbage would take a second before the process ends
 
-typer.echo = echo  # of all commands: what they print may come from files and from other machines
-
 app = typer.Typer(
     name="flcav",
     help="Design and verify federated learning for connected autonomous vehicle perception.\n\n"
@@ -44,7 +42,7 @@ app = typer.Typer(
 
 def _version(value: bool) -> None:
     if value:
-        typer.echo(f"flcav {__version__}")
+        echo(f"flcav {__version__}")
         raise typer.Exit
 
 

@@ -9,7 +9,7 @@ from flcav.cli import importance, sampling
 from flcav.cli.options import Device, check_finite
 from flcav.cli.sampling import JSON, ODD
 from flcav.cli.tables import numbers, read_table
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import echo, print_json
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
 
@@ -65,9 +65,9 @@ def check(
         print_json({"domain": found.name, "revision": found.definition.revision, "parts": rows})
         return
     where = f"frames of {data}" if data else f"places of {town or ', '.join(TOWNS)}"
-    typer.echo(f"{found.name}: {plural(len(parts), 'attribute')} tested, against {where}")
+    echo(f"{found.name}: {plural(len(parts), 'attribute')} tested, against {where}")
     for part in parts:
-        typer.echo(f"    {part.attribute:<32}{part.sentence}")
+        echo(f"    {part.attribute:<32}{part.sentence}")
 
 
 @odd.command("of")
@@ -94,11 +94,11 @@ def of_(
     if as_json:
         print_json({"frames": len(measured), "rows": rows, "attributes": [span.as_json() for span in spans]})
         return
-    typer.echo(f"{data}: {plural(len(measured), 'frame')} of vehicles")
+    echo(f"{data}: {plural(len(measured), 'frame')} of vehicles")
     for span in spans:
-        typer.echo(f"    {span.attribute:<20}{span.sentence}")
+        echo(f"    {span.attribute:<20}{span.sentence}")
     if rows is not None:
-        typer.echo(f"{out}: {plural(rows, 'row')} of COD tables")
+        echo(f"{out}: {plural(rows, 'row')} of COD tables")
 
 
 @odd.command()
@@ -163,13 +163,13 @@ def inside(
         told = None if agreement is None else agreement.as_json()
         print_json({"domain": found.name, **truth.as_json(), "frames_per_s": rate, "perceived": told})
         return
-    typer.echo(f"{found.name}: {truth.sentence}, by ground truth ({rate:,.0f} a second)")
+    echo(f"{found.name}: {truth.sentence}, by ground truth ({rate:,.0f} a second)")
     for module, count in truth.failed.items():
-        typer.echo(f"    {module} puts {plural(count, 'frame')} outside")
+        echo(f"    {module} puts {plural(count, 'frame')} outside")
     if seen is not None and agreement is not None:
-        typer.echo(f"{found.name}: {seen.sentence}, as perceived")
+        echo(f"{found.name}: {seen.sentence}, as perceived")
         for line in describe_agreement(agreement):
-            typer.echo(f"    {line}")
+            echo(f"    {line}")
 
 
 @odd.command()
@@ -223,13 +223,13 @@ def cover(
     if as_json:
         print_json(result.as_json())
         return
-    typer.echo(f"{found.name}: {plural(result.runs, 'run')}, mean coverage {result.grade:.0%} of buckets inside")
+    echo(f"{found.name}: {plural(result.runs, 'run')}, mean coverage {result.grade:.0%} of buckets inside")
     for row in result.attributes:
         holes = f"; not covered: {', '.join(row.holes)}" if row.holes else ""
-        typer.echo(f"    {row.attribute:<32}{row.grade:>4.0%}{holes}")
+        echo(f"    {row.attribute:<32}{row.grade:>4.0%}{holes}")
     for row in result.cells:
-        typer.echo(_describe_cell(row))
-    typer.echo(f"{out / 'matrix.html'}: {by}")
+        echo(_describe_cell(row))
+    echo(f"{out / 'matrix.html'}: {by}")
 
 
 @odd.command()
@@ -275,9 +275,9 @@ def tasks(
     for each in scenarios:
         parts = ", ".join(f"{name} {value:.2f}" for name, value in each.complexity.as_json().items())
         named = ", ".join(task.task for task in each.tasks)
-        typer.echo(f"{each.town}, {each.kind}: complexity {each.complexity.total:.2f} ({parts})")
-        typer.echo(f"    {plural(len(each.tasks), 'task')}: {named}")
-    typer.echo(f"{out}: run recipe of {plural(len({task.task for each in scenarios for task in each.tasks}), 'task')}")
+        echo(f"{each.town}, {each.kind}: complexity {each.complexity.total:.2f} ({parts})")
+        echo(f"    {plural(len(each.tasks), 'task')}: {named}")
+    echo(f"{out}: run recipe of {plural(len({task.task for each in scenarios for task in each.tasks}), 'task')}")
 
 
 def _describe_cell(row: "CellErrors") -> str:

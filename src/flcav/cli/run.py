@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from flcav.cli.options import AGENTS, ENGINE, FLEET, JOBS, STALE, EngineName, Runtime, Stale, refuse_unused
-from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
+from flcav.cli.terminal import echo, only_writer_of, print_json, when_interrupted
 from flcav.config import InputError
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
@@ -72,7 +72,7 @@ def _forecast(path: Path, as_json: bool) -> None:
         print_json(forecast.as_json())
         return
     for line in forecast.lines():
-        typer.echo(line)
+        echo(line)
 
 
 @when_interrupted()
@@ -134,7 +134,7 @@ def _run(
     _tell(list(results.values()), summary)
     for report, result in zip(reports, results.values(), strict=True):
         took = f", in {result.elapsed_s / 60:.1f} minutes" if result.elapsed_s else ""
-        typer.echo(f"{report}: the report{took}")
+        echo(f"{report}: the report{took}")
 
 
 def _tell(results: "list[Run]", summary: "Summary | None") -> None:
@@ -144,23 +144,23 @@ def _tell(results: "list[Run]", summary: "Summary | None") -> None:
 
     if summary is None:
         for sentence in tell_gain(results[0]):
-            typer.echo(sentence)
+            echo(sentence)
         for finding in results[0].findings:
-            typer.echo(f"{finding.question}: {finding.decision}. {finding.sentence}")
+            echo(f"{finding.question}: {finding.decision}. {finding.sentence}")
         for name, arm in results[0].arms.items():
             if arm.privacy is not None:
-                typer.echo(f"{name}, {TOGETHER}: {arm.privacy.describe()}")
+                echo(f"{name}, {TOGETHER}: {arm.privacy.describe()}")
         for arm in results[0].lifelong or ():
-            typer.echo(f"lifelong, {arm.task}, {arm.describe()}")
+            echo(f"lifelong, {arm.task}, {arm.describe()}")
         if PLACED_BARE in results[0].caveats:
-            typer.echo(f"privacy: {PLACED_BARE}")
+            echo(f"privacy: {PLACED_BARE}")
         return
     for row in (*summary.measures, *summary.differences):
         kind = f" ({row.kind} claim)" if row.kind else ""
         judged = f": {row.judged.verdict}{kind}, {row.judged.describe()}" if row.judged else ""
-        typer.echo(f"{row.name}: {row.estimate.describe()} over {plural(len(summary.seeds), 'seed')}{judged}")
+        echo(f"{row.name}: {row.estimate.describe()} over {plural(len(summary.seeds), 'seed')}{judged}")
     for claim in summary.claims:
-        typer.echo(claim.describe())
+        echo(claim.describe())
 
 
 def compare(
@@ -188,7 +188,7 @@ def compare(
         change = row.difference
         interval = "no interval: one scene" if change.low is None else f"{change.low:+.3f} to {change.high:+.3f}"
         arm = "" if row.arm == "main" else f" ({row.arm})"
-        typer.echo(
+        echo(
             f"{row.region}, {row.task}, {row.stage}{arm}: {row.measure} {row.first:.3f} -> {row.second:.3f}, "
             f"{change.mean:+.3f} ({interval}): {row.verdict}{f', p {row.judged.p_cell}' if row.judged else ''}"
         )
@@ -210,4 +210,4 @@ def _compare_networks(
         print_json(found.as_json())
         return
     for line in found.lines():
-        typer.echo(line)
+        echo(line)

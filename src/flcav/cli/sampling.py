@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import echo, print_json
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
 
@@ -118,12 +118,12 @@ def sample(
         )
         return
     kinds = Counter(each.place.kind for each in drawn.samples)
-    typer.echo(f"{out}: {plural(len(paths), 'recipe')} in {found.name}, by {method.value}")
-    typer.echo(f"    {', '.join(f'{kind}: {number}' for kind, number in kinds.most_common())}")
-    typer.echo(f"    pairwise coverage {drawn.pairwise:.0%}: {drawn.pairs} of {drawn.possible} pairs of buckets")
+    echo(f"{out}: {plural(len(paths), 'recipe')} in {found.name}, by {method.value}")
+    echo(f"    {', '.join(f'{kind}: {number}' for kind, number in kinds.most_common())}")
+    echo(f"    pairwise coverage {drawn.pairwise:.0%}: {drawn.pairs} of {drawn.possible} pairs of buckets")
     if searched:
         failing = plural(sum(bool(each.failures) for each in searched), "scenario")
-        typer.echo(f"    {plural(len(cells), 'distinct failure')} in {plural(frames, 'frame')}, of {failing}")
+        echo(f"    {plural(len(cells), 'distinct failure')} in {plural(frames, 'frame')}, of {failing}")
 
 
 def _search(

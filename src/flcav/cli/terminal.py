@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import typer
 
 from flcav.config import Json
+from flcav.interface.wording import escape_invisible, make_printable
 from flcav.machine.locks import only_writer
 
 if TYPE_CHECKING:
@@ -21,26 +21,17 @@ LONGEST = 1000  # characters of a message
 GOES_ON = "the same command goes on where it stopped"
 
 
-def printable(text: str) -> str:
-    """Return a text whose characters can all be seen: others than newlines and tabs are escapes such as \\x1b.
-
-    Names in files, and what other machines say, could else rewrite what a terminal shows.
-    """
-    return "".join(
-        each if each.isprintable() or each in "\n\t" else each.encode("unicode_escape", "surrogatepass").decode()
-        for each in text
-    )
-
-
 def one_line(message: str) -> str:
     """Return a message as one printable line, cut to `LONGEST`."""
-    line = printable(" ".join(message.split()))
-    return line if len(line) <= LONGEST else f"{line[:LONGEST]} ..."
+    return make_printable(" ".join(message.split()), LONGEST)
 
 
 def echo(message: object = "", nl: bool = True, err: bool = False) -> None:
-    """Print a message, made printable, on stdout or stderr: what commands call as `typer.echo`, see `cli.main`."""
-    click.echo(printable(str(message)), nl=nl, err=err)
+    """Print a message on stdout or stderr, its invisible characters escaped.
+
+    What commands print may come from files and from other machines, and must not rewrite what a terminal shows.
+    """
+    click.echo(escape_invisible(str(message), "\n\t"), nl=nl, err=err)
 
 
 def plain_console() -> "Console":
@@ -52,7 +43,7 @@ def plain_console() -> "Console":
 
 def print_json(value: Json) -> None:
     """Print one JSON object on stdout; numbers that JSON does not have, inf and nan, are null."""
-    typer.echo(json.dumps(_finite(value), allow_nan=False))
+    echo(json.dumps(_finite(value), allow_nan=False))
 
 
 def _finite(value: Json) -> Json:

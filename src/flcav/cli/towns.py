@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import check_png
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import echo, print_json
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
@@ -35,8 +35,8 @@ def list_towns(as_json: bool = typer.Option(False, "--json", help="Print one JSO
         print_json({"towns": rows})
         return
     for name, town in found.items():
-        typer.echo(f"{name}: {town.parameters.description}")
-        typer.echo(f"    {summary(counts[name])}")
+        echo(f"{name}: {town.parameters.description}")
+        echo(f"    {summary(counts[name])}")
 
 
 @towns.command()
@@ -59,13 +59,13 @@ def show(
     loaded = load_town(town)
     if poles is not None:
         write_table(_poles_table(loaded), poles)
-        typer.echo(f"{poles}: {plural(len(loaded.poles.id), 'candidate pole')} of {loaded.name}")
+        echo(f"{poles}: {plural(len(loaded.poles.id), 'candidate pole')} of {loaded.name}")
     if out is not None:
         write_bytes(out, town_map(loaded))
-        typer.echo(f"{out}: map of {loaded.name}")
-    typer.echo(f"{loaded.name}: {summary(summarise_town(loaded))}")
+        echo(f"{out}: map of {loaded.name}")
+    echo(f"{loaded.name}: {summary(summarise_town(loaded))}")
     if out is None:
-        typer.echo(f"its map: flcav towns show {town} --out {loaded.name}.png")
+        echo(f"its map: flcav towns show {town} --out {loaded.name}.png")
 
 
 @towns.command("import")
@@ -78,9 +78,9 @@ def import_(
     from flcav.world.opendrive.importing import import_town
 
     imported = import_town(xodr, out)
-    typer.echo(f"{out}: {summary(summarise_town(imported.town))}")
+    echo(f"{out}: {summary(summarise_town(imported.town))}")
     for note in imported.notes:
-        typer.echo(f"    {note}")
+        echo(f"    {note}")
 
 
 def _poles_table(town: "Town") -> "pa.Table":

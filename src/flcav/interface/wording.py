@@ -29,9 +29,17 @@ def make_printable(text: str, most: int = 200) -> str:
     >>> make_printable("well\\x1b[2J")
     'well\\\\x1b[2J'
     """
-    shown = [each if each.isprintable() else ascii(each)[1:-1] for each in text[: most + 1]]
-    line = "".join(shown)
+    line = escape_invisible(text[: most + 1])
     return line if len(line) <= most else f"{line[:most]} ..."
+
+
+def escape_invisible(text: str, kept: str = "") -> str:
+    """Return a text in which characters that cannot be seen, but for those of `kept`, are shown as Python escapes them.
+
+    >>> escape_invisible("well\\x1b[2J")
+    'well\\\\x1b[2J'
+    """
+    return "".join(each if each.isprintable() or each in kept else ascii(each)[1:-1] for each in text)
 
 
 def plural(number: int, noun: str) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import check_finite, check_png
+from flcav.cli.terminal import echo
 from flcav.interface.wording import plural
 
 
@@ -34,6 +35,4 @@ def birdseye(
     seen = dataset.frame(0 if frame is None else dataset.number(frame))
     view = view_frame(dataset, seen, range_m=range_m, tracks=tracks)
     write_bytes(out, style.png(birdseye(view)))
-    typer.echo(
-        f"{out}: {seen.key}, {plural(len(view.points), 'point')}, {plural(len(seen.annotations), 'annotated actor')}"
-    )
+    echo(f"{out}: {seen.key}, {plural(len(view.points), 'point')}, {plural(len(seen.annotations), 'annotated actor')}")

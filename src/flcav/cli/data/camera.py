@@ -5,6 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import check_png
+from flcav.cli.terminal import echo
 
 
 def register(app: typer.Typer) -> None:
@@ -40,4 +41,4 @@ def camera(
     rows = arrange_cameras(seen, names[number] if name is None else [name])
     shots = [[make_shot(seen, each) for each in row] for row in rows]
     write_bytes(out, style.png(camera_sheet(f"{seen.key} · {seen.time_s:.1f} s", shots, boxes=boxes)))
-    typer.echo(f"{out}: {seen.key}, {', '.join(each for row in rows for each in row)}")
+    echo(f"{out}: {seen.key}, {', '.join(each for row in rows for each in row)}")

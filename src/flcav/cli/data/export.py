@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import OWN, join_choices
+from flcav.cli.terminal import echo
 from flcav.dataset.formats.formats import EXPORTS, export_format
 from flcav.interface.wording import plural
 
@@ -60,9 +61,9 @@ def export(
     with progress.show_progress(f"export {out}") as report:
         exported = write(dataset, format, out, options, progress=report)
     size_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
-    typer.echo(f"{out}: exported {_format_counts(exported.counts)}, {size_mb:.1f} MB")
+    echo(f"{out}: exported {_format_counts(exported.counts)}, {size_mb:.1f} MB")
     for line in _format_left_out(exported.left_out):
-        typer.echo(line)
+        echo(line)
 
 
 def _format_counts(counts: Counter[str]) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 import typer
 
 from flcav.cli.options import OWN, join_choices
-from flcav.cli.terminal import one_line
+from flcav.cli.terminal import echo, one_line
 from flcav.dataset.formats.formats import IMPORTS
 from flcav.interface.wording import plural
 
@@ -44,11 +44,11 @@ def import_(
         notes = import_dataset(format, folder, out, split=split, progress=report, **how)
     manifest = read_manifest(out)
     counts = manifest.counts
-    typer.echo(
+    echo(
         f"{out}: imported {plural(counts.scenes, 'scene')}, {plural(counts.frames, 'frame')}, "
         f"{plural(counts.annotations, 'object')}, {plural(counts.points, 'point')}, {plural(counts.images, 'image')}"
     )
     for note in notes:
-        typer.echo(one_line(f"{folder}: {note}"))
+        echo(one_line(f"{folder}: {note}"))
     for leak in find_leaks({str(out): manifest}) + find_copies([out]):
-        typer.echo(one_line(leak), err=True)
+        echo(one_line(leak), err=True)

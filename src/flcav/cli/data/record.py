@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import ENGINE, EngineName
-from flcav.cli.terminal import when_interrupted
+from flcav.cli.terminal import echo, when_interrupted
 from flcav.interface.wording import plural
 
 
@@ -44,7 +44,7 @@ def record(
     counts = manifest.counts
     done = "recorded" if written else "already recorded, nothing to do:"
     size_mb = (counts.payload_bytes + sum(entry.bytes for entry in manifest.tables.values())) / 1e6
-    typer.echo(
+    echo(
         f"{out}: {done} {plural(counts.frames, 'frame')} of {plural(counts.scenes, 'scene')}, "
         f"{plural(counts.annotations, 'annotation')}, {plural(counts.points, 'point')}, "
         f"{plural(counts.images, 'image')}, {size_mb:.1f} MB"
@@ -53,4 +53,4 @@ def record(
         happened = [event.kind for scene in manifest.scenes for event in Trace.load(out / trace_path(scene)).events]
         asked_for = counts.scenes * len(asked.scenarios)
         each = ", ".join(f"{happened.count(kind)} {kind}" for kind in sorted(set(happened)))
-        typer.echo(f"corner cases: {len(happened)} of {asked_for} found their moment ({each or 'none'})")
+        echo(f"corner cases: {len(happened)} of {asked_for} found their moment ({each or 'none'})")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.terminal import one_line
+from flcav.cli.terminal import echo, one_line
 from flcav.interface.wording import plural
 
 
@@ -29,7 +29,7 @@ def validate(
         with progress.show_progress(f"validate {folder}") as report:
             problems += problems_of(folder, progress=report)
     for problem in dict.fromkeys(problems):  # copies within a dataset are found by both
-        typer.echo(one_line(problem))
+        echo(one_line(problem))
     if problems:
         raise typer.Exit(1)
-    typer.echo(f"{plural(sum(manifest.counts.frames for manifest in manifests.values()), 'frame')}, no problems")
+    echo(f"{plural(sum(manifest.counts.frames for manifest in manifests.values()), 'frame')}, no problems")

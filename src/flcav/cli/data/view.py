@@ -7,6 +7,7 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.terminal import echo
 from flcav.interface.wording import plural
 
 
@@ -66,4 +67,4 @@ def view(
         recording.save(temporary, default_blueprint=layout)
         log()
         recording.disconnect()
-    typer.echo(f"{save}: scene {shown}, {plural(len(selected), 'frame')}, {save.stat().st_size / 1e6:.1f} MB")
+    echo(f"{save}: scene {shown}, {plural(len(selected), 'frame')}, {save.stat().st_size / 1e6:.1f} MB")

@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import check_png
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import echo, print_json
 
 POLES = typer.Option(
     [],
@@ -78,10 +78,10 @@ def radio(
         )
         return
     span_s = links.time_s[-1] - links.time_s[0]
-    typer.echo(f"{recorded.scene}: {len(links.time_s)} instants over {span_s:g} s in {recorded.town.name}")
+    echo(f"{recorded.scene}: {len(links.time_s)} instants over {span_s:g} s in {recorded.town.name}")
     for row in found:
         rate = f"{row.mean_mbps:.1f} Mbit/s on average, {row.least_mbps:.1f} to {row.most_mbps:.1f}"
         shares = f"LOS {row.los:.0%}, NLOSv {row.nlosv:.0%}, NLOS {row.nlos:.0%}"
-        typer.echo(f"    {row.vehicle} at {row.unit}: {rate}; {shares}; {row.nearest_m:.0f} to {row.farthest_m:.0f} m")
+        echo(f"    {row.vehicle} at {row.unit}: {rate}; {shares}; {row.nearest_m:.0f} to {row.farthest_m:.0f} m")
     if map_ is not None:
-        typer.echo(f"{map_}: rate by place in {recorded.town.name}")
+        echo(f"{map_}: rate by place in {recorded.town.name}")

@@ -6,7 +6,7 @@ import typer
 
 from flcav.cli.network.radio import NETWORK, POLES, SCENE, SEED
 from flcav.cli.options import check_all_finite, check_finite, check_png
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import echo, print_json
 from flcav.interface.wording import plural
 
 BYTES_PER_MB = 1_000_000
@@ -98,7 +98,7 @@ def rounds(
     for record in records:
         wire = record.wireline_down_s + record.wireline_up_s
         last = "nobody's update arrived" if record.straggler is None else f"{record.straggler.client} was last"
-        typer.echo(
+        echo(
             f"round {record.round}: {record.end_s - record.start_s:.2f} s"
             + (f", {wire:.2f} s of them wireline" if wire else "")
             + f"; {len(record.finished)} of {len(record.clients)} updates arrived, {last}"
@@ -108,7 +108,7 @@ def rounds(
                 f"download {client.download_s:.2f} s, compute {client.compute_s:.2f} s, upload {client.upload_s:.2f} s"
             )
             lost = f"; dropped at {client.end_s:.2f} s, {client.dropped}" if client.dropped else ""
-            typer.echo(f"    {client.client} at {client.server}: {spent}{lost}")
+            echo(f"    {client.client} at {client.server}: {spent}{lost}")
     for path in (out, timeline):
         if path is not None:
-            typer.echo(f"{path}: {plural(len(records), 'round')}")
+            echo(f"{path}: {plural(len(records), 'round')}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device, check_finite, check_png, refuse_unused
+from flcav.cli.terminal import echo
 from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
@@ -84,12 +85,12 @@ def errors(
     if map_ is not None and town is not None:
         write_bytes(map_, _draw(town, found))
     if found.chosen is not None:
-        typer.echo(found.chosen.sentence)
-    typer.echo(networks.origin_of(learned, weights))
+        echo(found.chosen.sentence)
+    echo(networks.origin_of(learned, weights))
     counts = Counter(error.kind for error in found)
     told = ", ".join(f"{PLURALS.get(kind, kind)}: {count}" for kind, count in counts.items())
     lost = f"; {found.dropped} false positives that point at nothing in the town left out" if found.dropped else ""
-    typer.echo(f"{out}: {told or 'no errors'}{lost}")
+    echo(f"{out}: {told or 'no errors'}{lost}")
 
 
 def _draw(town: "Town", found: "Registry") -> bytes:

@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import echo, print_json
 from flcav.machine.threads import use_threads
 
 
@@ -62,4 +62,4 @@ def evaluate(
     if as_json:
         print_json(vars(origin) | found.chosen.summary() | dict(found.numbers))
         return
-    typer.echo("\n".join([found.chosen.sentence, str(origin), *found.lines]))
+    echo("\n".join([found.chosen.sentence, str(origin), *found.lines]))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device, check_finite, refuse_unused
-from flcav.cli.terminal import only_writer_of, print_json
+from flcav.cli.terminal import echo, only_writer_of, print_json
 from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
@@ -73,9 +73,9 @@ def infer(
         print_json({"datasets": datasets, "inputs": results})
         return
     for path, choice in found.chosen.items():
-        typer.echo(f"{path}: {choice.sentence}")
+        echo(f"{path}: {choice.sentence}")
     for path, result in findings:
-        typer.echo("\n  ".join([f"{path}:", *result.lines()]))
+        echo("\n  ".join([f"{path}:", *result.lines()]))
 
 
 def _draw(finding: "Finding", path: Path) -> None:

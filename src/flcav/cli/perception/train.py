@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import AGENTS, ANY_TASK, THREADS, Device
-from flcav.cli.terminal import when_interrupted
+from flcav.cli.terminal import echo, when_interrupted
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
 
@@ -64,13 +64,13 @@ def train(
         prepared = prepare(learner, request, out)
         if prepared.finished is not None:
             train_prepared(prepared)  # its card may be missing
-            typer.echo(f"{out / WEIGHTS}: trained with these settings before, nothing to do")
+            echo(f"{out / WEIGHTS}: trained with these settings before, nothing to do")
             return
-        typer.echo("\n".join(prepared.lines()))
+        echo("\n".join(prepared.lines()))
         with progress.show_progress(f"train {task}") as report:
             trained = train_prepared(prepared, report)
     card = trained.card
     told = f"{out / WEIGHTS}: trained on {plural(card.samples, 'sample')}, {plural(card.learning.steps, 'step')}"
-    typer.echo(f"{told}, mean loss of the last epoch {card.learning.loss:.3f}")
+    echo(f"{told}, mean loss of the last epoch {card.learning.loss:.3f}")
     if trained.evaluation is not None:
-        typer.echo("\n".join(["on the validation data:", *trained.evaluation.lines()]))
+        echo("\n".join(["on the validation data:", *trained.evaluation.lines()]))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from flcav.cli.options import check_all_finite, check_finite, refuse_unused
-from flcav.cli.terminal import only_writer_of, print_json
+from flcav.cli.terminal import echo, only_writer_of, print_json
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def fit(
         return
     _show(answers, shown)
     if problem is not None:
-        typer.echo(_next(problem, list(found_of)))
+        echo(_next(problem, list(found_of)))
 
 
 def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:

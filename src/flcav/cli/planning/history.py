@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import ENGINE, JOBS, STALE, EngineName, Stale
-from flcav.cli.terminal import only_writer_of, when_interrupted
+from flcav.cli.terminal import echo, only_writer_of, when_interrupted
 from flcav.config import InputError
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
@@ -55,7 +55,7 @@ def history(
             recipes, out, beside=found.parent, jobs=jobs, notify=notify, stale=stale.value, engine=engine.value
         )
     save_origin(asked, task, runs, out)
-    typer.echo(f"{out / HISTORY}: {plural(len(runs), 'run')}; next: flcav fit {out / HISTORY}")
+    echo(f"{out / HISTORY}: {plural(len(runs), 'run')}; next: flcav fit {out / HISTORY}")
 
 
 def _parse_counts(text: str) -> tuple[int, ...]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import Method, check_finite, check_png
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import echo, print_json
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
@@ -149,9 +149,9 @@ def place(
     else:
         _show(given, np.diff(candidates.covers.indptr).tolist(), result, conventional, least)
         for line in [] if hidden is None else hidden.lines():
-            typer.echo(line)
+            echo(line)
         told = [] if verified is None else verified.lines(counted=count is not None or not given.priced)
-        typer.echo("\n".join(told), nl=verified is not None)
+        echo("\n".join(told), nl=verified is not None)
     if verified is not None and verified.faults:
         raise typer.Exit(1)
 
@@ -166,22 +166,22 @@ def _show(
     """Print the placement; `near` are the numbers of errors within range of each candidate."""
     cost, by_range = given.cost_of(result), given.names == (None,)
     chosen = [f"{each['pole']}" + ("" if by_range else f" ({each['sensor']})") for each in _name(given, result)]
-    typer.echo(f"poles {', '.join(chosen)}")
+    echo(f"poles {', '.join(chosen)}")
     if by_range:
         for number, (pole, errors_near) in enumerate(zip(given.ids, near, strict=True)):
             placed = ", placed" if number in result.chosen else ""
-            typer.echo(f"    pole {pole}: {plural(errors_near, 'error')} within {given.ranges_m[0]:g} m{placed}")
+            echo(f"    pole {pole}: {plural(errors_near, 'error')} within {given.ranges_m[0]:g} m{placed}")
     proof = "optimal" if result.optimal else f"at most {result.upper_bound:.6g} can be covered"
     if least is not None and not result.optimal:
         proof = f"at least {least:.6g} has to be spent for that"
     told = "" if cost is None else f", cost {cost:.6g}"
-    typer.echo(
+    echo(
         f"cover {result.covered} of {plural(len(given.errors), 'error')}, "
         f"weight {result.covered_weight:.6g}{told} ({proof})"
     )
     for name, placed in conventional.items():
         if placed is not None:
-            typer.echo(f"by {name.replace('-', ' ')}: weight {placed.covered_weight:.6g}")
+            echo(f"by {name.replace('-', ' ')}: weight {placed.covered_weight:.6g}")
 
 
 def _verify(

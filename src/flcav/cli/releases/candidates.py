@@ -6,7 +6,7 @@ import typer
 
 from flcav.cli.options import check_finite, parse_axes
 from flcav.cli.releases.options import AS_JSON, CANDIDATE, DRIVING, NUMBER, TASK, draw_page
-from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
+from flcav.cli.terminal import echo, only_writer_of, print_json, when_interrupted
 from flcav.interface.wording import plural
 
 
@@ -31,7 +31,7 @@ def propose(
         out, weights, driving, number, changes, audience, task=task, data=data, recipe=recipe, ledger=ledger
     )
     known = plural(len(made.data), "dataset")
-    typer.echo(f"{out}: release {made.release} of {made.task}, weights {made.weights[:16]}, {known}")
+    echo(f"{out}: release {made.release} of {made.task}, weights {made.weights[:16]}, {known}")
 
 
 @when_interrupted()
@@ -82,6 +82,6 @@ def verify(
     if as_json:
         print_json(found.as_json())
     else:
-        typer.echo("\n".join(found.lines()))
+        echo("\n".join(found.lines()))
     if not found.accepted:
         raise typer.Exit(1)

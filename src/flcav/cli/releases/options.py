@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from flcav.cli.terminal import echo
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def describe_candidate(folder: Path) -> "Candidate":
 def tell_signatures(repository: Path, state: "Staged") -> None:
     """Print how many signatures a party's next metadata have."""
     more = "publish it" if state.complete else "another owner's is missing"
-    typer.echo(
+    echo(
         f"{repository}: {state.signatures} of {plural(state.threshold, 'signature')} of version {state.version}; {more}"
     )
 

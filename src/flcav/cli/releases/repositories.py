@@ -16,7 +16,7 @@ from flcav.cli.releases.options import (
     draw_page,
     tell_signatures,
 )
-from flcav.cli.terminal import only_writer_of, print_json
+from flcav.cli.terminal import echo, only_writer_of, print_json
 from flcav.config import InputError, parse_config
 from flcav.interface.wording import plural
 
@@ -41,9 +41,9 @@ def init(
     from flcav.releases.repositories.creation import create_repository
 
     made = create_repository(out, party.value, keys, threshold)
-    typer.echo(f"{out}: repository of the {party.value}, {threshold} of {plural(len(made), 'key')} sign a release")
+    echo(f"{out}: repository of the {party.value}, {threshold} of {plural(len(made), 'key')} sign a release")
     for number, key in enumerate(made, start=1):
-        typer.echo(f"    {out / 'keys' / f'{number}.pem'}: {key.short}")
+        echo(f"    {out / 'keys' / f'{number}.pem'}: {key.short}")
 
 
 @only_writer_of("repository")
@@ -95,7 +95,7 @@ def publish(repository: Path = typer.Argument(help="Folder of a party.")) -> Non
     """Make what a party has signed its repository's current state; without anything, renew its timestamp."""
     from flcav.releases.repositories.repository import publish as publish_staged
 
-    typer.echo(f"{repository}: version {publish_staged(repository)} of its targets is current")
+    echo(f"{repository}: version {publish_staged(repository)} of its targets is current")
 
 
 @only_writer_of("folder")
@@ -122,7 +122,7 @@ def install(
             check_is_file(path)
         trust_roots(folder, image_root.read_bytes(), director_root.read_bytes())
     driving = update_vehicle(folder, name, open_sources(image, director), task)
-    typer.echo(
+    echo(
         f"{name}: "
         + ("drives no network" if driving is None else f"drives release {driving.release} of {driving.task}")
     )
@@ -159,7 +159,7 @@ def equip(
             raise InputError(f"--drive {drive}: is not in {data}, which has {', '.join([*known][:5])}")
         recorded = RecordedDrive(str(data.resolve()), own.scene, own.agent)
     equip_vehicle(folder, roots, recorded)
-    typer.echo(f"{folder}: follows the releases of its fleet")
+    echo(f"{folder}: follows the releases of its fleet")
 
 
 def status(
@@ -180,4 +180,4 @@ def status(
         print_json({"repositories": [each.as_json() for each in found]})
         return
     for each in found:
-        typer.echo("\n".join(each.lines()))
+        echo("\n".join(each.lines()))

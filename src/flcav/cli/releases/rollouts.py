@@ -17,7 +17,7 @@ from flcav.cli.releases.options import (
     draw_page,
     tell_signatures,
 )
-from flcav.cli.terminal import only_writer_of, print_json, when_interrupted
+from flcav.cli.terminal import echo, only_writer_of, print_json, when_interrupted
 from flcav.config import InputError
 from flcav.interface.wording import plural
 
@@ -54,7 +54,7 @@ def shadow(
             found = run_shadow(name, map(opened.frame, opened.select(agents=[name])), networks[0], networks[1])
             write_json(out / f"{name}.json", found.as_json())
             report(done, len(agents), f"{name} {found.disagreement:.3f}")
-            typer.echo(f"{name}: disagreement {found.disagreement:.3f} over {plural(found.frames, 'frame')}")
+            echo(f"{name}: disagreement {found.disagreement:.3f} over {plural(found.frames, 'frame')}")
 
 
 @when_interrupted()
@@ -116,7 +116,7 @@ def rollout(
         )
     if out is not None:
         ledger.save(out)
-    typer.echo("\n".join(found.lines()))
+    echo("\n".join(found.lines()))
     if found.stopped or not found.complete:
         raise typer.Exit(1)
 
@@ -137,12 +137,12 @@ def _widen(
         if any(run.candidate != read_weights(repository, task, now.release) for run in runs):
             raise InputError(f"{shadows}: has shadow runs of other weights than those of release {now.release}")
         decision = judge_shadows(runs)
-        typer.echo(decision.describe())
+        echo(decision.describe())
         wanted = next_share(now.share, decision)
         stopped = decision.judgement == "stop"
     assert wanted is not None
     directive, state = change_share(repository, task, wanted, key, revoke)
-    typer.echo(f"release {directive.release} of {task}: {directive.share:.0%} of the fleet")
+    echo(f"release {directive.release} of {task}: {directive.share:.0%} of the fleet")
     tell_signatures(repository, state)
     if stopped:
         raise typer.Exit(1)
@@ -182,9 +182,9 @@ def deliver(
         return
     for each in found:
         said = f"has it at {each.at_s:.2f} s" if each.at_s is not None else f"has it not: {each.reason}"
-        typer.echo(f"{each.vehicle}: {said}, {plural(each.attempts, 'attempt')}, {each.bytes / 1e6:.2f} MB")
+        echo(f"{each.vehicle}: {said}, {plural(each.attempts, 'attempt')}, {each.bytes / 1e6:.2f} MB")
     down = {link: ledger.used_mb(link, direction="down") for link in ("wireless", "wireline")}
-    typer.echo(f"downlink: {down['wireless']:.2f} MB wireless, {down['wireline']:.2f} MB wireline")
+    echo(f"downlink: {down['wireless']:.2f} MB wireless, {down['wireline']:.2f} MB wireline")
 
 
 @when_interrupted()
@@ -232,7 +232,7 @@ def rehearse(
     if as_json:
         print_json(found.as_json())
     else:
-        typer.echo("\n".join(found.lines()))
+        echo("\n".join(found.lines()))
     if found.stopped or not found.complete:
         raise typer.Exit(1)
 
@@ -254,4 +254,4 @@ def rollback(
     read_verification(earlier)
     made = roll_back(earlier, number, reason, out, sha256(driving))
     draw_page(out, [])
-    typer.echo(f"{out}: release {made.release} of {made.task}, weights {made.weights[:16]}; sign and publish it")
+    echo(f"{out}: release {made.release} of {made.task}, weights {made.weights[:16]}; sign and publish it")

@@ -5,12 +5,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from flcav.cli.options import EngineName, Stale
 from flcav.cli.reproductions.figures import write_figures
 from flcav.cli.reproductions.targets import EXCHANGES, Target
-from flcav.cli.terminal import when_interrupted
+from flcav.cli.terminal import echo, when_interrupted
 
 if TYPE_CHECKING:
     from flcav.pipeline.recipe import RunRecipe
@@ -27,13 +25,11 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName,
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "arms.png", draw_arms(results))
     for arm, closed in results.summary.gap_closed.items():
-        typer.echo(f"{arm}: closes of the gap {closed.describe()}")
+        echo(f"{arm}: closes of the gap {closed.describe()}")
     if results.summary.road_share is not None:
-        typer.echo(f"share of the gain with an ideal road detector: {results.summary.road_share.describe()}")
+        echo(f"share of the gain with an ideal road detector: {results.summary.road_share.describe()}")
     for name, judged in judge_differences(results.summary).items():
-        typer.echo(
-            f"{name}: {results.summary.differences[name].describe(sign=True)}, {judged.verdict}: {judged.describe()}"
-        )
+        echo(f"{name}: {results.summary.differences[name].describe(sign=True)}, {judged.verdict}: {judged.describe()}")
 
 
 @when_interrupted()
@@ -58,7 +54,7 @@ def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: Engi
     write_bytes(out / "plans.png", draw_allocation(results))
     for each in results.budgets:
         for finding in each.findings:
-            typer.echo(f"Budgets {each.name}. {finding.question} {finding.verdict}. {finding.sentence}")
+            echo(f"Budgets {each.name}. {finding.question} {finding.verdict}. {finding.sentence}")
 
 
 def _distillation(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
@@ -128,7 +124,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName,
     import_map(IMPORTED, out)
     overlaps = {region: list_overlaps(asked, region, out) for region in list_regions(asked)}
     for sentence in describe_overlaps(overlaps, asked.placement.range_m):
-        typer.echo(sentence)
+        echo(sentence)
     how: Any = (seeds, scale, jobs, engine, stale, shrink_recipe, out)
     recipe, runs = _run_seeds(Target.placement, "placement", out, *how)
     results = prove_placement(recipe, runs, [out / f"seed{run.recipe.seed}" / WORK for run in runs], out)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
+from flcav.cli.terminal import echo
 
 if TYPE_CHECKING:
     from flcav.config import Json
@@ -18,4 +18,4 @@ def write_figures(out: Path, numbers: "Json", pictures: Mapping[str, bytes], sen
     for name, picture in pictures.items():
         write_bytes(out / name, picture)
     for sentence in sentences:
-        typer.echo(sentence)
+        echo(sentence)

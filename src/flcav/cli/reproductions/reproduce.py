@@ -22,7 +22,7 @@ from flcav.cli.reproductions.targets import (
     Scale,
     Target,
 )
-from flcav.cli.terminal import only_writer_of, when_interrupted
+from flcav.cli.terminal import echo, only_writer_of, when_interrupted
 from flcav.config import InputError
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
@@ -95,7 +95,7 @@ def reproduce(
         _task(target, out, numbers, "quick" if quick else "full", jobs, engine, stale)
     else:
         COMPARISONS[target](out, count, "quick" if quick else "paper", jobs, engine, stale)
-    typer.echo(f"{out / 'result.json'}: the numbers of {plural(count, 'seed')}")
+    echo(f"{out / 'result.json'}: the numbers of {plural(count, 'seed')}")
 
 
 @when_interrupted()
@@ -107,7 +107,7 @@ def _fig1b(out: Path) -> None:
     with progress.show_progress("record") as report:
         picture = fig1b(out, report)
     write_bytes(out / "fig1b.png", picture)
-    typer.echo(f"{out / 'fig1b.png'}: four tasks on one scene")
+    echo(f"{out / 'fig1b.png'}: four tasks on one scene")
 
 
 def _fig3a(out: Path) -> None:
@@ -118,7 +118,7 @@ def _fig3a(out: Path) -> None:
     write_json(out / "result.json", results.as_json())
     write_bytes(out / "fig3a.png", draw_fig3a(results))
     for sentence in results.findings:
-        typer.echo(sentence)
+        echo(sentence)
 
 
 @when_interrupted()
@@ -184,9 +184,9 @@ def _sim_to_real(
         if row.targets:
             found = f"{row.found} of {row.targets} found, {row.false_positives} false"
             ap = f"AP {row.ap:.3f} {interval_words(row.low, row.high)}"
-            typer.echo(f"{row.label} {row.kind} at IoU {row.iou}: {found}, {ap}")
+            echo(f"{row.label} {row.kind} at IoU {row.iou}: {found}, {ap}")
     for line in describe_counts(results.counts or ()):
-        typer.echo(line)
+        echo(line)
 
 
 @when_interrupted()
@@ -204,7 +204,7 @@ def _task(target: str, out: Path, seeds: range, scale: str, jobs: int, engine: E
     for test, numbers in results.summary.items():
         for name, value in numbers.items():
             spread = f", standard deviation over seeds {value.sd:.3f}" if value.seeds > 1 else ""
-            typer.echo(f"{test}, {name}: {value.describe()}{spread}")
+            echo(f"{test}, {name}: {value.describe()}{spread}")
 
 
 def register(app: typer.Typer) -> None:
