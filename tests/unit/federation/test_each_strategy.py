@@ -343,7 +343,7 @@ def test_what_makes_no_sense_is_one_sentence():
     for spec, said in (
         ({"fedprox": {"mu": -1}}, r"strategy 'fedprox': mu = -1: Input should be greater than or equal to 0"),
         ({"krum": {"mu": 1}}, r"strategy 'krum': has no setting 'mu'; it has byzantine, kept"),
-        ({"median": {"mu": 1}}, r"strategy 'median': has no setting 'mu'; it has none"),
+        ({"fedavg": {"mu": 1}}, r"strategy 'fedavg': has no setting 'mu'; it has none"),
         ({"fedavg": {}, "krum": {}}, r"one name is wanted, with its settings"),
     ):
         with pytest.raises(InputError, match=said):
