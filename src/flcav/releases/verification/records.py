@@ -111,7 +111,7 @@ class Verification(Record):
                 if guard.judgement == "kept":
                     continue
                 lines.append(
-                    f"{guard.by:<10}{guard.name:<34}{guard.driving:.3f} -> {guard.candidate:.3f}  "
+                    f"{guard.by:<10}{guard.name:<44}{guard.driving:.3f} -> {guard.candidate:.3f}  "
                     f"({guard.low:+.3f} to {guard.high:+.3f})  {guard.judgement}  (objects: {guard.targets})"
                 )
         if self.domain is not None:
