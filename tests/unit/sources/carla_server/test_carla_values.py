@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from carla_calls import describe, invoke, place
 
+from flcav.config import InputError
 from flcav.sensors.frame import SEMANTICS
+from flcav.sources.carla.server import maps as carla_maps
 from flcav.sources.carla.server.calls import Calls
 from flcav.sources.carla.server.driving import choose_gear
 from flcav.sources.carla.server.lights import find_limits
 from flcav.sources.carla.server.maps import SPAWN_LEAST_M, SPAWN_POINTS, Maps
 from flcav.sources.carla.server.wire import VehicleControl
+from flcav.world.opendrive.importing import ImportedTown
 
 DT_S = 0.05
 
@@ -228,3 +231,44 @@ def test_tags_alone_are_those_of_the_colour_image(calls):
     assert (tags == SEMANTICS["road_line"]).sum() > 20
     np.testing.assert_array_equal(tags, picture.semantic)
     np.testing.assert_array_equal(instance, picture.instance)
+
+
+def test_an_imported_map_is_kept_for_the_next_server(maps, tmp_path, monkeypatch):
+    """Another map of the same name is imported anew, a damaged copy is not used, and a cache is not needed."""
+    town = maps.load("suburb").town
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    file = tmp_path / "maps" / "crossing.xodr"
+    file.parent.mkdir()
+    imported, loaded = [], []
+
+    def import_town(path, out):
+        out.mkdir()
+        imported.append(path.read_text())
+        (out / "town.yaml").write_text("whole")
+        return ImportedTown(town, ())
+
+    def load_town(folder):
+        if (folder / "town.yaml").read_text() != "whole":
+            raise InputError("damaged")
+        loaded.append(folder)
+        return town
+
+    monkeypatch.setattr(carla_maps, "import_town", import_town)
+    monkeypatch.setattr(carla_maps, "load_town", load_town)
+
+    def start(text):
+        file.write_text(text)
+        assert Maps(file.parent).load("crossing").town is town
+
+    start("a")
+    start("a")
+    assert (imported, len(loaded)) == (["a"], 1)
+    (loaded[0] / "town.yaml").write_text("half")
+    start("a")
+    start("b")
+    assert (imported, len(loaded)) == (["a", "a", "b"], 1)
+    start("b")
+    assert (imported, len(loaded)) == (["a", "a", "b"], 2)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(file))  # which is no folder
+    start("b")
+    assert imported == ["a", "a", "b", "b"]

@@ -1,15 +1,19 @@
 """The maps that are served: towns with the OpenDRIVE text that clients get, and where cars may be spawned."""
 
+import os
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from shapely.geometry import LineString
 
+from flcav import world
 from flcav.config import InputError, shorten
 from flcav.interface.wording import suggest
 from flcav.sources.carla.frames import MapFrame, to_rotation, to_vector
@@ -82,6 +86,17 @@ class ServedMap:
         return build_navigation_mesh(self.net, self.town, self.frame)
 
 
+def _find_cache() -> Path:
+    """Return the folder of imported maps, in that of the user's caches."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flcav" / "maps"
+
+
+def _hash_import(path: Path) -> str:
+    """Return a name for the town of a map: another one for another map, and for another import of it."""
+    code = b"".join(each.read_bytes() for each in sorted(Path(world.__file__).parent.rglob("*.py")))
+    return f"map-{sha256(sha256(code).digest() + path.name.encode() + path.read_bytes()).hexdigest()[:24]}"
+
+
 def _driving_lanes(net: RoadNet) -> Iterator[Lane]:
     return (lane for edge in net.streets for lane in edge.lanes_of("driving"))
 
@@ -122,7 +137,7 @@ class Maps:
     def _read(self, name: str) -> ServedMap:
         for known in (name, name.removesuffix(OPTIMISED)):
             if known in self._files:
-                return self._import(name, self._files[known])
+                return self._import(name, self._files[known], _find_cache() / _hash_import(self._files[known]))
         if name not in PACKAGED and not Path(name).is_dir():
             known = self.names()
             raise InputError(f"no map {shorten(name)}; maps here: {', '.join(known)}{suggest(name, known)}")
@@ -134,10 +149,19 @@ class Maps:
         self._sent += 1
         path = Path(self._scratch.name) / f"sent-{self._sent}.xodr"
         path.write_text(text, encoding="utf-8", errors="surrogateescape")
-        self._loaded[OPENDRIVE_MAP] = self._import(OPENDRIVE_MAP, path)
+        self._loaded[OPENDRIVE_MAP] = self._import(OPENDRIVE_MAP, path, Path(self._scratch.name) / path.stem)
 
-    def _import(self, name: str, path: Path) -> ServedMap:
-        town = import_town(path, Path(self._scratch.name) / f"{path.stem}-{len(self._loaded)}-{self._sent}").town
+    def _import(self, name: str, path: Path, folder: Path) -> ServedMap:
+        """Return the map of a file, whose town is in a folder, or is written there."""
+        town = None
+        with suppress(OSError, InputError):  # no such folder yet, or one that is damaged
+            town = load_town(folder) if folder.is_dir() else None
+        try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            out = folder if not folder.exists() else Path(self._scratch.name) / folder.name
+            town = town or import_town(path, out).town
+        except OSError:  # no place for a cache
+            town = import_town(path, Path(self._scratch.name) / folder.name).town
         source = town.parameters.source
         offset = (0.0, 0.0) if source is None else source.offset_m
         text = path.read_text(encoding="utf-8", errors="surrogateescape")
