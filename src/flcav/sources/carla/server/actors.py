@@ -24,6 +24,23 @@ FIRST_LIMIT_KMH = 30.0  # CARLA's speed limit of a vehicle that has passed no si
 STANDING, WAITING = wire.VehicleControl(), wire.WalkerControl()
 
 
+class Counters:
+    """The numbers of actors, streams, frames and episodes, which a server never uses twice."""
+
+    def __init__(self) -> None:
+        self.actor = self.episode = self.frame = self.stream = 0
+
+    def next_actor(self) -> int:
+        """Return a number for an actor."""
+        self.actor += 1
+        return self.actor
+
+    def next_stream(self) -> int:
+        """Return a number for a stream."""
+        self.stream += 1
+        return self.stream
+
+
 class Place(NamedTuple):
     """Where an actor is, and how it moves."""
 

@@ -14,9 +14,9 @@ import numpy as np
 from flcav.config import InputError, shorten
 from flcav.sources.carla.frames import mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.actors import NOTHING, Actor
+from flcav.sources.carla.server.actors import NOTHING, Actor, Counters
 from flcav.sources.carla.server.blueprints import Refused, list_blueprints
-from flcav.sources.carla.server.episode import Counters, Episode
+from flcav.sources.carla.server.episode import Episode
 from flcav.sources.carla.server.maps import Maps
 from flcav.sources.carla.server.physics import describe_physics, describe_telemetry
 from flcav.sources.carla.server.scenery import find_boxes, find_objects, project

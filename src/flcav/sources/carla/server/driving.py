@@ -1,11 +1,15 @@
 """How vehicles are driven: pedals and steering wheel of Ackermann control, and the friction of the road."""
 
+from collections.abc import Collection, Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.sources.carla.server.actors import Actor
-from flcav.sources.carla.server.catalogue import FLOAT
+from flcav.sources.carla.server.catalogue import FLOAT, TRIGGER
 from flcav.sources.carla.server.wire import AckermannControl, VehicleControl
+from flcav.world.commands import Grip
+from flcav.world.dynamics.bodies import Body
 
 PULL_MPS2, BRAKE_MPS2 = 4.0, 8.0  # accelerations that full pedals give
 SHIFT_KMH = (20.0, 40.0, 60.0, 85.0, 115.0)  # at which an automatic gearbox takes the next gear
@@ -26,6 +30,19 @@ def find_grip(box: Actor, point: NDArray[np.float64]) -> float | None:
     half = [told[f"extent_{axis}"] / 100 for axis in "xyz"]
     inside = np.abs(box.pose[:3, :3].T @ (point - box.pose[:3, 3])) <= half
     return min(told["friction"], 1.0) if inside.all() else None
+
+
+def list_grips(actors: Collection[Actor], bodies: Iterable[Body]) -> list[Grip]:
+    """Return how the tyres of vehicles hold, by the last box of friction that each is in, where that has changed."""
+    known = {actor.name: actor for actor in actors if actor.kind == "vehicle"}
+    boxes, changed = [actor for actor in actors if actor.description.id == TRIGGER], []
+    for body in bodies:
+        if (actor := known.get(body.name)) is not None:
+            shares = [share for box in boxes if (share := find_grip(box, actor.pose[:3, 3])) is not None]
+            share = shares[-1] if shares else 1.0
+            if body.grip != share:
+                changed.append(Grip(body.name, share))
+    return changed
 
 
 def steer_towards(

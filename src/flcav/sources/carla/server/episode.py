@@ -3,7 +3,6 @@
 Every tick the world makes a step; then all actors take their places, and the sensors measure.
 """
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,20 +15,19 @@ from numpy.typing import NDArray
 from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sources.carla.frames import from_mount, mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.actors import STANDING, WAITING, Actor, list_places
+from flcav.sources.carla.server.actors import STANDING, WAITING, Actor, Counters, list_places
 from flcav.sources.carla.server.blueprints import TRUE, Blueprint, Refused, check, find_paint, list_blueprints
-from flcav.sources.carla.server.catalogue import TRIGGER
-from flcav.sources.carla.server.driving import choose_gear, find_grip, steer_towards
+from flcav.sources.carla.server.driving import choose_gear, list_grips, steer_towards
 from flcav.sources.carla.server.lights import Lights, find_approaches, find_limits
 from flcav.sources.carla.server.maps import ServedMap
 from flcav.sources.carla.server.recorder import Recorder
 from flcav.sources.carla.server.sensing.events import describe_thing, find_collisions, find_obstacle
-from flcav.sources.carla.server.sensing.sight import Sensor, Sight
+from flcav.sources.carla.server.sensing.sight import Scenes, Sensor, Sight
 from flcav.sources.carla.server.sensing.table import KINDS, Clock
 from flcav.sources.carla.server.weather import to_weather
 from flcav.sources.carla.server.wire import Transform
 from flcav.world import commands
-from flcav.world.commands import Controls, Drive, Grip, Push, Remove, Simulate, Spawn, Walk
+from flcav.world.commands import Controls, Drive, Push, Remove, Simulate, Spawn, Walk
 from flcav.world.live import LiveWorld, Obstructed, Settings
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
@@ -61,23 +59,6 @@ class Measurement(NamedTuple):
     late: bool = False  # it takes so long that the client need not wait
 
 
-class Counters:
-    """The numbers of actors, streams, frames and episodes, which a server never uses twice."""
-
-    def __init__(self) -> None:
-        self.actor = self.episode = self.frame = self.stream = 0
-
-    def next_actor(self) -> int:
-        """Return a number for an actor."""
-        self.actor += 1
-        return self.actor
-
-    def next_stream(self) -> int:
-        """Return a number for a stream."""
-        self.stream += 1
-        return self.stream
-
-
 class Episode:
     """One map, from loading it until the next is loaded."""
 
@@ -94,8 +75,7 @@ class Episode:
         self.tick, self.time_s = 0, 0.0
         self._begun_s = time.monotonic()
         self._bodies: dict[str, Actor] = {}  # by name in the live world
-        self._scenes: dict[str, Scene] = {}  # one for each of the threads that look at the town at once
-        self._building = threading.Lock()  # of the scenes
+        self._scenes = Scenes(served.town)
         self.recorder = Recorder()
         self._spawned = 0
         self.spectator = self._add(wire.Description(0, "spectator", ()), np.eye(4))
@@ -320,7 +300,8 @@ class Episode:
                 limit, _ = self.steering(actor)
                 self.drive(actor, steer_towards(actor.ackermann, actor.control, self.speed(actor), limit, dt_s))
             actor.told = False
-        self._slip()
+        for command in list_grips(self.actors.values(), self.world.bodies.members):
+            self.world.apply(command)
         snapshot = self.world.step(dt_s=dt_s)
         self.tick += 1
         self.counters.frame += 1
@@ -331,17 +312,6 @@ class Episode:
             if actor.kind == "vehicle" and (limit := self.signs.find_passed(actor.pose)) is not None:
                 actor.limit_kmh = limit
         self.recorder.add(snapshot)
-
-    def _slip(self) -> None:
-        """Tell the tyres of the vehicles in boxes of friction how they hold there, by the last box that they are in."""
-        boxes = [actor for actor in self.actors.values() if actor.description.id == TRIGGER]
-        for body in self.world.bodies.members:
-            actor = self._bodies.get(body.name)
-            if actor is not None and actor.kind == "vehicle":
-                shares = [share for box in boxes if (share := find_grip(box, actor.pose[:3, 3])) is not None]
-                share = shares[-1] if shares else 1.0
-                if body.grip != share:
-                    self.world.apply(Grip(body.name, share))
 
     def steering(self, actor: Actor) -> tuple[float, float]:
         """Return the greatest steering angle [rad] and the wheelbase [m] of a vehicle."""
@@ -477,13 +447,8 @@ class Episode:
         return self._follow_with("calls", self.world.snapshot.trace)
 
     def _follow_with(self, name: str, trace: Trace) -> Scene:
-        with self._building:
-            if name not in self._scenes:
-                self._scenes[name] = Scene(self.served.town, trace)
-            scene = self._scenes[name]
-            scene.paints = {own: actor.paint for own, actor in list(self._bodies.items()) if actor.paint is not None}
-            scene.follow(trace)
-        return scene
+        paints = {own: actor.paint for own, actor in list(self._bodies.items()) if actor.paint is not None}
+        return self._scenes.follow(name, trace, paints)
 
 
 def _measure(sense: Callable[[Sight, Sensor], bytes], look: Callable[[], Sight], sensor: Sensor) -> bytes:

@@ -27,6 +27,7 @@ from flcav.sources.carla.server.blueprints import Refused
 from flcav.sources.carla.server.calls import Calls, invoke
 from flcav.sources.carla.server.connections import Connections, send, write
 from flcav.sources.carla.server.episode import Episode, Measurement
+from flcav.sources.carla.server.framing import Unpacker
 
 # A client's Traffic Manager misses its wake-up, and waits for ever, where the next tick comes before its thread sleeps
 # (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are not closer than this while one runs.
@@ -36,7 +37,7 @@ LEARNT_S = 3.0  # clients have learnt of a new map by then
 # While a client that has loaded a map learns of it by these calls, its Traffic Manager's thread crashes if it goes on:
 # so that thread's calls, which are all others, are answered when the client listens to the new world.
 LEARNING = ("version", "get_episode_info", "get_sensor_token")
-MANAGER_S = 0.1  # a Traffic Manager's thread has made its next call by then
+MANAGER_S = 1.0  # the client that has loaded a map is told so when that thread waits for its next call, or by then
 LISTENER_S = 0.3  # a tick waits so long for the connection of a stream whose token a client has just asked for
 MOST_CUES, MOST_CUES_IN_ALL = 8, 256  # of a connection that wait for their ticks, and of all; clients have one each
 UNFINISHED_S = 30.0  # a call has come to its end by then, and the number of a stream
@@ -63,6 +64,7 @@ class Server:
         # A client that has the answer to its cue waits for the state by polling, which takes a core from the sensors.
         self._cued: deque[tuple[asyncio.StreamWriter, bytes]] = deque()  # answers that wait for the next ticks
         self._preparing: asyncio.Task[None] | None = None  # the scenes of a map that was loaded
+        self._loaded: dict[asyncio.StreamWriter, bytes] = {}  # replies to clients that have loaded a map
         self._held: dict[asyncio.StreamWriter, list[bytes]] = {}  # replies to managers of who learns of a new map
         self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick
 
@@ -185,7 +187,7 @@ class Server:
     async def _serve_calls(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if not self._links.admit(writer):
             return
-        unpacker, until = wire.Unpacker(), None
+        unpacker, until = Unpacker(), None
         try:
             while data := await _read(reader, until):
                 unpacker.feed(data)
@@ -215,6 +217,7 @@ class Server:
             await self._room.wait()
         if writer.is_closing():
             raise ConnectionResetError
+        self._tell_loaded(writer)
         asked = self._calls.ticks
         response = self._answer(call)
         reply = b"" if call.number is None else wire.pack_reply(call.number, response)
@@ -222,10 +225,9 @@ class Server:
         waits = cues > 0 and call.method != "apply_batch"
         self._cued.extend([(writer, reply if waits else b"")] * cues)
         if call.method == "load_new_episode" and self._calls.managed:
-            await asyncio.sleep(MANAGER_S)
-            writer.write(reply)
-            self._held[writer] = []
-            asyncio.get_running_loop().call_later(LEARNT_S, self._release, writer)
+            self._loaded[writer], self._held[writer] = reply, (held := [])
+            asyncio.get_running_loop().call_later(MANAGER_S, self._tell_loaded, writer, reply)
+            asyncio.get_running_loop().call_later(MANAGER_S + LEARNT_S, self._release, writer, held)
         elif writer in self._held and call.method not in LEARNING:
             self._held[writer].append(reply)
         elif not waits:
@@ -233,10 +235,16 @@ class Server:
         await self._links.await_readers([writer])
         await asyncio.sleep(0)  # others have their turn
 
-    def _release(self, writer: asyncio.StreamWriter) -> None:
-        """Send the replies that were held for a client that learnt of a new map."""
-        for reply in self._held.pop(writer, []):
-            write(writer, reply)
+    def _tell_loaded(self, writer: asyncio.StreamWriter, reply: bytes | None = None) -> None:
+        """Send the reply to who has loaded a map, if it is this one."""
+        if writer in self._loaded and reply in (None, self._loaded[writer]):
+            write(writer, self._loaded.pop(writer))
+
+    def _release(self, writer: asyncio.StreamWriter, held: list[bytes] | None = None) -> None:
+        """Send the replies that were held for a client that learnt of a new map, if they are these."""
+        if writer in self._held and (held is None or held is self._held[writer]):
+            for reply in self._held.pop(writer):
+                write(writer, reply)
 
     def _answer(self, call: wire.Call) -> wire.Packed:
         """Return the response to a call."""

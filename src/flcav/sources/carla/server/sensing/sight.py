@@ -1,6 +1,7 @@
 """What sensors see at one tick, and a sensor with its state from tick to tick."""
 
 import os
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -13,8 +14,10 @@ from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
 from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sources.carla.frames import MapFrame
 from flcav.statistics.streams import stream
+from flcav.world.map.town import Town
 from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
+from flcav.world.trace import Trace
 from flcav.world.weather import Weather
 
 Array = NDArray[np.float64]
@@ -111,3 +114,22 @@ class Sight:
                 self.scene, pose, camera, self.weather, rng, hidden=hidden, threads=THREADS
             )
         return self._exposures[key]
+
+
+class Scenes:
+    """The scenes of a town by name, one for each of the threads that look at it at once."""
+
+    def __init__(self, town: Town) -> None:
+        """Start without any: each is built when it is first looked at."""
+        self._town, self._building = town, threading.Lock()
+        self._scenes: dict[str, Scene] = {}
+
+    def follow(self, name: str, trace: Trace, paints: Mapping[str, tuple[float, float, float]]) -> Scene:
+        """Return a scene at the instant of a trace, with actors in these colours (linear RGB)."""
+        with self._building:
+            if name not in self._scenes:
+                self._scenes[name] = Scene(self._town, trace)
+            scene = self._scenes[name]
+            scene.paints = paints
+            scene.follow(trace)
+        return scene
