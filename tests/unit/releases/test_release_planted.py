@@ -132,7 +132,7 @@ def find_lost(driving: Driving, candidate: ConditionResults) -> list[str]:
         ("Cyclist", add_to_score(1.5), "false Cyclist"),
         ("Pedestrian", add_to_score(1.0), "false Pedestrian"),
         ("Pedestrian", add_to_score(-1.5), "found Pedestrian"),
-        ("Car", add_to_score(-2.0), "found Car"),
+        ("Car", add_to_score(-3.0), "found Car"),
         ("Car", reverse, "heading Car"),
         ("Pedestrian", reverse, "heading Pedestrian"),
         ("Car", add_to_box(0, 0.05), "bias Car x too large"),
