@@ -16,7 +16,8 @@ from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.importing import import_town
-from flcav.world.opendrive.mending import mend_map
+from flcav.world.opendrive.mending.maps import mend_map
+from flcav.world.opendrive.mending.roads import mend_roads
 from flcav.world.opendrive.mirror import mirror_map
 from flcav.world.opendrive.objects.crosswalks import find_crosswalks
 from flcav.world.opendrive.objects.parking_spaces import find_parking
@@ -24,7 +25,6 @@ from flcav.world.opendrive.objects.signal_heads import find_heads
 from flcav.world.opendrive.objects.signs import find_posts, find_signs
 from flcav.world.opendrive.objects.standing import find_objects
 from flcav.world.opendrive.objects.stop_lines import find_stop_lines
-from flcav.world.opendrive.road_mending import mend_roads
 
 DATA = Path(__file__).parents[1] / "data"
 MAPS = ("cross", "cross_with_objects")

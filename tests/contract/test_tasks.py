@@ -191,7 +191,8 @@ def test_a_client_is_trainable(task, samples):
         "centre",
         "shift",
         "layers",
-    }  # of the strategies that ask for them
+        "optimiser",
+    }  # of the strategies and rules that ask for them
     weights = to_arrays(build_network(task, small(task), 1))
     before = {key: array.copy() for key, array in weights.items()}
     one, other = (client.train(weights, steps=1, learning_rate=1e-3, seed=3) for _ in range(2))

@@ -28,7 +28,7 @@ from flcav.dataset.layout import MANIFEST, FrameKey, Manifest, navigation_path, 
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import list_files
 from flcav.interface.progress import Report, print_progress
-from flcav.interface.wording import plural
+from flcav.interface.wording import make_printable, plural
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Frame
 from flcav.storage.files import sha256
@@ -48,7 +48,7 @@ def validate(path: Path | str, *, progress: Report = print_progress) -> list[str
     manifest = read_manifest(folder)
     listed = list_files(folder, manifest)
     damaged = {name: problem for name, entry in listed.items() if (problem := _damage(folder, name, *entry))}
-    problems = [f"{folder / name}: {problem}" for name, problem in damaged.items()]
+    problems = [f"{folder / make_printable(name)}: {problem}" for name, problem in damaged.items()]
     problems += _extra_files(folder, listed)
     try:
         dataset = Dataset.open(folder, checked=False)

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flcav.sources.carla.server import framing, wire
+from flcav.sources.carla.server import connections, wire
 from flcav.sources.carla.server.wire import Transform
 
-MOST = framing.MOST_ARRAYS
+MOST = connections.MOST_ARRAYS
 HERE = Transform((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
 SIX = "0000803f0000004000004040000080400000a0400000c040"  # of HERE, as float32
 BOX = wire.BoundingBox((0.0, 0.0, 0.5), (1.0, 0.5, 0.5), actor_id=7)
@@ -108,7 +108,7 @@ def test_settings_have_an_optional():
 
 def test_calls_are_read_one_after_another_and_in_parts():
     message = wire.pack([0, 1, "version", [[False]]]) + wire.pack([2, "tick_cue", [[True], 4]])
-    unpacker = framing.Unpacker()
+    unpacker = connections.Unpacker()
     unpacker.feed(message[:5])
     assert list(unpacker) == []
     unpacker.feed(message[5:])
@@ -129,14 +129,15 @@ def test_other_messages_are_no_calls(message):
     [
         (
             b"\x92"
-            + 2 * (b"\xdd" + struct.pack(">I", framing.MOST_ARRAYS // 2) + b"\x90" * (framing.MOST_ARRAYS // 2)),
+            + 2
+            * (b"\xdd" + struct.pack(">I", connections.MOST_ARRAYS // 2) + b"\x90" * (connections.MOST_ARRAYS // 2)),
             "arrays",
         ),
         (b"\xdd" + struct.pack(">I", MOST + 1) + b"\xc0" * (MOST + 1), "max_array_len"),
     ],
 )
 def test_a_call_of_very_many_values_is_refused(message, told):
-    unpacker = framing.Unpacker()
+    unpacker = connections.Unpacker()
     unpacker.feed(message)
     with pytest.raises(ValueError, match=told):
         next(unpacker)
@@ -144,7 +145,7 @@ def test_a_call_of_very_many_values_is_refused(message, told):
 
 def test_of_an_unfinished_call_only_its_bytes_are_kept():
     """A million empty values would be a list of eight times as many bytes, or of more where they are texts."""
-    unpacker = framing.Unpacker()
+    unpacker = connections.Unpacker()
     begun = b"\x94\x00\x01\xa7version\xdd" + struct.pack(">I", 2_000_000)
     tracemalloc.start()
     for part in (begun, *[b"\xa2ab" * 10_000] * 100):

@@ -25,9 +25,8 @@ from flcav.config import InputError
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.blueprints import Refused
 from flcav.sources.carla.server.calls import Calls, invoke
-from flcav.sources.carla.server.connections import Connections, send, write
+from flcav.sources.carla.server.connections import Connections, Unpacker, send, write
 from flcav.sources.carla.server.episode import Episode, Measurement
-from flcav.sources.carla.server.framing import Unpacker
 
 # A client's Traffic Manager misses its wake-up, and waits for ever, where the next tick comes before its thread sleeps
 # (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are not closer than this while one runs.

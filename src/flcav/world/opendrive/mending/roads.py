@@ -9,7 +9,7 @@ import numpy as np
 
 from flcav.config import shorten
 from flcav.world.opendrive.document import FASTEST, TO_METRES_PER_SECOND
-from flcav.world.opendrive.lane_widths import rewrite_widths
+from flcav.world.opendrive.mending.lane_widths import rewrite_widths
 from flcav.world.opendrive.objects.places import read_number
 from flcav.world.opendrive.plan_view import NOTED_M, NOTED_RAD, SHORTEST_M, close_gaps, order_geometry
 from flcav.world.opendrive.reference_line import is_by_length
