@@ -36,11 +36,11 @@ from flcav.sources.recipe import Recipe
 from flcav.storage.files import write_json
 
 CONFIG = replace(pillars_config(CLASSES, GROUND_M), uncertainty=True, augmentation=Augmentation(paste=6))
-STEPS, SHORT = 2000, 200  # of the driving network, and of those that are trained from the beginning
-GO_ON, PEAK = 30, 2e-4  # steps of a retraining, and its peak learning rate
+STEPS, SHORT = 2000, 400  # of the driving network, and of those that are trained from the beginning
+GO_ON, PEAK = 60, 5e-5  # steps of a retraining, and its peak learning rate
 KINDS = ("goes on", "half of the frames", "two clients", "from the beginning")
 EACH = 5
-TEST = {**RECORDED["test"], "cavs": 2}
+TEST = {**RECORDED["test"], "scenes": 180, "cavs": 1}
 
 
 def main() -> None:

@@ -62,6 +62,7 @@ BAD_STEPS, BAD_PEAK = 80, 5e-4  # of a training on the wrong samples
 ALONE_STEPS = 400  # of one from the beginning, in one weather
 BAD = (*EDITS, *TRAININGS, *PAPERS)
 FURTHER = (*FURTHER_EDITS, *FURTHER_TRAININGS, *FURTHER_PAPERS)
+EVERY_BAD = (*BAD, *FURTHER)
 
 
 class Spoilt(Sequence):
@@ -186,6 +187,7 @@ def main() -> None:
     arguments.add_argument("--jobs", type=int, default=1)
     arguments.add_argument("--first", type=int, default=1, help="seed of the first retraining: others are fresh ones")
     arguments.add_argument("--retrainings", type=int, default=20)
+    arguments.add_argument("--only", nargs="*", default=EVERY_BAD, choices=EVERY_BAD, help="of the bad candidates")
     asked = arguments.parse_args()
     use_threads(1)
     out: Path = asked.out
@@ -201,10 +203,12 @@ def main() -> None:
     (known,) = run_tests([driving], frames, (PLAIN, *CONDITIONS), asked.jobs)
     seeds = range(asked.first, asked.first + asked.retrainings)
     groups = {"retrainings": [f"retraining {seed}" for seed in seeds], "bad": BAD, "further bad": FURTHER}
+    chosen = {*groups["retrainings"], *asked.only}
     counts = {}
     for group, names in groups.items():
-        accepted = 0
-        for number, name in enumerate(names, start=seeds.start if group == "retrainings" else 1):
+        numbered = enumerate(names, start=seeds.start if group == "retrainings" else 1)
+        accepted, tried = 0, [(number, name) for number, name in numbered if name in chosen]
+        for number, name in tried:
             decided = out / "decisions" / f"{name}.json"
             path, folder = out / "networks" / f"{name}.safetensors", out / "candidates" / name
             if not path.exists():
@@ -224,7 +228,7 @@ def main() -> None:
             accepted += row["accepted"]
             said = "accepted" if row["accepted"] else "undecided" if row["undecided"] else "refused"
             print(f"{name:<36}{said:<11}{(row['reasons'] or [''])[0][:110]}", flush=True)
-        counts[group] = f"{group}: {accepted} of {len(names)} accepted"
+        counts[group] = f"{group}: {accepted} of {len(tried)} accepted"
     print("\n".join(counts.values()))
 
 
