@@ -88,6 +88,13 @@ def test_a_vehicle_that_hangs_is_given_up_and_not_waited_for_while_it_is_away(fl
     assert ask(grid)[SILENT].has_content()
 
 
+def test_a_silent_vehicle_is_asked_again_ever_more_seldom(fleet, monkeypatch):
+    monkeypatch.setattr(deployed_grid, "ALLOWANCE_S", 1.8)
+    monkeypatch.setattr(deployed_grid, "AGAIN_S", 0.4)
+    ask(fleet.open(0.2))
+    assert fleet.nodes.pushed == [1, 2, 3, SILENT, SILENT]  # after 0.4 s, and 0.8 s more; given up before 1.6 s more
+
+
 def test_limit_of_answers(fleet):
     messages = [Message(RecordDict({"a": ArrayRecord([np.zeros(10**6, np.uint8)])}), node, "train") for node in NAMES]
     assert fleet.open()._limit_answers(messages) == float("inf")

@@ -1,7 +1,9 @@
 """What the proxy counts by vehicle: who came in anew, and who may have lost a message."""
 
+import httpx
 import pytest
 
+from flcav.federation.fleet.proxy import FleetProxy
 from flcav.federation.fleet.traffic import Traffic, read_traffic
 
 
@@ -22,3 +24,13 @@ def test_losses(call, status, activations, lost, tmp_path):
     traffic.save(tmp_path)
     own = read_traffic(tmp_path).vehicles["cav-1"]
     assert (own.activations, own.lost) == (activations, lost)
+
+
+def test_answers_that_reach_nobody_and_a_proxy_that_begins_anew_may_lose_a_message(tmp_path):
+    traffic = Traffic()
+    traffic.count("cav-1", "pull-messages", 1, 2, (10, 20), 200)
+    traffic.count("cav-2", "pull-messages", 1, 2, (10, 20), 200, gone=True)
+    assert [own.lost for own in traffic.vehicles.values()] == [0, 1]
+    traffic.save(tmp_path)
+    begun = FleetProxy(httpx.AsyncClient(), tmp_path)
+    assert [own.lost for own in begun._traffic.vehicles.values()] == [1, 2]

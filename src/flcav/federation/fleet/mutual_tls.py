@@ -43,6 +43,7 @@ class Connection:
 
     def __init__(self, transport: Any) -> None:
         self._socket, self.abort = transport.get_extra_info("socket"), transport.abort
+        self.is_closed = transport.is_closing
         self._counted = (0, 0)
 
     def count_bytes(self) -> tuple[int, int]:

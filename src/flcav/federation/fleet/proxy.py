@@ -67,7 +67,8 @@ class FleetProxy:
         self._registry: Registry | None = None
         self._file: tuple[int, int] | None = None  # device and number of the registry's file
         self._objects = defaultdict[str, asyncio.Semaphore](lambda: asyncio.Semaphore(AT_ONCE))
-        self._traffic, self._changed = read_traffic(folder), False
+        self._traffic, self._changed = read_traffic(folder), True
+        self._traffic.lose_all()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a vehicle's call on, or refuse it: 401 for who calls, 403 for what is called."""
@@ -109,16 +110,22 @@ class FleetProxy:
             raise Refused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
         if node_key(headers.get(NODE_KEY, b"")) != vehicle.public_key:
             raise Refused(401, "the node's key is not the certificate's")
-        passed = [*choose_headers(headers), name_key(vehicle)]
+        passed, gone = [*choose_headers(headers), name_key(vehicle)], False
+        connection: Connection = scope["state"][CONNECTION]
+
+        async def checked(event: Message) -> None:
+            nonlocal gone
+            gone |= connection.is_closed()
+            await send(event)
+
         slot = self._objects[vehicle.name] if call == "push-object" else contextlib.nullcontext()
         async with slot:
             body = await read_body(scope, receive, largest_body(call))
             vehicle = self.find(scope["state"][CERTIFICATE])  # which may have been revoked meanwhile
-            done = await relay(self._client, path, passed, check_body(call, body, vehicle), send)
+            done = await relay(self._client, path, passed, check_body(call, body, vehicle), checked)
         if done.status == httpx.codes.UNAUTHORIZED:
             self._traffic.refuse(vehicle.name, describe_clock(headers.get(SIGNED_AT, b""), came))
-        connection: Connection = scope["state"][CONNECTION]
-        self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), done.status)
+        self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), done.status, gone)
         self._changed = True
 
     def find(self, certificate: bytes | None) -> Vehicle:

@@ -27,7 +27,7 @@ class Crossed:
     activations: int = 0  # of its SuperNode: how often it has come in
     release_up: int = 0  # of those that crossed the socket, the ones for releases and their reports
     release_down: int = 0
-    lost: int = 0  # calls that the SuperLink failed, with which a message may be lost
+    lost: int = 0  # calls with which a message may be lost: the SuperLink failed them, or their answer went nowhere
 
 
 @dataclass
@@ -37,17 +37,19 @@ class Traffic:
     vehicles: dict[str, Crossed] = field(default_factory=dict)
     refused: list[str] = field(default_factory=list)
 
-    def count(self, vehicle: str, call: str, up: int, down: int, socket: tuple[int, int], status: int) -> None:
+    def count(
+        self, vehicle: str, call: str, up: int, down: int, socket: tuple[int, int], status: int, gone: bool = False
+    ) -> None:
         """Count one call with the sizes of its bodies, and the bytes that crossed the socket since the last one.
 
-        status: of the SuperLink's answer.
+        status: of the SuperLink's answer. gone: whether the connection had ended before the answer.
         """
         own = self.vehicles.setdefault(vehicle, Crossed())
         own.calls += 1
         own.socket_up += socket[0]
         own.socket_down += socket[1]
         own.activations += status == HTTPStatus.OK and call == "activate-node"
-        own.lost += status >= HTTPStatus.INTERNAL_SERVER_ERROR and call not in LOOKS
+        own.lost += gone or (status >= HTTPStatus.INTERNAL_SERVER_ERROR and call not in LOOKS)
         if call in CONTENT:
             own.content_up += up
             own.content_down += down
@@ -63,6 +65,11 @@ class Traffic:
         own.release_up += socket[0]
         own.release_down += socket[1]
         return own.release_down
+
+    def lose_all(self) -> None:
+        """Count a loss for every vehicle: a proxy that was killed may have had a message for it in its hands."""
+        for own in self.vehicles.values():
+            own.lost += 1
 
     def refuse(self, who: str, why: str) -> None:
         """Note a refusal."""

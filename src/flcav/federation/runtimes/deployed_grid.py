@@ -1,8 +1,9 @@
 """The grid of a deployed federation: its nodes are vehicles of a fleet, reached through Flower's SuperLink.
 
 Where the SuperLink was killed, Flower gives the run up; then the server begins another one, and asks those again whose
-answers have not come. A vehicle whose node came back is asked again, too. Since vehicles keep their last answer, the
-weights are those of a federation that nothing happened to.
+answers have not come. A vehicle whose node came back, or that may have lost a message, is asked again, and so is one that
+has been silent for long. Since vehicles keep their last answer, the weights are those of a federation that nothing
+happened to.
 
 Where training has a time limit, so have answers: a vehicle that hangs, and cannot keep the limit itself, is given up.
 One whose certificate is no longer in force is neither asked nor waited for.
@@ -38,6 +39,7 @@ ALLOWANCE_S, SLOWEST_MBPS = 60.0, 1.0  # beyond the time to train: for polls and
 LOOK_S = 0.5  # between looks at the registry
 LONGEST = 500  # characters of a vehicle's words
 BUSY_S = 0.1  # that a look waits for a registry which another process holds
+AGAIN_S = 150.0  # after which a vehicle that has not answered is asked again, then after twice as long, and so on
 POLL_S, PAUSE_S = 0.2, 1.0  # between looks for answers; before a vehicle that was not there is asked again
 RAISED = 2  # Flower's error code of an app that raised an exception, whose words are the reason
 FULL = re.compile(rf"\[Errno (?:{errno.ENOSPC}|{errno.EDQUOT}|{errno.EFBIG})\] ([A-Z][A-Za-z ]*)")
@@ -299,6 +301,7 @@ class _Exchange:
         self.nodes: dict[str, int] = {}  # of the messages that are out, by their ids
         self._losses = dict(losses)
         self._due: dict[int, float] = {}  # of nodes that were asked: when they are to be asked again
+        self._patience: dict[int, float] = {}  # with nodes that were asked, until they are asked again [s]
         self._lost: dict[int, float] = {}  # since when nodes are not available
         self._begun: dict[int, float] = {}  # when nodes were asked first
 
@@ -309,7 +312,8 @@ class _Exchange:
         return node in self._lost and time.monotonic() > self._lost[node] + REJOIN_S
 
     def sent(self, node: int, identifier: str) -> None:
-        self.nodes[identifier], self._due[node] = node, float("inf")
+        self.nodes[identifier], self._due[node] = node, time.monotonic() + self._patience.get(node, AGAIN_S)
+        self._patience[node] = 2 * self._patience.get(node, AGAIN_S)
         self._begun.setdefault(node, time.monotonic())
 
     def waited_s(self, node: int) -> float:
