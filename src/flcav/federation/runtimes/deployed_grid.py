@@ -1,8 +1,8 @@
 """The grid of a deployed federation: its nodes are vehicles of a fleet, reached through Flower's SuperLink.
 
 Where the SuperLink was killed, Flower gives the run up; then the server begins another one, and asks those again whose
-answers have not come. A vehicle whose node came back, or that may have lost a message, is asked again, and so is one that
-has been silent for long. Since vehicles keep their last answer, the weights are those of a federation that nothing
+answers have not come. A vehicle whose node came back, or that may have lost a message, is asked again, and so is one
+that has been silent for long. Since vehicles keep their last answer, the weights are those of a federation that nothing
 happened to.
 
 Where training has a time limit, so have answers: a vehicle that hangs, and cannot keep the limit itself, is given up.
