@@ -28,10 +28,8 @@ class Actors(NamedTuple):
         return np.column_stack((self.position[:, :2], self.yaw))
 
 
-NOBODY = Actors(
-    *((), (), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3))),
-    *(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2))),
-)
+_ONES, _TWOS, _THREES = np.zeros(0), np.zeros((0, 2)), np.zeros((0, 3))
+NOBODY = Actors((), (), np.zeros(0, np.int64), _THREES, _THREES, _ONES, _THREES, _THREES, _ONES, _TWOS)
 
 
 def pick_actors(actors: Actors, mask: NDArray[np.bool_]) -> Actors:
@@ -40,7 +38,14 @@ def pick_actors(actors: Actors, mask: NDArray[np.bool_]) -> Actors:
     return Actors(
         tuple(actors.name[row] for row in rows),
         tuple(actors.category[row] for row in rows),
-        *(column[mask] for column in actors[2:]),
+        actors.shape[mask],
+        actors.size[mask],
+        actors.position[mask],
+        actors.yaw[mask],
+        actors.velocity[mask],
+        actors.acceleration[mask],
+        actors.yaw_rate[mask],
+        actors.tilt[mask],
     )
 
 

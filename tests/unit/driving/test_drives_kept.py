@@ -165,9 +165,11 @@ def test_a_forecast_moves_on_with_its_track_and_keeps_its_last_velocity() -> Non
     network, roads = resolve_network(TRAJECTORY, None), load_roads("ring")
     route = draw_route(read_net(load_town("ring").net), np.random.default_rng(5), 200.0)
     following = Following(network, roads, CERTAIN)
-    for tick in range(26):
-        x, y, yaw = route.at(20.0 + 0.8 * tick)
-        last = following.step(replace(cars((x, y)), yaw=np.full(1, yaw)), tick / 10, frozenset())
+    poses = [route.at(20.0 + 0.8 * tick) for tick in range(26)]
+    *_, last = [
+        following.step(replace(cars((x, y)), yaw=np.full(1, yaw)), tick / 10, frozenset())
+        for tick, (x, y, yaw) in enumerate(poses)
+    ]
     late = following.step(cars(), 2.8, frozenset())  # without a detection for 0.3 s
     assert last.motion == late.motion == ("forecast",)
     moved = late.path[0, 0] - last.boxes.center[0, :2]

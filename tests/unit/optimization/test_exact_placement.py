@@ -45,7 +45,7 @@ class Drawn:
 
     def __init__(self, seed: int) -> None:
         self.rng = rng = np.random.default_rng(seed)
-        poles, errors, kinds = rng.integers(2, 6), rng.integers(2, 14), rng.integers(1, 4)
+        poles, errors, kinds = (int(rng.integers(least, end)) for least, end in ((2, 6), (2, 14), (1, 4)))
         self.errors = np.c_[rng.integers(0, 100, (errors, 2)), np.ones(errors)].astype(float)
         self.poles = np.c_[rng.integers(0, 100, (poles, 2)), np.full(poles, 6)].astype(float)
         self.ranges = rng.choice([20.0, 30.0, 45.0, 60.0], kinds, replace=False)
@@ -180,8 +180,10 @@ def tampered(costs: list[float], budget: float, **change: object) -> tuple[str, 
     """Return the faults of the placement of all poles, as if it were within the budget."""
     errors, poles, pole_cost = apart(costs)
     placed = place(errors, poles, 20, budget=float(sum(map(exact, costs))), pole_cost=pole_cost)
-    given = tuple(np.array(each, float) for each in (errors, np.ones(len(costs)), poles, [20.0]))
-    asked = PlacementProblem(*given, np.array(pole_cost)[:, None], budget=budget)
+    worth, ranges = np.ones(len(costs)), np.array([20.0])
+    asked = PlacementProblem(
+        np.array(errors, float), worth, np.array(poles, float), ranges, np.array(pole_cost)[:, None], budget=budget
+    )
     return verify_placement(asked, json.dumps(asdict(replace(placed, **change)))).faults  # pyright: ignore[reportArgumentType]
 
 

@@ -196,14 +196,14 @@ class Bodies:
 
         These go down ahead when they brake, and outwards in a curve.
         """
-        lie = np.column_stack((np.pi / 2 * self._lie(), np.zeros(len(self.members))))
+        lie: Array = np.column_stack((np.pi / 2 * self._lie(), np.zeros(len(self.members)))).astype(np.float64)
         if not self._leans:
             return lie
         cars = np.array([body.physics and body.category in ON_SPRINGS for body in self.members], np.bool_)
         felt = np.clip(self.acceleration[:, :2], -MOST_LEAN_MPS2, MOST_LEAN_MPS2)
         ahead, aside = ((felt * axis(self.yaw)).sum(axis=1) for axis in (heading_vectors, left_vectors))
         leans = np.column_stack((-PITCH_S2PM * ahead, ROLL_S2PM * aside))
-        return lie + np.where((cars & ~self.aloft)[:, None], leans, 0.0)
+        return np.asarray(lie + np.where((cars & ~self.aloft)[:, None], leans, 0.0), np.float64)
 
     def _lie(self) -> NDArray[np.bool_]:
         return np.array([body.fallen for body in self.members], np.bool_)

@@ -156,8 +156,10 @@ def integrate(curvature, s: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("pieces", [1, 2])
 def test_a_spiral_cut_short_goes_the_same_way(pieces: int) -> None:
     row = ElementTree.fromstring(geometry(0, 0, 80, shape='<spiral curvStart="-0.01" curvEnd="0.04"/>'))
-    for length in (60.0, 33.0)[:pieces]:
-        shorten(row, length)
+    lengths = (60.0, 33.0)[:pieces]
+    for each in lengths:
+        shorten(row, each)
+    length = lengths[-1]
     s = np.linspace(0.0, length, 50)
     np.testing.assert_allclose(
         list_pieces([row])[0].at(s)[:, :2], integrate(lambda at: -0.01 + 0.05 * at / 80, s), atol=1e-4

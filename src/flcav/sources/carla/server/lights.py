@@ -102,9 +102,10 @@ def _read_signs(served: ServedMap) -> dict[str, Array]:
 def _list_signals(served: ServedMap) -> Iterator[tuple[ElementTree.Element, Array]]:
     """Yield each signal of a map with its place in the town: x, y [m] and the heading of its road [rad] (3,)."""
     for road in ElementTree.fromstring(served.opendrive.encode("utf-8", "surrogateescape")).iterfind("road"):
-        rows = road.findall("signals/signal")
-        line = ReferenceLine(road) if rows else None
-        for row in rows if line is not None else ():
+        if not (rows := road.findall("signals/signal")):
+            continue
+        line = ReferenceLine(road)
+        for row in rows:
             x, y, heading = line.at(np.array([float(row.get("s", "0"))]))[0]
             t, (dx, dy) = float(row.get("t", "0")), served.frame.offset_m
             yield row, np.array((x - t * np.sin(heading) + dx, y + t * np.cos(heading) + dy, heading))
@@ -138,7 +139,7 @@ def find_limits(served: ServedMap) -> Limits:
         turns = {"+": (0.0,), "-": (np.pi,)}.get(row.get("orientation", "none"), (0.0, np.pi))
         place += [np.array([[at[0], at[1], at[2] + turn]]) for turn in turns]
         kmh += [3.6 * limit] * len(turns)
-    return Limits(np.concatenate(place), np.round(kmh, 1))
+    return Limits(np.concatenate(place), np.round(np.array(kmh, np.float64), 1))
 
 
 @dataclass

@@ -62,8 +62,8 @@ class ServedMap:
         """Poses on driving lanes; on CARLA's own maps as many as CARLA has there."""
         wanted = SPAWN_POINTS.get(self.name.removesuffix(OPTIMISED))
         found = list(self._places(SPAWN_EVERY_M))
-        for every in np.arange(SPAWN_EVERY_M, SPAWN_LEAST_M, -0.5) if wanted else ():
-            if len(found := list(self._places(every))) >= wanted:
+        for every in np.arange(SPAWN_EVERY_M, SPAWN_LEAST_M, -0.5) if wanted is not None else ():
+            if wanted is not None and len(found := list(self._places(every))) >= wanted:
                 found = [found[row] for row in np.linspace(0, len(found) - 1, wanted).round().astype(int)]
                 break
         return found
