@@ -15,6 +15,7 @@ import os
 import signal
 import socket
 import struct
+import sys
 import threading
 import time
 from collections import deque
@@ -307,24 +308,35 @@ def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
 
 
 def serve(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
-    """Serve clients until interrupted or terminated (SIGTERM), at the sockets of `open_doors`."""
+    """Serve clients until interrupted or terminated (SIGTERM), at the sockets of `open_doors`.
+
+    Raises `KeyboardInterrupt` once it has ended after Ctrl-C.
+    """
+    interrupted = False
 
     def leave() -> None:
         calls.maps.discard_files()
-        os._exit(0)
+        if interrupted:
+            print("flcav: interrupted", file=sys.stderr, flush=True)  # as the command line does
+        os._exit(128 + signal.SIGINT if interrupted else 0)
 
     async def run() -> None:
         task, loop = asyncio.current_task(), asyncio.get_running_loop()
         assert task is not None
 
-        def end(*_: object) -> None:
+        def end(number: int, _: object) -> None:
+            nonlocal interrupted
+            interrupted = number == signal.SIGINT
             last = threading.Timer(ENDING_S, leave)  # a map that is loaded, or an image, may take longer
             last.daemon = True
             last.start()
             loop.call_soon_threadsafe(task.cancel)
 
-        signal.signal(signal.SIGTERM, end)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, end)
         await Server(calls).run(doors, ready)
 
     with suppress(asyncio.CancelledError):
         asyncio.run(run())
+    if interrupted:
+        raise KeyboardInterrupt
