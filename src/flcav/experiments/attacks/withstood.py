@@ -1,4 +1,4 @@
-"""What robust rules withstand, with nearest-neighbour mixing and without, by share of attackers and unlikeness of data.
+"""Robust rules under attack, with nearest-neighbour mixing and without, by share of attackers and unlikeness of data.
 
 Attackers collude, and know all honest updates of a round. *A little is enough*: all send the honest mean minus 1.5
 standard deviations of each coordinate (Baruch et al., NeurIPS 2019). *Inner product*: minus the honest mean change (Xie
