@@ -171,17 +171,17 @@ def _show(
         for number, (pole, errors_near) in enumerate(zip(given.ids, near, strict=True)):
             placed = ", placed" if number in result.chosen else ""
             echo(f"    pole {pole}: {plural(errors_near, 'error')} within {given.ranges_m[0]:g} m{placed}")
-    proof = "optimal" if result.optimal else f"at most {result.upper_bound:.12g} can be covered"
+    proof = "optimal" if result.optimal else f"at most {result.upper_bound:.10g} can be covered"
     if least is not None and not result.optimal:
-        proof = f"at least {least:.12g} has to be spent for that"
-    told = "" if cost is None else f", cost {cost:.12g}"
+        proof = f"at least {least:.10g} has to be spent for that"
+    told = "" if cost is None else f", cost {cost:.10g}"
     echo(
         f"cover {result.covered} of {plural(len(given.errors), 'error')}, "
-        f"weight {result.covered_weight:.12g}{told} ({proof})"
+        f"weight {result.covered_weight:.10g}{told} ({proof})"
     )
     for name, placed in conventional.items():
         if placed is not None:
-            echo(f"by {name.replace('-', ' ')}: weight {placed.covered_weight:.12g}")
+            echo(f"by {name.replace('-', ' ')}: weight {placed.covered_weight:.10g}")
 
 
 def _verify(
