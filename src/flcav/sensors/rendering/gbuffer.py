@@ -54,12 +54,13 @@ def fill_gbuffer(
         np.zeros((count, 3), np.float32),
         np.zeros((count, 3), np.float32),
     )
-    pose = world_from_camera.astype(np.float32)
+    pose, rays = world_from_camera.astype(np.float32), directions.view()
+    rays.flags.writeable = False  # as some are: the loop is compiled once for all
     first, normals = scene.surfaces.first, scene.surfaces.normal
 
     def look_up(start: int, end: int) -> None:
         at = slice(start, end)
-        _look_up(pose, directions[at], hits.face[at], first, normals, bodies, appearance, out.part(at))
+        _look_up(pose, rays[at], hits.face[at], first, normals, bodies, appearance, out.part(at))
 
     share_among_threads(look_up, count, threads)
     return out
