@@ -43,12 +43,13 @@ def _compile(function: Callable[P, T], *, counted: bool) -> Callable[P, T]:
 
 
 def inlined(function: Callable[P, T]) -> Callable[P, T]:
-    """Return `function` for use inside compiled functions, each of which gets a copy of its body (inlining).
+    """Return `function` for use inside kernels, whose machine code gets a copy of its own (inlining).
 
-    A call costs two atomic reference counts for every array passed, arrays within records included: too much where it
-    is made for every pixel.
+    It is free of counts of references as they are: a call would cost two atomic ones for every array passed, arrays
+    within records included, which is too much for every pixel. Copied as machine code it is compiled once, not once for
+    each call, as it would be with Numba's own inlining.
     """
-    return numba.njit(nogil=True, inline="always")(function)
+    return numba.njit(nogil=True, forceinline=True, _nrt=False)(function)
 
 
 def _inlined_files(function: Callable[P, T]) -> set[Path]:

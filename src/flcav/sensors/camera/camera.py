@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flcav.machine.compiled import kernel
+from flcav.machine.threads import share_among_threads
 from flcav.sensors.camera.tone import GRAINS, develop, grain
 from flcav.sensors.frame import SEMANTICS
 from flcav.sensors.lens import Lens, compute_pixel_rays
@@ -58,7 +59,13 @@ def photograph(
         add_drops(picture.radiance.reshape(*shape, 3), weather.rain_mm_h, rng)
     rgb = np.empty((*shape, 3), np.uint8)
     shift = int(rng.integers(GRAINS))
-    develop(picture.radiance, picture.exposure, grain(), shift, np.float32(camera.noise), rgb.reshape(-1, 3))
+    shown = rgb.reshape(-1, 3)
+
+    def develop_part(first: int, last: int) -> None:
+        at, noise = slice(first, last), np.float32(camera.noise)
+        develop(picture.radiance[at], picture.exposure, grain(), shift + 3 * first, noise, shown[at])
+
+    share_among_threads(develop_part, len(shown), threads)
     semantic, instance = _labels(picture.seen, picture.painted, picture.appearance)
     depth = picture.seen.distance * compute_pixel_rays(camera)[:, 2]
     return Exposure(rgb, depth.reshape(shape), semantic.reshape(shape), instance.reshape(shape))

@@ -47,11 +47,14 @@ def develop(radiance, exposure, grain, shift, noise, out):
     `exposure` is a factor of the radiance; `noise` is the standard deviation of the noise in bytes, read from the table
     `grain` (GRAINS,), from index `shift` on.
     """
-    number = shift
+    number = shift % GRAINS
     for pixel in range(len(radiance)):
         for band in range(3):
             light = max(radiance[pixel, band] * exposure, np.float32(0))
             value = TABLE[int(light / (np.float32(1) + light) * np.float32(STEPS - 0.01))]
-            number = number + 1 if number + 1 < GRAINS else 0
-            value += noise * grain[number] + np.float32(0.5)
+            rise = np.float32(0.5)
+            if noise > 0:
+                number = number + 1 if number + 1 < GRAINS else 0
+                rise = noise * grain[number] + np.float32(0.5)
+            value += rise
             out[pixel, band] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))

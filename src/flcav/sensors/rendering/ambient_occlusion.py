@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.machine.compiled import compiled
+from flcav.machine.threads import share_among_threads
 from flcav.sensors.lens import Lens
 from flcav.sensors.rendering.gbuffer import GBuffer
 from flcav.world.scene import Scene
@@ -31,8 +32,13 @@ def compute_ambient_occlusion(
     _hemisphere(seen, lens.width, columns, rows, _ways(), origin, towards, far)
     starts, aims = origin.reshape(-1, 3), towards.reshape(-1, 3)
     blocked = scene.find_occluded(starts, aims, far.ravel(), hidden=hidden, threads=threads)
-    out = np.empty(len(seen), np.float32)
-    _spread(seen, blocked.reshape(blocks), lens.width, lens.height, columns, rows, out)
+    around = blocked.reshape(blocks).transpose(2, 0, 3, 1).reshape(blocks[2] * SPAN, -1)[:rows, :columns]
+    around, out = np.ascontiguousarray(around).view(np.uint8), np.empty(len(seen), np.float32)
+
+    def spread(first: int, last: int) -> None:
+        _spread(seen, around, lens.width, lens.height, columns, first, last, out)
+
+    share_among_threads(spread, rows, threads)
     return out
 
 
@@ -64,21 +70,36 @@ def _hemisphere(seen, width, columns, rows, ways, origin, towards, far):
 
 
 @compiled
-def _spread(seen, blocked, width, height, columns, rows, out):
-    for row in range(rows):
+def _spread(seen, blocked, width, height, columns, first, last, out):
+    """Write the shares of the blocks in rows `first` to `last`: 1 where no ray is blocked nearby, as mostly."""
+    half = SPAN // 2
+    along = np.zeros(columns, np.int64)  # blocked rays in the neighbourhood's rows, by column
+    for row in range(max(first - half, 0), min(first + half - 1, len(blocked))):
+        for column in range(columns):
+            along[column] += blocked[row, column]
+    for row in range(first, last):
+        entering, left = row + half - 1, row - half - 1
+        for column in range(columns):
+            if entering < len(blocked):
+                along[column] += blocked[entering, column]
+            if left >= max(first - half, 0):
+                along[column] -= blocked[left, column]
         for column in range(columns):
             pixel = 2 * row * width + 2 * column
-            free, total = np.float32(0), np.float32(0)
-            if seen.row[pixel] >= 0:
+            share, around = np.float32(1), 0
+            for i in range(max(column - half, 0), min(column + half, columns)):
+                around += along[i]
+            if around > 0 and seen.row[pixel] >= 0:
+                free, total = np.float32(0), np.float32(0)
                 near = np.float32(0.1) * seen.distance[pixel] + np.float32(0.1)
-                for j in range(max(row - SPAN // 2, 0), min(row + SPAN // 2, rows)):
-                    for i in range(max(column - SPAN // 2, 0), min(column + SPAN // 2, columns)):
+                for j in range(max(row - half, 0), min(row + half, len(blocked))):
+                    for i in range(max(column - half, 0), min(column + half, columns)):
                         other = 2 * j * width + 2 * i
                         if seen.row[other] >= 0 and abs(seen.distance[other] - seen.distance[pixel]) <= near:
                             total += 1
-                            if not blocked[j % SPAN, i % SPAN, j // SPAN, i // SPAN]:
+                            if not blocked[j, i]:
                                 free += 1
-            share = free / total if total > 0 else np.float32(1)
+                share = free / total if total > 0 else np.float32(1)
             share = np.float32(DARKEST) + np.float32(1 - DARKEST) * share
             for y in range(2 * row, min(2 * row + 2, height)):
                 for x in range(2 * column, min(2 * column + 2, width)):

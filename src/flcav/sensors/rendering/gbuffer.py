@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import heading_vectors
 from flcav.machine.compiled import inlined, kernel
+from flcav.machine.threads import share_among_threads
 from flcav.sensors.rendering.appearance import Appearance
 from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
@@ -39,6 +40,7 @@ def fill_gbuffer(
     world_from_camera: NDArray[np.float64],
     directions: NDArray[np.float32],
     hits: Hits,
+    threads: int = 1,
 ) -> GBuffer:
     """Return the G-buffer of N rays `directions` (N, 3), unit, optical frame, from their `hits`."""
     count, poses = len(directions), scene.poses()
@@ -52,9 +54,15 @@ def fill_gbuffer(
         np.zeros((count, 3), np.float32),
         np.zeros((count, 3), np.float32),
     )
-    pose = world_from_camera.astype(np.float32)
+    pose, rays = world_from_camera.astype(np.float32), directions.view()
+    rays.flags.writeable = False  # as some are: the loop is compiled once for all
     first, normals = scene.surfaces.first, scene.surfaces.normal
-    _look_up(pose, directions, hits.face, first, normals, bodies, appearance, out)
+
+    def look_up(start: int, end: int) -> None:
+        at = slice(start, end)
+        _look_up(pose, rays[at], hits.face[at], first, normals, bodies, appearance, out.part(at))
+
+    share_among_threads(look_up, count, threads)
     return out
 
 

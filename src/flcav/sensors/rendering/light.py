@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.machine.compiled import compiled
+from flcav.machine.threads import share_among_threads
 from flcav.sensors.rendering.gbuffer import GBuffer
 from flcav.sensors.rendering.state import Lamps, light_up
 from flcav.world.scene import Scene
@@ -153,13 +154,17 @@ def compute_sun_visibility(
     return (~blocked).view(np.uint8).astype(np.float32)
 
 
-def soften(lit: NDArray[np.float32], seen: GBuffer, width: int) -> NDArray[np.float32]:
+def soften(lit: NDArray[np.float32], seen: GBuffer, width: int, threads: int = 1) -> NDArray[np.float32]:
     """Return `lit` (N,), an image's row after row, with soft shadow edges, as of an extended sun.
 
     A 3 x 3 binomial filter (weights 1, 2, 1 each way) over pixels of similar distance.
     """
     out = np.empty_like(lit)
-    _soften(lit, seen.distance, width, out)
+
+    def soften_rows(first: int, last: int) -> None:
+        _soften(lit, seen.distance, width, first, last, out)
+
+    share_among_threads(soften_rows, len(lit) // width, threads)
     return out
 
 
@@ -180,12 +185,13 @@ def _add_where_free(light, most, blocked):
 
 
 @compiled
-def _soften(lit, distance, width, out):
-    count = len(lit)
-    for pixel in range(count):
-        own, column = lit[pixel], pixel % width
+def _soften(lit, distance, width, first, last, out):
+    column = 0
+    for pixel in range(max(first * width, 0), last * width):  # not negative, as the compiler can see
+        column = column + 1 if column < width else 1  # from 1 on
+        own = lit[pixel]
         out[pixel] = own
-        if column == 0 or column == width - 1 or pixel < width or pixel >= count - width:
+        if column == 1 or column == width or pixel < width or pixel >= len(lit) - width:
             continue
         if lit[pixel - 1] == own and lit[pixel + 1] == own and lit[pixel - width] == own and lit[pixel + width] == own:
             continue

@@ -76,7 +76,7 @@ def render(
     radiance, painted = _radiance(world, seen, open_sky, lens.width)
     if light.wetness > MIRRORS:
         _mirror(world, world_from_camera, lens, rays, seen, radiance)
-    kind = supersampling.find_edges(seen, radiance, light.exposure, appearance, lens)
+    kind = supersampling.find_edges(seen, radiance, light.exposure, appearance, lens, threads)
     supersampling.mark_thin(kind, scene.town, world_from_camera, lens, seen)
     further, pixel = supersampling.further_rays(rays, kind, lens)
     if len(pixel):
@@ -97,7 +97,7 @@ def survey(
     """Return what the rays through the pixels' centres meet, and where that is paint (N,), as `render` does."""
     rays, appearance = compute_pixel_rays(lens), build_appearance(scene)
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden, threads=threads)
-    seen = fill_gbuffer(scene, appearance, world_from_camera, rays, hits)
+    seen = fill_gbuffer(scene, appearance, world_from_camera, rays, hits, threads)
     painted = np.empty(len(seen), np.bool_)
     mark_paint(seen, appearance, np.float32(1 / lens.intrinsics()[0, 0]), painted)
     return seen, painted, appearance
@@ -111,7 +111,7 @@ def _meet(
 ) -> GBuffer:
     reach, hidden, threads = FAR_M, world.hidden, world.threads
     hits = world.scene.cast(world_from_camera, rays, near_m=near_m, far_m=reach, hidden=hidden, threads=threads)
-    return fill_gbuffer(world.scene, world.appearance, world_from_camera, rays, hits)
+    return fill_gbuffer(world.scene, world.appearance, world_from_camera, rays, hits, threads)
 
 
 def _radiance(
@@ -120,7 +120,7 @@ def _radiance(
     scene, light, hidden, threads = world.scene, world.light, world.hidden, world.threads
     lit = compute_sun_visibility(scene, seen, light, hidden, threads)
     if width is not None:  # the rays are those of a whole image
-        lit = soften(lit, seen, width)
+        lit = soften(lit, seen, width, threads)
     lamplight = compute_lamplight(scene, seen, world.lamps, hidden, threads) if light.lamps > 0 else NO_LAMPS
     radiance, painted = np.empty((len(seen), 3), np.float32), np.empty(len(seen), np.bool_)
     tables, angle = (light, world.appearance, world.state), world.pixel_angle

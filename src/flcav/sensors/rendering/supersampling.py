@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import inverse, transform_points
 from flcav.machine.compiled import compiled
+from flcav.machine.threads import share_among_threads
 from flcav.sensors.lens import Lens, project
 from flcav.sensors.rendering.appearance import Appearance
 from flcav.sensors.rendering.gbuffer import GBuffer
@@ -34,11 +35,21 @@ BRIGHTEST = 3.0  # exposed light at which samples are clamped: else edges of lam
 
 
 def find_edges(
-    seen: GBuffer, radiance: NDArray[np.float32], exposure: np.float32, appearance: Appearance, lens: Lens
+    seen: GBuffer,
+    radiance: NDArray[np.float32],
+    exposure: np.float32,
+    appearance: Appearance,
+    lens: Lens,
+    threads: int = 1,
 ) -> NDArray[np.uint8]:
     """Return (N,) EDGE for pixels at visible edges, else 0, by their G-buffer and `radiance` (N, 3)."""
     out = np.zeros(len(seen), np.uint8)
-    _edges(seen, radiance, np.float32(DARK / exposure), appearance.material, lens.width, out)
+    dark = np.float32(DARK / exposure)
+
+    def find_part(first: int, last: int) -> None:
+        _edges(seen, radiance, dark, appearance.material, lens.width, first, last, out)
+
+    share_among_threads(find_part, lens.height, threads)
     return out
 
 
@@ -81,11 +92,13 @@ def thin_bars(town: Town) -> NDArray[np.float64]:
 
 
 @compiled
-def _edges(seen, radiance, dark, material, width, out):
+def _edges(seen, radiance, dark, material, width, first, last, out):
     row = seen.row
-    for pixel in range(len(out)):
+    column = 0
+    for pixel in range(max(first * width, 0), last * width):  # not negative, as the compiler can see
+        column = column + 1 if column < width else 1  # from 1 on
         for side in range(2):
-            if side == 0 and pixel % width + 1 == width:
+            if side == 0 and column == width:
                 continue
             other = pixel + (width if side else 1)
             if other >= len(out) or row[pixel] == row[other]:
@@ -130,7 +143,8 @@ def further_rays(
     rays: NDArray[np.float32], kind: NDArray[np.uint8], lens: Lens
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return further unit rays (S, 3), optical frame, for pixels flagged in `kind` (N,), and each one's pixel (S,)."""
-    total = int(np.bincount(kind, minlength=4) @ (0, len(_THREE), len(_NINE), len(_NINE)))
+    flagged = kind[kind > 0]
+    total = int(np.bincount(flagged, minlength=4) @ (0, len(_THREE), len(_NINE), len(_NINE)))
     directions, pixel = np.empty((total, 3), np.float32), np.empty(total, np.int32)
     _spread(rays, kind, lens.width, lens.height, _THREE, _NINE, directions, pixel)
     return directions, pixel
@@ -186,8 +200,9 @@ def _spread(rays, kind, width, height, three, nine, directions, pixel):
         a, b = rays[own, 0] / rays[own, 2], rays[own, 1] / rays[own, 2]
         a_x, b_x = (rays[right, 0] / rays[right, 2] - a) * sign_x, (rays[right, 1] / rays[right, 2] - b) * sign_x
         a_y, b_y = (rays[below, 0] / rays[below, 2] - a) * sign_y, (rays[below, 1] / rays[below, 2] - b) * sign_y
-        for offset in offsets:
-            x, y = a + offset[0] * a_x + offset[1] * a_y, b + offset[0] * b_x + offset[1] * b_y
+        for number in range(len(offsets)):
+            u, v = offsets[number, 0], offsets[number, 1]
+            x, y = a + u * a_x + v * a_y, b + u * b_x + v * b_y
             length = np.sqrt(x * x + y * y + 1)
             directions[sample, 0], directions[sample, 1], directions[sample, 2] = x / length, y / length, 1 / length
             pixel[sample] = own

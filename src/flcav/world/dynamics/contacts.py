@@ -179,15 +179,15 @@ def _resolve(
     for _ in range(PASSES):
         apart = True
         for row in range(len(pairs)):
-            i, j = pairs[row]
+            i, j = pairs[row, 0], pairs[row, 1]
             depth, x, y = _meet(place, before, half, i, j)
             if depth <= 0:
                 continue
             apart = False
             if not touched[row]:
                 touched[row] = True
-                normal[row] = (x, y)
-                point[row] = _find_point(place, half, i, j)
+                normal[row, 0], normal[row, 1] = x, y  # numbers: whole rows take seconds to compile
+                point[row, 0], point[row, 1] = _find_point(place, half, i, j)
             impulse[row] += _strike(row, i, j, place, velocity, yaw_rate, inverse_mass, inverse_inertia, normal, point)
             a, b = inverse_mass[i], inverse_mass[j]
             a, b = (0.0 if a * HEAVY < b else a), (0.0 if b * HEAVY < a else b)
@@ -201,7 +201,7 @@ def _resolve(
     for _ in range(UNDO_PASSES):
         apart = True
         for row in range(len(pairs)):
-            i, j = pairs[row]
+            i, j = pairs[row, 0], pairs[row, 1]
             if _overlap(place, half, i, j)[0] <= 0:
                 continue
             for body in (i, j):
@@ -211,9 +211,9 @@ def _resolve(
                     or place[body, 2] != before[body, 2]
                 )
                 if inverse_mass[body] > 0 and away:
-                    place[body] = before[body]
-                    velocity[body] = 0.0
-                    yaw_rate[body] = 0.0
+                    for axis in range(3):
+                        place[body, axis] = before[body, axis]
+                    velocity[body, 0], velocity[body, 1], yaw_rate[body] = 0.0, 0.0, 0.0
                     apart = False
         if apart:
             return
@@ -222,16 +222,16 @@ def _resolve(
 @compiled
 def _strike(row, i, j, place, velocity, yaw_rate, inverse_mass, inverse_inertia, normal, point):
     """Return the impulse [N s] by which two boxes that approach each other stop doing so, and apply it."""
-    x, y = normal[row]
-    arm_i = point[row] - place[i, :2]
-    arm_j = point[row] - place[j, :2]
-    speed_x = velocity[i, 0] - yaw_rate[i] * arm_i[1] - velocity[j, 0] + yaw_rate[j] * arm_j[1]
-    speed_y = velocity[i, 1] + yaw_rate[i] * arm_i[0] - velocity[j, 1] - yaw_rate[j] * arm_j[0]
+    x, y = normal[row, 0], normal[row, 1]
+    from_i_x, from_i_y = point[row, 0] - place[i, 0], point[row, 1] - place[i, 1]
+    from_j_x, from_j_y = point[row, 0] - place[j, 0], point[row, 1] - place[j, 1]
+    speed_x = velocity[i, 0] - yaw_rate[i] * from_i_y - velocity[j, 0] + yaw_rate[j] * from_j_y
+    speed_y = velocity[i, 1] + yaw_rate[i] * from_i_x - velocity[j, 1] - yaw_rate[j] * from_j_x
     towards = speed_x * x + speed_y * y
     if towards >= 0:
         return 0.0
-    lever_i = arm_i[0] * y - arm_i[1] * x
-    lever_j = arm_j[0] * y - arm_j[1] * x
+    lever_i = from_i_x * y - from_i_y * x
+    lever_j = from_j_x * y - from_j_y * x
     give = inverse_mass[i] + inverse_mass[j] + lever_i**2 * inverse_inertia[i] + lever_j**2 * inverse_inertia[j]
     size = -(1 + RESTITUTION) * towards / give
     velocity[i, 0] += size * inverse_mass[i] * x

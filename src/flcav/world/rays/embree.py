@@ -199,7 +199,8 @@ def _buffers(
 
     Raises `ValueError` where `near_m` is not of the rays' number.
     """
-    rays = np.ascontiguousarray(directions, np.float32)
+    rays = np.ascontiguousarray(directions, np.float32).view()
+    rays.flags.writeable = False  # as some are: loops are compiled once for all
     near = np.zeros(1, np.float32) if near_m is None else np.ascontiguousarray(near_m, np.float32)
     if near_m is not None and len(near) != len(rays):
         raise ValueError(f"near_m has {len(near)} values for {len(rays)} rays")
