@@ -33,6 +33,9 @@ from flcav.sources.carla.server.episode import Episode, Measurement
 # (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are not closer than this while one runs.
 PACE_S = 0.008
 DELIVERY_S = 1.5  # clients give a tick 2 s at least
+PREPARING_S = (
+    3.0  # a server waits so long until it is ready for cameras; the first one on a machine compiles for longer
+)
 LEARNT_S = 3.0  # clients have learnt of a new map by then
 # While a client that has loaded a map learns of it by these calls, its Traffic Manager's thread crashes if it goes on:
 # so that thread's calls, which are all others, are answered when the client listens to the new world.
@@ -72,6 +75,7 @@ class Server:
         """Serve until cancelled, calls at the first of two bound sockets and streams at the second."""
         connected = self._serve_calls, self._serve_stream
         servers = [await asyncio.start_server(serve, sock=door) for serve, door in zip(connected, doors, strict=True)]
+        await asyncio.wait({self._prepare()}, timeout=PREPARING_S)
         ready()
         try:
             await self._tick_forever()
@@ -83,6 +87,17 @@ class Server:
             if self._drawing is not None:
                 self._drawing.cancel()
             self._calls.episode.close()
+
+    def _prepare(self) -> asyncio.Task[None]:
+        """Prepare for the sensors of the episode, beside all else."""
+        self._preparing = asyncio.create_task(self._prepare_episode(self._calls.episode))
+        return self._preparing
+
+    async def _prepare_episode(self, episode: Episode) -> None:
+        try:
+            await asyncio.to_thread(episode.prepare)
+        except Exception:  # what fails here fails again, and is told, where it is needed
+            log.debug("preparing failed", exc_info=True)
 
     # ---- ticks
 
@@ -259,7 +274,7 @@ class Server:
             return wire.fail(f"{call.method[:60]} failed on the server: {type(error).__name__}")
         if call.method == "load_new_episode":
             self._state = self._calls.episode.describe_world(0.0)
-            self._preparing = asyncio.create_task(asyncio.to_thread(self._calls.episode.prepare))
+            self._prepare()
         if self._calls.ticks or call.method in ("set_episode_settings", "load_new_episode"):
             self._cue.set()
         if call.method == "apply_batch":
