@@ -3,7 +3,7 @@
 In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends what sensors measure, in order,
 then the world's state, then the cameras' images, which take longest, and the answer to its cue, upon which a client
 goes on. The answer waits for the images no longer than `DELIVERY_S`; they are then drawn beside the next ticks, as they
-are when ticks follow the clock, and the next images wait for them.
+are when ticks follow the clock, and the next images wait for them. Cameras are prepared beside the ticks, too.
 
 What strangers may ask for is bounded: a connection with many cues that wait for their ticks is read no further; other
 bounds are those of `Connections`.
@@ -32,6 +32,7 @@ from flcav.sources.carla.server.episode import Episode, Measurement
 # A client's Traffic Manager misses its wake-up, and waits for ever, where the next tick comes before its thread sleeps
 # (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are not closer than this while one runs.
 PACE_S = 0.008
+MOST_UNDRAWN = 100  # cued ticks whose images wait while cameras are prepared, for longer than clients give a tick
 DELIVERY_S = 1.5  # clients give a tick 2 s at least
 PREPARING_S = (
     3.0  # a server waits so long until it is ready for cameras; the first one on a machine compiles for longer
@@ -69,7 +70,8 @@ class Server:
         self._preparing: asyncio.Task[None] | None = None  # the scenes of a map that was loaded
         self._loaded: dict[asyncio.StreamWriter, bytes] = {}  # replies to clients that have loaded a map
         self._held: dict[asyncio.StreamWriter, list[bytes]] = {}  # replies to managers of who learns of a new map
-        self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick
+        self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick, after those before
+        self._undrawn = 0  # ticks whose images are yet to be drawn
 
     async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
         """Serve until cancelled, calls at the first of two bound sockets and streams at the second."""
@@ -149,21 +151,30 @@ class Server:
         await self._publish_state(episode)
         self._published_s = time.monotonic()
         if images := [each for each in measurements if each.late]:
-            if self._drawing is not None:
+            synchronous = self._calls.settings.synchronous
+            unprepared = synchronous and self._preparing is not None and not self._preparing.done()
+            if self._drawing is not None and not (unprepared and self._undrawn < MOST_UNDRAWN):
                 await self._drawing
-            self._drawing = asyncio.create_task(self._draw(images, episode))
-            if self._calls.settings.synchronous:
+            self._undrawn += 1
+            self._drawing = asyncio.create_task(self._draw(images, episode, self._drawing))
+            if synchronous:
                 await asyncio.wait({self._drawing}, timeout=max(begun_s + DELIVERY_S - time.monotonic(), 0.0))
         self._answer_cues(1)
         await self._links.await_readers()
 
-    async def _draw(self, images: list[Measurement], episode: Episode) -> None:
+    async def _draw(self, images: list[Measurement], episode: Episode, before: asyncio.Task[None] | None) -> None:
+        """Draw and send the images of a tick, once those of the tick before are drawn."""
         try:
+            if before is not None:
+                await before
             for each in images:
-                await self._measure(each, episode)
+                if episode is self._calls.episode:
+                    await self._measure(each, episode)
             await self._links.await_readers()
         except Exception:  # a server that fails one image draws the next
             log.exception("an image failed")
+        finally:
+            self._undrawn -= 1
 
     def _answer_cues(self, most: int | None = None) -> None:
         """Answer what waits for the ticks that were made; all that waits, where none is to come."""
