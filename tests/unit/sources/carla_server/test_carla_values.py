@@ -252,6 +252,8 @@ def test_an_imported_map_is_kept_for_the_next_server(maps, tmp_path, monkeypatch
     def import_town(path, out):
         out.mkdir()
         imported.append(path.read_text())
+        if imported == ["a"]:
+            start("a")  # another server, which begins later and is done first
         (out / "town.yaml").write_text("whole")
         return ImportedTown(town, ())
 
@@ -270,7 +272,8 @@ def test_an_imported_map_is_kept_for_the_next_server(maps, tmp_path, monkeypatch
 
     start("a")
     start("a")
-    assert (imported, len(loaded)) == (["a"], 1)
+    assert (imported, len(loaded)) == (["a", "a"], 1)
+    imported.pop()
     (loaded[0] / "town.yaml").write_text("half")
     start("a")
     start("b")

@@ -1,6 +1,7 @@
 """The maps that are served: towns with the OpenDRIVE text that clients get, and where cars may be spawned."""
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
@@ -167,12 +168,13 @@ class Maps:
         town, folder, mesh = None, cache / path.stem, cache / "mesh.npz"
         with suppress(OSError, InputError):  # no such folder yet, or one that is damaged
             town = load_town(folder) if folder.is_dir() else None
-        try:
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            out = folder if not folder.exists() else self._find_scratch() / folder.name
-            town = town or import_town(path, out).town
-        except OSError:  # no place for a cache
-            town = import_town(path, self._find_scratch() / folder.name).town
+        if town is None:
+            made = self._find_scratch() / path.stem
+            town = import_town(path, made).town
+            with suppress(OSError):  # no place for a cache, or another server was faster
+                cache.mkdir(parents=True, exist_ok=True)
+                with tempfile.TemporaryDirectory(dir=cache) as beside:
+                    shutil.copytree(made, Path(beside) / path.stem).rename(folder)
         lacking = mesh if folder.exists() else None
         with suppress(OSError, ValueError):  # not there yet, or damaged
             recall_static_world(town, mesh)
