@@ -71,7 +71,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         ("--count", "--town", "--method", "--covered", "--weights", "--seed", "--openscenario"), ALWAYS
     ),
     "odd tasks": dict.fromkeys(("--data", "--errors", "--pretrain", "--wireless", "--wireline"), ALWAYS),
-    "carla serve": dict.fromkeys(("--port", "--seed", "--traffic", "--maps", "--host"), ALWAYS),
+    "carla serve": dict.fromkeys(("--port", "--seed", "--traffic", "--maps", "--quality", "--host"), ALWAYS),
     "release init": {"--keys": ALWAYS, "--threshold": ALWAYS},
     "release propose": dict.fromkeys(
         ("--driving", "--release", "--changes", "--for", "--data", "--recipe", "--ledger", "--task"), ALWAYS

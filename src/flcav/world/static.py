@@ -1,12 +1,14 @@
 """The static mesh of a town, with the object that each face belongs to."""
 
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from enum import IntEnum
 from hashlib import sha256
 from itertools import chain
+from pathlib import Path
 from typing import NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 import shapely
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import left_vectors
 from flcav.statistics.streams import stream
+from flcav.storage.files import atomic_path
 from flcav.world.map.relief import Relief
 from flcav.world.map.signals import Signals
 from flcav.world.map.town import KERB_M, Town
@@ -39,6 +42,8 @@ DECK_M = (0.2, 1.0)  # least and greatest thickness of a bridge's deck
 ROOM_M = 4.0  # a deck is thinner where less than this would be left below it
 LAND_M = 150.0  # width of open ground beyond the town's bounds
 TOWNS_KEPT = 4  # size of the cache of meshes
+_FIELDS = ("vertices", "faces", "material", "part", "row")  # of a static world in a file, and their forms
+_FORMS = [("float32", (3,)), ("int32", (3,)), ("uint8", ()), ("uint8", ()), ("int32", ())]
 
 
 class TownPart(IntEnum):
@@ -115,18 +120,58 @@ _WORLDS: dict[str, StaticWorld] = {}  # by hash of the town: the last TOWNS_KEPT
 
 def build_static_world(town: Town) -> StaticWorld:
     """Return the static mesh of a town with the object of each face; the last `TOWNS_KEPT` are cached."""
+    return _keep(town, lambda: _build_world(town))
+
+
+def _keep(town: Town, make: Callable[[], StaticWorld]) -> StaticWorld:
+    """Return the world of a town that is kept, or else keep what `make` makes."""
     key = sha256(pickle.dumps(town)).hexdigest()
     if key not in _WORLDS:
         while len(_WORLDS) >= TOWNS_KEPT:
             del _WORLDS[next(iter(_WORLDS))]
-        owned = list(_parts(town))
-        faces = [len(mesh.faces) for _, _, mesh in owned]
-        _WORLDS[key] = StaticWorld(
-            join_meshes([mesh for _, _, mesh in owned]),
-            np.repeat([part for part, _, _ in owned], faces).astype(np.uint8),
-            np.repeat([row for _, row, _ in owned], faces).astype(np.int32),
-        )
+        _WORLDS[key] = make()
     return _WORLDS[key]
+
+
+def _build_world(town: Town) -> StaticWorld:
+    owned = list(_parts(town))
+    faces = [len(mesh.faces) for _, _, mesh in owned]
+    return StaticWorld(
+        join_meshes([mesh for _, _, mesh in owned]),
+        np.repeat([part for part, _, _ in owned], faces).astype(np.uint8),
+        np.repeat([row for _, row, _ in owned], faces).astype(np.int32),
+    )
+
+
+def save_static_world(town: Town, path: Path) -> None:
+    """Write the static world of a town as NumPy's archive `path`, whole or not at all."""
+    world = build_static_world(town)
+    with atomic_path(path) as scratch, scratch.open("wb") as file:
+        fields = {"vertices": world.mesh.vertices, "faces": world.mesh.faces, "material": world.mesh.material}
+        np.savez(file, **fields, part=world.part, row=world.row)
+
+
+def recall_static_world(town: Town, path: Path) -> None:
+    """Read what `save_static_world` wrote of the same town: `build_static_world` need not build it any more.
+
+    Raises `OSError` or `ValueError`, and recalls nothing, where there is no such file or it is damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            vertices, faces, material, part, row = (file[name] for name in _FIELDS)
+    except (EOFError, KeyError, BadZipFile) as error:
+        raise ValueError(f"{path}: no static world of a town ({error})") from None
+    forms = [(array.dtype.name, array.shape[1:]) for array in (vertices, faces, material, part, row)]
+    if forms != _FORMS or not len(faces) or {len(material), len(part), len(row)} != {len(faces)}:
+        raise ValueError(f"{path}: its arrays are not those of a static world")
+    if (
+        faces.min() < 0
+        or faces.max() >= len(vertices)
+        or material.max() >= len(Material)
+        or part.max() >= len(TownPart)
+    ):
+        raise ValueError(f"{path}: a face names a corner, a material or a part that is not there")
+    _keep(town, lambda: StaticWorld(Mesh(vertices, faces, material), part, row))
 
 
 Owned = tuple[TownPart, int, Mesh]  # kind of object, its row, its mesh in the world frame

@@ -99,7 +99,13 @@ def survey(
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden, threads=threads)
     seen = fill_gbuffer(scene, appearance, world_from_camera, rays, hits, threads)
     painted = np.empty(len(seen), np.bool_)
-    mark_paint(seen, appearance, np.float32(1 / lens.intrinsics()[0, 0]), painted)
+    angle = np.float32(1 / lens.intrinsics()[0, 0])
+
+    def mark(first: int, last: int) -> None:
+        at = slice(first, last)
+        mark_paint(seen.part(at), appearance, angle, painted[at])
+
+    share_among_threads(mark, len(seen), threads)
     return seen, painted, appearance
 
 

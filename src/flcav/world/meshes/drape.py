@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 FLAT_M = 0.01  # by which a wall may differ from the relief between its corners
 GRID_M = 1e-3  # of coordinates, where exact ones defeat GEOS
+FEW = 64  # triangles, or corners of an area, that are intersected at once
+BESIDE_M = 1.0  # around triangles, of the part of an area with which they are intersected
 
 
 def drape_polygon(polygon: Array, relief: Relief, above_m: float, material: Material) -> Mesh:
@@ -26,17 +28,33 @@ def drape_area(area: BaseGeometry, relief: Relief, above_m: float, material: Mat
     """Return the part of a relief inside a valid area, which may have holes: see `drape_polygon`."""
     shapely.prepare(area)
     near = relief.tree.geometries[relief.tree.query(area, predicate="intersects")]
-    try:
-        pieces = shapely.intersection(near, area)
-    except shapely.GEOSException:
-        pieces = shapely.intersection(near, area, grid_size=GRID_M)
-    parts = shapely.get_parts(pieces)
+    parts = shapely.get_parts(_cut(near, area))
     parts = parts[(shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0)]
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(parts))
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3].reshape(-1, 2)
     vertices = np.c_[corners, relief.heights(*corners.T) + above_m].astype(np.float32)
     faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
     return Mesh(vertices, faces, np.full(len(faces), material, np.uint8))
+
+
+def _cut(triangles: NDArray[np.object_], area: BaseGeometry) -> NDArray[np.object_]:
+    """Return what of each of `triangles` (F,) is inside an area.
+
+    An intersection takes time with all corners of the area: for many triangles, it is first halved, and halved again.
+    """
+    if len(triangles) <= FEW or shapely.get_num_coordinates(area) <= FEW:
+        try:
+            return shapely.intersection(triangles, area)
+        except shapely.GEOSException:
+            return shapely.intersection(triangles, area, grid_size=GRID_M)
+    bounds = shapely.bounds(triangles)
+    middle = bounds[:, :2] + bounds[:, 2:]
+    rank = np.argsort(middle[:, np.ptp(middle, axis=0).argmax()], kind="stable")
+    out = np.empty(len(triangles), object)
+    for half in np.array_split(rank, 2):
+        low, high = bounds[half, :2].min(axis=0) - BESIDE_M, bounds[half, 2:].max(axis=0) + BESIDE_M
+        out[half] = _cut(triangles[half], shapely.intersection(area, shapely.box(*low, *high)))
+    return out
 
 
 def drape_wall(ring: Array, relief: Relief, between_m: tuple[float, float], material: Material) -> Mesh:

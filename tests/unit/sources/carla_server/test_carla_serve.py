@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import struct
+import threading
 import time
 from contextlib import asynccontextmanager, suppress
 
@@ -12,6 +13,7 @@ import pytest
 from flcav.sources.carla.server import connections, serve, wire
 from flcav.sources.carla.server.blueprints import list_blueprints
 from flcav.sources.carla.server.calls import Calls
+from flcav.sources.carla.server.episode import Episode
 from flcav.sources.carla.server.maps import Maps
 from flcav.sources.carla.server.sensing.table import KINDS, Kind
 from flcav.sources.carla.server.serve import Server
@@ -254,6 +256,31 @@ def test_a_tick_is_answered_when_its_images_are_delivered(bound_s, maps, monkeyp
                 assert waits[0] < drawing_s
                 assert [await asyncio.wait_for(read_frame(reader), 5.0) for _ in frames] == frames
             assert sum(waits) > 2 * drawing_s - 0.1
+            writer.close()
+
+    asyncio.run(session())
+
+
+def test_ticks_go_on_while_cameras_are_prepared_and_no_image_is_lost(maps, monkeypatch):
+    """The first server on a machine compiles for longer than clients give a tick."""
+    prepared, frames = threading.Event(), []
+    monkeypatch.setattr(serve, "DELIVERY_S", 0.05)
+    monkeypatch.setattr(serve, "PREPARING_S", 0.1)
+    monkeypatch.setattr(Episode, "prepare", lambda episode: prepared.wait(10.0))
+    camera = Kind(Stream.DEPTH, lambda sight, sensor: bytes([prepared.wait(10.0)]), True, True)
+    monkeypatch.setitem(KINDS, "sensor.camera.depth", camera)
+
+    async def session():
+        async with serving(maps) as (port, streams, _):
+            try:
+                client = await Client().connect(port)
+                await client.call("set_episode_settings", SYNCHRONOUS)
+                reader, writer = await listen(client, streams, "sensor.camera.depth")
+                for _ in range(5):
+                    frames.append(await asyncio.wait_for(client.call("tick_cue"), 2.0))
+            finally:
+                prepared.set()
+            assert [await asyncio.wait_for(read_frame(reader), 5.0) for _ in frames] == frames
             writer.close()
 
     asyncio.run(session())

@@ -1,19 +1,24 @@
 """What clients read of vehicles, signs and sensors, against CARLA's rules."""
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
 from carla_calls import describe, invoke, place
+from PIL import Image
 
 from flcav.config import InputError
 from flcav.sensors.frame import SEMANTICS
 from flcav.sources.carla.server import maps as carla_maps
+from flcav.sources.carla.server import wire
+from flcav.sources.carla.server.blueprints import Quality, Refused, check
 from flcav.sources.carla.server.calls import Calls
 from flcav.sources.carla.server.driving import choose_gear
 from flcav.sources.carla.server.lights import find_limits
 from flcav.sources.carla.server.maps import SPAWN_LEAST_M, SPAWN_POINTS, Maps
+from flcav.sources.carla.server.sensing.cameras import sense_rgb
 from flcav.sources.carla.server.wire import VehicleControl
+from flcav.world import static
 from flcav.world.opendrive.importing import ImportedTown
 
 DT_S = 0.05
@@ -84,6 +89,9 @@ def test_a_fresh_vehicle_has_30_kmh_until_it_passes_a_sign(maps, calls):
         road += f'<signal s="{s}" t="-4" id="{s}" orientation="{orientation}" type="274" value="{kmh}"/>'
     text = served.opendrive.replace("</OpenDRIVE>", f"{road}</signals></road></OpenDRIVE>")
     limits = find_limits(replace(served, opendrive=text))
+    spaced = "<!-- whose map -->\n" + text.replace("<OpenDRIVE>", '<OpenDRIVE xmlns="http://code.asam.net/simulation">')
+    assert "xmlns" in spaced
+    assert find_limits(replace(served, opendrive=spaced)).kmh.tolist() == limits.kmh.tolist() == [60.0, 90.0]
     ahead = np.array((np.cos(0.5), np.sin(0.5)))
 
     def passed(s, turn=0.0):
@@ -244,6 +252,8 @@ def test_an_imported_map_is_kept_for_the_next_server(maps, tmp_path, monkeypatch
     def import_town(path, out):
         out.mkdir()
         imported.append(path.read_text())
+        if imported == ["a"]:
+            start("a")  # another server, which begins later and is done first
         (out / "town.yaml").write_text("whole")
         return ImportedTown(town, ())
 
@@ -262,13 +272,76 @@ def test_an_imported_map_is_kept_for_the_next_server(maps, tmp_path, monkeypatch
 
     start("a")
     start("a")
-    assert (imported, len(loaded)) == (["a"], 1)
+    assert (imported, len(loaded)) == (["a", "a"], 1)
+    imported.pop()
     (loaded[0] / "town.yaml").write_text("half")
     start("a")
     start("b")
     assert (imported, len(loaded)) == (["a", "a", "b"], 1)
     start("b")
     assert (imported, len(loaded)) == (["a", "a", "b"], 2)
+    assert {folder.name for folder in loaded} == {"crossing"}  # houses are drawn by the town's name
     monkeypatch.setenv("XDG_CACHE_HOME", str(file))  # which is no folder
     start("b")
     assert imported == ["a", "a", "b", "b"]
+
+
+def test_the_mesh_of_an_imported_map_is_kept_for_the_next_server(maps, tmp_path, monkeypatch):
+    """A damaged one is not used, and is written anew."""
+    town, built = maps.load("suburb").town, []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(carla_maps, "import_town", lambda path, out: out.mkdir() or ImportedTown(town, ()))
+    monkeypatch.setattr(carla_maps, "load_town", lambda folder: town)
+    monkeypatch.setattr(static, "_build_world", lambda town, build=static._build_world: built.append(1) or build(town))
+    (tmp_path / "crossing.xodr").write_text("a")
+
+    def start():
+        monkeypatch.setattr(static, "_WORLDS", {})
+        served = Maps(tmp_path).load("crossing")
+        world = static.build_static_world(town)
+        served.keep()
+        return world
+
+    first, second = start(), start()
+    assert len(built) == 1
+    for one, other in zip((*astuple(first.mesh), *first[1:]), (*astuple(second.mesh), *second[1:])):
+        np.testing.assert_array_equal(one, other, strict=True)
+    (file,) = (tmp_path / "cache").rglob("mesh.npz")
+    whole = file.read_bytes()
+    for damaged in (whole[: len(whole) // 2], b"", whole[:5000] + b"\0" * 99 + whole[5099:]):
+        file.write_bytes(damaged)
+        start()
+        start()
+    assert len(built) == 4
+
+
+def test_low_quality_is_told_and_draws_smaller_pictures_of_the_same_street(maps, calls):
+    low = Calls(maps, "suburb", seed=3, traffic=0, port=2000, quality=Quality.LOW)
+    try:
+        blueprints = {each.id: each.attributes for each in invoke(low, "get_actor_definitions", ())}
+        told = {name: [each for each in known if each.id == "quality"] for name, known in blueprints.items()}
+        assert {name for name, known in told.items() if known} == {"sensor.camera.rgb"}
+        assert [(each.value, set(each.recommended)) for each in told["sensor.camera.rgb"]] == [("low", {"low", "high"})]
+        here, size = place(calls), (("image_size_x", "321"), ("image_size_y", "203"))
+        above, pictures, drawn = [[*here[0][:2], here[0][2] + 2.4], here[1]], [], []
+        for served, quality in ((calls, []), (low, []), (low, [("quality", "high")])):
+            camera = spawn(served, "sensor.camera.rgb", above, *size, *quality).sensor
+            assert camera is not None
+            sight = served.episode.look("images")()
+            body = np.frombuffer(sense_rgb(sight, camera), np.uint8, offset=12).reshape(203, 321, 4)
+            pictures.append(body[..., :3].astype(float))
+            drawn.append(sight.photograph(camera).rgb.shape[:2])
+            assert sight.label(camera)[0].shape == (203, 321)
+        assert drawn == [(203, 321), (102, 161), (203, 321)]
+        np.testing.assert_array_equal(pictures[0], pictures[2])
+        smooth = [
+            np.asarray(Image.fromarray(each.astype(np.uint8)).resize((40, 25), Image.Resampling.BOX), float)
+            for each in pictures
+        ]
+        assert 0 < np.abs(smooth[0] - smooth[1]).mean() < 3.0
+        assert smooth[0].std() > 20.0
+        with pytest.raises(Refused, match="'quality' = 'medium' is not high or low"):
+            check(wire.Description(0, "sensor.camera.rgb", (wire.Attribute("quality", 2, "medium"),)), Quality.LOW)
+        assert not {each.id for each in check(wire.Description(0, "sensor.camera.rgb", ()))[1].attributes} & {"quality"}
+    finally:
+        low.episode.close()

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.interpolate import LinearNDInterpolator
-from shapely import box, contains_xy
-from shapely.geometry import Polygon
+from shapely import box, contains_xy, union_all
+from shapely.geometry import Point, Polygon
 
 from flcav.geometry import Boxes, angles_of, inverse, points_in_boxes, pose, rotations
 from flcav.world.map.relief import Deck, Relief, find_tilts
 from flcav.world.materials import Material
-from flcav.world.meshes.drape import FLAT_M, drape_area, drape_polygon, drape_wall
+from flcav.world.meshes.drape import FLAT_M, _cut, drape_area, drape_polygon, drape_wall
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.reference_line import ReferenceLine
 from flcav.world.opendrive.road_surface import Road
@@ -174,6 +174,18 @@ def test_an_area_with_a_hole_is_draped_around_it() -> None:
     one, other = (corners[:, i, :2] - corners[:, 0, :2] for i in (1, 2))
     assert np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum() / 2 == pytest.approx(area.area, rel=1e-5)
     assert not contains_xy(box(-1.9, -1.9, 2.9, 3.9), *corners.mean(axis=1)[:, :2].T).any()
+
+
+def test_an_area_of_many_corners_is_cut_as_a_whole_would_be() -> None:
+    """Triangles and corners so many that the area is halved several times: each triangle's part is as large."""
+    draw = np.random.default_rng(2)
+    relief = Relief(np.c_[draw.uniform(-100, 100, (400, 2)), draw.uniform(0, 5, 400)])
+    holes = [Point(*at).buffer(2.5) for at in draw.uniform(-90, 90, (60, 2))]
+    area = relief.area.difference(union_all(holes))
+    triangles = relief.tree.geometries
+    parts = _cut(triangles, area)
+    assert [part.area for part in parts] == pytest.approx([each.intersection(area).area for each in triangles])
+    assert sum(part.area for part in parts) == pytest.approx(area.area)
 
 
 def slope(ahead: float, left: float) -> Relief:

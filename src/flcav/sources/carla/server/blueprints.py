@@ -1,6 +1,7 @@
 """Blueprints: the actors that can be spawned, and the check of a client's description of one."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import cache
 from zlib import crc32
 
@@ -37,9 +38,16 @@ class Blueprint:
         return self.definition.id.partition(".")[0]
 
 
+class Quality(StrEnum):
+    """How colour images are drawn where clients do not choose."""
+
+    HIGH = "high"
+    LOW = "low"  # with a quarter of the rays: half of the columns and rows, between which colours are interpolated
+
+
 @cache
-def list_blueprints() -> dict[str, Blueprint]:
-    """Return all blueprints by name."""
+def list_blueprints(quality: Quality = Quality.HIGH) -> dict[str, Blueprint]:
+    """Return all blueprints by name; below high quality colour cameras have an attribute of that name."""
     found: list[Blueprint] = []
 
     def add(name: str, variations: list[wire.Variation], fields: dict[str, Field] | None = None, **body) -> None:
@@ -67,6 +75,8 @@ def list_blueprints() -> dict[str, Blueprint]:
     add("controller.ai.walker", [_free("role_name", STRING, "default")])
     for name, fields in (catalogue.SENSORS | catalogue.OTHERS | catalogue.NOT_SERVED).items():
         told = [_free("role_name", STRING, "front"), _free("ros_name", STRING, name)]
+        if name == "sensor.camera.rgb" and quality != Quality.HIGH:
+            told.append(wire.Variation("quality", STRING, quality, tuple(Quality), True, True))
         add(name, [*(_free(key, field.type, field.default) for key, field in fields.items()), *told], fields)
     clutter = list(CLUTTER)
     for name, (kind, extent) in catalogue.PROPS.items():
@@ -75,9 +85,9 @@ def list_blueprints() -> dict[str, Blueprint]:
     return {blueprint.definition.id: blueprint for blueprint in found}
 
 
-def check(description: wire.Description) -> tuple[Blueprint, wire.Description]:
+def check(description: wire.Description, quality: Quality = Quality.HIGH) -> tuple[Blueprint, wire.Description]:
     """Return the blueprint of a description and the description with all attributes; raises `Refused`."""
-    known = list_blueprints()
+    known = list_blueprints(quality)
     blueprint = known.get(description.id)
     if blueprint is None:
         raise Refused(f"no blueprint {shorten(description.id)}{suggest(description.id, known)}")
@@ -95,6 +105,9 @@ def check(description: wire.Description) -> tuple[Blueprint, wire.Description]:
 
 
 def _check_value(name: str, variation: wire.Variation, field: Field | None, value: str) -> None:
+    if variation.restricted and value not in variation.recommended:
+        allowed = " or ".join(variation.recommended)
+        raise Refused(f"{name}: attribute '{variation.id}' = {shorten(value)} is not {allowed}")
     if variation.type in (INT, FLOAT):
         low, high = (field.low, field.high) if field else (-LARGEST_INT, LARGEST_INT)
         try:

@@ -15,7 +15,7 @@ from flcav.config import InputError, shorten
 from flcav.sources.carla.frames import mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.actors import NOTHING, Actor, Counters
-from flcav.sources.carla.server.blueprints import Refused, list_blueprints
+from flcav.sources.carla.server.blueprints import Quality, Refused, list_blueprints
 from flcav.sources.carla.server.episode import Episode
 from flcav.sources.carla.server.maps import Maps
 from flcav.sources.carla.server.physics import describe_physics, describe_telemetry
@@ -32,9 +32,12 @@ TIMES = {"green": 0, "yellow": 1, "red": 2}
 class Calls:
     """The calls on one server: its settings and its episode."""
 
-    def __init__(self, maps: Maps, name: str, *, seed: int, traffic: int, port: int) -> None:
+    def __init__(
+        self, maps: Maps, name: str, *, seed: int, traffic: int, port: int, quality: Quality = Quality.HIGH
+    ) -> None:
         """Load the first map; raises `InputError` where there is none of this name."""
         self.maps, self._seed, self._traffic, self._port = maps, seed, traffic, port
+        self._quality = quality
         self._counters = Counters()
         self._managers: dict[int, tuple[str, int]] = {}  # Traffic Managers of clients, by port
         self.settings = wire.Settings()
@@ -44,7 +47,8 @@ class Calls:
 
     def _start(self, name: str) -> Episode:
         served = self.maps.load(name)
-        return Episode(served, self._counters, seed=self._seed, traffic=self._traffic, port=self._port + 1)
+        settings = {"seed": self._seed, "traffic": self._traffic, "port": self._port + 1}
+        return Episode(served, self._counters, **settings, quality=self._quality)
 
     @property
     def dt_s(self) -> float:
@@ -151,7 +155,7 @@ class Calls:
 
     def get_actor_definitions(self) -> wire.Packed:
         """Return all blueprints."""
-        return [blueprint.definition for blueprint in list_blueprints().values()]
+        return [blueprint.definition for blueprint in list_blueprints(self._quality).values()]
 
     def get_spectator(self) -> wire.Packed:
         """Return the spectator."""

@@ -16,11 +16,12 @@ from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sources.carla.frames import from_mount, mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.actors import STANDING, WAITING, Actor, Counters, list_places
-from flcav.sources.carla.server.blueprints import TRUE, Blueprint, Refused, check, find_paint, list_blueprints
+from flcav.sources.carla.server.blueprints import TRUE, Blueprint, Quality, Refused, check, find_paint, list_blueprints
 from flcav.sources.carla.server.driving import choose_gear, list_grips, steer_towards
 from flcav.sources.carla.server.lights import Lights, find_approaches, find_limits
 from flcav.sources.carla.server.maps import ServedMap
 from flcav.sources.carla.server.recorder import Recorder
+from flcav.sources.carla.server.sensing.cameras import sense_depth, sense_instance, sense_rgb
 from flcav.sources.carla.server.sensing.events import describe_thing, find_collisions, find_obstacle
 from flcav.sources.carla.server.sensing.sight import Scenes, Sensor, Sight
 from flcav.sources.carla.server.sensing.table import KINDS, Clock
@@ -62,9 +63,19 @@ class Measurement(NamedTuple):
 class Episode:
     """One map, from loading it until the next is loaded."""
 
-    def __init__(self, served: ServedMap, counters: Counters, *, seed: int, traffic: int, port: int) -> None:
+    def __init__(
+        self,
+        served: ServedMap,
+        counters: Counters,
+        *,
+        seed: int,
+        traffic: int,
+        port: int,
+        quality: Quality = Quality.HIGH,
+    ) -> None:
         """Start the world of a map; `port` is that of the streams, which actors' tokens name."""
         self.served, self.counters, self.seed, self.port = served, counters, seed, port
+        self._quality = quality
         counters.episode += 1
         self.id = counters.episode
         self.stream = counters.next_stream()  # of the world's state
@@ -90,20 +101,23 @@ class Episode:
         self._follow(self.world.snapshot, 0.0)
 
     def warm_up(self) -> None:
-        """Build the scene, and load the compiled code of vehicles and cameras, so that no client waits for it."""
+        """Load the compiled code of vehicles, so that no client waits for it."""
         with LiveWorld(self.served.town, Settings(parked=False)) as world:
             world.apply(Spawn("car", "car", 0, *self.spectator.pose[:2, 3].tolist(), anywhere=True))
             world.step({"car": Controls(throttle=1.0)})
-        self.prepare()
-        told = {"image_size_x": "32", "image_size_y": "32", "fov": "90"}
-        camera, sight = Sensor("sensor.camera.rgb", told, 0, self.spectator.pose), self.look("images")()
-        sight.label(camera)
-        sight.photograph(camera)
 
     def prepare(self) -> None:
-        """Build the scenes in which sensors look, so that the first of them need not wait."""
+        """Build the scenes in which sensors look, and load the compiled code of cameras, so that none need wait.
+
+        It may run beside the ticks: pictures are taken in a scene of its own.
+        """
         for scene in ("images", "rays"):
             build_appearance(self.look(scene)().scene)
+        told = {"image_size_x": "32", "image_size_y": "32", "fov": "90"}
+        camera, look = Sensor("sensor.camera.depth", told, 0, self.spectator.pose), self.look("first")
+        for sense in (sense_depth, sense_instance, sense_rgb):
+            sense(look(), camera)
+        self.served.keep()
 
     @property
     def age_s(self) -> float:
@@ -128,7 +142,7 @@ class Episode:
 
     def spawn(self, description: wire.Description, transform: Transform, parent: int | None = None) -> Actor:
         """Return a new actor, attached to a parent where one is given; raises `Refused` where that cannot be."""
-        blueprint, description = check(description)
+        blueprint, description = check(description, self._quality)
         carrier = self.find(parent) if parent else None
         if carrier is not None:
             pose = carrier.pose @ from_mount(*transform)

@@ -101,7 +101,11 @@ def _read_signs(served: ServedMap) -> dict[str, Array]:
 
 def _list_signals(served: ServedMap) -> Iterator[tuple[ElementTree.Element, Array]]:
     """Yield each signal of a map with its place in the town: x, y [m] and the heading of its road [rad] (3,)."""
-    for road in ElementTree.fromstring(served.opendrive.encode("utf-8", "surrogateescape")).iterfind("road"):
+    text = served.opendrive.encode("utf-8", "surrogateescape")
+    root = ElementTree.fromstring(text[max(text.find(b"<?xml "), 0) :])  # comments may stand before the declaration
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]  # version 1.8 has a namespace
+    for road in root.iterfind("road"):
         if not (rows := road.findall("signals/signal")):
             continue
         line = ReferenceLine(road)

@@ -1,10 +1,11 @@
 """The maps that are served: towns with the OpenDRIVE text that clients get, and where cars may be spawned."""
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -23,6 +24,7 @@ from flcav.world.map.roads import Lane, RoadNet, read_net
 from flcav.world.map.town import NAME, PACKAGED, Town, load_town
 from flcav.world.opendrive.exporting import export_town
 from flcav.world.opendrive.importing import import_town
+from flcav.world.static import recall_static_world, save_static_world
 
 Array = NDArray[np.float64]
 
@@ -51,6 +53,13 @@ class ServedMap:
     town: Town
     opendrive: str  # the map's text
     frame: MapFrame
+    lacking: Path | None = None  # file in which the next server seeks the town's mesh, and which is not there yet
+
+    def keep(self) -> None:
+        """Write the town's mesh, where there is a place for it and it is not there yet."""
+        if self.lacking is not None:
+            with suppress(OSError):
+                save_static_world(self.town, self.lacking)
 
     @cached_property
     def net(self) -> RoadNet:
@@ -149,20 +158,32 @@ class Maps:
         self._sent += 1
         path = Path(self._scratch.name) / f"sent-{self._sent}.xodr"
         path.write_text(text, encoding="utf-8", errors="surrogateescape")
-        self._loaded[OPENDRIVE_MAP] = self._import(OPENDRIVE_MAP, path, Path(self._scratch.name) / path.stem)
+        self._loaded[OPENDRIVE_MAP] = replace(self._import(OPENDRIVE_MAP, path, self._find_scratch()), lacking=None)
 
-    def _import(self, name: str, path: Path, folder: Path) -> ServedMap:
-        """Return the map of a file, whose town is in a folder, or is written there."""
-        town = None
+    def _import(self, name: str, path: Path, cache: Path) -> ServedMap:
+        """Return the map of a file, whose town is in a folder of `cache`, or is written there.
+
+        The town has the map's name: its houses are drawn by it.
+        """
+        town, folder, mesh = None, cache / path.stem, cache / "mesh.npz"
         with suppress(OSError, InputError):  # no such folder yet, or one that is damaged
             town = load_town(folder) if folder.is_dir() else None
-        try:
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            out = folder if not folder.exists() else Path(self._scratch.name) / folder.name
-            town = town or import_town(path, out).town
-        except OSError:  # no place for a cache
-            town = import_town(path, Path(self._scratch.name) / folder.name).town
+        if town is None:
+            made = self._find_scratch() / path.stem
+            town = import_town(path, made).town
+            with suppress(OSError):  # no place for a cache, or another server was faster
+                cache.mkdir(parents=True, exist_ok=True)
+                with tempfile.TemporaryDirectory(dir=cache) as beside:
+                    shutil.copytree(made, Path(beside) / path.stem).rename(folder)
+        lacking = mesh if folder.exists() else None
+        with suppress(OSError, ValueError):  # not there yet, or damaged
+            recall_static_world(town, mesh)
+            lacking = None
         source = town.parameters.source
         offset = (0.0, 0.0) if source is None else source.offset_m
         text = path.read_text(encoding="utf-8", errors="surrogateescape")
-        return ServedMap(name, town, text, MapFrame(offset))
+        return ServedMap(name, town, text, MapFrame(offset), lacking)
+
+    def _find_scratch(self) -> Path:
+        """Return a new folder for a town that is kept as long as this server runs."""
+        return Path(tempfile.mkdtemp(dir=self._scratch.name))

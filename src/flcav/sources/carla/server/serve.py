@@ -3,7 +3,7 @@
 In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends what sensors measure, in order,
 then the world's state, then the cameras' images, which take longest, and the answer to its cue, upon which a client
 goes on. The answer waits for the images no longer than `DELIVERY_S`; they are then drawn beside the next ticks, as they
-are when ticks follow the clock, and the next images wait for them.
+are when ticks follow the clock, and the next images wait for them. Cameras are prepared beside the ticks, too.
 
 What strangers may ask for is bounded: a connection with many cues that wait for their ticks is read no further; other
 bounds are those of `Connections`.
@@ -32,7 +32,11 @@ from flcav.sources.carla.server.episode import Episode, Measurement
 # A client's Traffic Manager misses its wake-up, and waits for ever, where the next tick comes before its thread sleeps
 # (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are not closer than this while one runs.
 PACE_S = 0.008
+MOST_UNDRAWN = 100  # cued ticks whose images wait while cameras are prepared, for longer than clients give a tick
 DELIVERY_S = 1.5  # clients give a tick 2 s at least
+PREPARING_S = (
+    3.0  # a server waits so long until it is ready for cameras; the first one on a machine compiles for longer
+)
 LEARNT_S = 3.0  # clients have learnt of a new map by then
 # While a client that has loaded a map learns of it by these calls, its Traffic Manager's thread crashes if it goes on:
 # so that thread's calls, which are all others, are answered when the client listens to the new world.
@@ -66,12 +70,14 @@ class Server:
         self._preparing: asyncio.Task[None] | None = None  # the scenes of a map that was loaded
         self._loaded: dict[asyncio.StreamWriter, bytes] = {}  # replies to clients that have loaded a map
         self._held: dict[asyncio.StreamWriter, list[bytes]] = {}  # replies to managers of who learns of a new map
-        self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick
+        self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick, after those before
+        self._undrawn = 0  # ticks whose images are yet to be drawn
 
     async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
         """Serve until cancelled, calls at the first of two bound sockets and streams at the second."""
         connected = self._serve_calls, self._serve_stream
         servers = [await asyncio.start_server(serve, sock=door) for serve, door in zip(connected, doors, strict=True)]
+        await asyncio.wait({self._prepare()}, timeout=PREPARING_S)
         ready()
         try:
             await self._tick_forever()
@@ -83,6 +89,17 @@ class Server:
             if self._drawing is not None:
                 self._drawing.cancel()
             self._calls.episode.close()
+
+    def _prepare(self) -> asyncio.Task[None]:
+        """Prepare for the sensors of the episode, beside all else."""
+        self._preparing = asyncio.create_task(self._prepare_episode(self._calls.episode))
+        return self._preparing
+
+    async def _prepare_episode(self, episode: Episode) -> None:
+        try:
+            await asyncio.to_thread(episode.prepare)
+        except Exception:  # what fails here fails again, and is told, where it is needed
+            log.debug("preparing failed", exc_info=True)
 
     # ---- ticks
 
@@ -134,21 +151,30 @@ class Server:
         await self._publish_state(episode)
         self._published_s = time.monotonic()
         if images := [each for each in measurements if each.late]:
-            if self._drawing is not None:
+            synchronous = self._calls.settings.synchronous
+            unprepared = synchronous and self._preparing is not None and not self._preparing.done()
+            if self._drawing is not None and not (unprepared and self._undrawn < MOST_UNDRAWN):
                 await self._drawing
-            self._drawing = asyncio.create_task(self._draw(images, episode))
-            if self._calls.settings.synchronous:
+            self._undrawn += 1
+            self._drawing = asyncio.create_task(self._draw(images, episode, self._drawing))
+            if synchronous:
                 await asyncio.wait({self._drawing}, timeout=max(begun_s + DELIVERY_S - time.monotonic(), 0.0))
         self._answer_cues(1)
         await self._links.await_readers()
 
-    async def _draw(self, images: list[Measurement], episode: Episode) -> None:
+    async def _draw(self, images: list[Measurement], episode: Episode, before: asyncio.Task[None] | None) -> None:
+        """Draw and send the images of a tick, once those of the tick before are drawn."""
         try:
+            if before is not None:
+                await before
             for each in images:
-                await self._measure(each, episode)
+                if episode is self._calls.episode:
+                    await self._measure(each, episode)
             await self._links.await_readers()
         except Exception:  # a server that fails one image draws the next
             log.exception("an image failed")
+        finally:
+            self._undrawn -= 1
 
     def _answer_cues(self, most: int | None = None) -> None:
         """Answer what waits for the ticks that were made; all that waits, where none is to come."""
@@ -259,7 +285,7 @@ class Server:
             return wire.fail(f"{call.method[:60]} failed on the server: {type(error).__name__}")
         if call.method == "load_new_episode":
             self._state = self._calls.episode.describe_world(0.0)
-            self._preparing = asyncio.create_task(asyncio.to_thread(self._calls.episode.prepare))
+            self._prepare()
         if self._calls.ticks or call.method in ("set_episode_settings", "load_new_episode"):
             self._cue.set()
         if call.method == "apply_batch":

@@ -6,6 +6,8 @@ image adds the two lower bytes of the actor's number as green and blue.
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+from PIL.Image import Resampling
 
 from flcav.machine.compiled import compiled
 from flcav.sensors.lens import BODY_FROM_OPTICAL, compute_pixel_rays
@@ -18,7 +20,9 @@ DEPTH_STEPS = 2**24 - 1
 
 def sense_rgb(sight: Sight, sensor: Sensor) -> bytes:
     """Return a colour image."""
-    rgb = sight.photograph(sensor).rgb
+    rgb, lens = sight.photograph(sensor).rgb, lens_of(sensor)
+    if rgb.shape[:2] != (lens.height, lens.width):  # of low quality
+        rgb = np.asarray(Image.fromarray(rgb).resize((lens.width, lens.height), Resampling.BILINEAR))
     image = np.empty((*rgb.shape[:2], 4), np.uint8)
     _write_colours(rgb, image)
     return _pack(sensor, image)

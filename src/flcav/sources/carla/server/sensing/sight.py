@@ -13,6 +13,7 @@ from flcav.sensors.camera.camera import Camera, Exposure, label, photograph
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
 from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sources.carla.frames import MapFrame
+from flcav.sources.carla.server.blueprints import Quality
 from flcav.statistics.streams import stream
 from flcav.world.map.town import Town
 from flcav.world.rays.hits import Hits
@@ -51,8 +52,12 @@ def lens_of(sensor: Sensor) -> Lens:
     return Lens(width=width, height=height, fov_deg=sensor.number_of("fov"))
 
 
-def _key(sensor: Sensor) -> tuple[bytes, Lens]:
-    return sensor.pose.tobytes(), lens_of(sensor)
+def _drawn_lens(sensor: Sensor) -> Lens:
+    """Return the lens by which a camera's colours are drawn: of low quality it has half of the columns and rows."""
+    lens = lens_of(sensor)
+    if sensor.attributes.get("quality") != Quality.LOW:
+        return lens
+    return Lens(width=-(-lens.width // 2), height=-(-lens.height // 2), fov_deg=lens.fov_deg)
 
 
 @dataclass
@@ -98,16 +103,18 @@ class Sight:
 
     def label(self, sensor: Sensor) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
         """Return the semantic and the instance image of a camera: those of its colour image, if there is one."""
-        if (known := self._exposures.get(_key(sensor))) is not None:
+        lens = lens_of(sensor)
+        if (known := self._exposures.get((sensor.pose.tobytes(), lens))) is not None:
             return known.semantic, known.instance
         pose, hidden = sensor.pose @ BODY_FROM_OPTICAL, self.find_inside(sensor)
-        return label(self.scene, pose, lens_of(sensor), hidden=hidden, threads=THREADS)
+        return label(self.scene, pose, lens, hidden=hidden, threads=THREADS)
 
     def photograph(self, sensor: Sensor) -> Exposure:
-        """Return the image of a camera, taken once for all cameras of one pose and lens."""
-        key = _key(sensor)
+        """Return the image of a camera, taken once for all cameras of one pose and lens; smaller in low quality."""
+        lens = _drawn_lens(sensor)
+        key = sensor.pose.tobytes(), lens
         if key not in self._exposures:
-            camera = Camera(**lens_of(sensor).model_dump(), noise=0.0)
+            camera = Camera(**lens.model_dump(), noise=0.0)
             pose, hidden = sensor.pose @ BODY_FROM_OPTICAL, self.find_inside(sensor)
             rng = stream(self.seed, "carla", "camera", self.tick)
             self._exposures[key] = photograph(
