@@ -5,15 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from carla_calls import describe, invoke, place
+from shapely.geometry import LineString, Point
 
 from flcav.config import InputError
 from flcav.sensors.frame import SEMANTICS
 from flcav.sources.carla.server import maps as carla_maps
+from flcav.sources.carla.server.blueprints import list_blueprints
 from flcav.sources.carla.server.calls import Calls
 from flcav.sources.carla.server.driving import choose_gear
 from flcav.sources.carla.server.lights import find_limits
-from flcav.sources.carla.server.maps import SPAWN_LEAST_M, SPAWN_POINTS, Maps
+from flcav.sources.carla.server.maps import OPENDRIVE_MAP, SPAWN_POINTS, Maps
 from flcav.sources.carla.server.wire import VehicleControl
+from flcav.world.dynamics.obstacles import list_obstacles
 from flcav.world.opendrive.importing import ImportedTown
 
 DT_S = 0.05
@@ -203,21 +206,61 @@ def test_a_car_that_is_thrown_up_comes_down(calls):
 def test_spawn_points_are_as_many_as_carla_has_and_follow_the_road(maps, monkeypatch):
     for town, most_deg in (("suburb", 0.0), ("hilly_ring", 10.0)):
         served = maps.load(town)
-        rotations = np.array([point.rotation for point in served.spawn_points])
+        points = served.list_spawn_points(list_obstacles(served.town).boxes)
+        rotations = np.array([point.rotation for point in points])
         assert (np.abs(rotations[:, 0]).max() > 0.5) == (most_deg > 0)
-        for point in served.spawn_points[::10]:
+        for point in points[::10]:
             ahead = np.array((np.cos(np.radians(point.rotation[1])), np.sin(np.radians(point.rotation[1]))))
             here = np.array(point.location[:2])
             rise = served.town.ground(*((here + ahead) * (1, -1))) - served.town.ground(*((here - ahead) * (1, -1)))
             assert point.rotation[0] == pytest.approx(np.degrees(np.arctan2(rise, 2.0)), abs=1.0)  # upwards is positive
-    usual = len(maps.load("suburb").spawn_points)
+    served = maps.load("suburb")
+    standing = list_obstacles(served.town).boxes
+    usual = len(served.list_spawn_points(standing))
     for wanted in (usual - 7, usual + 9):
         monkeypatch.setitem(SPAWN_POINTS, "suburb", wanted)
-        points = replace(maps.load("suburb")).spawn_points
+        points = served.list_spawn_points(standing)
         assert len(points) == wanted
         places = np.array([point.location for point in points])
         assert len(np.unique(places.round(2), axis=0)) == wanted
-    assert SPAWN_LEAST_M > 2 * 5.136  # of the longest bus
+
+
+@pytest.mark.parametrize("town", ["suburb", "ring", "grid"])
+def test_the_longest_and_the_widest_vehicle_fit_at_all_spawn_points_at_once(town, maps):
+    """Beside posts, buildings and the parked cars of a seed, which leave no room at some places."""
+    calls = Calls(maps, town, seed=0, traffic=0, port=2000)
+    sizes = {name: each.size for name, each in list_blueprints().items() if name.startswith("vehicle.")}
+    longest, widest = (max(sizes, key=lambda name: sizes[name][side:]) for side in (0, 1))
+    for name in (longest, widest):
+        for location, rotation in calls.episode.spawn_points:
+            spawn(calls, name, [list(location), list(rotation)])
+        for actor in [actor for actor in calls.episode.actors.values() if actor.kind == "vehicle"]:
+            calls.episode.destroy(actor)
+    calls.episode.close()
+
+
+TWO_STREETS = '<OpenDRIVE><header revMajor="1" revMinor="4"/>{}{}</OpenDRIVE>'
+STREET = """<road id="{}" length="120" junction="-1"><planView><geometry s="0" x="0" y="{}" hdg="0" length="120">
+<line/></geometry></planView><lanes><laneSection s="0"><center><lane id="0"/></center><right>
+<lane id="-1" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></right>
+</laneSection></lanes></road>"""
+
+
+def test_streets_that_lead_to_no_other_are_built(maps):
+    """All that the client has in its map is a street of the town, with spawn points."""
+    carla = pytest.importorskip("carla", reason="needs the extra 'carla'")
+    pytest.importorskip("sumo", reason="needs the extra 'towns'")
+    maps.receive(TWO_STREETS.format(STREET.format(1, 0), STREET.format(2, 300)))
+    calls = Calls(maps, OPENDRIVE_MAP, seed=0, traffic=0, port=2000)
+    assert {round(point.location[1] / 300) for point in calls.episode.spawn_points} == {0, -1}
+    lanes = [LineString(lane.shape) for edge in calls.episode.served.net.streets for lane in edge.lanes]
+    waypoints = carla.Map("two", calls.get_map_data()).generate_waypoints(10.0)
+    assert len(waypoints) > 20
+    for waypoint in waypoints:
+        at = waypoint.transform.location
+        pose = calls.episode.served.frame.from_transform((at.x, at.y, at.z), (0.0, 0.0, 0.0))
+        assert min(lane.distance(Point(pose[:2, 3])) for lane in lanes) < 0.2
+    calls.episode.close()
 
 
 def test_tags_alone_are_those_of_the_colour_image(calls):

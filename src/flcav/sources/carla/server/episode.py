@@ -6,7 +6,7 @@ Every tick the world makes a step; then all actors take their places, and the se
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -109,6 +109,11 @@ class Episode:
     def age_s(self) -> float:
         """The time since the map was loaded [s], by the clock."""
         return time.monotonic() - self._begun_s
+
+    @cached_property
+    def spawn_points(self) -> list[Transform]:
+        """Poses at which there is room for every vehicle while nobody else is there."""
+        return self.served.list_spawn_points(self.world.obstacles.boxes)
 
     def close(self) -> None:
         """End the world, and write what is recorded."""
