@@ -141,6 +141,21 @@ def test_smoke_tests(smoke):
     assert "14 passed" in told
 
 
+def test_lights_count_before_the_lanes_that_the_map_says(usual_port):
+    """The client finds these lanes by a light's id in the map, which says them of all lights but one."""
+    carla = pytest.importorskip("carla")
+    client = carla.Client("127.0.0.1", usual_port)
+    client.set_timeout(60.0)
+    world = client.load_world("Town10HD_Opt")
+    lights = world.get_actors().filter("traffic.traffic_light")
+    middles = [light.get_transform().transform(light.trigger_volume.location) for light in lights]
+    lanes = [light.get_affected_lane_waypoints() for light in lights]
+    off = [min(at.distance(lane.transform.location) for lane in own) for at, own in zip(middles, lanes)]
+    assert (len(off), sum(away < 8.0 for away in off)) == (16, 15)
+    assert len({light.get_opendrive_id() for light in lights}) == 16
+    assert {sign.type_id for sign in world.get_actors().filter("traffic.[sy]*")} == {"traffic.stop", "traffic.yield"}
+
+
 def test_the_recorder_of_the_article_loses_nothing_and_is_read(python, usual_port, tmp_path):
     """Five cars and a post with eleven images and 18 other measurements a tick, each waited for a second at most."""
     raw = tmp_path / "raw_data" / "record_2026_0101_0000"

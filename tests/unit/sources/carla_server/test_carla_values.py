@@ -9,8 +9,9 @@ from shapely.geometry import LineString, Point
 
 from flcav.config import InputError
 from flcav.sensors.frame import SEMANTICS
+from flcav.sources.carla.frames import mirror
 from flcav.sources.carla.server import maps as carla_maps
-from flcav.sources.carla.server.blueprints import list_blueprints
+from flcav.sources.carla.server.blueprints import Refused, list_blueprints
 from flcav.sources.carla.server.calls import Calls
 from flcav.sources.carla.server.driving import choose_gear
 from flcav.sources.carla.server.lights import find_limits
@@ -315,3 +316,32 @@ def test_an_imported_map_is_kept_for_the_next_server(maps, tmp_path, monkeypatch
     monkeypatch.setenv("XDG_CACHE_HOME", str(file))  # which is no folder
     start("b")
     assert imported == ["a", "a", "b", "b"]
+
+
+SIGNALS = """<signals><signal id="7" s="60" t="-4" orientation="+" type="206" subtype="-1" value="-1" dynamic="no"/>
+<signal id="8" s="30" t="-4" orientation="+" type="274" subtype="50" value="50" unit="km/h" country="DE" dynamic="no"/>
+</signals></road>"""
+
+
+def test_signs_of_a_map_are_actors_that_count_on_their_lane(maps):
+    pytest.importorskip("sumo", reason="needs the extra 'towns'")
+    maps.receive(f"<OpenDRIVE>{STREET.format(1, 0)}</OpenDRIVE>".replace("</road>", SIGNALS))
+    calls = Calls(maps, OPENDRIVE_MAP, seed=0, traffic=0, port=2000)
+    signs = {actor.sign: actor for actor in calls.episode.actors.values() if actor.kind == "traffic"}
+    assert {number: sign.description.id for number, sign in signs.items()} == {
+        "7": "traffic.stop",
+        "8": "traffic.speed_limit.50",
+    }
+    for number, along in (("7", 60.0), ("8", 30.0)):
+        sign = signs[number]
+        x, y, _ = calls.episode.served.frame.to_location(sign.pose[:3, 3])
+        assert (x, y) == pytest.approx((along, 4.0), abs=1e-3)  # to the right, y of CARLA
+        middle = sign.pose @ np.append(mirror(np.array(sign.bounding_box().location)), 1.0)
+        x, y, _ = calls.episode.served.frame.to_location(middle[:3])
+        assert (x, y) == pytest.approx((along - 3.0, 1.75), abs=0.1)
+        with pytest.raises(Refused, match="cannot be destroyed"):
+            invoke(calls, "destroy_actor", (sign.id,))
+    assert (
+        calls.episode.describe_world(0.05).count(b"\x00" * 36 + b"7\x00") == 1
+    )  # its id in the state of a still actor
+    calls.episode.close()
