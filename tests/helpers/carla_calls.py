@@ -20,5 +20,5 @@ def describe(name, *attributes):
 
 def place(calls, number=0, ahead=0.0):
     """Return the transform of a spawn point, moved along x."""
-    location, rotation = calls.episode.served.spawn_points[number]
+    location, rotation = calls.episode.spawn_points[number]
     return [[location[0] + ahead, *location[1:]], list(rotation)]

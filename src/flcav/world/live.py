@@ -93,7 +93,7 @@ class LiveWorld:
         self.bodies = Bodies(ground := Ground(town), leans=settings.leans)
         self._ground = ground
         self._parked = stand_parked(town, ground, settings.seed) if settings.parked else NOBODY
-        self._obstacles = list_obstacles(town, self._parked)
+        self.obstacles = list_obstacles(town, self._parked)
         self._time_s, self._number = 0.0, 0
         self._collisions: tuple[Collision, ...] = ()
         self._hit: set[str] = set()  # since the last step of SUMO
@@ -259,10 +259,10 @@ class LiveWorld:
 
     def _list_boxes(self, own: Actors, low: Array, high: Array) -> tuple[Footprints, list[str]]:
         """Return the boxes of the bodies, of SUMO's actors, and of obstacles about these corners; and their names."""
-        near = self._obstacles.near(low - NEAR_M, high + NEAR_M)
-        obstacles = Footprints(*(array[near] for array in self._obstacles.boxes))
+        near = self.obstacles.near(low - NEAR_M, high + NEAR_M)
+        obstacles = Footprints(*(array[near] for array in self.obstacles.boxes))
         boxes = join_footprints(outline(own), outline(self._flow), obstacles)
-        return boxes, [*own.name, *self._flow.name, *(self._obstacles.name[row] for row in near.tolist())]
+        return boxes, [*own.name, *self._flow.name, *(self.obstacles.name[row] for row in near.tolist())]
 
     def _report(self, contacts: Contacts, names: Sequence[str], found: dict[tuple[str, str], Collision]) -> None:
         """Add the contacts to those `found` during a step: impulses of the same two add up."""

@@ -45,7 +45,6 @@ OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}
 JOINING = {
     "offset.disable-normalization": "true",
     "no-turnarounds.except-deadend": "true",
-    "keep-edges.components": "1",
     "walkingareas": "true",
     "junctions.corner-detail": "8",
     "junctions.internal-link-detail": "12",

@@ -314,7 +314,7 @@ def test_cars_have_the_colour_that_they_are_spawned_with(calls):
 
 
 def test_rays_that_meet_nothing_are_answered_as_clients_read_them(calls):
-    (x, y, z), _ = calls.episode.served.spawn_points[0]
+    (x, y, z), _ = calls.episode.spawn_points[0]
     assert invoke(calls, "project_point", ([x, y, z], [0.0, 0.0, 1.0], 5.0)) == [False, [(0.0, 0.0, 0.0), 0]]
     hit, (_, tag) = invoke(calls, "project_point", ([x, y, z], [0.0, 0.0, -1.0], 5.0))
     assert (hit, tag) == (True, 1)

@@ -87,6 +87,20 @@ def test_who_bursts_cues_is_read_no_further_while_others_are_served(maps):
     asyncio.run(session())
 
 
+def test_a_server_ends_although_cues_wait(maps, monkeypatch):
+    monkeypatch.setattr(Server, "_tick", lambda self: asyncio.sleep(60.0))
+
+    async def session():
+        async with serving(maps) as (port, _, calls):  # it waits 5 s for the end
+            client = await Client().connect(port)
+            await client.call("set_episode_settings", SYNCHRONOUS)
+            client.writer.write(wire.pack([0, 2, "tick_cue", [[False]]]) * 100)
+            while calls.ticks < serve.MOST_CUES - 1:
+                await asyncio.sleep(0.001)
+
+    asyncio.run(session())
+
+
 def test_all_who_read_nothing_share_one_deadline(maps, monkeypatch):
     monkeypatch.setattr(connections, "STUCK_S", 0.5)
     monkeypatch.setitem(KINDS, "sensor.other.gnss", Kind(Stream.GNSS, lambda sight, sensor: bytes(8 << 20)))

@@ -6,19 +6,22 @@ import numpy as np
 import pytest
 from carla_calls import describe, invoke, place
 from PIL import Image
+from shapely.geometry import LineString, Point
 
 from flcav.config import InputError
 from flcav.sensors.frame import SEMANTICS
+from flcav.sources.carla.frames import mirror
 from flcav.sources.carla.server import maps as carla_maps
 from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.blueprints import Quality, Refused, check
+from flcav.sources.carla.server.blueprints import Quality, Refused, check, list_blueprints
 from flcav.sources.carla.server.calls import Calls
 from flcav.sources.carla.server.driving import choose_gear
 from flcav.sources.carla.server.lights import find_limits
-from flcav.sources.carla.server.maps import SPAWN_LEAST_M, SPAWN_POINTS, Maps
+from flcav.sources.carla.server.maps import OPENDRIVE_MAP, SPAWN_POINTS, Maps
 from flcav.sources.carla.server.sensing.cameras import sense_rgb
 from flcav.sources.carla.server.wire import VehicleControl
 from flcav.world import static
+from flcav.world.dynamics.obstacles import list_obstacles
 from flcav.world.opendrive.importing import ImportedTown
 
 DT_S = 0.05
@@ -211,21 +214,61 @@ def test_a_car_that_is_thrown_up_comes_down(calls):
 def test_spawn_points_are_as_many_as_carla_has_and_follow_the_road(maps, monkeypatch):
     for town, most_deg in (("suburb", 0.0), ("hilly_ring", 10.0)):
         served = maps.load(town)
-        rotations = np.array([point.rotation for point in served.spawn_points])
+        points = served.list_spawn_points(list_obstacles(served.town).boxes)
+        rotations = np.array([point.rotation for point in points])
         assert (np.abs(rotations[:, 0]).max() > 0.5) == (most_deg > 0)
-        for point in served.spawn_points[::10]:
+        for point in points[::10]:
             ahead = np.array((np.cos(np.radians(point.rotation[1])), np.sin(np.radians(point.rotation[1]))))
             here = np.array(point.location[:2])
             rise = served.town.ground(*((here + ahead) * (1, -1))) - served.town.ground(*((here - ahead) * (1, -1)))
             assert point.rotation[0] == pytest.approx(np.degrees(np.arctan2(rise, 2.0)), abs=1.0)  # upwards is positive
-    usual = len(maps.load("suburb").spawn_points)
+    served = maps.load("suburb")
+    standing = list_obstacles(served.town).boxes
+    usual = len(served.list_spawn_points(standing))
     for wanted in (usual - 7, usual + 9):
         monkeypatch.setitem(SPAWN_POINTS, "suburb", wanted)
-        points = replace(maps.load("suburb")).spawn_points
+        points = served.list_spawn_points(standing)
         assert len(points) == wanted
         places = np.array([point.location for point in points])
         assert len(np.unique(places.round(2), axis=0)) == wanted
-    assert SPAWN_LEAST_M > 2 * 5.136  # of the longest bus
+
+
+@pytest.mark.parametrize("town", ["suburb", "ring", "grid"])
+def test_the_longest_and_the_widest_vehicle_fit_at_all_spawn_points_at_once(town, maps):
+    """Beside posts, buildings and the parked cars of a seed, which leave no room at some places."""
+    calls = Calls(maps, town, seed=0, traffic=0, port=2000)
+    sizes = {name: each.size for name, each in list_blueprints().items() if name.startswith("vehicle.")}
+    longest, widest = (max(sizes, key=lambda name: sizes[name][side:]) for side in (0, 1))
+    for name in (longest, widest):
+        for location, rotation in calls.episode.spawn_points:
+            spawn(calls, name, [list(location), list(rotation)])
+        for actor in [actor for actor in calls.episode.actors.values() if actor.kind == "vehicle"]:
+            calls.episode.destroy(actor)
+    calls.episode.close()
+
+
+TWO_STREETS = '<OpenDRIVE><header revMajor="1" revMinor="4"/>{}{}</OpenDRIVE>'
+STREET = """<road id="{}" length="120" junction="-1"><planView><geometry s="0" x="0" y="{}" hdg="0" length="120">
+<line/></geometry></planView><lanes><laneSection s="0"><center><lane id="0"/></center><right>
+<lane id="-1" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></right>
+</laneSection></lanes></road>"""
+
+
+def test_streets_that_lead_to_no_other_are_built(maps):
+    """All that the client has in its map is a street of the town, with spawn points."""
+    carla = pytest.importorskip("carla", reason="needs the extra 'carla'")
+    pytest.importorskip("sumo", reason="needs the extra 'towns'")
+    maps.receive(TWO_STREETS.format(STREET.format(1, 0), STREET.format(2, 300)))
+    calls = Calls(maps, OPENDRIVE_MAP, seed=0, traffic=0, port=2000)
+    assert {round(point.location[1] / 300) for point in calls.episode.spawn_points} == {0, -1}
+    lanes = [LineString(lane.shape) for edge in calls.episode.served.net.streets for lane in edge.lanes]
+    waypoints = carla.Map("two", calls.get_map_data()).generate_waypoints(10.0)
+    assert len(waypoints) > 20
+    for waypoint in waypoints:
+        at = waypoint.transform.location
+        pose = calls.episode.served.frame.from_transform((at.x, at.y, at.z), (0.0, 0.0, 0.0))
+        assert min(lane.distance(Point(pose[:2, 3])) for lane in lanes) < 0.2
+    calls.episode.close()
 
 
 def test_tags_alone_are_those_of_the_colour_image(calls):
@@ -345,3 +388,32 @@ def test_low_quality_is_told_and_draws_smaller_pictures_of_the_same_street(maps,
         assert not {each.id for each in check(wire.Description(0, "sensor.camera.rgb", ()))[1].attributes} & {"quality"}
     finally:
         low.episode.close()
+
+
+SIGNALS = """<signals><signal id="7" s="60" t="-4" orientation="+" type="206" subtype="-1" value="-1" dynamic="no"/>
+<signal id="8" s="30" t="-4" orientation="+" type="274" subtype="50" value="50" unit="km/h" country="DE" dynamic="no"/>
+</signals></road>"""
+
+
+def test_signs_of_a_map_are_actors_that_count_on_their_lane(maps):
+    pytest.importorskip("sumo", reason="needs the extra 'towns'")
+    maps.receive(f"<OpenDRIVE>{STREET.format(1, 0)}</OpenDRIVE>".replace("</road>", SIGNALS))
+    calls = Calls(maps, OPENDRIVE_MAP, seed=0, traffic=0, port=2000)
+    signs = {actor.sign: actor for actor in calls.episode.actors.values() if actor.kind == "traffic"}
+    assert {number: sign.description.id for number, sign in signs.items()} == {
+        "7": "traffic.stop",
+        "8": "traffic.speed_limit.50",
+    }
+    for number, along in (("7", 60.0), ("8", 30.0)):
+        sign = signs[number]
+        x, y, _ = calls.episode.served.frame.to_location(sign.pose[:3, 3])
+        assert (x, y) == pytest.approx((along, 4.0), abs=1e-3)  # to the right, y of CARLA
+        middle = sign.pose @ np.append(mirror(np.array(sign.bounding_box().location)), 1.0)
+        x, y, _ = calls.episode.served.frame.to_location(middle[:3])
+        assert (x, y) == pytest.approx((along - 3.0, 1.75), abs=0.1)
+        with pytest.raises(Refused, match="cannot be destroyed"):
+            invoke(calls, "destroy_actor", (sign.id,))
+    assert (
+        calls.episode.describe_world(0.05).count(b"\x00" * 36 + b"7\x00") == 1
+    )  # its id in the state of a still actor
+    calls.episode.close()

@@ -68,7 +68,8 @@ class Actor:
     sensor: Sensor | None = None
     clock: Clock | None = None
     light: int | None = None  # row of its approach, of a traffic light
-    box: BoundingBox | None = None  # of a traffic light
+    sign: str = ""  # its id in the map, of a traffic sign
+    box: BoundingBox | None = None  # of a traffic light or sign
     motion: Sequence[wire.Vector] = STILL  # CARLA's velocity, angular velocity, acceleration
     control: wire.VehicleControl = STANDING
     walk: wire.WalkerControl = WAITING
@@ -110,6 +111,8 @@ class Actor:
         """Return CARLA's semantic tags."""
         if self.light is not None:
             return bytes([SEMANTICS["traffic_light"]])
+        if self.sign:
+            return bytes([SEMANTICS["traffic_sign"]])
         if not self.category:
             return b""
         names = {"van": "car", "prop": "static"}

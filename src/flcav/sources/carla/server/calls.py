@@ -80,7 +80,7 @@ class Calls:
 
     def get_map_info(self) -> wire.Packed:
         """Return the map's name and spawn points."""
-        return [f"Carla/Maps/{self.episode.served.name}", self.episode.served.spawn_points]
+        return [f"Carla/Maps/{self.episode.served.name}", self.episode.spawn_points]
 
     def get_map_data(self) -> str:
         """Return the map's OpenDRIVE text."""

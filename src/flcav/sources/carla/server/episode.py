@@ -6,7 +6,7 @@ Every tick the world makes a step; then all actors take their places, and the se
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.actors import STANDING, WAITING, Actor, Counters, list_places
 from flcav.sources.carla.server.blueprints import TRUE, Blueprint, Quality, Refused, check, find_paint, list_blueprints
 from flcav.sources.carla.server.driving import choose_gear, list_grips, steer_towards
-from flcav.sources.carla.server.lights import Lights, find_approaches, find_limits
+from flcav.sources.carla.server.lights import Lights, find_approaches, find_limits, list_signs
 from flcav.sources.carla.server.maps import ServedMap
 from flcav.sources.carla.server.recorder import Recorder
 from flcav.sources.carla.server.sensing.cameras import sense_depth, sense_instance, sense_rgb
@@ -97,6 +97,9 @@ class Episode:
         for row, approach in enumerate(self.lights.approaches):
             light = self._add(wire.Description(0, "traffic.traffic_light", ()), approach.pose)
             light.light, light.box = row, approach.box()
+        for each in list_signs(served):
+            sign = self._add(wire.Description(0, each.blueprint, ()), each.pose)
+            sign.sign, sign.box = each.id, each.box
         self.lights.follow(self.world, 0.0)
         self._follow(self.world.snapshot, 0.0)
 
@@ -123,6 +126,11 @@ class Episode:
     def age_s(self) -> float:
         """The time since the map was loaded [s], by the clock."""
         return time.monotonic() - self._begun_s
+
+    @cached_property
+    def spawn_points(self) -> list[Transform]:
+        """Poses at which there is room for every vehicle while nobody else is there."""
+        return self.served.list_spawn_points(self.world.obstacles.boxes)
 
     def close(self) -> None:
         """End the world, and write what is recorded."""
@@ -194,7 +202,7 @@ class Episode:
 
     def destroy(self, actor: Actor) -> None:
         """Remove an actor; sensors that it carries stay where they are."""
-        if actor is self.spectator or actor.light is not None:
+        if actor is self.spectator or actor.kind == "traffic":
             raise Refused(f"actor {actor.id} is a {actor.description.id} of the town, which cannot be destroyed")
         del self.actors[actor.id]
         if actor.name:
@@ -402,6 +410,8 @@ class Episode:
             return wire.pack_vehicle(actor.control, gear, actor.limit_kmh, light, row >= 0, number)
         if actor.kind == "walker":
             return wire.pack_walker(actor.walk)
+        if actor.sign:
+            return wire.pack_sign(actor.sign)
         if (row := actor.light) is not None:
             green, yellow, red = self.lights.times_s[row]
             sign, elapsed = self.lights.approaches[row].sign, self.lights.elapsed_s[row]

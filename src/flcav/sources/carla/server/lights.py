@@ -1,4 +1,4 @@
-"""Traffic lights as CARLA's actors, one for each approach to a light, and the speed limits of signs.
+"""Traffic lights as CARLA's actors, one for each approach to a light, and signs with their speed limits.
 
 A light that a client sets keeps its state for the time of that state, then its junction goes on with its program.
 """
@@ -6,9 +6,13 @@ A light that a client sets keeps its state for the time of that state, then its 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry import LineString, Point
 
 from flcav.geometry import heading_vectors, inverse, pose, wrap_angle
 from flcav.sources.carla.frames import mirror
@@ -16,7 +20,7 @@ from flcav.sources.carla.server.maps import ServedMap
 from flcav.sources.carla.server.wire import BoundingBox
 from flcav.world.commands import SetLight
 from flcav.world.live import LiveWorld
-from flcav.world.map.roads import Edge
+from flcav.world.map.roads import Edge, Lane
 from flcav.world.opendrive.exporting import TRAFFIC_LIGHT, list_approaches, name_signal
 from flcav.world.opendrive.objects.signs import read_limit
 from flcav.world.opendrive.reference_line import ReferenceLine
@@ -29,6 +33,8 @@ STATES = {letter: state for state, letters in LETTERS_OF.items() for letter in l
 TIMES_S = (10.0, 3.0, 2.0)  # CARLA's of green, yellow and red
 BEFORE_M, BEYOND_M = 8.0, 1.0  # a vehicle is at a light where its front is so near to the stop line
 ALIGNED_RAD = 1.0
+SIGNS = {"205": "traffic.yield", "206": "traffic.stop"}  # by their types in CARLA's maps, which are Germany's
+LANE_M = 3.5  # width of the volume in which a sign counts
 PASSED_M, BESIDE_M = 10.0, 12.0  # a vehicle that is so far beyond a sign, and beside it, has just passed it
 
 
@@ -46,15 +52,19 @@ class Approach:
 
     def box(self) -> BoundingBox:
         """Return the volume before the stop line in which the light counts, in the frame of its actor."""
-        ahead = heading_vectors(self.stop[2])
-        middle = np.append(self.stop[:2] - 3.0 * ahead, self.pose[2, 3] + 1.0)
-        x, y, z = mirror((inverse(self.pose) @ np.append(middle, 1.0))[:3]).tolist()
-        return BoundingBox((x, y, z), (self.half_width, 2.5, 1.5))
+        return _box_before(self.stop, self.half_width, self.pose)
+
+
+def _box_before(line: Array, half_width: float, pose: Array) -> BoundingBox:
+    """Return the volume before a line across the road, x, y [m] and direction of driving [rad], in an actor's frame."""
+    middle = np.append(line[:2] - 3.0 * heading_vectors(line[2]), pose[2, 3] + 1.0)
+    x, y, z = mirror((inverse(pose) @ np.append(middle, 1.0))[:3]).tolist()
+    return BoundingBox((x, y, z), (half_width, 2.5, 1.5))
 
 
 def find_approaches(served: ServedMap) -> list[Approach]:
     """Return the approaches to all lights of a map, in the net's order."""
-    signs = _read_signs(served)
+    signs = _list_lights(served)
     net, signals = served.net, served.town.signals
     place = {link: row for row, link in reversed(list(enumerate(signals.link)))}
     found = []
@@ -64,10 +74,8 @@ def find_approaches(served: ServedMap) -> list[Approach]:
         lanes = {lane.id for lane in edge.lanes}
         ruled = {way.light for way in net.connections if way.light and way.start in lanes}
         foot = signals.foot[place[link]] if link in place else (x, y)
-        sign = name_signal(link)
-        if signs:
-            near = signals.position[place[link], :2] if link in place else np.array((x, y))
-            sign = min(signs, key=lambda each: float(np.hypot(*(signs[each] - near))))
+        head = signals.position[place[link], :2] if link in place else np.array((x, y))
+        sign = min(signs, key=partial(_measure_off, head, np.array((x, y)))).id if signs else name_signal(link)
         ground = served.town.ground(float(foot[0]), float(foot[1]))
         found.append(
             Approach(
@@ -92,27 +100,57 @@ def _find_stop(edge: Edge) -> tuple[float, float, float, float]:
     return float(x), float(y), float(np.arctan2(ahead[1], ahead[0])), sum(lane.width for lane in lanes) / 2
 
 
-def _read_signs(served: ServedMap) -> dict[str, Array]:
-    """Return the places (2,) of the traffic lights of an imported map by their ids; none of a town of flcav."""
+class Mapped(NamedTuple):
+    """A signal of a map."""
+
+    id: str
+    row: ElementTree.Element
+    place: Array  # (3,) x, y [m], and the heading of its road [rad]
+    entries: Array  # (K, 2) where roads refer to it, at the beginning of the lanes that it is for [m]
+
+
+def _measure_off(head: Array, stop: Array, signal: Mapped) -> float:
+    """Return how far a signal is from a light [m]: its entries from the stop line, or itself from the light's head.
+
+    Lights may hang beyond the junction, next to another stop line.
+    """
+    return float(
+        np.hypot(*(signal.entries - stop).T).min() if len(signal.entries) else np.hypot(*(signal.place[:2] - head))
+    )
+
+
+def _list_lights(served: ServedMap) -> list[Mapped]:
+    """Return the traffic lights of an imported map; none of a town of flcav."""
     if served.town.parameters.source is None:
-        return {}
-    return {row.get("id", ""): at[:2] for row, at in _list_signals(served) if row.get("type") == TRAFFIC_LIGHT}
+        return []
+    return [each for each in _list_signals(served) if each.row.get("type") == TRAFFIC_LIGHT]
 
 
-def _list_signals(served: ServedMap) -> Iterator[tuple[ElementTree.Element, Array]]:
-    """Yield each signal of a map with its place in the town: x, y [m] and the heading of its road [rad] (3,)."""
+def _list_signals(served: ServedMap) -> list[Mapped]:
+    """Return the signals of a map."""
+    signals: list[tuple[ElementTree.Element, Array]] = []
+    entries: dict[str, list[Array]] = {}
     text = served.opendrive.encode("utf-8", "surrogateescape")
     root = ElementTree.fromstring(text[max(text.find(b"<?xml "), 0) :])  # comments may stand before the declaration
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]  # version 1.8 has a namespace
     for road in root.iterfind("road"):
-        if not (rows := road.findall("signals/signal")):
+        if not (rows := road.findall("signals/*")):
             continue
         line = ReferenceLine(road)
         for row in rows:
             x, y, heading = line.at(np.array([float(row.get("s", "0"))]))[0]
             t, (dx, dy) = float(row.get("t", "0")), served.frame.offset_m
-            yield row, np.array((x - t * np.sin(heading) + dx, y + t * np.cos(heading) + dy, heading))
+            at = np.array((x - t * np.sin(heading) + dx, y + t * np.cos(heading) + dy, heading))
+            if row.tag == "signal":
+                signals.append((row, at))
+            elif row.tag == "signalReference":
+                entries.setdefault(row.get("id", ""), []).append(at[:2])
+    found = []
+    for row, at in signals:
+        name = row.get("id", "")
+        found.append(Mapped(name, row, at, np.array(entries.get(name, [])).reshape(-1, 2)))
+    return found
 
 
 @dataclass(frozen=True)
@@ -137,13 +175,56 @@ class Limits:
 def find_limits(served: ServedMap) -> Limits:
     """Return the speed-limit signs of a map; one that is for both directions stands twice."""
     place, kmh = [np.zeros((0, 3))], []
-    for row, at in _list_signals(served):
+    for _, row, at, _ in _list_signals(served):
         if (limit := read_limit(row)) is None:
             continue
-        turns = {"+": (0.0,), "-": (np.pi,)}.get(row.get("orientation", "none"), (0.0, np.pi))
-        place += [np.array([[at[0], at[1], at[2] + turn]]) for turn in turns]
+        turns = _list_turns(row)
+        place += [at[None] + (0.0, 0.0, turn) for turn in turns]
         kmh += [3.6 * limit] * len(turns)
     return Limits(np.concatenate(place), np.round(np.array(kmh, np.float64), 1))
+
+
+def _list_turns(signal: ElementTree.Element) -> tuple[float, ...]:
+    """Return the directions of driving that a signal is for, from that of its road [rad]."""
+    return {"+": (0.0,), "-": (np.pi,)}.get(signal.get("orientation", "none"), (0.0, np.pi))
+
+
+@dataclass(frozen=True)
+class Sign:
+    """A traffic sign that CARLA has as an actor."""
+
+    blueprint: str
+    id: str  # in the map
+    pose: Array  # (4, 4) world from actor: its x axis points across the road
+    box: BoundingBox  # in which it counts, in its own frame
+
+
+def list_signs(served: ServedMap) -> list[Sign]:
+    """Return the signs of a map that tell to stop or to give way, or a speed limit, in its order."""
+    lanes = [lane for edge in served.net.streets for lane in edge.lanes_of("driving")]
+    lines = shapely.STRtree([LineString(lane.shape) for lane in lanes])
+    found = []
+    for name, signal, at, entries in _list_signals(served):
+        limit, kind = read_limit(signal), SIGNS.get(signal.get("type", ""))
+        blueprint = kind if limit is None else f"traffic.speed_limit.{3.6 * limit:.0f}"
+        if blueprint is None or not lanes:
+            continue
+        heading = at[2] + _list_turns(signal)[0]
+        place = pose(at[0], at[1], served.town.ground(at[0], at[1]), heading - np.pi / 2)
+        here = entries[0] if len(entries) else at[:2]
+        spots = [_project(lanes[row], here) for row in lines.query(Point(here), "dwithin", BESIDE_M).tolist()]
+        ahead = [spot for spot in spots if len(entries) or abs(wrap_angle(spot[2] - heading)) < ALIGNED_RAD]
+        line = min(ahead, key=lambda spot: float(np.hypot(*(spot[:2] - here))), default=np.append(here, heading))
+        found.append(Sign(blueprint, name, place, _box_before(line, LANE_M / 2, place)))
+    return found
+
+
+def _project(lane: Lane, place: Array) -> Array:
+    """Return the nearest place on a lane's middle: x, y [m] and the direction of driving [rad] (3,)."""
+    line = LineString(lane.shape)
+    along = min(line.project(Point(place)), line.length - 0.1)
+    here, there = (np.array(line.interpolate(at).coords[0]) for at in (along, along + 0.1))
+    return np.append(here, np.arctan2(*(there - here)[::-1]))
 
 
 @dataclass

@@ -18,8 +18,11 @@ from flcav import world
 from flcav.config import InputError, shorten
 from flcav.interface.wording import suggest
 from flcav.sources.carla.frames import MapFrame, to_rotation, to_vector
+from flcav.sources.carla.server.blueprints import list_blueprints
 from flcav.sources.carla.server.navmesh import build_navigation_mesh
 from flcav.sources.carla.server.wire import Transform
+from flcav.world.dynamics.contacts import Footprints, find_overlaps
+from flcav.world.dynamics.obstacles import CLEARANCE_M
 from flcav.world.map.roads import Lane, RoadNet, read_net
 from flcav.world.map.town import NAME, PACKAGED, Town, load_town
 from flcav.world.opendrive.exporting import export_town
@@ -66,16 +69,38 @@ class ServedMap:
         """The town's road network."""
         return read_net(self.town.net)
 
-    @cached_property
-    def spawn_points(self) -> list[Transform]:
-        """Poses on driving lanes; on CARLA's own maps as many as CARLA has there."""
+    def list_spawn_points(self, standing: Footprints) -> list[Transform]:
+        """Return poses on driving lanes where each vehicle has room beside what is standing and those at other poses.
+
+        CARLA's own maps have as many as CARLA has there.
+        """
         wanted = SPAWN_POINTS.get(self.name.removesuffix(OPTIMISED))
-        found = list(self._places(SPAWN_EVERY_M))
-        for every in np.arange(SPAWN_EVERY_M, SPAWN_LEAST_M, -0.5) if wanted is not None else ():
-            if wanted is not None and len(found := list(self._places(every))) >= wanted:
-                found = [found[row] for row in np.linspace(0, len(found) - 1, wanted).round().astype(int)]
-                break
+        if wanted is None:
+            return self._pick_free(SPAWN_EVERY_M, standing)
+        found: list[Transform] = []
+        for every in np.arange(SPAWN_EVERY_M, SPAWN_LEAST_M, -0.5):
+            if len(found := self._pick_free(every, standing)) >= wanted:
+                return [found[row] for row in np.linspace(0, len(found) - 1, wanted).round().astype(int)]
         return found
+
+    def _pick_free(self, every_m: float, standing: Footprints) -> list[Transform]:
+        """Return the poses, so far apart, at which the largest vehicle meets nothing, nor itself at an earlier one."""
+        places = list(self._places(every_m))
+        poses = np.array([self.frame.from_transform(*place) for place in places]).reshape(-1, 4, 4)
+        length, width, height = (
+            max(sides) for sides in zip(*(each.size for each in list_blueprints().values() if each.kind == "vehicle"))
+        )
+        bottom = poses[:, 2, 3] - ABOVE_M + CLEARANCE_M
+        boxes = Footprints(
+            np.column_stack((poses[:, :2, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))),
+            np.tile((length / 2, width / 2), (len(places), 1)),
+            np.column_stack((bottom, bottom + height)),
+        )
+        free = np.ones(len(places), np.bool_)
+        free[find_overlaps(boxes, standing)[:, 0]] = False
+        for one, other in find_overlaps(boxes, boxes).tolist():
+            free[other] &= one >= other or not free[one]
+        return [place for place, fits in zip(places, free) if fits]
 
     def _places(self, every_m: float) -> Iterator[Transform]:
         for lane in _driving_lanes(self.net):

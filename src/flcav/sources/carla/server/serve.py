@@ -238,7 +238,7 @@ class Server:
 
     async def _serve_call(self, call: wire.Call, writer: asyncio.StreamWriter) -> None:
         """Answer a call: at once, or after the tick that it cues."""
-        while len(self._cued) >= MOST_CUES_IN_ALL or sum(each is writer for each, _ in self._cued) >= MOST_CUES:
+        while not writer.is_closing() and self._is_full(writer):
             self._room.clear()
             await self._room.wait()
         if writer.is_closing():
@@ -260,6 +260,11 @@ class Server:
             writer.write(reply)
         await self._links.await_readers([writer])
         await asyncio.sleep(0)  # others have their turn
+
+    def _is_full(self, writer: asyncio.StreamWriter) -> bool:
+        """Return whether a connection has to wait with its next call until cues are served."""
+        waiting = sum(each is writer for each, _ in self._cued)
+        return waiting >= MOST_CUES or len(self._cued) >= MOST_CUES_IN_ALL
 
     def _tell_loaded(self, writer: asyncio.StreamWriter, reply: bytes | None = None) -> None:
         """Send the reply to who has loaded a map, if it is this one."""

@@ -393,6 +393,11 @@ def pack_light(
     return LIGHT.pack(sign.encode()[:31], *times_s, elapsed_s, pole, frozen, state)
 
 
+def pack_sign(sign: str) -> bytes:
+    """Return the state of a traffic sign: its id in OpenDRIVE."""
+    return sign.encode()[:31]
+
+
 def pack_image(width: int, height: int, fov_deg: float, bgra: NDArray[np.uint8]) -> bytes:
     """Return the body of an image (H, W, 4) of blue, green, red and alpha."""
     return struct.pack("<IIf", width, height, fov_deg) + bgra.tobytes()
