@@ -48,7 +48,7 @@ def time_images(maps: Maps, town: str, repeats: int) -> dict[str, list[float]]:
     for _ in range(100):
         episode.step(DT_S)
     episode.prepare()
-    points = episode.served.spawn_points
+    points = episode.spawn_points
     poses = []
     for (x, y, z), rotation in points[:: max(1, len(points) // PLACES)][:PLACES]:
         poses.append(episode.served.frame.from_transform((x, y, z + EYE_M), rotation))

@@ -49,7 +49,7 @@ def inlined(function: Callable[P, T]) -> Callable[P, T]:
     within records included, which is too much for every pixel. Copied as machine code it is compiled once, not once for
     each call, as it would be with Numba's own inlining.
     """
-    return numba.njit(nogil=True, forceinline=True, _nrt=False)(function)
+    return numba.njit(nogil=True, forceinline=True, _nrt=False)(function)  # pyright: ignore[reportCallIssue]
 
 
 def _inlined_files(function: Callable[P, T]) -> set[Path]:
