@@ -2,21 +2,14 @@
 
 import ipaddress
 import logging
-from enum import StrEnum
 from pathlib import Path
 
 import typer
 
 from flcav.cli.terminal import echo
+from flcav.sources.carla.server.catalogue import Quality
 
 carla = typer.Typer(help="CARLA: serve its clients from a town, without a GPU.", no_args_is_help=True)
-
-
-class QualityName(StrEnum):
-    """Quality of colour images, see `flcav.sources.carla.server.blueprints`."""
-
-    high = "high"
-    low = "low"
 
 
 @carla.callback()
@@ -36,13 +29,12 @@ def serve(
     seed: int = typer.Option(0, "--seed", min=0, help="Seed of traffic, walkers and sensors."),
     traffic: int = typer.Option(0, "--traffic", min=0, max=1000, help="Vehicles of SUMO that drive by themselves."),
     maps: Path | None = typer.Option(None, "--maps", help="Folder with OpenDRIVE maps: NAME.xodr is served as NAME."),
-    quality: QualityName = typer.Option(
-        QualityName.high, "--quality", help="Of colour images; low draws a quarter of the rays."
+    quality: Quality = typer.Option(
+        Quality.HIGH, "--quality", help="Of colour images; low draws a quarter of the rays."
     ),
     host: str = typer.Option("127.0.0.1", "--host", help="Address to listen on; anyone who reaches it is served."),
 ) -> None:
     """Serve the clients of CARLA 0.9.16 until interrupted: their scripts run unchanged (docs/carla.md)."""
-    from flcav.sources.carla.server.blueprints import Quality
     from flcav.sources.carla.server.calls import Calls
     from flcav.sources.carla.server.maps import Maps
     from flcav.sources.carla.server.serve import open_doors
@@ -53,12 +45,10 @@ def serve(
     if not _is_loopback(host):
         echo(f"flcav: {host} is open to the network, and CARLA's protocol asks nobody for a password", err=True)
     doors = open_doors(host, port)
-    calls = Calls(Maps(maps), town, seed=seed, traffic=traffic, port=port, quality=Quality(quality))
+    calls = Calls(Maps(maps), town, seed=seed, traffic=traffic, port=port, quality=quality)
     calls.episode.warm_up()
-    name, told = (
-        calls.episode.served.name,
-        "" if quality == QualityName.high else f"; colour images of {quality} quality",
-    )
+    name = calls.episode.served.name
+    told = "" if quality == Quality.HIGH else f"; colour images of {quality} quality"
     serve_calls(calls, doors, lambda: echo(f"{name}: ready for clients of CARLA {VERSION} at {host}:{port}{told}"))
 
 

@@ -60,8 +60,7 @@ def read_map(path: Path) -> ElementTree.Element:
     if path.is_dir():
         raise InputError(f"{path}: is a folder, expected an OpenDRIVE file (.xodr)")
     root = read_xml(path, "an OpenDRIVE map")
-    for element in root.iter():
-        element.tag = element.tag.rpartition("}")[2]  # version 1.8 has a namespace, earlier ones do not
+    drop_namespaces(root)
     if root.tag.lower() != "opendrive":
         raise InputError(
             f"{path}: not an OpenDRIVE map (its root is <{root.tag[:SHOWN]}>, expected <OpenDRIVE>: OpenDRIVE 1.8, 6.4)"
@@ -78,6 +77,12 @@ def read_map(path: Path) -> ElementTree.Element:
         )
     check_standard(root, path)
     return root
+
+
+def drop_namespaces(root: ElementTree.Element) -> None:
+    """Leave the names of elements without their namespace: version 1.8 has one, earlier ones do not."""
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
 
 
 def describe_map(root: ElementTree.Element) -> Document:

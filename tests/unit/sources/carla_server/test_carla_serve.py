@@ -91,12 +91,14 @@ def test_a_server_ends_although_cues_wait(maps, monkeypatch):
     monkeypatch.setattr(Server, "_tick", lambda self: asyncio.sleep(60.0))
 
     async def session():
-        async with serving(maps) as (port, _, calls):  # it waits 5 s for the end
+        async with serving(maps) as (port, _, calls):
             client = await Client().connect(port)
             await client.call("set_episode_settings", SYNCHRONOUS)
             client.writer.write(wire.pack([0, 2, "tick_cue", [[False]]]) * 100)
             while calls.ticks < serve.MOST_CUES - 1:
                 await asyncio.sleep(0.001)
+            ending = time.monotonic()
+        assert time.monotonic() - ending < 5.0
 
     asyncio.run(session())
 

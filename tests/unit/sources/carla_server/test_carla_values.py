@@ -13,10 +13,11 @@ from flcav.sensors.frame import SEMANTICS
 from flcav.sources.carla.frames import mirror
 from flcav.sources.carla.server import maps as carla_maps
 from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.blueprints import Quality, Refused, check, list_blueprints
+from flcav.sources.carla.server.blueprints import Refused, check, list_blueprints
 from flcav.sources.carla.server.calls import Calls
+from flcav.sources.carla.server.catalogue import Quality
 from flcav.sources.carla.server.driving import choose_gear
-from flcav.sources.carla.server.lights import find_limits
+from flcav.sources.carla.server.lights import find_limits, list_signals
 from flcav.sources.carla.server.maps import OPENDRIVE_MAP, SPAWN_POINTS, Maps
 from flcav.sources.carla.server.sensing.cameras import sense_rgb
 from flcav.sources.carla.server.wire import VehicleControl
@@ -91,10 +92,12 @@ def test_a_fresh_vehicle_has_30_kmh_until_it_passes_a_sign(maps, calls):
     for s, orientation, kmh in ((40, "+", 60), (60, "-", 90)):
         road += f'<signal s="{s}" t="-4" id="{s}" orientation="{orientation}" type="274" value="{kmh}"/>'
     text = served.opendrive.replace("</OpenDRIVE>", f"{road}</signals></road></OpenDRIVE>")
-    limits = find_limits(replace(served, opendrive=text))
+    limits = find_limits(list_signals(replace(served, opendrive=text)))
     spaced = "<!-- whose map -->\n" + text.replace("<OpenDRIVE>", '<OpenDRIVE xmlns="http://code.asam.net/simulation">')
     assert "xmlns" in spaced
-    assert find_limits(replace(served, opendrive=spaced)).kmh.tolist() == limits.kmh.tolist() == [60.0, 90.0]
+    assert (
+        find_limits(list_signals(replace(served, opendrive=spaced))).kmh.tolist() == limits.kmh.tolist() == [60.0, 90.0]
+    )
     ahead = np.array((np.cos(0.5), np.sin(0.5)))
 
     def passed(s, turn=0.0):
@@ -242,7 +245,9 @@ def test_the_longest_and_the_widest_vehicle_fit_at_all_spawn_points_at_once(town
     for name in (longest, widest):
         for location, rotation in calls.episode.spawn_points:
             spawn(calls, name, [list(location), list(rotation)])
-        for actor in [actor for actor in calls.episode.actors.values() if actor.kind == "vehicle"]:
+        spawned = [actor for actor in calls.episode.actors.values() if actor.kind == "vehicle"]
+        assert len(spawned) == len(calls.episode.spawn_points) > 50
+        for actor in spawned:
             calls.episode.destroy(actor)
     calls.episode.close()
 
@@ -413,7 +418,6 @@ def test_signs_of_a_map_are_actors_that_count_on_their_lane(maps):
         assert (x, y) == pytest.approx((along - 3.0, 1.75), abs=0.1)
         with pytest.raises(Refused, match="cannot be destroyed"):
             invoke(calls, "destroy_actor", (sign.id,))
-    assert (
-        calls.episode.describe_world(0.05).count(b"\x00" * 36 + b"7\x00") == 1
-    )  # its id in the state of a still actor
+    still = b"\x00" * 36  # motion of an actor at rest, before what is particular to it: the sign's id
+    assert calls.episode.describe_world(0.05).count(still + b"7\x00") == 1
     calls.episode.close()

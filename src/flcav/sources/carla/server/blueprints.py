@@ -1,14 +1,13 @@
 """Blueprints: the actors that can be spawned, and the check of a client's description of one."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import cache
 from zlib import crc32
 
 from flcav.config import shorten
 from flcav.interface.wording import suggest
 from flcav.sources.carla.server import catalogue, wire
-from flcav.sources.carla.server.catalogue import BOOL, COLOUR, FLOAT, INT, STRING, Field
+from flcav.sources.carla.server.catalogue import BOOL, COLOUR, FLOAT, INT, STRING, Field, Quality
 from flcav.world.map.parameters import CLUTTER
 from flcav.world.shapes import SHAPES
 
@@ -36,13 +35,6 @@ class Blueprint:
     def kind(self) -> str:
         """The first part of its name: vehicle, walker, static, sensor or controller."""
         return self.definition.id.partition(".")[0]
-
-
-class Quality(StrEnum):
-    """How colour images are drawn where clients do not choose."""
-
-    HIGH = "high"
-    LOW = "low"  # with a quarter of the rays: half of the columns and rows, between which colours are interpolated
 
 
 @cache

@@ -15,7 +15,8 @@ from flcav.config import InputError, shorten
 from flcav.sources.carla.frames import mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.actors import NOTHING, Actor, Counters
-from flcav.sources.carla.server.blueprints import Quality, Refused, list_blueprints
+from flcav.sources.carla.server.blueprints import Refused, list_blueprints
+from flcav.sources.carla.server.catalogue import Quality
 from flcav.sources.carla.server.episode import Episode
 from flcav.sources.carla.server.maps import Maps
 from flcav.sources.carla.server.physics import describe_physics, describe_telemetry
@@ -47,8 +48,14 @@ class Calls:
 
     def _start(self, name: str) -> Episode:
         served = self.maps.load(name)
-        settings = {"seed": self._seed, "traffic": self._traffic, "port": self._port + 1}
-        return Episode(served, self._counters, **settings, quality=self._quality)
+        return Episode(
+            served,
+            self._counters,
+            seed=self._seed,
+            traffic=self._traffic,
+            port=self._port + 1,
+            quality=self._quality,
+        )
 
     @property
     def dt_s(self) -> float:

@@ -5,7 +5,15 @@ reference". Half extents are those of CARLA's bounding boxes, but for the widths
 narrow or 0.
 """
 
+from enum import StrEnum
 from typing import NamedTuple
+
+
+class Quality(StrEnum):
+    """How colour images are drawn where clients do not choose."""
+
+    HIGH = "high"
+    LOW = "low"  # with a quarter of the rays: half of the columns and rows, between which colours are interpolated
 
 
 class Body(NamedTuple):

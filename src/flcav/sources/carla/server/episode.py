@@ -16,9 +16,10 @@ from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sources.carla.frames import from_mount, mirror, mirror_spin, to_vector
 from flcav.sources.carla.server import wire
 from flcav.sources.carla.server.actors import STANDING, WAITING, Actor, Counters, list_places
-from flcav.sources.carla.server.blueprints import TRUE, Blueprint, Quality, Refused, check, find_paint, list_blueprints
+from flcav.sources.carla.server.blueprints import TRUE, Blueprint, Refused, check, find_paint, list_blueprints
+from flcav.sources.carla.server.catalogue import Quality
 from flcav.sources.carla.server.driving import choose_gear, list_grips, steer_towards
-from flcav.sources.carla.server.lights import Lights, find_approaches, find_limits, list_signs
+from flcav.sources.carla.server.lights import Lights, find_approaches, find_limits, list_signals, list_signs
 from flcav.sources.carla.server.maps import ServedMap
 from flcav.sources.carla.server.recorder import Recorder
 from flcav.sources.carla.server.sensing.cameras import sense_depth, sense_instance, sense_rgb
@@ -81,7 +82,8 @@ class Episode:
         self.stream = counters.next_stream()  # of the world's state
         self.world = LiveWorld(served.town, Settings(seed=seed, traffic=traffic, leans=True, remembers=False))
         self.weather = wire.WeatherParameters(cloudiness=10.0, sun_azimuth_angle=160.0, sun_altitude_angle=45.0)
-        self.lights, self.signs = Lights(find_approaches(served)), find_limits(served)
+        signals = list_signals(served)
+        self.lights, self.signs = Lights(find_approaches(served, signals)), find_limits(signals)
         self.actors: dict[int, Actor] = {}
         self.tick, self.time_s = 0, 0.0
         self._begun_s = time.monotonic()
@@ -97,7 +99,7 @@ class Episode:
         for row, approach in enumerate(self.lights.approaches):
             light = self._add(wire.Description(0, "traffic.traffic_light", ()), approach.pose)
             light.light, light.box = row, approach.box()
-        for each in list_signs(served):
+        for each in list_signs(served, signals):
             sign = self._add(wire.Description(0, each.blueprint, ()), each.pose)
             sign.sign, sign.box = each.id, each.box
         self.lights.follow(self.world, 0.0)

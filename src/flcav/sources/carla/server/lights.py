@@ -4,7 +4,7 @@ A light that a client sets keeps its state for the time of that state, then its 
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
@@ -21,6 +21,7 @@ from flcav.sources.carla.server.wire import BoundingBox
 from flcav.world.commands import SetLight
 from flcav.world.live import LiveWorld
 from flcav.world.map.roads import Edge, Lane
+from flcav.world.opendrive.document import STOP_SIGN, drop_namespaces
 from flcav.world.opendrive.exporting import TRAFFIC_LIGHT, list_approaches, name_signal
 from flcav.world.opendrive.objects.signs import read_limit
 from flcav.world.opendrive.reference_line import ReferenceLine
@@ -33,9 +34,44 @@ STATES = {letter: state for state, letters in LETTERS_OF.items() for letter in l
 TIMES_S = (10.0, 3.0, 2.0)  # CARLA's of green, yellow and red
 BEFORE_M, BEYOND_M = 8.0, 1.0  # a vehicle is at a light where its front is so near to the stop line
 ALIGNED_RAD = 1.0
-SIGNS = {"205": "traffic.yield", "206": "traffic.stop"}  # by their types in CARLA's maps, which are Germany's
+SIGNS = {"205": "traffic.yield", STOP_SIGN: "traffic.stop"}  # by their types in CARLA's maps, which are Germany's
 LANE_M = 3.5  # width of the volume in which a sign counts
 PASSED_M, BESIDE_M = 10.0, 12.0  # a vehicle that is so far beyond a sign, and beside it, has just passed it
+
+
+class MapSignal(NamedTuple):
+    """A signal of a map."""
+
+    id: str
+    row: ElementTree.Element
+    place: Array  # (3,) x, y [m], and the heading of its road [rad]
+    entries: Array  # (K, 2) where roads refer to it, at the beginning of the lanes that it is for [m]
+
+
+def list_signals(served: ServedMap) -> list[MapSignal]:
+    """Return the signals of a map."""
+    signals: list[tuple[ElementTree.Element, Array]] = []
+    entries: dict[str, list[Array]] = {}
+    text = served.opendrive.encode("utf-8", "surrogateescape")
+    root = ElementTree.fromstring(text[max(text.find(b"<?xml "), 0) :])  # comments may stand before the declaration
+    drop_namespaces(root)
+    for road in root.iterfind("road"):
+        if not (rows := road.findall("signals/*")):
+            continue
+        line = ReferenceLine(road)
+        for row in rows:
+            x, y, heading = line.at(np.array([float(row.get("s", "0"))]))[0]
+            t, (dx, dy) = float(row.get("t", "0")), served.frame.offset_m
+            at = np.array((x - t * np.sin(heading) + dx, y + t * np.cos(heading) + dy, heading))
+            if row.tag == "signal":
+                signals.append((row, at))
+            elif row.tag == "signalReference":
+                entries.setdefault(row.get("id", ""), []).append(at[:2])
+    found = []
+    for row, at in signals:
+        name = row.get("id", "")
+        found.append(MapSignal(name, row, at, np.array(entries.get(name, [])).reshape(-1, 2)))
+    return found
 
 
 @dataclass(frozen=True)
@@ -62,20 +98,21 @@ def _box_before(line: Array, half_width: float, pose: Array) -> BoundingBox:
     return BoundingBox((x, y, z), (half_width, 2.5, 1.5))
 
 
-def find_approaches(served: ServedMap) -> list[Approach]:
-    """Return the approaches to all lights of a map, in the net's order."""
-    signs = _list_lights(served)
-    net, signals = served.net, served.town.signals
-    place = {link: row for row, link in reversed(list(enumerate(signals.link)))}
+def find_approaches(served: ServedMap, signals: Sequence[MapSignal]) -> list[Approach]:
+    """Return the approaches to all lights of a map with these signals, in the net's order."""
+    imported = served.town.parameters.source is not None  # towns of flcav name their lights by their links
+    mapped = [each for each in signals if imported and each.row.get("type") == TRAFFIC_LIGHT]
+    net, lights = served.net, served.town.signals
+    place = {link: row for row, link in reversed(list(enumerate(lights.link)))}
     found = []
     for name, link in list_approaches(net).items():
         edge = net.edges[name]
         x, y, heading, half_width = _find_stop(edge)
         lanes = {lane.id for lane in edge.lanes}
         ruled = {way.light for way in net.connections if way.light and way.start in lanes}
-        foot = signals.foot[place[link]] if link in place else (x, y)
-        head = signals.position[place[link], :2] if link in place else np.array((x, y))
-        sign = min(signs, key=partial(_measure_off, head, np.array((x, y)))).id if signs else name_signal(link)
+        foot = lights.foot[place[link]] if link in place else (x, y)
+        head = lights.position[place[link], :2] if link in place else np.array((x, y))
+        sign = min(mapped, key=partial(_measure_off, head, np.array((x, y)))).id if mapped else name_signal(link)
         ground = served.town.ground(float(foot[0]), float(foot[1]))
         found.append(
             Approach(
@@ -100,16 +137,7 @@ def _find_stop(edge: Edge) -> tuple[float, float, float, float]:
     return float(x), float(y), float(np.arctan2(ahead[1], ahead[0])), sum(lane.width for lane in lanes) / 2
 
 
-class Mapped(NamedTuple):
-    """A signal of a map."""
-
-    id: str
-    row: ElementTree.Element
-    place: Array  # (3,) x, y [m], and the heading of its road [rad]
-    entries: Array  # (K, 2) where roads refer to it, at the beginning of the lanes that it is for [m]
-
-
-def _measure_off(head: Array, stop: Array, signal: Mapped) -> float:
+def _measure_off(head: Array, stop: Array, signal: MapSignal) -> float:
     """Return how far a signal is from a light [m]: its entries from the stop line, or itself from the light's head.
 
     Lights may hang beyond the junction, next to another stop line.
@@ -117,40 +145,6 @@ def _measure_off(head: Array, stop: Array, signal: Mapped) -> float:
     return float(
         np.hypot(*(signal.entries - stop).T).min() if len(signal.entries) else np.hypot(*(signal.place[:2] - head))
     )
-
-
-def _list_lights(served: ServedMap) -> list[Mapped]:
-    """Return the traffic lights of an imported map; none of a town of flcav."""
-    if served.town.parameters.source is None:
-        return []
-    return [each for each in _list_signals(served) if each.row.get("type") == TRAFFIC_LIGHT]
-
-
-def _list_signals(served: ServedMap) -> list[Mapped]:
-    """Return the signals of a map."""
-    signals: list[tuple[ElementTree.Element, Array]] = []
-    entries: dict[str, list[Array]] = {}
-    text = served.opendrive.encode("utf-8", "surrogateescape")
-    root = ElementTree.fromstring(text[max(text.find(b"<?xml "), 0) :])  # comments may stand before the declaration
-    for element in root.iter():
-        element.tag = element.tag.rpartition("}")[2]  # version 1.8 has a namespace
-    for road in root.iterfind("road"):
-        if not (rows := road.findall("signals/*")):
-            continue
-        line = ReferenceLine(road)
-        for row in rows:
-            x, y, heading = line.at(np.array([float(row.get("s", "0"))]))[0]
-            t, (dx, dy) = float(row.get("t", "0")), served.frame.offset_m
-            at = np.array((x - t * np.sin(heading) + dx, y + t * np.cos(heading) + dy, heading))
-            if row.tag == "signal":
-                signals.append((row, at))
-            elif row.tag == "signalReference":
-                entries.setdefault(row.get("id", ""), []).append(at[:2])
-    found = []
-    for row, at in signals:
-        name = row.get("id", "")
-        found.append(Mapped(name, row, at, np.array(entries.get(name, [])).reshape(-1, 2)))
-    return found
 
 
 @dataclass(frozen=True)
@@ -172,10 +166,10 @@ class Limits:
         return float(self.kmh[passed[along[passed].argmin()]]) if len(passed) else None
 
 
-def find_limits(served: ServedMap) -> Limits:
-    """Return the speed-limit signs of a map; one that is for both directions stands twice."""
+def find_limits(signals: Sequence[MapSignal]) -> Limits:
+    """Return the speed-limit signs among a map's signals; one that is for both directions stands twice."""
     place, kmh = [np.zeros((0, 3))], []
-    for _, row, at, _ in _list_signals(served):
+    for _, row, at, _ in signals:
         if (limit := read_limit(row)) is None:
             continue
         turns = _list_turns(row)
@@ -199,12 +193,12 @@ class Sign:
     box: BoundingBox  # in which it counts, in its own frame
 
 
-def list_signs(served: ServedMap) -> list[Sign]:
-    """Return the signs of a map that tell to stop or to give way, or a speed limit, in its order."""
+def list_signs(served: ServedMap, signals: Sequence[MapSignal]) -> list[Sign]:
+    """Return those of a map's signals that tell to stop or to give way, or a speed limit, in its order."""
     lanes = [lane for edge in served.net.streets for lane in edge.lanes_of("driving")]
     lines = shapely.STRtree([LineString(lane.shape) for lane in lanes])
     found = []
-    for name, signal, at, entries in _list_signals(served):
+    for name, signal, at, entries in signals:
         limit, kind = read_limit(signal), SIGNS.get(signal.get("type", ""))
         blueprint = kind if limit is None else f"traffic.speed_limit.{3.6 * limit:.0f}"
         if blueprint is None or not lanes:

@@ -34,9 +34,7 @@ from flcav.sources.carla.server.episode import Episode, Measurement
 PACE_S = 0.008
 MOST_UNDRAWN = 100  # cued ticks whose images wait while cameras are prepared, for longer than clients give a tick
 DELIVERY_S = 1.5  # clients give a tick 2 s at least
-PREPARING_S = (
-    3.0  # a server waits so long until it is ready for cameras; the first one on a machine compiles for longer
-)
+PREPARING_S = 3.0  # a server waits so long for its cameras; the first one on a machine compiles for longer
 LEARNT_S = 3.0  # clients have learnt of a new map by then
 # While a client that has loaded a map learns of it by these calls, its Traffic Manager's thread crashes if it goes on:
 # so that thread's calls, which are all others, are answered when the client listens to the new world.

@@ -13,7 +13,7 @@ from flcav.sensors.camera.camera import Camera, Exposure, label, photograph
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
 from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sources.carla.frames import MapFrame
-from flcav.sources.carla.server.blueprints import Quality
+from flcav.sources.carla.server.catalogue import Quality
 from flcav.statistics.streams import stream
 from flcav.world.map.town import Town
 from flcav.world.rays.hits import Hits
