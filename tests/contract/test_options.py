@@ -10,17 +10,17 @@ import pytest
 import typer
 
 from flcav.cli.main import app, run
-from flcav.cli.reproductions.targets import DRIVES, RECORDED, TARGETS
 from flcav.config import InputError
 from flcav.dataset.formats.formats import EXPORTS, IMPORTS
+from flcav.experiments import list_experiments
+from flcav.experiments.experiment import OPTIONS, load_experiment
 from flcav.perception.errors import RegistersErrors
 from flcav.perception.task import Scores
 from flcav.perception.tasks import TASKS, task_named
 
 ALWAYS = "always"
 SCORED = tuple(name for name in TASKS if isinstance(task_named(name), Scores))
-SINGLE = ("fig1b", "fig3a", "sim-to-real", *map(str, (*RECORDED, *DRIVES)))  # are no studies
-STUDIES = tuple(target for target in TARGETS if target not in SINGLE)
+EXPERIMENTS = {name: load_experiment(name) for name in list_experiments()}
 # command -> what it can be asked for -> the arguments that ask for it, of inputs that are not there
 CHOICES: dict[str, dict[str, str]] = {
     "export": {name: f"{name} none --out out" for name in EXPORTS},
@@ -37,7 +37,7 @@ CHOICES: dict[str, dict[str, str]] = {
     "fit": {model: f"none --model {model}" for model in ("additive", "effective", "federated")},
     "federate": {name: f"none --out out --runtime {name}" for name in ("embedded", "ray", "flower")},
     "run": {name: f"none --out out --runtime {name}" for name in ("embedded", "ray", "flower")},
-    "reproduce": {target: f"{target} --out out" for target in TARGETS},
+    "reproduce": {target: f"{target} --out out" for target in EXPERIMENTS},
 }
 RUNS: dict[str, str | tuple[str, ...]] = dict.fromkeys(("--agents", "--threads", "--device"), ALWAYS)
 # command -> option -> what of CHOICES takes it; `--out` and `--json` are always taken
@@ -181,11 +181,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         ALWAYS,
     ),
     "reproduce": {
-        "--seeds": (*STUDIES, *map(str, DRIVES)),
-        "--scale": STUDIES,
-        "--jobs": (*STUDIES, "sim-to-real"),
-        **dict.fromkeys(("--engine", "--stale"), (*STUDIES, "sim-to-real")),
-        **dict.fromkeys(("--kitti", "--data", "--around", "--weights"), ("sim-to-real",)),
+        f"--{option}": tuple(name for name, own in EXPERIMENTS.items() if option in own.takes) for option in OPTIONS
     },
 }
 LATER = {("place", "range_m"), ("export", "validation")}  # are refused by what takes them

@@ -18,7 +18,6 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.experiments.fig1b.layers import LAYERS, capture_outputs
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
@@ -37,8 +36,9 @@ from flcav.perception.weather.evaluate import evaluate_whole_space
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import load_network, save_network, to_arrays
 from flcav.report import style
-from flcav.report.charts.task_columns import show_layers
 from flcav.report.pictures.inference import draw
+from flcav.reproductions.fig1b.columns import show_layers
+from flcav.reproductions.fig1b.run import LAYERS, capture_outputs
 from flcav.sensors.frame import Frame
 from flcav.world.weather import Weather
 

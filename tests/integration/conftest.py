@@ -18,11 +18,11 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> "Studied":
     """Return the folder of both comparisons of one seed, and their results."""
     from toy_run import RECIPE
 
-    from flcav.experiments.arms.run import compare_arms
-    from flcav.experiments.fig6a.run import compare_plans
     from flcav.pipeline.results.run import Run
     from flcav.pipeline.running import run_seeds
     from flcav.report.pages.run_page import write_report
+    from flcav.reproductions.demo_arms.run import compare_arms
+    from flcav.reproductions.fig6a_allocation.run import compare_plans
 
     base = tmp_path_factory.getbasetemp()
     folder = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base  # the workers' own lie in one

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from flcav.cli.main import run as command
-from flcav.experiments.run_tables import tables
 from flcav.network.clock.records import ClientTiming, load_rounds
 from flcav.network.ledger import Ledger
 from flcav.pipeline.alone import TRAIN_TIMES, Federations, name_results
@@ -16,6 +15,7 @@ from flcav.pipeline.results.run import Run
 from flcav.pipeline.running import SPREAD, run
 from flcav.pipeline.training.timing import TrainTimes
 from flcav.report.pages.run_page import draw
+from flcav.report.run_tables import tables
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,6 @@ from safetensors.numpy import load_file
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
-from flcav.experiments.gap.megabytes import IN_BYTES, UPLOADED, trace_bytes
 from flcav.federation.privacy import Privacy
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.objects.distillation import imitation
@@ -47,6 +46,7 @@ from flcav.pipeline.running import RESULTS, run
 from flcav.pipeline.steps.graph import Graph
 from flcav.pipeline.tables import parse_history
 from flcav.report.pages.run_page import page, write_report
+from flcav.reproductions.gap.run import IN_BYTES, UPLOADED, trace_bytes
 from flcav.statistics.verdicts import UNDECIDED
 from flcav.world.opendrive.importing import import_town
 

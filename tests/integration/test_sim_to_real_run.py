@@ -9,7 +9,7 @@ import pytest
 from reproduction_pages import TABLES
 
 from flcav.cli.main import run
-from flcav.experiments.sim_to_real import run as sim_to_real
+from flcav.reproductions.sim_to_real import run as sim_to_real
 
 REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[2].parent / "shared" / "data")) / "kitti_frame"
 TOY = {**sim_to_real.RECIPE, "scenes": 1, "warmup_s": 20.0, "spins_per_scene": 1, "cavs": 1}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flcav.experiments.splits import open_split, record_split
+from flcav.experiments.study import open_split, record_split
 from flcav.pipeline.engine import Step, Work, run_side_by_side, run_steps
 
 pytest.importorskip("ray", reason="the extra 'ray' is not installed")

@@ -54,7 +54,7 @@ def test_the_recipes_of_the_readme_are_installed(installed: Path, tmp_path: Path
 
 @pytest.mark.slow
 def test_the_wheel_holds_what_the_checkout_holds(installed: Path, tmp_path: Path):
-    where = "import flcav, flcav.experiments.studies; print(flcav.__file__)"
+    where = "import flcav, flcav.reproductions.demo_arms.run; print(flcav.__file__)"
     assert Path(ran(installed, [sys.executable, "-c", where], tmp_path).strip()).parent == installed / "flcav"
     for folder, into in ((ROOT / "src" / "flcav", "."), (ROOT / "recipes", "recipes")):
         files = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
@@ -93,3 +93,9 @@ def test_the_demo_starts_without_a_checkout(installed: Path, tmp_path: Path):
     (plan,) = json.loads((planned.parent / "result.json").read_text())["tasks"].values()
     assert 20 <= plan["samples"] <= 24
     assert plan["predicted"] is not None  # by the history that the wheel brings
+
+
+@pytest.mark.slow
+def test_an_installation_reproduces_a_figure(installed: Path, tmp_path: Path):
+    ran(installed, [installed / "bin" / "flcav", "reproduce", "fig3a", "--out", "own"], tmp_path)
+    assert sorted(path.name for path in (tmp_path / "own").iterdir()) == ["fig3a.png", "result.json"]

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flcav.experiments.arms.run import ArmsResult
-from flcav.experiments.fig6a.results import AllocationResult
 from flcav.pipeline.recipe import load_run_recipe
 from flcav.pipeline.running import RESULTS
+from flcav.reproductions.demo_arms.run import ArmsResult
+from flcav.reproductions.fig6a_allocation.findings import AllocationResult
 
 Studied = tuple[Path, ArmsResult, AllocationResult]
 TOY = Path(__file__).parent / "toy.yaml"

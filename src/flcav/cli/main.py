@@ -11,7 +11,7 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import carla, drive, federate, fleet, odd, release, towns
+from flcav.cli import carla, drive, federate, fleet, odd, release, reproduce, towns
 from flcav.cli import (
     run as run_command,
 )
@@ -20,7 +20,6 @@ from flcav.cli.network import radio, rounds
 from flcav.cli.options import escape_markup
 from flcav.cli.perception import errors, evaluate, infer, train
 from flcav.cli.planning import allocate, fit, history, place
-from flcav.cli.reproductions import reproduce
 from flcav.cli.terminal import Interrupted, echo, one_line
 from flcav.config import InputError
 from flcav.interface.wording import describe_number, suggest

@@ -104,11 +104,11 @@ def _run(
     """Run a recipe; `how`: arguments of `flcav.run`."""
     use_threads(1)
     from flcav.cli.steps import live_steps
-    from flcav.experiments.seed_tables import draw_seeds
     from flcav.pipeline.recipe import load_run_recipe
     from flcav.pipeline.running import run as run_one
     from flcav.pipeline.running import run_seeds
     from flcav.report.pages.run_page import write_report
+    from flcav.report.seed_tables import draw_seeds
     from flcav.sources.recipe import find_recipe
     from flcav.storage.files import check_writable, write_bytes
 

@@ -1,1 +1,17 @@
-"""Reproductions of the article's figures, comparisons of arms and plans, and the studies of tasks."""
+"""Experiments: what each is, a study of a task, and those that come with flcav.
+
+These are folders of `reproductions/` in a checkout, and within the package of an installation (`flcav/reproductions`).
+The name of a target is the path of its folder: `reproductions/federation/groups` is `federation-groups`.
+"""
+
+from pathlib import Path
+
+import flcav
+
+FOLDER = Path(flcav.__file__).parent / "reproductions"  # in a checkout, a link to the folder beside `src`
+
+
+def list_experiments() -> dict[str, Path]:
+    """Return the folders of the experiments that come with flcav, by name of their target."""
+    folders = sorted(path.parent.relative_to(FOLDER) for path in FOLDER.rglob("run.py"))
+    return {"-".join(folder.parts).replace("_", "-"): FOLDER / folder for folder in folders}

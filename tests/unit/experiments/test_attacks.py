@@ -8,13 +8,39 @@ import torch
 from scipy.stats import mannwhitneyu
 from torch.nn import functional
 
-from flcav.experiments.attacks import faults, withstood
-from flcav.experiments.attacks.drives import CLASSES, Drives, Pictures, Vehicle, differentiate, draw_head, find_right
-from flcav.experiments.attacks.faults import LIES, STRATEGIES, Liar, choose_liars, run_federation, summarise
-from flcav.experiments.attacks.inference import invert, membership_advantage, membership_auc, name_nearest
-from flcav.experiments.attacks.leakage import attack, make_level, split_members
-from flcav.experiments.attacks.tables import fault_tables, withstood_tables
-from flcav.experiments.attacks.withstood import (
+from flcav.federation.rounds import Schedule
+from flcav.federation.rules import Rules, SecureAggregation
+from flcav.reproductions.federation.drives import (
+    CLASSES,
+    Drives,
+    Pictures,
+    Vehicle,
+    differentiate,
+    draw_head,
+    find_right,
+)
+from flcav.reproductions.federation.faults import run as faults
+from flcav.reproductions.federation.faults.run import (
+    LIES,
+    STRATEGIES,
+    Liar,
+    choose_liars,
+    fault_tables,
+    run_federation,
+    summarise,
+)
+from flcav.reproductions.federation.leakage.run import (
+    attack,
+    invert,
+    make_level,
+    membership_advantage,
+    membership_auc,
+    name_nearest,
+    read_round,
+    split_members,
+)
+from flcav.reproductions.federation.mixing import run as withstood
+from flcav.reproductions.federation.mixing.run import (
     ATTACKS,
     CLIENTS,
     INNER,
@@ -31,10 +57,8 @@ from flcav.experiments.attacks.withstood import (
     repeat_withstood,
     run_rounds,
     train_clients,
+    withstood_tables,
 )
-from flcav.federation.reading import read_round
-from flcav.federation.rounds import Schedule
-from flcav.federation.rules import Rules, SecureAggregation
 from flcav.statistics.seeds import OWN_SCENES
 
 START = draw_head(1)
@@ -202,8 +226,8 @@ def test_the_study_of_what_rules_withstand_at_toy_scale(monkeypatch, tmp_path):
         assert worst[rule] == [hardest]
         lost = first.accuracy["mean"].mean - hardest
         assert results.worst("alike", 6, rule).lost[rule].mean == pytest.approx(lost)
-    monkeypatch.setattr("flcav.experiments.attacks.tables.UNLIKENESS", ["alike"])
-    monkeypatch.setattr("flcav.experiments.attacks.tables.ATTACKERS", (6,))
+    monkeypatch.setattr("flcav.reproductions.federation.mixing.run.UNLIKENESS", ["alike"])
+    monkeypatch.setattr("flcav.reproductions.federation.mixing.run.ATTACKERS", (6,))
     tables = withstood_tables(results)
     assert tables["worst"].splitlines()[-1].startswith("| alike | 30 % |")
     assert len(tables["thirty"].splitlines()) == 2 + 6

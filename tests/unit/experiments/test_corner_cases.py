@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flcav.experiments.corner_cases import run as corner_cases
-from flcav.experiments.corner_cases.run import (
+from flcav.geometry import Boxes
+from flcav.perception.objects.evaluate import score_detections
+from flcav.perception.objects.truth import FrameTruth
+from flcav.pipeline.recipe import MAIN, load_run_recipe
+from flcav.reproductions.corner_cases import run as corner_cases
+from flcav.reproductions.corner_cases.run import (
     ARMS,
     COMPARED,
     GLOBAL,
@@ -21,15 +25,11 @@ from flcav.experiments.corner_cases.run import (
     CornerCaseResult,
     RareScore,
     compare_corner_cases,
+    corner_case_tables,
     draw_corner_cases,
     is_rare,
     only_rare,
 )
-from flcav.experiments.corner_cases.tables import corner_case_tables
-from flcav.geometry import Boxes
-from flcav.perception.objects.evaluate import score_detections
-from flcav.perception.objects.truth import FrameTruth
-from flcav.pipeline.recipe import MAIN, load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.world.shapes import PARKED_ONLY, RARE, SHAPES
 

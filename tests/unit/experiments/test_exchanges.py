@@ -8,25 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flcav.experiments.exchanges import run as exchanges
-from flcav.experiments.exchanges.clock import mean_round_s
-from flcav.experiments.exchanges.run import (
-    NAMES,
-    NO_CLOUD,
-    NONE,
-    OTHERS,
-    OWN,
-    UNSEEN,
-    WHOLE,
-    ExchangeArm,
-    draw_results,
-    judge_differences,
-    measure_places,
-    measure_seed,
-    summarise,
-)
-from flcav.experiments.exchanges.tables import tables
-from flcav.experiments.scales import shrink_recipe
+from flcav.experiments.experiment import shrink_recipe
 from flcav.federation.divergence import Divergence, RoundDivergence
 from flcav.federation.upload import name_like
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
@@ -38,6 +20,24 @@ from flcav.perception.task import build_network, find_configuration
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import check_federations, resolve_settings
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Federation, load_run_recipe
+from flcav.reproductions.federation.exchange import run as exchanges
+from flcav.reproductions.federation.exchange.run import (
+    NAMES,
+    NO_CLOUD,
+    NONE,
+    OTHERS,
+    OWN,
+    UNSEEN,
+    WHOLE,
+    ExchangeArm,
+    draw_results,
+    judge_differences,
+    mean_round_s,
+    measure_places,
+    measure_seed,
+    summarise,
+    tables,
+)
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED
 

@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from flcav.experiments.fig3a.run import Fig3a, article_graph, draw_fig3a, fig3a
 from flcav.optimization.graph import to_problem
 from flcav.pipeline.tables import load_history
+from flcav.reproductions.fig3a.run import Fig3a, article_graph, draw_fig3a, fig3a
 
 pytestmark = pytest.mark.slow
 

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError
-from flcav.experiments.fig6a.findings import allocation_findings
-from flcav.experiments.fig6a.results import (
+from flcav.pipeline.provenance import provenance
+from flcav.pipeline.recipe import load_run_recipe
+from flcav.pipeline.results.plans import Placed, Pole
+from flcav.pipeline.results.run import LinkUse
+from flcav.report.charts.plans import predicted_and_realised
+from flcav.reproductions.fig6a_allocation.findings import (
     EQUAL,
     JOINT,
     MEAN,
@@ -14,14 +18,18 @@ from flcav.experiments.fig6a.results import (
     AtBudgets,
     Planned,
     StageAP,
+    allocation_findings,
 )
-from flcav.experiments.fig6a.run import BUDGETS, PLANS, STAGES, _collect, budget_recipes, draw_allocation, summarise
-from flcav.experiments.fig6a.tables import tables
-from flcav.pipeline.provenance import provenance
-from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.results.plans import Placed, Pole
-from flcav.pipeline.results.run import LinkUse
-from flcav.report.charts.plans import predicted_and_realised
+from flcav.reproductions.fig6a_allocation.run import (
+    BUDGETS,
+    PLANS,
+    STAGES,
+    _collect,
+    budget_recipes,
+    draw_allocation,
+    summarise,
+    tables,
+)
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.estimates import Estimate
 

@@ -5,12 +5,14 @@ from typing import Any, cast
 
 import pytest
 
-from flcav.experiments.gap.megabytes import FEDERATED, ROUNDS, AtBytes, list_uploads
-from flcav.experiments.gap.run import (
+from flcav.pipeline.recipe import MAIN, load_run_recipe
+from flcav.pipeline.results.training import LabelQuality
+from flcav.reproductions.gap.run import (
     ARMS,
     AT_HOME,
     BOXES,
     COMPARED,
+    FEDERATED,
     GLOBAL,
     HOME,
     IMITATING,
@@ -18,16 +20,17 @@ from flcav.experiments.gap.run import (
     PRETRAINED,
     REPLAY,
     ROAD,
+    ROUNDS,
     TRACKS,
     TRUTH,
+    AtBytes,
     GapResult,
     compare_gap,
     draw_gap,
     draw_megabytes,
+    gap_tables,
+    list_uploads,
 )
-from flcav.experiments.gap.tables import gap_tables
-from flcav.pipeline.recipe import MAIN, load_run_recipe
-from flcav.pipeline.results.training import LabelQuality
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/gap"))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from flcav.experiments.attacks.drives import CLASSES, Drives, Pictures
-from flcav.experiments.groups.run import (
+from flcav.reproductions.federation.drives import CLASSES, Drives, Pictures
+from flcav.reproductions.federation.groups.run import (
     ALIKE,
     DRAWN,
     GROUP,
@@ -18,7 +18,7 @@ from flcav.experiments.groups.run import (
     keep,
     score,
 )
-from flcav.experiments.groups.vehicles import MEET, PRETRAIN_SCENES, RARE, open_fleet
+from flcav.reproductions.federation.groups.vehicles import MEET, PRETRAIN_SCENES, RARE, open_fleet
 
 
 def made_drives() -> Drives:

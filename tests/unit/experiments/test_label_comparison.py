@@ -5,7 +5,10 @@ from typing import Any, cast
 
 import pytest
 
-from flcav.experiments.distillation.run import (
+from flcav.pipeline.recipe import EDGE, MAIN, load_run_recipe
+from flcav.pipeline.results.run import Spent
+from flcav.pipeline.results.training import LabelQuality
+from flcav.reproductions.distillation.run import (
     ARMS,
     AVERAGE,
     DENSEST,
@@ -15,11 +18,8 @@ from flcav.experiments.distillation.run import (
     ROAD,
     TRACKS,
     compare_labels,
+    tables,
 )
-from flcav.experiments.distillation.tables import tables
-from flcav.pipeline.recipe import EDGE, MAIN, load_run_recipe
-from flcav.pipeline.results.run import Spent
-from flcav.pipeline.results.training import LabelQuality
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/distillation"))

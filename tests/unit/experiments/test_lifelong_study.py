@@ -7,12 +7,18 @@ from typing import Any, cast
 import pytest
 from PIL import Image
 
-from flcav.experiments.lifelong.run import ARMS, LifelongResult, compare_lifelong, count_mended, draw_lifelong
-from flcav.experiments.lifelong.tables import lifelong_tables
 from flcav.pipeline.recipe import load_run_recipe
 from flcav.pipeline.results.lifelong import LifelongArm, Passed
 from flcav.report import style
 from flcav.report.charts.lifelong import draw_rounds
+from flcav.reproductions.lifelong.run import (
+    ARMS,
+    LifelongResult,
+    compare_lifelong,
+    count_mended,
+    draw_lifelong,
+    lifelong_tables,
+)
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/lifelong"))

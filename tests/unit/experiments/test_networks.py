@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flcav.experiments.networks import run as networks
-from flcav.experiments.networks.run import (
+from flcav.pipeline.recipe import load_run_recipe
+from flcav.reproductions.networks import run as networks
+from flcav.reproductions.networks.run import (
     CHOSEN,
     NETWORKS,
     REFERENCE,
@@ -18,10 +19,9 @@ from flcav.experiments.networks.run import (
     draw_networks,
     find_front,
     list_steps,
+    networks_tables,
     search_networks,
 )
-from flcav.experiments.networks.tables import networks_tables
-from flcav.pipeline.recipe import load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.seeds import mean_over_seeds
 

@@ -2,18 +2,18 @@
 
 import numpy as np
 
-from flcav.experiments.sim_to_real import tables as sim_to_real_tables
-from flcav.experiments.sim_to_real.clouds import CloudNumbers, SeenCar, Street
-from flcav.experiments.sim_to_real.run import FrameResult, LabelledCar, RealScore, SimToReal, draw_clouds
-from flcav.experiments.studies import objects as objects_tables
-from flcav.experiments.studies.objects import STUDY
-from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResult
+from flcav.experiments.study import SeedResult, StudyRecordings, StudyResult
 from flcav.geometry import Boxes
 from flcav.perception.card import Card
 from flcav.perception.images import CameraView
 from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.pipeline.provenance import provenance
 from flcav.report.pictures.clouds import real_frame
+from flcav.reproductions.sim_to_real import run as sim_to_real_tables
+from flcav.reproductions.sim_to_real.clouds import CloudNumbers, SeenCar, Street
+from flcav.reproductions.sim_to_real.run import FrameResult, LabelledCar, RealScore, SimToReal, draw_clouds
+from flcav.reproductions.task_objects import run as objects_tables
+from flcav.reproductions.task_objects.run import STUDY
 from flcav.statistics.seeds import mean_over_seeds
 
 

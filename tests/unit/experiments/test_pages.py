@@ -2,18 +2,20 @@ import re
 from pathlib import Path
 
 import pytest
-from reproduction_pages import TABLES, fill, fill_folder, tables_of
+from reproduction_pages import fill, fill_folder, tables_of
 
 from flcav.config import InputError, read_json
-from flcav.experiments.arms.run import ARMS, ArmsResult, order_arms
 from flcav.pipeline.results.run import Summary
 from flcav.pipeline.running import RESULTS
+from flcav.reproductions.demo_arms.run import ARMS, ArmsResult, order_arms
 from flcav.storage.markdown import format_table
 
 REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"
 RUNS = sorted((REPRODUCTIONS / "runs").glob("*"))
-FEDERATIONS = sorted((REPRODUCTIONS / "federation").glob("*"))
-PAGES = [*(folder for folder in (*REPRODUCTIONS.iterdir(), *FEDERATIONS) if folder.name in TABLES), *RUNS]
+PAGES = [
+    *(path.parent for path in sorted(REPRODUCTIONS.rglob("run.py")) if (path.parent / "result.json").is_file()),
+    *RUNS,
+]
 MADE = [folder for folder in PAGES if any((folder / name).exists() for name in ("result.json", RESULTS, Summary.file))]
 
 
@@ -100,7 +102,7 @@ def test_markdown() -> None:
 
 
 def test_arms_are_drawn_in_their_own_order_whatever_that_of_the_file() -> None:
-    results = ArmsResult.from_json(read_json(REPRODUCTIONS / "demo" / "result.json"), "demo")
+    results = ArmsResult.from_json(read_json(REPRODUCTIONS / "demo_arms" / "result.json"), "demo")
     drawn = order_arms(results.summary.ap50)
     assert {town: set(arms) for town, arms in drawn.items()} == {
         town: set(arms) for town, arms in results.summary.ap50.items()

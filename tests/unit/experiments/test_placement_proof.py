@@ -12,12 +12,19 @@ import pytest
 from scipy.stats import spearmanr, t
 from shapely.geometry import Point
 
-from flcav.experiments.maps import import_map
-from flcav.experiments.placement import predictors, spread
-from flcav.experiments.placement.claims import describe_claims, list_claims
-from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps, overlap_of_circles
-from flcav.experiments.placement.predictors import RECALL, count_added_labels, expect_labels
-from flcav.experiments.placement.records import (
+from flcav.experiments.experiment import import_map
+from flcav.fusion.detector import TRAINED_IN
+from flcav.fusion.road import RoadView
+from flcav.geometry import Boxes, pose
+from flcav.optimization.curves.held_out import rank_correlation
+from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError
+from flcav.perception.objects.model import second_tiny
+from flcav.perception.outcomes import Outcomes
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.recipe import load_run_recipe
+from flcav.reproductions.placement import records
+from flcav.reproductions.placement import run as placement_run
+from flcav.reproductions.placement.records import (
     ADDED,
     COVERAGE,
     EXPECTED,
@@ -29,19 +36,23 @@ from flcav.experiments.placement.records import (
     PlacementProof,
     PoleGain,
     SeedGains,
+    describe_claims,
+    list_claims,
+    spread_over_scenes,
 )
-from flcav.experiments.placement.run import choose_near, list_regions, plan_half_width, summarise_gains
-from flcav.experiments.placement.spread import spread_over_scenes
-from flcav.experiments.placement.tables import tables
-from flcav.fusion.detector import TRAINED_IN
-from flcav.fusion.road import RoadView
-from flcav.geometry import Boxes, pose
-from flcav.optimization.curves.held_out import rank_correlation
-from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError
-from flcav.perception.objects.model import second_tiny
-from flcav.perception.outcomes import Outcomes
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import load_run_recipe
+from flcav.reproductions.placement.run import (
+    RECALL,
+    choose_near,
+    count_added_labels,
+    describe_overlaps,
+    expect_labels,
+    list_overlaps,
+    list_regions,
+    overlap_of_circles,
+    plan_half_width,
+    summarise_gains,
+)
+from flcav.reproductions.placement.tables import tables
 from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.verdicts import judge_means
@@ -49,7 +60,7 @@ from flcav.world.map.town import load_town
 
 RECIPE = load_run_recipe(recipe_path("runs/placement"))
 BOTH = ("grid", "quarter")
-RANGES = Path(__file__).parents[3] / "reproductions/sensor-ranges/result.json"
+RANGES = Path(__file__).parents[3] / "reproductions/sensor_ranges/result.json"
 
 
 @pytest.fixture(scope="module")
@@ -165,8 +176,8 @@ def test_labels_really_added_are_road_boxes_with_returns_that_the_vehicle_lacks(
         return {spin: {poles[0]: RoadView(told[poles[0]], np.zeros(2), grid, grid)} for spin in spins}
 
     own = replace(cars((10.5, 2.2), z=-1.0), label=np.array(["Car"]))  # of both vehicles, in the LiDAR's frame
-    monkeypatch.setattr(predictors, "road_views", views)
-    monkeypatch.setattr(predictors, "detect_in", lambda network, frames, score_threshold: [own])
+    monkeypatch.setattr(placement_run, "road_views", views)
+    monkeypatch.setattr(placement_run, "detect_in", lambda network, frames, score_threshold: [own])
     network: Any = SimpleNamespace(config=second_tiny().config)
     places = {3: np.array((5.0, 5.0, 6.0)), 7: np.array((215.0, 5.0, 6.0))}
     assert count_added_labels(network, 0.5, split, (0, 1), places) == {3: 1, 7: 1}  # `missed`; `far`, 20 m from cav1
@@ -223,7 +234,7 @@ def test_the_draw_of_scenes_moves_two_poles_apart_as_far_as_their_scenes_differ(
     def measure(outcomes: Outcomes, times: np.ndarray) -> np.ndarray:
         return times @ outcomes.arrays["reached"] / times.sum(axis=1)
 
-    monkeypatch.setattr(spread, "OBJECTS", SimpleNamespace(measure=measure))
+    monkeypatch.setattr(records, "OBJECTS", SimpleNamespace(measure=measure))
     tested = [Outcomes(scenes, {"reached": own}) for own in reached]
     counted = {TOWN: np.ones(20, dtype=bool), NEAR: np.arange(20) < 19}
     found = spread_over_scenes(tested, counted, 1)

@@ -10,7 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flcav.config import InputError
-from flcav.experiments.redundant_tasks.run import (
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.outcomes import Outcomes
+from flcav.pipeline.engine import run_steps
+from flcav.reproductions.redundant_tasks.run import (
     ALL,
     LEAST,
     MOST,
@@ -20,9 +23,10 @@ from flcav.experiments.redundant_tasks.run import (
     list_steps,
     mean_score,
     name_step,
+    redundant_tasks_tables,
     summarise,
 )
-from flcav.experiments.redundant_tasks.scenarios import (
+from flcav.reproductions.redundant_tasks.scenarios import (
     EVEN,
     REVERSED,
     RULE,
@@ -37,10 +41,6 @@ from flcav.experiments.redundant_tasks.scenarios import (
     split_tasks,
     spread_frames,
 )
-from flcav.experiments.redundant_tasks.tables import redundant_tasks_tables
-from flcav.perception.objects.task import OBJECTS
-from flcav.perception.outcomes import Outcomes
-from flcav.pipeline.engine import run_steps
 from flcav.storage.records import from_json
 
 

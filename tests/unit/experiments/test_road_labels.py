@@ -2,11 +2,9 @@
 
 import numpy as np
 
-from flcav.experiments.roadside.detector import RoadDetectorResult
-from flcav.experiments.roadside.labels import RoadLabels, grade_labels
-from flcav.experiments.roadside.tables import detector_tables
 from flcav.geometry import Boxes
 from flcav.pipeline.provenance import provenance
+from flcav.reproductions.road_detector.run import RoadDetectorResult, RoadLabels, detector_tables, grade_labels
 
 
 def cars(*rows: tuple[float, float, float]) -> Boxes:

@@ -4,7 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from flcav.experiments.roadside.cameras import (
+from flcav.fusion.association import PairedShot, Pairs
+from flcav.fusion.registration import Offset
+from flcav.geometry import Boxes
+from flcav.pipeline.provenance import provenance
+from flcav.reproductions.fig4.cameras import (
     CALIBRATED,
     CORRECTED,
     EXACT,
@@ -15,12 +19,7 @@ from flcav.experiments.roadside.cameras import (
     judge_pairs,
     name_actors,
 )
-from flcav.experiments.roadside.fig4 import Fig4
-from flcav.experiments.roadside.tables import fig4_tables
-from flcav.fusion.association import PairedShot, Pairs
-from flcav.fusion.registration import Offset
-from flcav.geometry import Boxes
-from flcav.pipeline.provenance import provenance
+from flcav.reproductions.fig4.run import Fig4, fig4_tables
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
 
 NONE = np.zeros(0, np.int64)

@@ -8,7 +8,7 @@ from PIL import Image
 
 from flcav.driving.errors import load_errors
 from flcav.driving.measures import Drive, Hit
-from flcav.experiments.safety_distance.run import SafetyDistance, list_settings, summarise_margins
+from flcav.reproductions.safety_distance.run import SafetyDistance, list_settings, summarise_margins
 from flcav.storage.records import from_json
 
 HIT = Hit(3.0, "car", "vehicle", 5.0, at_fault=True)

@@ -4,11 +4,11 @@ import pytest
 
 from flcav.config import parse_config
 from flcav.dataset.rectangles import SIGNS
-from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResult
-from flcav.experiments.studies.signs import STUDY, tables
+from flcav.experiments.study import SeedResult, StudyRecordings, StudyResult
 from flcav.perception.card import Card
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
 from flcav.pipeline.provenance import provenance
+from flcav.reproductions.task_signs.run import STUDY, tables
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.seeds import mean_over_seeds

@@ -8,11 +8,11 @@ import pytest
 from flcav.config import InputError
 from flcav.dataset.formats.kitti.files import KittiCalibration, KittiFrame, Objects
 from flcav.dataset.recording.recorder import record
-from flcav.experiments.sim_to_real import run as sim_to_real
-from flcav.experiments.sim_to_real.clouds import summarise_clouds
 from flcav.geometry import Boxes
 from flcav.perception.kitti_benchmark import in_image, truth_of
 from flcav.perception.objects.model import second, small_config
+from flcav.reproductions.sim_to_real import run as sim_to_real
+from flcav.reproductions.sim_to_real.clouds import summarise_clouds
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

@@ -9,22 +9,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from studies import STUDIES
 
 from flcav.cli.main import run as command
 from flcav.config import InputError, parse_config
-from flcav.experiments.studies import STUDIES, study_named, weather
-from flcav.experiments.studies.run import (
+from flcav.experiments.experiment import load_experiment
+from flcav.experiments.study import (
     list_counts,
-    results_as_json,
-    results_of_json,
+    load_own_study,
+    make_experiment,
     run_study,
     steps_of,
 )
 from flcav.perception.study import TEST_SEEDS
 from flcav.perception.training.run import CARD, EVENTS, WEIGHTS
+from flcav.reproductions.task_weather import run as weather
 from flcav.sources.recipe import Recipe
 
-each_study = pytest.mark.parametrize("study", [study_named(name) for name in STUDIES], ids=STUDIES)
+each_study = pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
 
 
 @each_study
@@ -73,7 +75,7 @@ RECORDED = {
 @pytest.mark.parametrize("name", STUDIES)
 def test_what_a_study_records_stays_what_its_committed_figures_are_of(name):
     """A recipe that changes, changes the frames, and the steps' fingerprints: run the study anew, then write both."""
-    study = study_named(name)
+    study = STUDIES[name]
     recipe = study.recipe
     recipes = {"train": list(recipe.train), "validation": recipe.validation, "tests": dict(recipe.tests)}
     assert hashlib.sha256(json.dumps(recipes, sort_keys=True).encode()).hexdigest()[:16] == RECORDED[name]
@@ -111,13 +113,13 @@ OWN = replace(
 
 def test_a_study_of_ones_own_is_found_by_its_module(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("sys.path", [str(Path(__file__).parent), *sys.path])
-    assert study_named(f"{Path(__file__).stem}:OWN").recipe.tests.keys() == OWN.recipe.tests.keys()
+    assert load_own_study(f"{Path(__file__).stem}:OWN").recipe.tests.keys() == OWN.recipe.tests.keys()
     with pytest.raises(InputError, match=r"has no 'NONE'"):
-        study_named(f"{Path(__file__).stem}:NONE")
+        load_own_study(f"{Path(__file__).stem}:NONE")
     with pytest.raises(InputError, match=r"neither a study nor a task with a study"):
-        study_named("pathlib:Path")
-    with pytest.raises(InputError, match=r"choose one of .*weather.*, or name your own as module:NAME"):
-        study_named("none")
+        load_own_study("pathlib:Path")
+    with pytest.raises(InputError, match=r"neither a folder with a run.py nor one of .*task-weather"):
+        load_experiment("none")
 
 
 def test_the_command_says_what_is_no_study(tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -154,9 +156,10 @@ def test_a_toy_study_gives_numbers_of_each_seed_and_goes_on(tmp_path: Path):
         assert mean.high is not None
         assert 0 < mean.low < mean.mean < mean.high < 1
     assert "nearest class" in results.summary[weather.WHOLE_SPACE]
-    values = results_as_json(study, results)
+    experiment = make_experiment(study, lambda read: {"same": str(read == results)})
+    values = experiment.encode(results)
     assert json.loads(json.dumps(values, allow_nan=False)) == values
-    assert results_of_json(study, values, "result.json") == results
+    assert experiment.tabulate(values, "result.json") == {"same": "True"}
     assert study.draw(results).startswith(b"\x89PNG")
 
     said.clear()

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flcav.experiments.studies import study_named
-from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResult
-from flcav.experiments.studies.trajectory import CAMERAS, STUDY, tables
+from flcav.experiments.study import SeedResult, StudyRecordings, StudyResult
 from flcav.perception.card import Card
 from flcav.perception.trajectory.config import FUTURE, PAST
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
 from flcav.pipeline.provenance import provenance
+from flcav.reproductions.task_trajectory.run import CAMERAS, STUDY, tables
 from flcav.statistics.seeds import mean_over_seeds
 
 
@@ -70,5 +69,4 @@ def test_errors_have_a_row_for_each_slice_and_predictor():
 
 
 def test_the_picture_shows_every_test():
-    assert study_named("trajectory") is STUDY
     assert STUDY.draw(results(4.0, 4.1)).startswith(b"\x89PNG")

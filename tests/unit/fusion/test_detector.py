@@ -6,7 +6,6 @@ import shapely
 
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.experiments.roadside.detector import detect_frames, score_town
 from flcav.fusion.detector import (
     OFF_ROAD_M,
     ROAD,
@@ -22,6 +21,7 @@ from flcav.perception.foreground import frame_reader
 from flcav.perception.objects.samples import select_fitting_frames
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import find_shipped, read_card
+from flcav.reproductions.road_detector.run import detect_frames, score_town
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.world.map.relief import Relief

@@ -14,7 +14,6 @@ from flwr.app import Array, ArrayRecord, MetricRecord, RecordDict
 from flwr.common.serde import recorddict_to_proto
 
 from flcav.config import InputError
-from flcav.experiments.fig6a.run import BUDGETS
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.trainable import LocalUpdate
@@ -39,6 +38,7 @@ from flcav.pipeline.recipe import FixedPlan, PlanLimits, load_run_recipe
 from flcav.pipeline.results.plans import TaskPlan
 from flcav.pipeline.spread import read_spreads
 from flcav.pipeline.tables import HistoryPoint, append_records, load_history, parse_history
+from flcav.reproductions.fig6a_allocation.run import BUDGETS
 
 RECIPES = Path(__file__).parents[3] / "recipes/runs"
 FITTED: dict[tuple[bytes, ...], CurveFit] = {}

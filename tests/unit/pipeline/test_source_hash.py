@@ -9,9 +9,9 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 import pytest
+from studies import STUDIES
 
-from flcav.experiments.splits import record_split
-from flcav.experiments.studies import STUDIES, study_named
+from flcav.experiments.study import record_split
 from flcav.pipeline.engine.source_hash import PACKAGES, Sources, find_definitions
 from flcav.pipeline.recipe import Federation
 from flcav.pipeline.steps import centralised, cloud, edge, recording, testing
@@ -156,9 +156,9 @@ STEPS = {
     "evaluation": testing.test_step,
     "stage II": edge.edge_step,
     "stage III": cloud.cloud_step,
-} | {f"{name}, {part}": getattr(study_named(name), part) for name in STUDIES for part in ("learn", "test")}
+} | {f"{name}, {part}": getattr(study, part) for name, study in STUDIES.items() for part in ("learn", "test")}
 
-OF_STUDIES = ("run", "objects", "weather")  # modules with what a study trains, or measures beyond its task
+OF_STUDIES = ("objects", "weather")  # modules with what a study trains, or measures beyond its task
 
 
 def count_lines(package: Path, modules: Collection[str]) -> int:
@@ -176,8 +176,8 @@ def test_no_step_reaches_the_drawing_of_results_or_the_command_line(run):
     assert count_lines(PACKAGES["flcav"], reached) < 0.51 * count_lines(PACKAGES["flcav"], [])
     assert not [name for name in reached if name.startswith(("flcav.report", "flcav.cli"))]
     assert not [name for name in reached if name.startswith("flcav.pipeline.engine.run")]
-    experiments = {name for name in reached if name.startswith("flcav.experiments")}
-    assert experiments <= {"flcav.experiments.splits", *(f"flcav.experiments.studies.{name}" for name in OF_STUDIES)}
+    experiments = {name for name in reached if name.startswith(("flcav.experiments", "flcav.reproductions"))}
+    assert experiments <= {"flcav.experiments.study", *(f"flcav.reproductions.task_{name}.run" for name in OF_STUDIES)}
     observing = [name for name in reached if name.startswith(("flcav.sensors.rendering", "flcav.sensors.radar.radar"))]
     assert bool(observing) == (run in (record_split, recording.record_step))
 
@@ -212,7 +212,7 @@ def test_everything_that_a_step_loads_of_flcav_and_runs_is_among_what_it_reaches
     code = """
         import sys
         from pathlib import Path
-        from flcav.experiments.splits import record_split
+        from flcav.experiments.study import record_split
         from flcav.pipeline.engine import Work
         ran = set()
         def trace(frame, event, argument):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError
-from flcav.experiments.run_tables import tables
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.spread import SpreadRow, difference_key, list_figures, list_spreads, read_spreads, widen_anew
 from flcav.pipeline.tables import append_records
+from flcav.report.run_tables import tables
 from flcav.statistics.estimates import Spread
 
 ROOT = Path(__file__).parents[3]

@@ -3,10 +3,10 @@ from pathlib import Path
 import networkx as nx
 import pytest
 
-from flcav.experiments.fig3a.run import article_graph
 from flcav.optimization.graph import load_graph
 from flcav.report import style
 from flcav.report.charts.curves import COLUMNS, layout, three_layers
+from flcav.reproductions.fig3a.run import article_graph
 
 RECIPE = Path(__file__).parents[3] / "recipes" / "graphs" / "three_layers.yaml"
 

@@ -6,7 +6,6 @@ from typing import Any
 import networkx as nx
 import pytest
 
-from flcav.experiments.fig3a.run import article_graph
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.budget_sweep import compute_savings
 from flcav.optimization.allocation.comparison import PlanComparison, compare_plan
@@ -15,6 +14,7 @@ from flcav.optimization.allocation.problem_file import STEPS, TERMS
 from flcav.optimization.graph import load_problem
 from flcav.optimization.problem import Budgets, Limits, Problem, Uplink
 from flcav.report.pages.plan_page import SHOWN, plan_page, plan_results
+from flcav.reproductions.fig3a.run import article_graph
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 ONE = load_problem(RECIPES / "allocation" / "objects.yaml")

@@ -1,0 +1,166 @@
+"""Comparison of labels for stage II, the arms of recipes/runs/distillation.yaml: same frames, steps and budget.
+
+Arms differ only in their labels and in the pole that these come from. Every arm has a ledger of its own with the boxes
+that its vehicles send. Over seeds, which have recordings of their own, intervals cover training and traffic. The
+verdicts on all differences are corrected together.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flcav.config import Json
+from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
+from flcav.pipeline.analysis.histories import gap_closed
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.training import LabelQuality
+from flcav.report import style
+from flcav.report.charts import figures
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import describe_means, tabulate_means
+from flcav.storage.markdown import format_table
+from flcav.storage.records import Record
+
+TASK, TOWN = "objects", "grid"
+PRETRAINED, TRACKS, JOINED, DENSEST, ROAD, AVERAGE, IDEAL = (
+    "pretrained",
+    "tracks, no road sensor",
+    "tracks and road labels, VRCSP pole",
+    "tracks and road labels, densest pole",
+    "road labels, VRCSP pole",
+    "road average, VRCSP pole",
+    "ideal road labels, VRCSP pole",
+)
+ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
+    PRETRAINED: (MAIN, PRETRAIN),
+    ROAD: ("road", EDGE),
+    AVERAGE: ("average", EDGE),
+    TRACKS: ("tracks", EDGE),
+    DENSEST: ("densest", EDGE),
+    JOINED: (MAIN, EDGE),
+    IDEAL: ("ideal", EDGE),
+}
+COMPARED = (  # (after, before): claims that the difference is positive
+    (JOINED, PRETRAINED),
+    (JOINED, TRACKS),
+    (JOINED, DENSEST),
+    (JOINED, ROAD),
+    (AVERAGE, TRACKS),
+    (AVERAGE, ROAD),
+    (IDEAL, JOINED),
+)
+
+
+@dataclass(frozen=True)
+class DistillationArm:
+    """Result of one arm in one seed."""
+
+    ap50: float
+    ap70: float
+    up_mb: float  # by wireless in stage II, weights and boxes
+    labels: tuple[LabelQuality, ...]  # before each round; labels that stay: once; of the pretrained network: none
+
+
+@dataclass(frozen=True)
+class DistillationResult(Record):
+    """Results of the comparison: numbers by seed and arm, and means over seeds."""
+
+    seeds: Mapping[str, Mapping[str, DistillationArm]]  # by seed and arm
+    ap50: Mapping[str, MeanOverSeeds]  # by arm
+    differences: Mapping[str, MeanOverSeeds]  # "after - before", in AP50
+    closed: MeanOverSeeds  # share of the gain with the road sensor that tracks bring without one
+    recipe: Mapping[str, Json]
+    provenance: Provenance
+
+    def sentences(self) -> list[str]:
+        """Return AP50 by arm, the verdicts on differences, and what tracks bring without a road sensor, in words."""
+        reached = [f"{arm}: AP50 {mean.describe()}" for arm, mean in self.ap50.items()]
+        share = f"share of the gain with the road sensor that tracks bring without one: {self.closed.describe()}"
+        return [*reached, *describe_means(self.differences), share]
+
+
+def compare_labels(recipe: RunRecipe, runs: Sequence[Run]) -> DistillationResult:
+    """Return the results of the arms of `recipe`, from a run of each seed."""
+    seeds = {str(run.recipe.seed): {name: _reached(run, *arm) for name, arm in ARMS.items()} for run in runs}
+    each = [*seeds.values()]
+
+    def gain(seed: Mapping[str, DistillationArm], after: str, before: str) -> float:
+        return seed[after].ap50 - seed[before].ap50
+
+    shares = [gap_closed(*(seed[name].ap50 for name in (PRETRAINED, TRACKS, JOINED))) for seed in each]
+    return DistillationResult(
+        seeds=seeds,
+        ap50={name: mean_over_seeds([seed[name].ap50 for seed in each], share=True) for name in ARMS},
+        differences={
+            f"{after} - {before}": mean_over_seeds([gain(seed, after, before) for seed in each])
+            for after, before in COMPARED
+        },
+        closed=mean_over_seeds(shares),
+        recipe=recipe.model_dump(mode="json", exclude={"seed"}),
+        provenance=provenance(),
+    )
+
+
+def _reached(run: Run, arm: str, stage: str) -> DistillationArm:
+    test = run.test(arm=arm, stage=stage, region=TOWN, task=TASK)
+    ap70 = test.numbers["AP70"]
+    assert ap70 is not None  # the town has targets
+    if stage == PRETRAIN:
+        return DistillationArm(test.estimate.mean, ap70, 0.0, ())
+    labels = next(each.labels for each in run.arms[arm].stages if each.stage == stage and each.region == TOWN)
+    sent = sum(each.mb for each in run.arms[arm].spent if (each.stage, each.link) == (stage, "wireless"))
+    return DistillationArm(test.estimate.mean, ap70, sent, labels or ())
+
+
+def draw_labels(results: DistillationResult) -> bytes:
+    """Return the forest plot of the AP50 of all arms as a PNG."""
+    return style.png(figures.arms({TOWN: {name: results.ap50[name] for name in ARMS}}))
+
+
+def tables(results: DistillationResult) -> dict[str, str]:
+    """Return Markdown by name: arms, differences, labels."""
+    return {
+        "arms": _arms(results),
+        "differences": tabulate_means("difference in AP50", results.differences),
+        "labels": _labels(results),
+    }
+
+
+def _arms(results: DistillationResult) -> str:
+    rows = []
+    for name in ARMS:
+        own = [seed[name] for seed in results.seeds.values()]
+        ap70, sent = (float(np.mean([getattr(each, field) for each in own])) for field in ("ap70", "up_mb"))
+        rows.append([name, results.ap50[name].describe(), f"{ap70:.3f}", f"{sent:.2f} MB" if sent else ""])
+    return format_table(("stage II learns from", "AP50", "AP70, mean", "wireless uplink of stage II, mean"), rows)
+
+
+def _labels(results: DistillationResult) -> str:
+    """Return precision and recall of the labels before the first and the last round, means over seeds."""
+    rows = []
+    for name in ARMS:
+        if name == PRETRAINED:
+            continue
+        cells = []
+        for place in (0, -1):
+            found = [seed[name].labels[place] for seed in results.seeds.values() if seed[name].labels]
+            for field in ("precision", "recall"):
+                known = [value for each in found if (value := getattr(each, field)) is not None]
+                cells.append(f"{np.mean(known):.3f}" if known else "")
+        rows.append([name, *cells])
+    at = (f"{name}, {when} round" for when in ("first", "last") for name in ("precision", "recall"))
+    return format_table(("stage II learns from", *at), rows)
+
+
+def _run(out: Path, options: Options) -> Outcome[DistillationResult]:
+    recipe = options.load("distillation", shrink_recipe)
+    runs = options.run_seeds(recipe, out)
+    results = compare_labels(recipe, runs)
+    return Outcome(results, {"arms.png": draw_labels(results)}, results.sentences())
+
+
+EXPERIMENT = Experiment(DistillationResult, _run, tables)

@@ -1,0 +1,8 @@
+"""What vehicles exchange, of SECOND: `federation/exchange` with the recipe of detectors."""
+
+from functools import partial
+
+from flcav.experiments.experiment import Experiment
+from flcav.reproductions.federation.exchange.run import ExchangeResult, run_exchange, tables
+
+EXPERIMENT = Experiment(ExchangeResult, partial(run_exchange, "exchange_objects"), tables, seeds=5)

@@ -1,0 +1,361 @@
+"""Groups on request against a fixed roster: accuracy by megabytes of uplink, at equal megabytes and after the plan.
+
+Ten vehicles drive with a network that knows six of eight weathers. In one setting all of them meet the other two, in
+the other three do. A group is called as in stage II of a run (`flcav.pipeline.training.groups`): who errs asks, all
+offer, the lead chooses by their data, and the group dissolves when its loss on held-back pictures has levelled off.
+"""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from flcav.experiments.experiment import (
+    Differences,
+    Experiment,
+    Options,
+    Outcome,
+    describe_differences,
+    name_differences,
+)
+from flcav.federation.rounds import EVERYBODY, Schedule, federate
+from flcav.federation.rules import Rules
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.selection import Selection
+from flcav.federation.trainable import Weights
+from flcav.interface.progress import Report, ignore_progress
+from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes
+from flcav.network.messages import pack, send
+from flcav.perception.weather.task import WEATHER
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.recipe import EDGE, Requests
+from flcav.pipeline.training.groups import Levelled, choose_members, has_levelled, weigh_offers
+from flcav.report import style
+from flcav.reproductions.federation.drives import (
+    Drives,
+    Vehicle,
+    find_right,
+    measure_losses,
+    record_drives,
+    spread_over_scenes,
+)
+from flcav.reproductions.federation.groups.vehicles import Fleet, make_offer, open_fleet
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import judge_means
+from flcav.storage.markdown import format_table
+from flcav.storage.records import Record
+
+ROUNDS, STEPS, LEARNING_RATE = 20, 5, 0.05
+REQUESTS = Requests(excess=50.0, most=4)
+TARGET = 0.95  # accuracy
+ROSTER, GROUP, DRAWN = "fixed roster, all ten", "group on request", "four drawn for each round"
+RIVALS = (ROSTER, GROUP, DRAWN)
+UNLIKE, ALIKE = "three meet two new weathers", "all meet two new weathers"
+SETTINGS = (UNLIKE, ALIKE)
+MEGABYTES, WHOLE = "the group's megabytes", "the whole plan"
+MEASURES = (MEGABYTES, WHOLE)  # of accuracy
+UNTIL = f"megabytes until accuracy {TARGET}"
+UP: Any = {"stage": EDGE, "task": WEATHER.name, "link": "wireless", "direction": "up"}
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A federation of one seed: the uplink so far, and the accuracy on the test drives, from before the first round."""
+
+    up_mb: tuple[float, ...]
+    accuracy: tuple[float, ...]
+    members: tuple[str, ...]  # of each round, or of whom they are drawn
+    asked: tuple[str, ...] = ()  # of a group
+    at: Mapping[str, float] | None = None  # accuracy by `MEASURES`
+    gain_per_mb: Mapping[str, float] | None = None  # of accuracy since pretraining, by `MEASURES`
+    until_mb: float | None = None  # uplink until `TARGET`, at most that of the roster's whole plan
+
+
+@dataclass(frozen=True)
+class GroupsResult(Record):
+    """Results by setting: trajectories by seed and rival, means over seeds, and differences to the fixed roster."""
+
+    pictures: int  # of the test
+    scenes: int
+    meet: Mapping[str, tuple[str, ...]]  # by seed, the vehicles that meet the new weathers where three do
+    trajectories: Mapping[str, Mapping[str, Mapping[str, Trajectory]]]  # by setting, seed and rival
+    accuracy: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by setting, measure and rival
+    gains: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # per megabyte
+    until_mb: Mapping[str, Mapping[str, MeanOverSeeds]]  # by setting and rival
+    differences: Differences  # of accuracy; megabytes saved until `TARGET`
+    provenance: Provenance
+
+    @property
+    def claims(self) -> dict[str, MeanOverSeeds]:
+        """Return all differences by name, whose verdicts are corrected together."""
+        return name_differences(self.differences)
+
+    def sentences(self) -> list[str]:
+        """Return the differences in words."""
+        return describe_differences(self.differences, "roster")
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A federation's network, uplink [bytes] and vehicles after each round, from before the first."""
+
+    weights: tuple[Weights, ...]
+    up_bytes: tuple[int, ...]
+    members: tuple[str, ...]
+    asked: tuple[str, ...] = ()
+
+    def last_within(self, up_bytes: int) -> int:
+        """Return the last round with which no more bytes are sent."""
+        return int(np.flatnonzero(np.array(self.up_bytes) <= up_bytes)[-1])
+
+
+def compare_groups(
+    out: Path, seeds: int, progress: Report = ignore_progress, *, first: int = 1
+) -> tuple[GroupsResult, dict[str, bytes]]:
+    """Record the drives into `out`, and federate by each setting, seed and rival; return numbers and a picture."""
+    drives = record_drives(out, progress)
+    right: dict[tuple[str, str, str], list[NDArray[np.float64]]] = {}
+    found: dict[str, dict[str, dict[str, Trajectory]]] = {setting: {} for setting in SETTINGS}
+    meet: dict[str, tuple[str, ...]] = {}
+    total, done = seeds * len(SETTINGS), 0
+    for seed in range(first, first + seeds):
+        for setting in SETTINGS:
+            fleet = open_fleet(drives, seed, alike=setting == ALIKE, held_back=REQUESTS.held_back)
+            if setting == UNLIKE:
+                meet[str(seed)] = fleet.meet
+            followed = {GROUP: call(fleet, seed), ROSTER: keep(fleet, seed), DRAWN: draw(fleet, seed)}
+            found[setting][str(seed)], marks = score(followed, drives)
+            for key, each in marks.items():
+                right.setdefault((setting, *key), []).append(each)
+            done += 1
+            progress(done, total, f"seed {seed}, {setting}")
+    results = summarise(drives, meet, found, right)
+    return results, {"groups.png": style.png(draw_by_megabytes(results.trajectories, RIVALS))}
+
+
+def keep(fleet: Fleet, seed: int) -> Followed:
+    """Return the rounds of all vehicles, with all of their pictures."""
+    return follow(fleet, seed, Ledger(LinkMegabytes(1e6, 0.0)), [*fleet.whole])
+
+
+def draw(fleet: Fleet, seed: int) -> Followed:
+    """Return rounds of as many vehicles as a group has at most, drawn for each, with all of their pictures."""
+    rules = Rules(selection=Selection(rule="uniform", clients=REQUESTS.most))
+    return follow(fleet, seed, Ledger(LinkMegabytes(1e6, 0.0)), [*fleet.whole], rules)
+
+
+def call(fleet: Fleet, seed: int) -> Followed:
+    """Return the rounds of the group that those vehicles call whose loss on held-back pictures is above the limit."""
+    book, limit = Ledger(LinkMegabytes(1e6, 0.0)), REQUESTS.excess * fleet.loss
+    losses = {name: float(measure_losses(fleet.start, own).mean()) for name, own in fleet.held.items()}
+    asked = sorted((name for name, loss in losses.items() if loss > limit), key=lambda name: -losses[name])
+    if not asked:
+        return Followed((fleet.start,), (0,), ())
+    for name in asked:
+        about = {"position": np.zeros(3, np.float32), "loss": np.array([losses[name]], np.float32)}
+        send(book, pack(about), client=name, **UP)
+    offers = {name: make_offer(own, fleet.start, seed) for name, own in fleet.train.items()}
+    for name, offer in offers.items():
+        send(book, offer.message(), client=name, **UP)
+    chosen = choose_members(REQUESTS, asked, weigh_offers(offers), {})
+    return follow(fleet, seed, book, chosen.members, asked=asked)
+
+
+def follow(
+    fleet: Fleet, seed: int, book: Ledger, members: Sequence[str], rules: Rules = EVERYBODY, asked: Sequence[str] = ()
+) -> Followed:
+    """Return the rounds of the `members`; a group, of which some `asked`, dissolves when its loss has levelled off."""
+    kept, told = [fleet.start], pack({"loss": np.zeros(1, np.float32)})
+    held = [fleet.held[name] for name in members]
+    losses = [float(np.mean([measure_losses(fleet.start, own).mean() for own in held]))]
+
+    def after(number: int, weights: Weights, _loss: float | None) -> None:
+        kept.append(weights)
+        if asked:
+            losses.append(float(np.mean([measure_losses(weights, own).mean() for own in held])))
+            for name in members:
+                send(book, told, client=name, round_=number, **UP)
+            if has_levelled(losses, REQUESTS):
+                raise Levelled
+
+    pictures = fleet.train if asked else fleet.whole
+    with suppress(Levelled):
+        federate(
+            {name: Vehicle(pictures[name]) for name in sorted(members)},
+            fleet.start,
+            Schedule(ROUNDS, STEPS, LEARNING_RATE, LEARNING_RATE, seed),
+            Account(book, EDGE, WEATHER.name, "wireless"),
+            rules=rules,
+            on_round=after,
+        )
+    sent = [sum(e.bytes for e in book if e.direction == "up" and e.round <= number) for number in range(len(kept))]
+    return Followed(tuple(kept), tuple(sent), tuple(members), tuple(asked))
+
+
+def score(
+    followed: Mapping[str, Followed], drives: Drives
+) -> tuple[dict[str, Trajectory], dict[tuple[str, str], NDArray[np.float64]]]:
+    """Return the trajectories by rival, and which test pictures (N,) are right, by measure and rival."""
+    found: dict[str, Trajectory] = {}
+    marks: dict[tuple[str, str], NDArray[np.float64]] = {}
+    group_bytes, most_mb = followed[GROUP].up_bytes[-1], followed[ROSTER].up_bytes[-1] / BYTES_PER_MB
+    for name, own in followed.items():
+        right = [find_right(weights, drives.test).astype(float) for weights in own.weights]
+        mb = [each / BYTES_PER_MB for each in own.up_bytes]
+        ends = {MEGABYTES: own.last_within(group_bytes), WHOLE: len(right) - 1}
+        at = {measure: float(right[end].mean()) for measure, end in ends.items()}
+        gain = {m: (at[m] - float(right[0].mean())) / mb[end] if end else 0.0 for m, end in ends.items()}
+        accuracy = tuple(round(float(each.mean()), 5) for each in right)
+        until = next((sent for sent, each in zip(mb, accuracy, strict=True) if each >= TARGET), most_mb)
+        reached = (at, gain, round(min(until, most_mb), 4))
+        found[name] = Trajectory(tuple(np.round(mb, 4).tolist()), accuracy, own.members, own.asked, *reached)
+        marks |= {(measure, name): right[end] for measure, end in ends.items()}
+    return found, marks
+
+
+def summarise(
+    drives: Drives,
+    meet: Mapping[str, tuple[str, ...]],
+    found: Mapping[str, Mapping[str, Mapping[str, Trajectory]]],
+    right: Mapping[tuple[str, str, str], list[NDArray[np.float64]]],
+) -> GroupsResult:
+    """Return the means over seeds, which share the test's scenes."""
+
+    def mean(values: list[NDArray[np.float64]], share: bool) -> MeanOverSeeds:
+        means = [float(each.mean()) for each in values]
+        return mean_over_seeds(means, share=share, shared=spread_over_scenes(drives.test, values))
+
+    def gain(setting: str, measure: str, rival: str) -> MeanOverSeeds:
+        own = [seed[rival].gain_per_mb for seed in found[setting].values()]
+        return mean_over_seeds([each[measure] for each in own if each is not None])
+
+    def difference(setting: str, measure: str, rival: str) -> MeanOverSeeds:
+        pairs = zip(right[setting, measure, rival], right[setting, measure, ROSTER], strict=True)
+        return mean([one - other for one, other in pairs], share=False)
+
+    def until(setting: str, rival: str) -> list[float]:
+        return [seed[rival].until_mb or 0.0 for seed in found[setting].values()]
+
+    def saved(setting: str, rival: str) -> MeanOverSeeds:
+        return mean_over_seeds([a - b for a, b in zip(until(setting, ROSTER), until(setting, rival), strict=True)])
+
+    others = [rival for rival in RIVALS if rival != ROSTER]
+    return GroupsResult(
+        pictures=len(drives.test.scenes),
+        scenes=len(set(drives.test.scenes)),
+        meet=meet,
+        trajectories=found,
+        accuracy={s: {m: {n: mean(right[s, m, n], True) for n in RIVALS} for m in MEASURES} for s in SETTINGS},
+        gains={s: {m: {n: gain(s, m, n) for n in RIVALS} for m in MEASURES} for s in SETTINGS},
+        until_mb={s: {n: mean_over_seeds(until(s, n)) for n in RIVALS} for s in SETTINGS},
+        differences={
+            s: {m: {n: difference(s, m, n) for n in others} for m in MEASURES}
+            | {UNTIL: {n: saved(s, n) for n in others}}
+            for s in SETTINGS
+        },
+        provenance=provenance(),
+    )
+
+
+def groups_tables(results: GroupsResult) -> dict[str, str]:
+    """Return Markdown by name: accuracy, groups, differences."""
+    judged, accuracy, groups, differences = judge_means(results.claims), [], [], []
+    for setting in SETTINGS:
+        seeds = results.trajectories[setting]
+        for rival in RIVALS:
+            own = [seed[rival] for seed in seeds.values()]
+            means = [results.accuracy[setting][measure][rival].describe() for measure in MEASURES]
+            gain = results.gains[setting][WHOLE][rival].describe()
+            rounds = np.mean([len(each.up_mb) - 1 for each in own])
+            sent = np.mean([each.up_mb[-1] for each in own])
+            until = results.until_mb[setting][rival].describe()
+            accuracy.append([setting, rival, *means, f"{rounds:.1f}", f"{sent:.2f}", gain, until])
+            for measure in (*MEASURES, UNTIL) if rival != ROSTER else ():
+                one, verdict = (
+                    results.differences[setting][measure][rival],
+                    judged[f"{setting}, {measure}: {rival}"],
+                )
+                row = [setting, measure, rival, one.describe(sign=True), verdict.p_cell, verdict.verdict]
+                differences.append([*row, verdict.takes_cell])
+        for seed, rivals in sorted(seeds.items(), key=lambda each: int(each[0])):
+            group = rivals[RIVALS[1]]
+            told = (", ".join(group.asked), ", ".join(group.members))
+            met = ", ".join(results.meet[seed]) if setting == SETTINGS[0] else "all"
+            groups.append([setting, seed, met, *told, str(len(group.up_mb) - 1), f"{group.up_mb[0] * 1000:.1f}"])
+    heads = (
+        f"vehicles, {len(results.meet)} seeds",
+        "rounds",
+        f"accuracy at {MEGABYTES}",
+        "accuracy after the whole plan",
+        "rounds until its end",
+        "MB up by then",
+        "gain in accuracy per MB of it",
+        f"MB up until accuracy {TARGET}",
+    )
+    of_groups = ("vehicles", "seed", "met the new weathers", "asked", "came", "rounds", "requests and offers, kB")
+    more = "if undecided: seeds that detect a difference of the observed size"
+    told = (
+        "vehicles",
+        "at",
+        "rounds",
+        "accuracy - fixed roster's, or megabytes saved",
+        "p, corrected",
+        "claim that it is positive",
+        more,
+    )
+    return {
+        "accuracy": format_table(heads, accuracy),
+        "groups": format_table(of_groups, groups),
+        "differences": format_table(told, differences),
+    }
+
+
+COLOURS = (style.INK, style.BLUE, style.ORANGE)
+
+
+class Reached(Protocol):
+    """A federation's accuracy after each round, by what its vehicles have sent [MB], from before the first."""
+
+    @property
+    def up_mb(self) -> Sequence[float]:
+        """The megabytes, ascending."""
+        ...
+
+    @property
+    def accuracy(self) -> Sequence[float]:
+        """The accuracies."""
+        ...
+
+
+@style.styled
+def draw_by_megabytes(found: Mapping[str, Mapping[str, Mapping[str, Reached]]], names: Sequence[str]) -> Figure:
+    """Return the accuracy of every seed by uplink, a panel per setting, with a dot where each federation ends.
+
+    `found` is by setting, seed and name.
+    """
+    figure = style.canvas(7.2, 3.4)
+    panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
+    for panel, (setting, seeds) in zip(panels, found.items(), strict=True):
+        for name, colour in zip(names, COLOURS, strict=False):
+            for number, own in enumerate(seeds.values()):
+                mb, accuracy = np.asarray(own[name].up_mb), np.asarray(own[name].accuracy)
+                panel.plot(mb, accuracy, color=colour, linewidth=0.9, alpha=0.8, label=None if number else name)
+                panel.plot(mb[-1:], accuracy[-1:], "o", color=colour, markersize=3)
+        panel.set(xlabel="uplink of the vehicles [MB]", title=setting)
+    panels[0].set(ylabel="accuracy")
+    style.key(figure, panels[0].get_legend_handles_labels()[0], ncols=3)
+    return figure
+
+
+def _run(out: Path, options: Options) -> Outcome[GroupsResult]:
+    with options.show_progress(options.title) as report:
+        results, pictures = compare_groups(out, options.seeds, report)
+    return Outcome(results, pictures, results.sentences())
+
+
+EXPERIMENT = Experiment(GroupsResult, _run, groups_tables, seeds=10, takes=("seeds",))

@@ -1,0 +1,378 @@
+"""Comparison of federations and label sources by their share of what ground truth gains: recipes/runs/gap.yaml.
+
+Centralised training on ground truth (*oracle*) is what stage II on ground truth is compared with, which tells what the
+federation itself costs, with its rates and steps; ground truth with one fault of the tracks at a time tells what each
+fault costs. Beside the town that federates stands the town of pretraining, where boxes may get worse. Over seeds, which
+have recordings of their own, intervals cover training and traffic. The verdicts on all differences are corrected
+together.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flcav.config import Json
+from flcav.experiments.experiment import Experiment, Options, Outcome, list_works, shrink_recipe
+from flcav.interface.wording import plural
+from flcav.network.ledger import BYTES_PER_MB, Ledger
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.outcomes import score_network
+from flcav.perception.weights import load_network
+from flcav.pipeline.analysis.histories import gap_closed
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.saved import LEDGER, WEIGHTS
+from flcav.pipeline.training.checkpoints import load_round_network
+from flcav.report import style
+from flcav.report.charts import figures
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import describe_means, tabulate_means
+from flcav.storage.markdown import format_table
+from flcav.storage.records import Record
+
+FEDERATED: Mapping[str, str] = {"edge FL on tracks": MAIN, "edge FL on ground truth": "truth"}  # by name: arm
+IN_BYTES = "edge FL on ground truth, int8"
+LONGER_ARMS = (("longer", EDGE), ("longer", MORE_EDGE), ("longest", MORE_EDGE))  # arms and stages of that curve
+UPLOADED = "centralised on uploaded sweeps"
+ROUNDS = (1, 2, 3, 5, 10)  # after which a federation is tested; those that it has
+
+
+@dataclass(frozen=True)
+class AtBytes:
+    """AP50 on test frames after so many megabytes [MB, wireless uplink of a region's stage II]."""
+
+    label: str  # rounds or sweeps
+    mb: float
+    ap50: float
+
+
+@dataclass(frozen=True)
+class MeanAtBytes:
+    """The mean over seeds of `AtBytes`."""
+
+    label: str
+    mb: float
+    ap50: MeanOverSeeds
+
+
+Curves = Mapping[str, tuple[AtBytes, ...]]  # by name
+
+
+def trace_bytes(run: Run, work: Path, region: str) -> Curves:
+    """Return the curves of a run whose steps lie in `work`, in one region: they begin with the pretrained network."""
+    (task,) = run.recipe.tasks
+    test = Frames.open(work / run.steps.recording(region, "test", task))
+    start = load_network(OBJECTS, work / run.steps.pretrain(MAIN, task) / WEIGHTS)
+    begun = AtBytes("pretraining", 0.0, score_network(OBJECTS, start, test.data, test.vehicles))
+
+    def federated(arm: str) -> Iterator[AtBytes]:
+        how, folder = run.recipe.training_of(task), work / run.steps.edge(arm, region, task)
+        sent = Ledger.load(folder / LEDGER).entries
+        for number in (each for each in ROUNDS if each <= max(entry.round for entry in sent)):
+            ended = load_round_network(OBJECTS, start, folder, number, how.average_rounds, how.start_share)
+            up = (
+                entry.bytes
+                for entry in sent
+                if (entry.link, entry.direction) == ("wireless", "up") and entry.round <= number
+            )
+            ap50 = score_network(OBJECTS, ended, test.data, test.vehicles)
+            yield AtBytes(plural(number, "round"), sum(up) / BYTES_PER_MB, ap50)
+
+    def in_bytes() -> Iterator[AtBytes]:
+        for arm, stage in LONGER_ARMS:
+            folder = work / run.steps.stage(arm, stage, region, task)
+            number = sum(each.rounds for each in run.arms[arm].stages if each.stage in (EDGE, stage))
+            ap50 = run.test(arm=arm, stage=stage, region=region, task=task).estimate.mean
+            yield AtBytes(plural(number, "round"), Ledger.load(folder / LEDGER).used_mb("wireless"), ap50)
+
+    def uploaded() -> Iterator[AtBytes]:
+        for arm, own in list_uploads(run.recipe):
+            book = Ledger.load(work / run.steps.central(arm, region, task) / LEDGER)
+            ap50 = run.test(arm=arm, stage=CENTRAL, region=region, task=task).estimate.mean
+            yield AtBytes(plural(own, "sweep"), book.used_mb("wireless"), ap50)
+
+    curves = {name: (begun, *federated(arm)) for name, arm in FEDERATED.items()}
+    return {**curves, IN_BYTES: (begun, *in_bytes()), UPLOADED: (begun, *uploaded())}
+
+
+def list_uploads(recipe: RunRecipe) -> list[tuple[str, int]]:
+    """Return the arms that train centrally on uploaded sweeps, and how many these are, fewest first."""
+    found = [(name, arm.uploads) for name, arm in recipe.arms.items() if arm.uploads is not None]
+    return sorted(found, key=lambda each: each[1])
+
+
+def average_curves(curves: Sequence[Curves]) -> dict[str, tuple[MeanAtBytes, ...]]:
+    """Return the mean over seeds of the points of each curve."""
+    means = {}
+    for name in curves[0]:
+        rows = zip(*(own[name] for own in curves), strict=True)
+        means[name] = tuple(
+            MeanAtBytes(
+                points[0].label,
+                sum(point.mb for point in points) / len(points),
+                mean_over_seeds([point.ap50 for point in points], share=True),
+            )
+            for points in rows
+        )
+    return means
+
+
+TASK, TOWN, HOME = "objects", "grid", "suburb"
+PRETRAINED, ORACLE = "pretrained", "centralised on ground truth"
+JOINT, LONG_JOINT = (f"centralised on ground truth of both towns{how}" for how in ("", ", four times the steps"))
+TRUTH, TWICE, FOURFOLD, COARSE, LONGER, LONGEST = (
+    f"edge FL on ground truth{how}"
+    for how in (
+        "",
+        ", twice the steps",
+        ", four times the steps",
+        ", int8",
+        ", int8, twice the rounds",
+        ", int8, four times the rounds",
+    )
+)
+MISSED, UNSURE = "ground truth, missed objects background", "ground truth, missed objects neutral"
+FAR, OCCLUDED = "ground truth, missed far objects background", "ground truth, missed occluded objects background"
+FALSE, BOXES, PRESENCE = "ground truth, and false boxes", "ground truth, boxes of tracks", "ground truth, no boxes"
+ROAD, TRACKS, JOINED = "edge FL on road labels", "edge FL on tracks", "edge FL on road labels and tracks"
+GLOBAL, REPLAY, FROZEN, IMITATING, HALF, QUARTER = (
+    f"edge + cloud FL on tracks{how}"
+    for how in (
+        "",
+        ", with replay",
+        ", head frozen",
+        ", with imitation",
+        ", half pretrained",
+        ", three quarters pretrained",
+    )
+)
+GLOBAL_TRUTH, QUARTER_TRUTH, GLOBAL_PRESENCE = (
+    f"edge + cloud FL on ground truth{how}" for how in ("", ", three quarters pretrained", ", no boxes")
+)
+ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
+    PRETRAINED: (MAIN, PRETRAIN),
+    ROAD: ("road", EDGE),
+    TRACKS: (MAIN, EDGE),
+    JOINED: ("joined", EDGE),
+    MISSED: ("missed", EDGE),
+    UNSURE: ("unsure", EDGE),
+    FAR: ("range", EDGE),
+    OCCLUDED: ("occlusion", EDGE),
+    FALSE: ("false", EDGE),
+    BOXES: ("boxes", EDGE),
+    PRESENCE: ("presence", EDGE),
+    TRUTH: ("truth", EDGE),
+    TWICE: ("twice", EDGE),
+    FOURFOLD: ("fourfold", EDGE),
+    COARSE: ("longer", EDGE),
+    LONGER: ("longer", MORE_EDGE),
+    LONGEST: ("longest", MORE_EDGE),
+    GLOBAL: ("bare", CLOUD),
+    REPLAY: (MAIN, CLOUD),
+    FROZEN: ("frozen", CLOUD),
+    IMITATING: ("imitating", CLOUD),
+    HALF: ("half", CLOUD),
+    QUARTER: ("three_quarters", CLOUD),
+    GLOBAL_TRUTH: ("truth", CLOUD),
+    QUARTER_TRUTH: ("truth_three_quarters", CLOUD),
+    GLOBAL_PRESENCE: ("presence", CLOUD),
+    JOINT: ("joint", CENTRAL),
+    LONG_JOINT: ("joint_fourfold", CENTRAL),
+    ORACLE: ("oracle", CENTRAL),
+}
+FOR_ALL = tuple(name for name, (_, stage) in ARMS.items() if stage in (PRETRAIN, CLOUD))
+AT_HOME = (*FOR_ALL, JOINT, LONG_JOINT)  # one network for both towns: scored in that of pretraining, too
+COMPARED = (  # (after, before): claims that the difference in AP50 is positive
+    (TRUTH, PRETRAINED),
+    (TRACKS, PRETRAINED),
+    (TRACKS, ROAD),
+    (JOINED, TRACKS),
+    (TRUTH, TRACKS),
+    (TRUTH, MISSED),
+    (TRUTH, FAR),
+    (TRUTH, OCCLUDED),
+    (TRUTH, FALSE),
+    (TRUTH, BOXES),
+    (TRUTH, PRESENCE),
+    (TWICE, TRUTH),
+    (FOURFOLD, TWICE),
+    (LONGER, COARSE),
+    (LONGEST, LONGER),
+    (ORACLE, TRUTH),
+)
+
+
+@dataclass(frozen=True)
+class GapArm:
+    """AP of an arm in one seed, and precision and recall of the labels that it learns from."""
+
+    ap50: float
+    ap70: float
+    precision: float | None  # of its labels; None of an arm without any
+    recall: float | None
+
+
+@dataclass(frozen=True)
+class GapResult(Record):
+    """Results of the comparison: numbers by seed and arm, and means over seeds."""
+
+    seeds: Mapping[str, Mapping[str, GapArm]]  # by seed and arm, in the town that federates
+    home: Mapping[str, Mapping[str, GapArm]]  # in the town of pretraining
+    ap50: Mapping[str, MeanOverSeeds]  # by arm
+    ap70: Mapping[str, MeanOverSeeds]
+    closed50: Mapping[str, MeanOverSeeds]  # share of what edge FL on ground truth gains in AP50
+    closed70: Mapping[str, MeanOverSeeds]
+    differences: Mapping[str, MeanOverSeeds]  # "after - before", in AP50
+    home50: Mapping[str, MeanOverSeeds]  # change in AP50 in the town of pretraining, by arm
+    home70: Mapping[str, MeanOverSeeds]
+    megabytes: Mapping[str, tuple[MeanAtBytes, ...]]  # AP50 against uplink megabytes, by curve
+    recipe: Mapping[str, Json]
+    provenance: Provenance
+
+    def sentences(self) -> list[str]:
+        """Return AP and share of the gap by arm, the verdicts on differences, and the change at home, in words."""
+        reached = [
+            f"{arm}: AP50 {mean.describe()}, of its gain on truth {self.closed50[arm].describe()}; "
+            f"AP70 {self.ap70[arm].describe()}, of its gain on truth {self.closed70[arm].describe()}"
+            for arm, mean in self.ap50.items()
+        ]
+        home = [
+            f"at home, {name}: AP50 {mean.describe(sign=True)}, AP70 {self.home70[name].describe(sign=True)}"
+            for name, mean in self.home50.items()
+        ]
+        at_bytes = [
+            f"{name}, {point.label}, {point.mb:.1f} MB: AP50 {point.ap50.describe()}"
+            for name, points in self.megabytes.items()
+            for point in points
+        ]
+        return [*reached, *describe_means(self.differences), *home, *at_bytes]
+
+
+def compare_gap(recipe: RunRecipe, runs: Sequence[Run], curves: Sequence[Curves]) -> GapResult:
+    """Return the results of the arms of `recipe`, from a run of each seed and its `curves` of accuracy by bytes."""
+    seeds = {str(run.recipe.seed): {name: _reached(run, name, TOWN) for name in ARMS} for run in runs}
+    home = {str(run.recipe.seed): {name: _reached(run, name, HOME) for name in AT_HOME} for run in runs}
+    each, at_home = [*seeds.values()], [*home.values()]
+
+    def mean(arm: str, field: str) -> MeanOverSeeds:
+        return mean_over_seeds([getattr(seed[arm], field) for seed in each], share=True)
+
+    def closed(arm: str, field: str) -> MeanOverSeeds:
+        of = [[getattr(seed[name], field) for name in (PRETRAINED, arm, TRUTH)] for seed in each]
+        return mean_over_seeds([gap_closed(*values) for values in of])
+
+    def gain(seeds: Sequence[Mapping[str, GapArm]], after: str, before: str, field: str) -> MeanOverSeeds:
+        return mean_over_seeds([getattr(seed[after], field) - getattr(seed[before], field) for seed in seeds])
+
+    return GapResult(
+        seeds=seeds,
+        home=home,
+        ap50={arm: mean(arm, "ap50") for arm in ARMS},
+        ap70={arm: mean(arm, "ap70") for arm in ARMS},
+        closed50={arm: closed(arm, "ap50") for arm in ARMS},
+        closed70={arm: closed(arm, "ap70") for arm in ARMS},
+        differences={f"{after} - {before}": gain(each, after, before, "ap50") for after, before in COMPARED},
+        home50={arm: gain(at_home, arm, PRETRAINED, "ap50") for arm in AT_HOME[1:]},
+        home70={arm: gain(at_home, arm, PRETRAINED, "ap70") for arm in AT_HOME[1:]},
+        megabytes=average_curves(curves),
+        recipe=recipe.model_dump(mode="json", exclude={"seed"}),
+        provenance=provenance(),
+    )
+
+
+def _reached(run: Run, name: str, town: str) -> GapArm:
+    arm, stage = ARMS[name]
+    test = run.test(arm=arm, stage=stage, region=town, task=TASK)
+    ap70 = test.numbers["AP70"]
+    assert ap70 is not None  # the town has targets
+    stages = [each for each in run.arms[arm].stages if (each.stage, each.region) == (stage, TOWN)]
+    labels = stages[0].labels if stages and stage == EDGE else None
+    quality = (labels[0].precision, labels[0].recall) if labels else (None, None)
+    return GapArm(test.estimate.mean, ap70, *quality)
+
+
+def draw_megabytes(results: GapResult) -> bytes:
+    """Return AP50 against uplink megabytes, a line per curve, as a PNG."""
+    lines = {name: [(point.mb, point.ap50) for point in points] for name, points in results.megabytes.items()}
+    return style.png(figures.by_megabytes(lines))
+
+
+def draw_gap(results: GapResult) -> bytes:
+    """Return the forest plot of the AP50 of all arms as a PNG."""
+    return style.png(figures.arms({TOWN: {name: results.ap50[name] for name in ARMS}}))
+
+
+def gap_tables(results: GapResult) -> dict[str, str]:
+    """Return Markdown by name: arms, differences, home, seeds."""
+    return {
+        "arms": _arms(results),
+        "differences": tabulate_means("difference in AP50", results.differences),
+        "home": _home(results),
+        "megabytes": _megabytes(results),
+        "seeds": _seeds(results),
+    }
+
+
+def _arms(results: GapResult) -> str:
+    rows = []
+    for name in ARMS:
+        own = [seed[name] for seed in results.seeds.values()]
+        labels = (_mean([getattr(each, field) for each in own]) for field in ("precision", "recall"))
+        numbers = (results.ap50, results.closed50, results.ap70, results.closed70)
+        rows.append([name, *(each[name].describe() for each in numbers), *labels])
+    share = "share of the gain of truth"
+    titles = ("arm", "AP50", share, "AP70", share, "labels' precision", "labels' recall")
+    return format_table(titles, rows)
+
+
+def _home(results: GapResult) -> str:
+    rows = []
+    for name in AT_HOME:
+        own = [seed[name] for seed in results.home.values()]
+        row = [name]
+        for field, change in (("ap50", results.home50), ("ap70", results.home70)):
+            row += [
+                _mean([getattr(each, field) for each in own]),
+                change[name].describe(sign=True) if name in change else "",
+            ]
+        rows.append(row)
+    titles = ("AP50", "against pretrained", "AP70", "against pretrained")
+    return format_table((f"in {HOME}", *titles), rows)
+
+
+def _megabytes(results: GapResult) -> str:
+    rows = [
+        [name, point.label, f"{point.mb:.1f}", point.ap50.describe()]
+        for name, points in results.megabytes.items()
+        for point in points
+    ]
+    return format_table(("training", "after", "uplink MB", "AP50"), rows)
+
+
+def _seeds(results: GapResult) -> str:
+    def cell(arm: GapArm) -> str:
+        return f"{arm.ap50:.3f}, {arm.ap70:.3f}"
+
+    rows = [[name, *(cell(seed[name]) for seed in results.seeds.values())] for name in ARMS]
+    return format_table(("AP50, AP70", *(f"seed {seed}" for seed in results.seeds)), rows)
+
+
+def _mean(values: list[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return f"{np.mean(known):.3f}" if known else ""
+
+
+def _run(out: Path, options: Options) -> Outcome[GapResult]:
+    recipe = options.load("gap", shrink_recipe)
+    runs = options.run_seeds(recipe, out)
+    curves = [trace_bytes(run, work, TOWN) for run, work in zip(runs, list_works(runs, out), strict=True)]
+    results = compare_gap(recipe, runs, curves)
+    pictures = {"arms.png": draw_gap(results), "megabytes.png": draw_megabytes(results)}
+    return Outcome(results, pictures, results.sentences())
+
+
+EXPERIMENT = Experiment(GapResult, _run, gap_tables)

@@ -1,0 +1,186 @@
+"""Comparison of lifelong learning with replay, without replay, and doing nothing: recipes/runs/lifelong.yaml.
+
+Every seed has traffic, initial weights and test scenes of its own, so that intervals over seeds cover training and
+scenes. Arms of a seed share its frames, its pretrained network and the random draws of its rounds.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flcav.config import Json
+from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
+from flcav.pipeline.lifelong import NOTHING, PLAIN, REPLAY
+from flcav.pipeline.provenance import Provenance, provenance
+from flcav.pipeline.recipe import RunRecipe
+from flcav.pipeline.results.lifelong import LifelongArm
+from flcav.pipeline.results.run import Run
+from flcav.report import style
+from flcav.report.charts.lifelong import draw_conditions
+from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.verdicts import describe_means, tabulate_means
+from flcav.storage.markdown import format_table
+from flcav.storage.records import Record
+
+TASK, MEASURE = "objects", "AP50"
+ARMS = (REPLAY, PLAIN, NOTHING)
+FINAL, BACKWARD = "final mean AP50", "backward transfer"
+COMPARED = ((FINAL, REPLAY, NOTHING), (FINAL, REPLAY, PLAIN), (FINAL, PLAIN, NOTHING), (BACKWARD, REPLAY, PLAIN))
+
+
+@dataclass(frozen=True)
+class Mended(Record):
+    """Conditions of all seeds in an arm, and how many were mended."""
+
+    passed: int
+    broken: int  # for which the network that drove was not good enough when they came
+    mended: int  # of these
+    seconds: float | None  # until a network drove that was; median of the mended; None: none was
+
+
+@dataclass(frozen=True)
+class LifelongResult(Record):
+    """Results of the comparison: arms by seed, means over seeds, and differences between arms."""
+
+    conditions: tuple[str, ...]
+    seeds: Mapping[str, Mapping[str, LifelongArm]]  # by seed and arm
+    final: Mapping[str, MeanOverSeeds]  # AP50 in the mean of all conditions, after the last
+    backward: Mapping[str, MeanOverSeeds]
+    forward: Mapping[str, MeanOverSeeds]
+    up_mb: Mapping[str, MeanOverSeeds]
+    down_mb: Mapping[str, MeanOverSeeds]
+    tested: Mapping[str, Mapping[str, tuple[MeanOverSeeds, ...]]]  # by condition and arm: pretrained, then after each
+    mended: Mapping[str, Mended]
+    differences: Mapping[str, MeanOverSeeds]
+    recipe: Mapping[str, Json]
+    provenance: Provenance
+
+    def sentences(self) -> list[str]:
+        """Return what each arm reached, and the verdicts on differences, in words."""
+        reached = [
+            f"{arm}: {FINAL} {self.final[arm].describe()}, {BACKWARD} {self.backward[arm].describe(sign=True)}, "
+            f"{self.up_mb[arm].mean:.1f} MB up, {own.mended} of {own.broken} mended"
+            for arm, own in self.mended.items()
+        ]
+        return [*reached, *describe_means(self.differences)]
+
+
+def compare_lifelong(recipe: RunRecipe, runs: Sequence[Run]) -> LifelongResult:
+    """Return the results of a run of each seed of `recipe`."""
+    seeds = {str(run.recipe.seed): {own.arm: own for own in run.lifelong or () if own.task == TASK} for run in runs}
+    each = [*seeds.values()]
+    conditions = each[0][NOTHING].conditions
+
+    def mean(arm: str, value: Callable[[LifelongArm], float], share: bool = False) -> MeanOverSeeds:
+        return mean_over_seeds([value(own[arm]) for own in each], share=share)
+
+    def mean_tested(arm: str, row: int, column: int) -> MeanOverSeeds:
+        return mean(arm, lambda own: own.tested[row][column], share=True)
+
+    def difference(field: str, arm: str, other: str) -> MeanOverSeeds:
+        return mean_over_seeds([_MEASURES[field](own[arm]) - _MEASURES[field](own[other]) for own in each])
+
+    return LifelongResult(
+        conditions=conditions,
+        seeds=seeds,
+        final={arm: mean(arm, _MEASURES[FINAL], share=True) for arm in ARMS},
+        backward={arm: mean(arm, _MEASURES[BACKWARD]) for arm in ARMS},
+        forward={arm: mean(arm, lambda own: own.forward) for arm in ARMS},
+        up_mb={arm: mean(arm, lambda own: own.up_bytes / 1e6) for arm in ARMS},
+        down_mb={arm: mean(arm, lambda own: own.down_bytes / 1e6) for arm in ARMS},
+        tested={
+            condition: {arm: tuple(mean_tested(arm, row, column) for row in range(len(conditions) + 1)) for arm in ARMS}
+            for column, condition in enumerate(conditions)
+        },
+        mended={arm: count_mended([own[arm] for own in each]) for arm in ARMS},
+        differences={f"{field}: {arm} - {other}": difference(field, arm, other) for field, arm, other in COMPARED},
+        recipe=recipe.model_dump(mode="json", exclude={"seed"}),
+        provenance=provenance(),
+    )
+
+
+_MEASURES: Mapping[str, Callable[[LifelongArm], float]] = {
+    FINAL: lambda own: own.final,
+    BACKWARD: lambda own: own.backward,
+}
+
+
+def count_mended(arms: Sequence[LifelongArm]) -> Mended:
+    """Return how many conditions of all seeds of an arm were mended."""
+    seconds = [each for own in arms for each in own.mended]
+    broken = sum(len(own.broken) for own in arms)
+    median = float(np.median(seconds)) if seconds else None
+    return Mended(sum(len(own.passed) for own in arms), broken, len(seconds), median)
+
+
+def draw_lifelong(results: LifelongResult) -> bytes:
+    """Return AP50 on each condition after each condition, a line per arm, as a PNG."""
+    return style.png(draw_conditions(results.tested, MEASURE))
+
+
+def lifelong_tables(results: LifelongResult) -> dict[str, str]:
+    """Return Markdown by name: arms, conditions, differences, rounds, seeds."""
+    return {
+        "arms": _arms(results),
+        "conditions": _conditions(results),
+        "differences": tabulate_means("difference", results.differences),
+        "rounds": _rounds(results),
+        "seeds": _seeds(results),
+    }
+
+
+def _arms(results: LifelongResult) -> str:
+    rows = []
+    for arm in ARMS:
+        own = results.mended[arm]
+        seconds = "–" if own.seconds is None else f"{own.seconds:.0f}"
+        moved = [results.backward[arm].describe(sign=True), results.forward[arm].describe(sign=True)]
+        sent = [f"{results.up_mb[arm].mean:.1f}", f"{results.down_mb[arm].mean:.1f}"]
+        counts = [f"{own.broken} of {own.passed}", f"{own.mended}", seconds]
+        rows.append([arm, results.final[arm].describe(), *moved, *sent, *counts])
+    titles = ("final mean AP50", "backward transfer", "forward transfer", "MB up", "MB down")
+    return format_table(("arm", *titles, "conditions with errors", "mended", "median s until mended"), rows)
+
+
+def _conditions(results: LifelongResult) -> str:
+    rows = []
+    for number, condition in enumerate(results.conditions):
+        for arm in ARMS:
+            own = results.tested[condition][arm]
+            rows.append(
+                [condition, arm, *(each.describe() for each in (own[0], own[number], own[number + 1], own[-1]))]
+            )
+    titles = ("pretrained", "before it came", "after it", "at the end")
+    return format_table(("AP50 in", "arm", *titles), rows)
+
+
+def _rounds(results: LifelongResult) -> str:
+    rows = []
+    for seed, arms in results.seeds.items():
+        for arm in ARMS[:2]:
+            for own in arms[arm].passed:
+                seconds = "–" if own.mended_s is None else f"{own.mended_s:.0f}"
+                first, last = own.scores[own.condition][0], own.scores[own.condition][-1]
+                told = [f"{first:.3f}", f"{last:.3f}", f"{own.reachable:.3f}", "yes" if own.replaced else "no", seconds]
+                rows.append([seed, arm, own.condition, f"{len(own.asked)}", f"{own.members}", f"{own.rounds}", *told])
+    titles = ("asked", "members", "rounds", "before", "after", "reachable", "new network drives", "s until mended")
+    return format_table(("seed", "arm", "condition", *titles), rows)
+
+
+def _seeds(results: LifelongResult) -> str:
+    rows = [
+        [arm, *(f"{own[arm].final:.3f}, {own[arm].backward:+.3f}" for own in results.seeds.values())] for arm in ARMS
+    ]
+    return format_table(("final mean AP50, backward transfer", *(f"seed {seed}" for seed in results.seeds)), rows)
+
+
+def _run(out: Path, options: Options) -> Outcome[LifelongResult]:
+    recipe = options.load("lifelong", shrink_recipe)
+    runs = options.run_seeds(recipe, out)
+    results = compare_lifelong(recipe, runs)
+    return Outcome(results, {"lifelong.png": draw_lifelong(results)}, results.sentences())
+
+
+EXPERIMENT = Experiment(LifelongResult, _run, lifelong_tables, seeds=5)

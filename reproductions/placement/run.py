@@ -1,0 +1,440 @@
+"""Proof of placement by learning: what vehicles learn from a sensor on each pole, against what it covers.
+
+All arms of recipes/runs/placement.yaml start from the same pretrained network and train on the same frames in the same
+order; they differ in the poles whose sensors help to label them. The gain of poles is the AP50 after edge FL with their
+sensors minus that without any, on the same test frames: all of them, and the half with most registered errors around.
+If placement by coverage is right, poles that cover more errors have higher gains (Spearman's rank correlation; Wang et
+al., IEEE Network 37(3), 2023, finding iii), and the choice of VRCSP gains more than the densest or random poles.
+Each federating region with an arm of a single pole is a proof of its own. Regions of one seed share their pretraining,
+so that pooled numbers are means over regions first, and over seeds then.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.dataset.ground import Ground
+from flcav.experiments.experiment import Experiment, Options, Outcome, import_map, list_works, shrink_recipe
+from flcav.fusion.labels import label_sample
+from flcav.optimization.curves.held_out import rank_correlation
+from flcav.perception.errors import MISS, PerceptionError, load_errors
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import detect_in
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.truth import choose_lidar
+from flcav.perception.outcomes import Outcomes
+from flcav.perception.weights import load_network
+from flcav.pipeline.frames import Frames
+from flcav.pipeline.labels.pseudo_labels import road_views, select_frames_near
+from flcav.pipeline.poles import find_sites, read_traces
+from flcav.pipeline.provenance import provenance
+from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.pipeline.results.plans import Placed
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.saved import ERRORS, OUTCOMES, WEIGHTS
+from flcav.pipeline.results.training import Pretrained
+from flcav.report import style
+from flcav.report.charts.placement import draw_gains
+from flcav.reproductions.placement.records import (
+    ADDED,
+    COVERAGE,
+    EXPECTED,
+    FRAMES,
+    HALF_WIDTH,
+    NEAR,
+    PREDICTORS,
+    RULES,
+    TOWN,
+    TRAFFIC,
+    ByFrames,
+    ChoiceGain,
+    Means,
+    Pair,
+    PlacementProof,
+    PoleGain,
+    RegionProof,
+    SeedGains,
+    describe_claims,
+    pool_over_seeds,
+    spread_over_scenes,
+    spread_over_seeds,
+)
+from flcav.reproductions.placement.tables import tables
+from flcav.statistics.power import MOST_SEEDS
+from flcav.statistics.seeds import MeanOverSeeds, half_width, mean_over_seeds
+from flcav.world.line_of_sight import find_visible
+from flcav.world.map.town import Town, load_town
+from flcav.world.trace import Trace
+
+TASK = "objects"
+
+Numbers = Mapping[str, ByFrames]  # by name and frames
+
+IMPORTED = "quarter"  # map of the package that is imported as a town
+
+
+@dataclass(frozen=True)
+class _Folders:
+    """The steps of a run in one region that the proof reads."""
+
+    test: Frames
+    registry: Frames
+    edge: Frames
+    errors: tuple[PerceptionError, ...]
+    pretrained: Path
+
+    @classmethod
+    def open(cls, run: Run, work: Path, region: str) -> "_Folders":
+        names = run.steps
+        test, registry, edge = (
+            Frames.open(work / names.recording(region, split, TASK)) for split in ("test", "registry", EDGE)
+        )
+        errors = load_errors(work / names.errors(MAIN, region, TASK) / ERRORS)
+        return cls(test, registry, edge, errors, work / names.pretrain(MAIN, TASK))
+
+
+def list_regions(recipe: RunRecipe) -> tuple[str, ...]:
+    """Return the federating regions in which an arm has a sensor on a single pole; raises `InputError` for none."""
+    federating = recipe.with_role("federate")
+    single = [arm for arm in recipe.arms.values() if len(arm.placement.get("poles", ())) == 1]
+    found = tuple(region for region in federating if any(region in (arm.regions or federating) for arm in single))
+    if not found:
+        raise InputError("no arm has a sensor on a single pole")
+    return found
+
+
+def prove_placement(
+    recipe: RunRecipe, runs: Sequence[Run], works: Sequence[Path], beside: Path | None = None
+) -> PlacementProof:
+    """Return gains by pole and rule in the regions of `list_regions`, over the runs of the recipe's seeds.
+
+    `works`: the folder of each run's steps, with the outcomes of its tests; `beside`: where towns are looked for.
+    Raises `InputError` where a run has no arm with a single pole, or the test frames hold nothing to find.
+    """
+    measured = {
+        region: tuple(measure_gains(run, work, region) for run, work in zip(runs, works, strict=True))
+        for region in list_regions(recipe)
+    }
+    return summarise_gains(recipe, measured, beside)
+
+
+def summarise_gains(
+    recipe: RunRecipe, measured: Mapping[str, tuple[SeedGains, ...]], beside: Path | None = None
+) -> PlacementProof:
+    """Return the means over seeds of gains, of VRCSP's advantages and of correlations, with 95 % intervals.
+
+    measured: the same seeds of each region.
+    """
+    regions = {}
+    for region, seeds in measured.items():
+        spread = {frames: spread_over_seeds(seeds, frames) for frames in FRAMES}
+        regions[region] = RegionProof(
+            town=recipe.regions[region].town or region,
+            overlaps=list_overlaps(recipe, region, beside),
+            seeds=seeds,
+            means=_mean([[seed] for seed in seeds]),
+            pair_sd=spread,
+            seeds_wanted={frames: plan_half_width(sd) if len(seeds) > 1 else None for frames, sd in spread.items()},
+            scene_sd=pool_over_seeds(seeds),
+        )
+    return PlacementProof(
+        range_m=recipe.placement.range_m,
+        regions=regions,
+        pooled=_mean(list(zip(*measured.values(), strict=True))),
+        recipe=recipe.model_dump(mode="json", exclude={"seed"}),
+        provenance=provenance(),
+    )
+
+
+def _mean(seeds: Sequence[Sequence[SeedGains]]) -> Means:
+    """Return means over `seeds` of the mean over the regions of each."""
+    return Means(
+        correlation=_mean_numbers([[each.correlation for each in seed] for seed in seeds]),
+        gain=_mean_numbers([[_list_gains(each) for each in seed] for seed in seeds]),
+        advantage=_mean_numbers([[_list_advantages(each) for each in seed] for seed in seeds]),
+    )
+
+
+def _mean_numbers(seeds: Sequence[Sequence[Numbers]]) -> dict[str, dict[str, MeanOverSeeds]]:
+    """Return the means over seeds of the mean over regions, of the names that all have."""
+    every = [each for seed in seeds for each in seed]
+    names = [name for name in every[0] if all(name in each for each in every)]
+    return {
+        name: {
+            frames: mean_over_seeds([float(np.mean([each[name][frames] for each in seed])) for seed in seeds])
+            for frames in FRAMES
+        }
+        for name in names
+    }
+
+
+def _list_gains(seed: SeedGains) -> Numbers:
+    return {choice.name: choice.gain for choice in seed.choices}
+
+
+def _list_advantages(seed: SeedGains) -> Numbers:
+    best = {choice.count: choice.gain for choice in seed.choices if choice.rule == RULES["vrcsp"]}
+    return {
+        choice.name: {frames: best[choice.count][frames] - gain for frames, gain in choice.gain.items()}
+        for choice in seed.choices
+        if choice.rule != RULES["vrcsp"]
+    }
+
+
+def plan_half_width(sd: float, half: float = HALF_WIDTH) -> int | None:
+    """Return the least number of seeds whose mean has an interval of half-width `half`; None for too many."""
+    return next((seeds for seeds in range(2, MOST_SEEDS) if half_width(sd, seeds) <= half), None)
+
+
+def choose_near(places: NDArray[np.float64], errors: NDArray[np.float64], range_m: float) -> NDArray[np.bool_]:
+    """Return (F,) whether a frame is of the half with most errors within `range_m`, horizontally.
+
+    `places` (F, 2) of the vehicles, `errors` (E, 3), world [m]; of equals the earlier frames are taken.
+    """
+    apart = np.linalg.norm(places[:, None] - errors[None, :, :2], axis=2)
+    order = np.argsort(-(apart <= range_m).sum(axis=1), kind="stable")
+    near = np.zeros(len(places), dtype=np.bool_)
+    near[order[: -(-len(places) // 2)]] = True
+    return near
+
+
+def measure_gains(run: Run, work: Path, region: str) -> SeedGains:
+    """Return the gains of one seed's run in a region from the outcomes of its tests, whose folders are in `work`."""
+    recipe, folders = run.recipe, _Folders.open(run, work, region)
+    split = folders.test
+    places = np.array([split.data.world_from_agent(number)[:2, 3] for number in split.vehicles])
+    spots = np.array([(error.x, error.y, error.z) for error in folders.errors]).reshape(-1, 3)
+    counted = {
+        TOWN: np.ones(len(places), dtype=np.bool_),
+        NEAR: choose_near(places, spots, recipe.placement.range_m),
+    }
+    outcomes = {
+        (test.arm, test.stage): Outcomes.load(work / test.step / OUTCOMES)
+        for test in run.tested
+        if (test.region, test.task) == (region, TASK)
+    }
+    tested = {each: _precision(own, counted, region) for each, own in outcomes.items()}
+    without = tested[MAIN, EDGE]
+    gains = {
+        arm: {frames: value[frames] - without[frames] for frames in value}
+        for (arm, stage), value in tested.items()
+        if stage == EDGE
+    }
+    placed = {arm: _placed(run, arm, region) for arm in gains}
+    poles = _measure_poles(recipe, folders, placed, gains)
+    if not poles:
+        raise InputError(f"region '{region}': no arm has a sensor on a single pole that sees road users")
+    known = {pole.pole for pole in poles}
+    single = [arm for arm, own in placed.items() if own.rule == "fixed" and own.chosen in {(pole,) for pole in known}]
+    several = tuple(
+        ChoiceGain(RULES[each.rule], len(each.chosen), each.chosen, gains[arm])
+        for arm, each in placed.items()
+        if each.rule in RULES
+    )
+    return SeedGains(
+        seed=recipe.seed,
+        errors=placed[MAIN].errors,
+        pretrained=tested[MAIN, PRETRAIN],
+        without=without,
+        poles=poles,
+        choices=(*_choose_one(poles), *sorted(several, key=lambda choice: choice.count)),
+        correlation={name: _correlate(poles, name) for name in PREDICTORS},
+        scene_sd=spread_over_scenes([outcomes[arm, EDGE] for arm in single], counted, recipe.seed),
+    )
+
+
+def _measure_poles(
+    recipe: RunRecipe, folders: _Folders, placed: Mapping[str, Placed], gains: Mapping[str, ByFrames]
+) -> tuple[PoleGain, ...]:
+    """Return gains and predictors of the single poles of arms that see road users."""
+    known = {site.pole: site for site in placed[MAIN].poles if site.actors > 0}
+    single = {
+        pole: gains[arm]
+        for arm, each in placed.items()
+        if each.rule == "fixed" and len(each.chosen) == 1 and (pole := each.chosen[0]) in known
+    }
+    if not single:
+        return ()
+    sites, town = find_sites(folders.registry, None), folders.registry.data.town()
+    if town is None:
+        raise InputError(f"{folders.registry.data.folder}: recorded in no known town, so that no pole's sight is known")
+    where = dict(zip(sites.number.tolist(), sites.position, strict=True))
+    traces = read_traces(folders.registry.data, folders.registry.vehicles)
+    mounts = np.array([where[pole] for pole in single]).reshape(-1, 3)
+    expected = dict(zip(single, expect_labels(town, traces, folders.errors, mounts).tolist(), strict=True))
+    network, threshold = load_network(OBJECTS, folders.pretrained / WEIGHTS), _threshold(folders)
+    near = np.array([where[pole][:2] for each in placed.values() for pole in each.chosen]).reshape(-1, 2)
+    frames = select_frames_near(folders.edge, near, recipe.placement.group_range_m)
+    added = count_added_labels(network, threshold, folders.edge, frames, {pole: where[pole] for pole in single})
+    return tuple(
+        PoleGain(
+            pole,
+            {
+                COVERAGE: known[pole].covered,
+                TRAFFIC: known[pole].actors,
+                EXPECTED: round(expected[pole], 2),
+                ADDED: added[pole],
+            },
+            gain,
+        )
+        for pole, gain in single.items()
+    )
+
+
+def _threshold(folders: _Folders) -> float:
+    """Return the score threshold of pseudo-labels; raises `InputError` where labels do not come from detections."""
+    threshold = Pretrained.load(folders.pretrained).threshold
+    if threshold is None:
+        raise InputError("the labels of 'objects' come from no detections, so that no sensor adds any")
+    return threshold
+
+
+def _placed(run: Run, arm: str, region: str) -> Placed:
+    return next(each for each in run.arms[arm].placed if each.region == region)
+
+
+def _precision(outcomes: Outcomes, counted: Mapping[str, NDArray[np.bool_]], region: str) -> dict[str, float]:
+    """Return AP50 on each choice of frames; raises `InputError` where one holds nothing to find."""
+    found = {frames: float(OBJECTS.measure(outcomes, own[None].astype(np.int64))[0]) for frames, own in counted.items()}
+    if any(np.isnan(value) for value in found.values()):
+        raise InputError(f"region '{region}': the test frames hold nothing to find; take more scenes")
+    return found
+
+
+def _choose_one(poles: Sequence[PoleGain]) -> tuple[ChoiceGain, ...]:
+    """Return the gains of one sensor by each rule; at random it is the mean over all poles."""
+    rules = {RULES["vrcsp"]: COVERAGE, RULES["densest"]: TRAFFIC, EXPECTED: EXPECTED}
+    best = {rule: max(poles, key=lambda pole: pole.predictors[name]) for rule, name in rules.items()}
+    mean = {frames: float(np.mean([pole.gain[frames] for pole in poles])) for frames in FRAMES}
+    return (
+        *(ChoiceGain(rule, 1, (pole.pole,), pole.gain) for rule, pole in best.items()),
+        ChoiceGain(RULES["random"], 1, (), mean),
+    )
+
+
+def _correlate(poles: Sequence[PoleGain], name: str) -> dict[str, float]:
+    predictor = [pole.predictors[name] for pole in poles]
+    return {frames: rank_correlation([pole.gain[frames] for pole in poles], predictor) for frames in FRAMES}
+
+
+def draw_proof(results: PlacementProof) -> dict[str, bytes]:
+    """Return by file name the pictures of every pole's gain against each predictor as PNG, one of each region."""
+    pictures = {}
+    for region, own in results.regions.items():
+        panels = {
+            (frames, name): {
+                seed.seed: [(pole.predictors[name], pole.gain[frames]) for pole in seed.poles] for seed in own.seeds
+            }
+            for frames in FRAMES
+            for name in PREDICTORS
+        }
+        pictures[f"placement-{region}.png"] = style.png(draw_gains(panels))
+    return pictures
+
+
+def overlap_of_circles(apart: float, radius: float) -> float:
+    """Return the share of a circle's area that lies in another one of the same radius, `apart` between the centres."""
+    half = apart / (2 * radius)
+    if half >= 1:
+        return 0.0
+    return float(2 / np.pi * (np.arccos(half) - half * np.sqrt(1 - half**2)))
+
+
+def list_overlaps(recipe: RunRecipe, region: str, beside: Path | None = None) -> tuple[Pair, ...]:
+    """Return the pairs of candidate poles of a region whose circles overlap, the most first.
+
+    Its town is looked for in the folder `beside`.
+    """
+    poles, radius = load_town(recipe.regions[region].town or region, beside).poles, recipe.placement.range_m
+    pairs = []
+    for (one, here), (other, there) in combinations(zip(poles.id.tolist(), poles.position, strict=True), 2):
+        apart = float(np.linalg.norm(here[:2] - there[:2]))
+        if (share := overlap_of_circles(apart, radius)) > 0:
+            pairs.append(Pair((one, other), apart, share))
+    return tuple(sorted(pairs, key=lambda pair: -pair.overlap))
+
+
+def describe_overlaps(pairs: Mapping[str, Sequence[Pair]], range_m: float) -> list[str]:
+    """Return in words, a sentence for each region, how much the circles of candidate poles overlap."""
+    told = {
+        region: ", ".join(f"{pair.poles[0]} and {pair.poles[1]} by {pair.overlap:.0%}" for pair in own)
+        for region, own in pairs.items()
+    }
+    return [
+        f"{region}: circles of {range_m:g} m around candidate poles that overlap: {each}"
+        if each
+        else f"{region}: no two circles of {range_m:g} m around candidate poles overlap"
+        for region, each in told.items()
+    ]
+
+
+Array = NDArray[np.float64]
+
+BIN_M = 5.0  # of horizontal distance from the pole
+RECALL = np.array(
+    (0.67, 0.99, 0.92, 0.96, 0.91, 0.97, 0.94, 0.86, 0.53, 0.29, 0.05, 0.0)
+)  # reproductions/sensor-ranges
+REACH_M = 100.0  # between a pole and a vehicle, farther than both see together
+
+
+def expect_labels(town: Town, traces: Sequence[Trace], errors: Sequence[PerceptionError], sites: Array) -> Array:
+    """Return (P,) the expected labels of a sensor on each of `sites` (P, 3), world [m]: see the module.
+
+    traces: of the traffic that may stand in the way.
+    """
+    missed = [error for error in errors if error.kind == MISS and error.returns > 0]
+    places = np.array([(error.x, error.y, error.z) for error in missed]).reshape(-1, 3)
+    apart = np.linalg.norm(sites[:, None, :2] - places[None, :, :2], axis=2)
+    recall = np.append(RECALL, 0.0)[np.minimum(apart / BIN_M, len(RECALL)).astype(np.int64)]
+    pole, error = (rows.astype(np.int64) for rows in np.nonzero(recall))
+    seen = find_visible(town, traces, sites, places, (pole, error))
+    return np.bincount(pole, recall[pole, error] * seen, minlength=len(sites)).astype(np.float64)
+
+
+def count_added_labels(
+    network: Second, threshold: float, split: Frames, frames: Sequence[int], poles: Mapping[int, Array]
+) -> dict[int, int]:
+    """Return by pole the labels that its sensor adds to vehicles' `frames` of a split: see the module.
+
+    The network's detections that score `threshold` or more are the vehicles' own. poles: places (3,) of those whose
+    sweeps are in the split, world [m].
+    """
+    keys, relief = split.data.keys, Ground(split.data).relief
+    own = {i: detect_in(network, [split.data.frame(i)], score_threshold=threshold)[0] for i in frames}
+    added = {}
+    for pole, place in poles.items():
+        near = [i for i in frames if np.linalg.norm((split.data.world_from_agent(i)[:3, 3] - place)[:2]) <= REACH_M]
+        spins = {(keys[i].scene, keys[i].index) for i in near}
+        views = road_views(split, [pole], True, spins)
+        added[pole] = 0
+        for i in near:
+            frame, told = split.data.frame(i), [*views.get((keys[i].scene, keys[i].index), {}).values()]
+            lidar = choose_lidar(frame)
+            alone, helped = (label_sample(frame, own[i], each, network.config, lidar, relief) for each in ([], told))
+            if helped.exact is not None:
+                road, known = helped.boxes[helped.exact], alone.boxes.center[:, :2]
+                offset = np.linalg.norm(road.center[:, None, :2] - known[None], axis=2)
+                added[pole] += int((offset >= road.size[:, :1] / 2).all(axis=1).sum())
+    return added
+
+
+def _run(out: Path, options: Options) -> Outcome[PlacementProof]:
+    recipe = options.load("placement", shrink_recipe)
+    import_map(IMPORTED, out)
+    overlaps = {region: list_overlaps(recipe, region, out) for region in list_regions(recipe)}
+    runs = options.run_seeds(recipe, out, beside=out)
+    results = prove_placement(recipe, runs, list_works(runs, out), out)
+    sentences = [
+        *describe_overlaps(overlaps, recipe.placement.range_m),
+        *results.sentences(),
+        *describe_claims(results),
+    ]
+    return Outcome(results, draw_proof(results), sentences)
+
+
+EXPERIMENT = Experiment(PlacementProof, _run, tables, seeds=8)

@@ -1,1 +1,0 @@
-"""`flcav reproduce`: its targets, and what it does for each."""

@@ -1,1 +1,0 @@
-"""Attacks on a federation of the weather task: Byzantine clients, and a curious server."""

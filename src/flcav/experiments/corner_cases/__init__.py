@@ -1,1 +1,0 @@
-"""The comparison of corner cases: whether knowledge of rare kinds of objects travels between regions."""

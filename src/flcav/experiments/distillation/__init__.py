@@ -1,1 +1,0 @@
-"""Comparison of what vehicles learn from in stage II: the road average, pseudo-labels, ideal labels, no road sensor."""

@@ -1,0 +1,189 @@
+"""An experiment: a folder with a `run.py` whose `EXPERIMENT` says how it is run and how its results are tabulated.
+
+Beside `run.py` are the experiment's page, `README.md`, and the numbers that it shows, `result.json`.
+"""
+
+import importlib
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Generic, NamedTuple, TypedDict, TypeVar
+
+from flcav.config import InputError, Json
+from flcav.experiments import FOLDER, list_experiments
+from flcav.interface.progress import Report
+from flcav.interface.wording import suggest
+from flcav.pipeline.engine import Notify
+from flcav.pipeline.recipe import RunRecipe, load_run_recipe
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.running import WORK, run_seeds
+from flcav.sources.recipe import recipe_path
+from flcav.statistics.seeds import MeanOverSeeds
+from flcav.statistics.verdicts import judge_means
+from flcav.storage.records import from_json, to_json
+from flcav.world.opendrive.importing import import_town
+
+Results = TypeVar("Results")
+Resize = Callable[[RunRecipe], RunRecipe]
+Differences = Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by setting, measure and rival
+
+RUN = ("jobs", "engine", "stale")  # options of experiments that run as steps
+STUDY = ("seeds", "scale", *RUN)  # options of experiments that run over seeds, as steps
+OPTIONS = (*STUDY, "kitti", "data", "around", "weights")  # all
+
+
+class HowToRun(TypedDict):
+    """How steps are run, see `flcav.pipeline.engine.run_steps`."""
+
+    jobs: int
+    notify: Notify
+    stale: str
+    engine: str
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of `flcav reproduce`; `show_steps` and `show_progress` display what goes on in their contexts."""
+
+    title: str  # name of the target
+    seeds: int
+    quick: bool  # in minutes, to see that it runs
+    jobs: int
+    engine: str
+    stale: str
+    show_steps: Callable[[str], AbstractContextManager[Notify]]
+    show_progress: Callable[[str], AbstractContextManager[Report]]
+    kitti: Path | None = None
+    data: Path | None = None
+    around: bool = False
+    weights: Path | None = None
+
+    def how(self, notify: Notify) -> HowToRun:
+        """Return how steps are run."""
+        return {"jobs": self.jobs, "notify": notify, "stale": self.stale, "engine": self.engine}
+
+    def load(self, name: str, resize: Resize) -> RunRecipe:
+        """Return the package's recipe `runs/NAME`; a quick one by `resize`."""
+        recipe = load_run_recipe(recipe_path(f"runs/{name}"))
+        return resize(recipe) if self.quick else recipe
+
+    def run_seeds(self, recipe: RunRecipe, out: Path, beside: Path | None = None) -> tuple[Run, ...]:
+        """Run or finish a recipe with each seed in the folder `out`; imported towns are looked for in `beside`."""
+        with self.show_steps(self.title) as notify:
+            runs, _ = run_seeds(recipe, out, seeds=self.seeds, beside=beside, **self.how(notify))
+        return runs
+
+
+class Outcome(NamedTuple, Generic[Results]):
+    """What an experiment found: its results, PNG files by name, and sentences for the terminal."""
+
+    results: Results
+    pictures: Mapping[str, bytes]
+    sentences: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Experiment(Generic[Results]):
+    """How an experiment is run, and the Markdown tables of its page, by name."""
+
+    results: type[Results]  # a dataclass, the content of result.json
+    run: Callable[[Path, Options], Outcome[Results]]  # or goes on, in a folder
+    tables: Callable[[Results], Mapping[str, str]]
+    seeds: int = 3  # without `--seeds`
+    takes: tuple[str, ...] = STUDY  # of `OPTIONS`
+
+    def encode(self, results: Results) -> Json:
+        """Return results as a JSON value."""
+        return to_json(results, self.results)
+
+    def tabulate(self, values: Json, origin: str) -> Mapping[str, str]:
+        """Return the tables of the results that `encode` wrote; raises `InputError`, naming `origin`, for others."""
+        return self.tables(from_json(self.results, values, origin))
+
+
+def load_experiment(name: str) -> Experiment:
+    """Return the experiment of a target's name, or of a user's own folder.
+
+    Raises `InputError` for an unknown name, and a folder without `run.py`, with one that cannot be imported, or whose
+    name is that of another module.
+    """
+    known = list_experiments()
+    folder = known.get(name, Path(name)).resolve()
+    if not (folder / "run.py").is_file():
+        raise InputError(
+            f"reproduce '{name}': neither a folder with a run.py nor one of {', '.join(known)}{suggest(name, known)}"
+        )
+    loaded = _import_own(folder) if (place := _place(folder)) is None else importlib.import_module(place)
+    found = getattr(loaded, "EXPERIMENT", None)
+    if not isinstance(found, Experiment):
+        raise InputError(f"{folder / 'run.py'}: has no EXPERIMENT, an Experiment of flcav.experiments.experiment")
+    return found
+
+
+def _place(folder: Path) -> str | None:
+    """Return the module of the experiment in a folder of `FOLDER`; None for another folder."""
+    root = FOLDER.resolve()
+    return ".".join(("flcav.reproductions", *folder.relative_to(root).parts, "run")) if root in folder.parents else None
+
+
+def _import_own(folder: Path) -> ModuleType:
+    """Return a user's `run.py` as a module, which processes that run its steps import, too."""
+    if str(folder.parent) not in sys.path:
+        sys.path.insert(0, str(folder.parent))
+    try:
+        loaded = importlib.import_module(f"{folder.name}.run")
+    except Exception as error:
+        raise InputError(f"{folder / 'run.py'}: cannot be imported ({type(error).__name__}: {error})") from None
+    if Path(loaded.__file__ or "").resolve() != folder / "run.py":
+        raise InputError(f"{folder}: a module '{folder.name}' is installed; give the folder another name")
+    return loaded
+
+
+def list_works(runs: Sequence[Run], out: Path) -> list[Path]:
+    """Return the folder of the steps of each run that `Options.run_seeds` made in `out`."""
+    return [out / f"seed{run.recipe.seed}" / WORK for run in runs]
+
+
+def use_demo_size(recipe: RunRecipe) -> RunRecipe:
+    """Return a recipe with the frames and steps of the demo."""
+    return recipe.model_copy(update={"size": "demo"})
+
+
+def shrink_recipe(recipe: RunRecipe) -> RunRecipe:
+    """Return a recipe at toy size that shows that it runs, with plans that its few frames, anywhere, suffice for."""
+    few = {"samples": 16, "edge_rounds": 1}
+    tasks = {
+        name: task.model_copy(update={"plan": task.plan.model_copy(update=few)}) if task.plan else task
+        for name, task in recipe.tasks.items()
+    }
+    anywhere = recipe.placement.model_copy(update={"group_range_m": 1000.0})  # from a sensor
+    changes = {"size": "toy", "splits": None, "training": None, "tasks": tasks, "placement": anywhere}
+    return recipe.model_copy(update=changes)
+
+
+def import_map(name: str, folder: Path) -> None:
+    """Import recipes/maps/NAME.xodr as the town `folder`/NAME, unless it is there."""
+    if not (folder / name).exists():
+        import_town(recipe_path("runs/placement").parents[1] / "maps" / f"{name}.xodr", folder / name)
+
+
+def name_differences(differences: Differences) -> dict[str, MeanOverSeeds]:
+    """Return all differences by name, whose verdicts are corrected together."""
+    return {
+        f"{setting}, {measure}: {rival}": mean
+        for setting, of_setting in differences.items()
+        for measure, of_measure in of_setting.items()
+        for rival, mean in of_measure.items()
+    }
+
+
+def describe_differences(differences: Differences, reference: str) -> list[str]:
+    """Return the differences to the `reference` in words."""
+    claims = name_differences(differences)
+    judged = judge_means(claims)
+    return [
+        f"{name} - {reference}: {mean.describe(sign=True)}, {judged[name].describe()}" for name, mean in claims.items()
+    ]

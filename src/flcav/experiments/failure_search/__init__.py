@@ -1,1 +1,0 @@
-"""Adaptive search for failures against quasi-random sampling."""

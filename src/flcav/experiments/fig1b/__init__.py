@@ -1,1 +1,0 @@
-"""Fig. 1b of the article: the four perception tasks on one scene."""

@@ -1,1 +1,0 @@
-"""Fig. 3a of the article: the three-layer graph and learning curves."""

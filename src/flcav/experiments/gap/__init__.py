@@ -1,1 +1,0 @@
-"""The comparison of federations and label sources by the share of what ground truth gains."""

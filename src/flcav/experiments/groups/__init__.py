@@ -1,1 +1,0 @@
-"""Groups on request in stage II, against a fixed roster and vehicles drawn by lot."""

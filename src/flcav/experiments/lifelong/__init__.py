@@ -1,1 +1,0 @@
-"""Lifelong learning: with replay, without, and doing nothing."""

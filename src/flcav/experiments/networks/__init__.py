@@ -1,1 +1,0 @@
-"""Search of a network that is worth its training time."""

@@ -1,1 +1,0 @@
-"""Uncertainty of perception as safety distance."""

@@ -1,0 +1,193 @@
+"""Markdown tables of a run's results."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from flcav.federation.state import FAILED
+from flcav.network.ledger import LINKS
+from flcav.pipeline.analysis.costs import list_home_costs
+from flcav.pipeline.analysis.findings import findings, name_stage
+from flcav.pipeline.arms import resolve_settings
+from flcav.pipeline.label_sources import LABEL_SOURCES
+from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.pipeline.results.run import Run
+from flcav.pipeline.results.tests import RunFinding
+from flcav.pipeline.spread import read_spreads, widen_anew
+from flcav.report.cloud_rounds import cloud_tables
+from flcav.storage.markdown import format_bullets, format_table
+
+
+def tables(run: Run) -> dict[str, str]:
+    """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, labels, what cloud rounds
+    do, rounds of vehicles on a network, spread of retraining.
+
+    Findings are judged anew, by the present table of the spread of retraining, so that results of before a change of
+    either are judged as others are.
+    """
+    if run.recipe.spread is not None and not run.recipe.retrainings:
+        run = widen_anew(run, read_spreads(run.recipe.spread, Path()))
+    judged = judge_anew(run)
+    own = {
+        "findings": format_bullets(f"*{each.question}* **{each.decision}**. {each.sentence}" for each in judged),
+        "tests": _tests(run),
+        "differences": _differences(run),
+        "plan": _plan(run),
+        "budgets": _budgets(run),
+        "home": _home(run),
+        **cloud_tables(run),
+    }
+    own |= {"sensors": _sensors(run)} if any(each.chosen for each in run.arms[MAIN].placed) else {}
+    own |= {"labels": labels} if (labels := _labels(run)) else {}
+    own |= {} if run.recipe.federation.network is None else {"rounds": _rounds(run)}
+    return own | {"spread": _spread(run)} if run.recipe.retrainings else own
+
+
+def judge_anew(run: Run) -> tuple[RunFinding, ...]:
+    """Return the findings of a run's results by the present rules; those that it was saved with may be older."""
+    settings = resolve_settings(run.recipe)
+    caveats = {task: LABEL_SOURCES[kind].caveat for task, kind in settings[MAIN].labels.items()}
+    return findings(run.differences, run.tested, run.arms, settings, run.recipe, caveats)
+
+
+def _tests(run: Run) -> str:
+    """Return each task's measure with its interval in every region, a column per arm and stage."""
+    columns = list(dict.fromkeys(name_stage(test.arm, test.stage) for test in run.tested))
+    rows = []
+    for task in run.recipe.tasks:
+        for region, own in run.recipe.regions.items():
+            tests = [test for test in run.tested if (test.task, test.region) == (task, region)]
+            reached = {name_stage(test.arm, test.stage): test.estimate.describe() for test in tests}
+            one = tests[0].result
+            place = [task, f"{region} ({own.role})", one.measure, f"{one.frames} / {one.scenes}"]
+            rows.append([*place, *(reached.get(column, "") for column in columns)])
+    return format_table(("task", "region (role)", "measure", "frames / scenes", *columns), rows)
+
+
+def _home(run: Run) -> str:
+    """Return what federated learning costs in the towns of pretraining."""
+    rows = [
+        [
+            *(each.region, each.task, each.measure, f"{each.before:.3f}", f"{each.after:.3f}"),
+            each.difference.describe(sign=True) + ("" if each.difference.low is not None else ", no interval"),
+            each.trainings,
+        ]
+        for each in list_home_costs(run)
+    ]
+    heads = ("town of pretraining", "task", "measure", "pretrained", "after FL", "difference", "trainings")
+    return format_table(heads, rows)
+
+
+def _differences(run: Run) -> str:
+    rows = [[each.name, each.estimate.describe(sign=True)] for each in run.differences]
+    return format_table(("region, task: after - before", "difference"), rows)
+
+
+def _spread(run: Run) -> str:
+    """Return how each measure and difference varies over the run's trainings on the same frames."""
+    found = {
+        f"{test.region}, {test.task}: {name_stage(test.arm, test.stage)}": (test.result.estimate.mean, *test.retrained)
+        for test in run.tested
+    } | {each.name: (each.over_scenes.mean, *each.retrained) for each in run.differences}
+    rows = [
+        [name, f"{np.mean(values):.3f}", f"{np.std(values, ddof=1):.4f}", f"{min(values):.3f}", f"{max(values):.3f}"]
+        for name, values in found.items()
+        if len(values) > 1
+    ]
+    return format_table(("figure", "mean", "sd of retraining", "least", "most"), rows)
+
+
+def _plan(run: Run) -> str:
+    """Return every plan of each task: when it was made, from which score on validation frames, and what it predicts."""
+    rows = []
+    made = {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"}
+    for task in run.recipe.tasks:
+        for plan in run.arms[MAIN].plans:
+            own = plan.tasks[task]
+            if own.predicted is None and plan.after is not None:
+                continue
+            source = "fixed by hand" if own.predicted is None else f"planned: {own.predicted['cloud']:.3f}"
+            reached = f"{plan.reached[task]:.3f}" if plan.reached else ""
+            counts = (own.samples, own.edge_rounds, own.cloud_rounds)
+            sizes = (f"{mb:.3f}" for mb in (own.sample_mb, own.model_mb))
+            megabytes = (f"{own.wireless_mb:.1f}", f"{own.wireline_mb:.1f}")
+            rows.append([task, made[plan.after], reached, *counts, *sizes, *megabytes, source])
+    header = ("samples", "edge rounds", "cloud rounds", "sample MB", "network MB", "wireless MB", "wireline MB")
+    return format_table(("task", "made", "reached", *header, "predicted"), rows)
+
+
+def _budgets(run: Run) -> str:
+    """Return the traffic of both uplinks [MB]: budget, planned, used, and each task's part of what was used."""
+    main, rows = run.arms[MAIN], []
+    for link in LINKS:
+        use = main.links[link]
+        whole = (f"{mb:.1f}" for mb in (use.budget_mb, use.planned_mb, use.used_mb))
+        rows.append([link, *whole, *(f"{main.sent_mb(task, link):.1f}" for task in main.plan.tasks)])
+    return format_table(("uplink", "budget MB", "planned MB", "used MB", *main.plan.tasks), rows)
+
+
+def _rounds(run: Run) -> str:
+    """Return what became of each vehicle's rounds on the network: planned, combined, failed and why, their time."""
+    main, rows = run.arms[MAIN], []
+    for task, plan in main.plan.tasks.items():
+        stages = [stage for stage in main.stages if stage.task == task]
+        rounds = [each for stage in stages for each in stage.records or () if each.server != CLOUD]
+        asked = {*(plan.joins or ()), *(name for each in rounds for name in (*each.clients, *each.failed))}
+        for name in sorted(asked):
+            region, _, vehicle = name.partition("/")
+            own = [each for each in rounds if each.server == region]
+            joined = [each for each in own if name in each.clients or name in each.failed]
+            lost = Counter(each.failed[name] for each in joined if name in each.failed)
+            rows.append(
+                [
+                    *(task, name, f"{run.recipe.speeds(region).get(vehicle, 1.0):g}"),
+                    len(own) if plan.joins is None else len(plan.joins[name]),
+                    sum(name in each.clients for each in joined),
+                    ", ".join(f"{times} {reason}" for reason, times in lost.items()),
+                    f"{sum(each.seconds or 0.0 for each in joined):.1f}",
+                ]
+            )
+    header = ("task", "vehicle", "speed", "rounds planned", "combined", FAILED, "time of its rounds, s")
+    return format_table(header, rows)
+
+
+LABELS = {  # heading -> field of `LabelQuality`
+    "precision": "precision",
+    "recall": "recall",
+    "of the right ones, at IoU .7": "tight",
+    "centre off by m": "offset_m",
+    "size off by m": "size_m",
+}
+
+
+def _labels(run: Run) -> str | None:
+    """Return how good the labels of edge FL are, before the first round and, where they are made anew, the last."""
+    settings, rows, kinds = resolve_settings(run.recipe), [], []
+    for name, arm in run.arms.items():
+        for stage in arm.stages:
+            own = stage.labels or ()
+            for quality in dict.fromkeys((*own[:1], *own[-1:])):
+                counts = quality.round, quality.labels, quality.targets
+                known = quality.by_returns or ()  # results of before do not tell
+                kinds = kinds or [f"recall from {each.returns} returns" for each in known]
+                shares = [getattr(quality, field) for field in LABELS.values()]
+                shares += [each.found / each.targets if each.targets else None for each in known]
+                cells = ["" if share is None else f"{share:.2f}" for share in shares]
+                rows.append([stage.region, settings[name].labels[stage.task], *counts, *cells])
+    heads = ("region", "labels", "before round", "number", "objects", *LABELS, *kinds)
+    return format_table(heads, rows) if rows else None
+
+
+def _sensors(run: Run) -> str:
+    rows = [
+        [
+            each.region,
+            len(each.poles),
+            ", ".join(map(str, each.chosen)),
+            f"{each.covered} of {each.errors}",
+            each.densest,
+        ]
+        for each in run.arms[MAIN].placed
+    ]
+    return format_table(("region", "candidate poles", "chosen", "errors covered", "densest traffic"), rows)
