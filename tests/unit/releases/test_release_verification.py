@@ -24,7 +24,7 @@ from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import CARD, LEDGER, WEIGHTS, DataHash, LedgerSum, read_candidate
 from flcav.releases.verification import verify
 from flcav.releases.verification.comparison import Limit, Pair, compare, draw_scenes, measure_results, pair_slices
-from flcav.releases.verification.conditions import CONDITIONS, PLAIN
+from flcav.releases.verification.conditions import CONDITIONS, LIFTED_M, PLAIN
 from flcav.releases.verification.domain import describe_domain
 from flcav.releases.verification.files import find_faults, find_overlap
 from flcav.releases.verification.records import OddCoverage, Verification, VerificationData, VerifiedDomain
@@ -401,6 +401,12 @@ def test_conditions_change_points_and_nothing_that_is_to_be_found(recorded_frame
         assert all(
             np.array_equal(one, two) for one, two in zip(changed.lidar.values(), again.lidar.values(), strict=True)
         )
+    (points,), (turned,) = (
+        each.lidar.values() for each in (recorded_frame, CONDITIONS["miscalibration"](recorded_frame))
+    )
+    whole = np.c_[points[:, :3], np.ones(len(points))].astype(float)
+    origin = np.linalg.lstsq(whole, turned[:, :3], rcond=None)[0][3]  # of the one LiDAR, seen by the other
+    np.testing.assert_allclose(origin, (0.0, 0.0, -LIFTED_M), atol=0.1 * LIFTED_M)  # which is above it
     late = CONDITIONS["latency"](recorded_frame).annotations.boxes.center - recorded_frame.annotations.boxes.center
     assert np.allclose(late, (2.0, 0.0, 0.0))
 
