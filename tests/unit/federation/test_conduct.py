@@ -116,6 +116,7 @@ def test_requests_out_of_order_or_of_another_kind_are_refused(name: str):
     for late in agreed[1:]:
         with serve(name) as server:
             server.refuses(late)  # as the first
+            server.refuses(late, 0)  # of the round that a client has answered last before its first
     with serve(name) as server:
         for round_ in (1, 2, 4):
             for asked in agreed:

@@ -17,7 +17,7 @@ from flwr.supercore.task_identity import TaskIdentity
 from flcav.federation.attendance import ClientFailed
 from flcav.federation.fleet.authority import found_authority, open_registry
 from flcav.federation.fleet.keys import AUTHORITY, request_certificate, take_certificate
-from flcav.federation.messages.records import ASK, LOST_BY_NETWORK, OVER_BUDGET, to_arrays
+from flcav.federation.messages.records import ASK, LOST_BY_NETWORK, NAMES, OVER_BUDGET, SHARES, to_arrays
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.deployed import Agreement
@@ -27,7 +27,7 @@ from flcav.federation.runtimes.link import open_link
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.vehicle_app import Assignment, VehicleApp, load_identity
 from flcav.federation.secure.masks import draw_keys
-from flcav.federation.secure.parties import PublicKeys
+from flcav.federation.secure.parties import SEALED_BYTES, PublicKeys
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedbuff import FedBuff
@@ -233,6 +233,16 @@ def test_an_answer_of_any_rule_is_within_what_is_granted(folder: Path, monkeypat
         assert not state.records[0].failed
     assert all(size < limit for limit, size in granted)
     assert min(limit for limit, _ in granted) < 10**5
+
+
+@pytest.mark.parametrize("count", [3, 400])
+def test_shares_for_every_client_are_within_the_largest_answer(folder: Path, count: int):
+    names, link = {node: f"grid/cav{node}" for node in range(count)}, Apps(folder, {})
+    account: Any = None
+    with keep_identity():
+        grid = DeployedGrid(folder, link, names, {}, account)  # type: ignore[arg-type]
+    shares = ConfigRecord({NAMES: [*names.values()], SHARES: [bytes(SEALED_BYTES)] * count})
+    assert wire_bytes(RecordDict({ASK: shares})) < grid._most_bytes
 
 
 def of_keys(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Lie:

@@ -1,16 +1,11 @@
-"""Keys, shares, reports, arrays and folders that are not what they claim to be: each is refused."""
+"""Keys, shares, reports and arrays that are not what they claim to be: each is refused."""
 
-import asyncio
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from flwr.app import Array, ConfigRecord, RecordDict
 
-from flcav.config import InputError
-from flcav.federation.fleet.authority import AUTHORITY, REGISTRY, found_authority
-from flcav.federation.fleet.relay import Refused
-from flcav.federation.fleet.releases.service import RELEASES, answer_release
 from flcav.federation.messages.acceptance import ReplyRefused
 from flcav.federation.messages.records import to_numpy
 from flcav.federation.messages.release_report import MOST, ShadowReport
@@ -51,22 +46,3 @@ def test_an_array_of_no_numbers_is_refused_by_its_type(kind: str):
     whole = Array(np.zeros(2))
     with pytest.raises(ValueError, match="is no type of numbers"):
         to_numpy(Array(kind, whole.shape, whole.stype, whole.data))
-
-
-@pytest.mark.parametrize("kept", [AUTHORITY, REGISTRY])
-def test_what_is_left_of_an_authority_is_not_written_over(tmp_path, kept: str):
-    (tmp_path / kept).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / kept).write_bytes(b"a key")
-    with pytest.raises(InputError, match="has an authority already"):
-        found_authority(tmp_path)
-    assert (tmp_path / kept).read_bytes() == b"a key"
-
-
-@pytest.mark.parametrize("method", ["PUT", "DELETE", "HEAD", "POST"])
-def test_releases_are_only_read(tmp_path, method: str):
-    async def call() -> None:
-        scope = {"path": f"{RELEASES}image/metadata/root.json", "method": method}
-        await answer_release(tmp_path, "a", scope, None, None, lambda: 0)  # pyright: ignore
-
-    with pytest.raises(Refused, match="is no call of a vehicle's"):
-        asyncio.run(call())

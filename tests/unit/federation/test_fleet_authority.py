@@ -10,7 +10,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import found_authority, open_authority, open_registry
+from flcav.federation.fleet.authority import REGISTRY, found_authority, open_authority, open_registry
 from flcav.federation.fleet.keys import (
     AUTHORITY,
     CERTIFICATE,
@@ -164,6 +164,15 @@ def test_folder_of_another_authority(authority, tmp_path):
         open_authority(other.folder)
     with pytest.raises(InputError, match="has no authority"):
         open_authority(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("kept", [AUTHORITY, REGISTRY])
+def test_what_is_left_of_an_authority_is_not_written_over(tmp_path, kept: str):
+    (tmp_path / kept).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / kept).write_bytes(b"a key")
+    with pytest.raises(InputError, match="has an authority already"):
+        found_authority(tmp_path)
+    assert (tmp_path / kept).read_bytes() == b"a key"
 
 
 def test_certificate_for_another_key(authority, vehicle, tmp_path):

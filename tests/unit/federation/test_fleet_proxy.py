@@ -1,15 +1,30 @@
-"""Whom the proxy lets in, and how it names what is wrong."""
+"""Whom the proxy lets in, how it names what is wrong, and that servers of a fleet start with keys that are theirs."""
 
 import base64
+import itertools
+import ssl
+import sys
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 
 from flcav.federation.fleet.authority import found_authority
-from flcav.federation.fleet.keys import CERTIFICATE, load_key, public_der, request_certificate, take_certificate
-from flcav.federation.fleet.proxy import describe_clock, find_caller, node_key
+from flcav.federation.fleet.forwarder import run_forwarder
+from flcav.federation.fleet.keys import (
+    CERTIFICATE,
+    LOOPBACK,
+    load_key,
+    public_der,
+    request_certificate,
+    take_certificate,
+)
+from flcav.federation.fleet.proxy import describe_clock, find_caller, node_key, run_proxy
 from flcav.federation.fleet.registry import Vehicle
+from flcav.federation.fleet.vehicle import VehicleSettings, run_supernode
 
 
 @pytest.fixture
@@ -56,3 +71,35 @@ def test_key_in_flowers_header(vehicle):
 def test_clock(stamp, told):
     now = 1767312000.0  # 2 January 2026, UTC
     assert told in describe_clock(stamp.encode(), now)
+
+
+@pytest.mark.parametrize("which", ["forwarder", "proxy"])
+def test_servers_have_the_key_of_their_certificate(which, vehicle, tmp_path, monkeypatch):
+    """OpenSSL takes the two that a server is started with, and no key of another certificate."""
+    own, started = tmp_path / "cav-1", []
+
+    def start(app, host, port, certificate, key, *_):
+        started.append((host, port))
+        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(certificate, key)
+        return SimpleNamespace(run=lambda: None)
+
+    monkeypatch.setattr(f"flcav.federation.fleet.{which}.serve_https", start)
+    VehicleSettings("127.0.0.1:3", 1, 2).save(own)
+    if which == "forwarder":
+        run_forwarder(own, 1, "127.0.0.1:3")
+    else:
+        run_proxy(tmp_path / "fleet", "127.0.0.1", 1, "127.0.0.1:2")
+    assert started == [("127.0.0.1", 1)]
+
+
+def test_a_vehicle_s_node_trusts_its_own_forwarder(vehicle, tmp_path, monkeypatch):
+    own, settings = tmp_path / "cav-1", VehicleSettings("127.0.0.1:3", 1, 2)
+    settings.save(own)
+    monkeypatch.setattr("sys.argv", [])
+    monkeypatch.setattr(import_module("flwr.supernode.cli.flower_supernode"), "flower_supernode", lambda: None)
+    run_supernode(own, settings)
+    options = dict(itertools.pairwise(sys.argv))
+    trusted = x509.load_pem_x509_certificate(Path(options["--root-certificates"]).read_bytes())
+    assert trusted == x509.load_pem_x509_certificate((own / LOOPBACK).read_bytes())
+    assert (options["--superlink"], options["--port"]) == ("127.0.0.1:1", "2")
+    assert serialization.load_ssh_private_key(Path(options["--auth-supernode-private-key"]).read_bytes(), None)

@@ -4,7 +4,23 @@ import httpx
 import pytest
 
 from flcav.federation.fleet.proxy import FleetProxy
-from flcav.federation.fleet.traffic import Traffic, read_traffic
+from flcav.federation.fleet.traffic import Crossed, Traffic, read_traffic
+
+
+@pytest.mark.parametrize(
+    ("call", "counted"),
+    [
+        ("pull-object", Crossed(10, 20, content_up=1, content_down=2, calls=1)),
+        ("pull-messages", Crossed(10, 20, other_up=1, other_down=2, calls=1)),
+    ],
+)
+def test_bytes_are_counted_once_and_begin_at_none(call, counted, tmp_path):
+    traffic = Traffic()
+    traffic.count("cav-1", call, 1, 2, (10, 20), 200)
+    traffic.save(tmp_path)
+    assert read_traffic(tmp_path).vehicles["cav-1"] == counted
+    names = ("socket_up", "socket_down", "content_up", "content_down", "other_up", "other_down", "release_up")
+    assert not any(getattr(Crossed(), name) for name in (*names, "release_down", "calls", "activations", "lost"))
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,7 @@ def test_clipping_bounds_the_norm_of_all_arrays_together():
     assert change_norm(clipped) == pytest.approx(0.5)
     np.testing.assert_allclose(clipped["b"], change["b"] * 0.5 / length)
     np.testing.assert_array_equal(clip_change(change, 2 * length)["a"], change["a"])
+    np.testing.assert_array_equal(clip_change({"a": np.array([3.0, 4.0])}, 5.0)["a"], [3.0, 4.0])
     assert not clip_change({"a": np.zeros(3)}, 1.0)["a"].any()
 
 

@@ -9,8 +9,10 @@ from flcav.config import InputError
 from flcav.federation.fleet.authority import found_authority
 from flcav.federation.fleet.up import READY, Ready
 from flcav.federation.messages.fl_request import make_request
+from flcav.federation.rules import Rules
 from flcav.federation.runtimes import deployed
 from flcav.federation.runtimes.deployed import Deployment, RegionalDeployment
+from flcav.federation.strategies import FEDAVG
 from flcav.storage.files import write_json
 
 
@@ -96,6 +98,32 @@ def test_a_client_keeps_its_vehicle(one):
     fleet.online = {1}
     with pytest.raises(OSError, match="fewer than 2 vehicles are in"):
         enter(deployment, "r/1", "r/2")
+
+
+def test_vehicles_that_come_in_late_are_waited_for(one, monkeypatch):
+    deployment, fleet = one
+    monkeypatch.setattr(deployed, "STARTING_S", 30.0)
+    monkeypatch.setattr(deployed, "LOOK_S", 0.0)
+    coming = iter([set(), {3}, {2, 3}])
+    fleet.list_online = lambda: next(coming)
+    assert enter(deployment, "r/1", "r/2") == ["b", "c"]
+
+
+def test_each_client_is_reached_at_the_node_of_its_vehicle(one, monkeypatch):
+    deployment, fleet = one
+    fleet.online, reached = {2, 3}, []
+
+    class Grid:
+        def __init__(self, folder, link, names, vehicles, *_):
+            reached.append((names, {node: own.name for node, own in vehicles.items()}))
+
+        def end(self, failed=False):
+            pass
+
+    monkeypatch.setattr(deployed, "DeployedGrid", Grid)
+    agreed: Any = deployed.Agreement(FEDAVG, Rules(), {}, 0)
+    with deployment._open({"r/1": None, "r/2": None}, agreed, {}, None):
+        assert reached == [({2: "r/1", 3: "r/2"}, {2: "b", 3: "c"})]
 
 
 def test_fl_requests_of_the_vehicles_of_clients(one):

@@ -1,23 +1,32 @@
 """Secure aggregation: sums come out exactly, with drop-outs too, and the server holds no client's update."""
 
 import itertools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from cryptography.exceptions import InvalidTag
+from flwr.app import ConfigRecord, Context, Message, RecordDict
 from flwr.common.serde import recorddict_to_proto
+from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.config import InputError
 from flcav.federation.checks import check_federation
+from flcav.federation.fleet.authority import found_authority
+from flcav.federation.fleet.keys import AUTHORITY, request_certificate, take_certificate
+from flcav.federation.messages.records import ASK
 from flcav.federation.privacy import Privacy, account_epsilon
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules, SecureAggregation
+from flcav.federation.runtimes.embedded import keep_identity
 from flcav.federation.runtimes.metered import Account, MeteredGrid
+from flcav.federation.runtimes.vehicle_app import load_identity
+from flcav.federation.secure.certified import Identity
 from flcav.federation.secure.masks import add_vectors, agree, draw_keys, expand, seal, to_integers, to_values, unseal
-from flcav.federation.secure.messages import TooFewClients
+from flcav.federation.secure.messages import TooFewClients, answer_secretly
 from flcav.federation.secure.parties import SecureClient, SumLost, add_mask, settle_complaints, unmask_sum
-from flcav.federation.secure.shamir import find_wrong_shares, join_shares, split_secret
+from flcav.federation.secure.shamir import SHARE_BYTES, find_wrong_shares, join_shares, split_secret
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
@@ -286,6 +295,41 @@ def test_wrong_shares_are_found_among_enough_right_ones(threshold: int, count: i
     assert find_wrong_shares(told, threshold) == odd
     with pytest.raises(ValueError, match=f"no {threshold} of {threshold} shares make a secret"):
         find_wrong_shares({place: told[place] for place in [*odd, *({*shares} - odd)][:threshold]}, threshold)
+
+
+def test_shares_of_what_is_too_long_for_a_secret_make_none():
+    shares = dict.fromkeys(range(3), (256**32).to_bytes(SHARE_BYTES))  # of a constant polynomial
+    with pytest.raises(ValueError, match="no 2 of 3 shares make a secret"):
+        find_wrong_shares(shares, 2)
+
+
+@pytest.mark.parametrize(("certified", "needed"), [(False, 3), (True, 4)])
+def test_a_client_shares_its_secrets_at_the_threshold_that_its_authority_asks_for(
+    certified: bool, needed: int, tmp_path: Path
+):
+    """Of five: more than half of clients that trust their server, two thirds of certified ones."""
+    authority, names = found_authority(tmp_path), [f"cav{i}" for i in range(5)]
+    contexts = {name: Context(1, 2, {}, RecordDict(), {}) for name in names}
+    identities: dict[str, Identity | None] = dict.fromkeys(names)
+    for name in names if certified else ():
+        own, root = tmp_path / name, (tmp_path / AUTHORITY).read_bytes()
+        take_certificate(own, authority.register(request_certificate(own, name)), root)
+        identities[name] = load_identity(own)
+
+    def answer(name: str, **asked: Any) -> Any:
+        message = Message(RecordDict({ASK: ConfigRecord(asked)}), 2, "train")
+        reply = answer_secretly(message, contexts[name], name, SecureAggregation(), 1, identities[name])
+        return reply.content.config_records[ASK]
+
+    with keep_identity():
+        TaskIdentity.task_id = TaskIdentity.run_id = TaskIdentity.node_id = 1
+        keys = [answer(name, ask="keys") for name in names]
+        kinds = ("ciphers", "masks", *(("certificates", "signatures") if certified else ()))
+        both = {kind: [each[kind] for each in keys] for kind in kinds}
+        with pytest.raises(ValueError, match=f"a threshold of {needed - 1} of 5 clients: {needed} are agreed on"):
+            answer("cav0", ask="shares", names=names, threshold=needed - 1, **both)
+        sealed = answer("cav0", ask="shares", names=names, threshold=needed, **both)
+    assert {*sealed["names"]} == {*names[1:]}
 
 
 def test_the_fewest_liars_that_explain_all_complaints_are_out_and_of_two_alone_both():

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flwr.app import RecordDict
+from flwr.common.serde import recorddict_to_proto
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from regression import ledger
@@ -14,7 +16,7 @@ from flcav.config import InputError
 from flcav.federation.edge_server import EdgeServer
 from flcav.federation.messages.acceptance import Expected, ReplyRefused, read_update
 from flcav.federation.messages.encoding import encode
-from flcav.federation.messages.records import update_content
+from flcav.federation.messages.records import EXTRA, to_arrays, update_content
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.embedded import update_bytes
@@ -61,6 +63,14 @@ CLIENTS = {f"cav{i}": Walk(i) for i in range(3)}
 MEAN = {
     name: np.mean([client.targets[name] for client in CLIENTS.values()], axis=0) for name in CLIENTS["cav0"].targets
 }
+
+
+@pytest.mark.parametrize(
+    ("upload", "beside"), [(Upload(), ["body.weight", "head.weight"]), (Upload(layers=("head.*",)), ["head.weight"])]
+)
+def test_an_array_beside_each_that_is_learned_and_sent_is_priced(upload: Upload, beside: list[str]):
+    more = recorddict_to_proto(RecordDict({EXTRA: to_arrays({name: START[name] for name in beside})})).ByteSize()
+    assert update_bytes(START, upload, exchanging=True) - update_bytes(START, upload) == more
 
 
 def run(upload: Upload, start: Weights = START, **how: Any) -> tuple[Weights, Account]:

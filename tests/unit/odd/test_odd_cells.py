@@ -85,6 +85,7 @@ def test_one_scene_gives_no_interval_and_no_frame_no_measure():
         (20.0, 0.5, 19, MISS, False),
         (20.0, 2.5, 50, MISS, False),
         (-5.0, 0.0, 50, MISS, False),
+        (1.0, 0.0, 50, MISS, True),
         (41.0, 0.0, 50, MISS, False),
         (20.0, 0.0, 50, FALSE_POSITIVE, False),
     ],
@@ -110,6 +111,19 @@ def test_the_pole_nearest_to_a_cells_errors_covers_them(ring: Scenery):
     assert first.pole is not None
     assert (first.pole.town, first.pole.covered) == ("ring", 3)
     assert (second.errors, second.pole) == (0, None)
+
+
+def test_of_errors_in_two_places_one_pole_covers_those_of_one(ring: Scenery):
+    poles = ring.town.poles
+    apart = np.linalg.norm(poles.position[:, None, :2] - poles.position[:, :2], axis=2)
+    places = []
+    for row, count in zip(np.unravel_index(apart.argmax(), apart.shape), (3, 2), strict=True):
+        x, y = poles.position[row, :2] + 6.0 * np.array([np.cos(poles.yaw[row]), np.sin(poles.yaw[row])])
+        places += [error(x, y, track=f"car{row}-{number}") for number in range(count)]
+    tested = [Trial(ring.town, {0: ("here",)}, {0: places}, {0: False})]
+    (row,) = measure_cells(mean, Outcomes(SCENES[:1], {"score": np.ones(1)}), tested, 40.0)
+    assert row.pole is not None
+    assert (row.errors, row.pole.covered) == (5, 3)
 
 
 def test_the_cell_with_most_errors_per_frame_comes_first_and_no_pole_is_named_that_covers_none(ring: Scenery):

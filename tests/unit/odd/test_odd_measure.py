@@ -1,10 +1,12 @@
 """Measurement by columns against the frames, and against the recorded traffic."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flcav.dataset.store import Dataset
-from flcav.odd.measure import AROUND_M, describe_weather, measure, reach_of, summarise
+from flcav.odd.measure import AROUND_M, _speeds, describe_weather, measure, reach_of, summarise
 from flcav.sensors.rig import RIGS, Rig
 
 
@@ -35,6 +37,15 @@ def test_speeds_are_those_of_the_traffic(drive: Dataset):
         instant, actor = np.argmin(np.abs(trace.time_s - key.time_s)), list(trace.actor).index(key.agent)
         true = 3.6 * float(np.linalg.norm(trace.velocity[instant, actor]))
         assert row["ego_speed"] == pytest.approx(true, abs=6.0)  # km/h: the mean over half a second to either side
+
+
+@pytest.mark.filterwarnings("error")
+def test_frames_of_one_time_tell_no_speed(drive: Dataset, monkeypatch: pytest.MonkeyPatch):
+    alike = [replace(key, time_s=0.5 * (key.index // 2)) for key in drive.keys]
+    monkeypatch.setattr(drive, "keys", alike)
+    found = _speeds(drive)
+    assert np.isfinite(found[~np.isnan(found)]).all()
+    assert not np.isnan(found).all()
 
 
 def test_what_a_recording_does_not_say_is_missing():

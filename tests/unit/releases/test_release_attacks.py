@@ -21,7 +21,7 @@ from flcav.releases.keys import generate_key, read_private_key
 from flcav.releases.repositories import repository
 from flcav.releases.repositories.creation import create_repository, replace_online_key
 from flcav.releases.repositories.directive import Directive
-from flcav.releases.repositories.metadata import load_targets, read_root, sign_online, target_names
+from flcav.releases.repositories.metadata import load_root, load_targets, read_root, sign_online, target_names
 from flcav.releases.repositories.repository import publish, stage_directive, stage_release
 from flcav.releases.vehicles.checking import Refused, check_release, trust_roots
 from flcav.releases.vehicles.fetching import RepositoryFetcher
@@ -355,6 +355,14 @@ def test_a_check_keeps_nothing_but_metadata(parties: Parties):
     assert drives(parties) == 1
     assert 0 < checked.metadata_bytes < 50_000
     assert load_targets(parties.director).signed.version == 3
+
+
+def test_two_of_three_owners_sign_for_a_party(parties: Parties):
+    for folder in (parties.image, parties.director):
+        roles = load_root(folder).signed.roles
+        owned = [(roles[name].threshold, len(roles[name].keyids)) for name in ("root", "targets")]
+        assert owned == [(2, 3), (2, 3)]
+        assert not {*roles["targets"].keyids} & {*roles["timestamp"].keyids}
 
 
 def test_one_key_in_two_texts_is_one_owner(parties: Parties, tmp_path: Path):

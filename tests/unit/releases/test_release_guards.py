@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, concatenate
 from flcav.perception.metrics import match
+from flcav.perception.metrics.operating_point import DISTANCES_M
 from flcav.perception.objects.truth import FrameTruth
 from flcav.releases.verification.comparison import Measured, compare, draw_scenes, measure_results
-from flcav.releases.verification.guards import pair_classes, tabulate
+from flcav.releases.verification.guards import SECTORS_DEG, pair_classes, tabulate
 from flcav.releases.verification.testing import ConditionResults, VerificationFrame
 from flcav.releases.verification.verify import _find_broken
 
@@ -184,6 +186,12 @@ def test_a_class_that_is_lost_in_one_weather_is_lost(driving: Measured):
         for boxes, truth in zip(spoilt.detections, spoilt.truths, strict=True)
     ]
     assert "found Car fog" in find_lost(driving, replace(spoilt, detections=tuple(boxes)))
+
+
+def test_sectors_and_distances_leave_no_gap_and_overlap_nowhere():
+    for borders, ends in ((SECTORS_DEG, (-90, 90)), (DISTANCES_M, (0, 80))):
+        assert all(before[1] == after[0] for before, after in pairwise(borders))
+        assert (borders[0][0], borders[-1][1]) == ends
 
 
 @pytest.mark.parametrize("seed", range(1, 6))

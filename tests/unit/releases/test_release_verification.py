@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from release_drives import Drives
 from release_parties import Parties
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from flcav.config import InputError
+from flcav.dataset.recording.recorder import record
 from flcav.geometry import Boxes
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.perception.metrics import average_precision, match
@@ -22,13 +24,14 @@ from flcav.perception.weights import load_network
 from flcav.releases.candidates.candidate import CARD, LEDGER, WEIGHTS, DataHash, LedgerSum, read_candidate
 from flcav.releases.verification import verify
 from flcav.releases.verification.comparison import Limit, Pair, compare, draw_scenes, measure_results, pair_slices
-from flcav.releases.verification.conditions import CONDITIONS, PLAIN
+from flcav.releases.verification.conditions import CONDITIONS, LIFTED_M, PLAIN
+from flcav.releases.verification.domain import describe_domain
 from flcav.releases.verification.files import find_faults, find_overlap
 from flcav.releases.verification.records import OddCoverage, Verification, VerificationData, VerifiedDomain
 from flcav.releases.verification.testing import ConditionResults, VerificationFrame
 from flcav.releases.verification.verify import decide, read_verification, write_verification
 from flcav.report.pages.release_page import release_page
-from flcav.sensors.frame import Frame
+from flcav.sensors.frame import Annotations, Frame
 from flcav.statistics.power import plan_scenes
 from flcav.storage.files import sha256
 
@@ -332,6 +335,23 @@ def describe(_: ConditionResults):
     return VerifiedDomain(*own, odd)
 
 
+def test_a_domain_of_frames_without_objects_and_weather_says_so(recorded_frame: Frame, tmp_path: Path):
+    known = recorded_frame.annotations
+    moves, rest = (known.velocity[:0], known.acceleration[:0]), (known.returns[:0], known.occlusion[:0])
+    nothing = replace(recorded_frame, annotations=Annotations(known.track[:0], known.boxes[:0], *moves, *rest))
+    found = []
+    for name, frame, boxes in (("one", recorded_frame, known.boxes), ("none", nothing, known.boxes[:0])):
+        record(Drives(frame, 2), tmp_path / name)
+        frames = [VerificationFrame(tmp_path / name, number, "grid", "everyday traffic") for number in range(2)]
+        none = Boxes.empty()
+        truths = [FrameTruth(f"s{i}", boxes, none, none, None, weather) for i, weather in enumerate(("fog", None))]
+        found.append(describe_domain(frames, truths, ["car"], describe(run(1)[PLAIN]).odd))
+    one, none = found
+    assert (one.speed_m_s, one.distance_m, one.objects) == ((10.0, 10.0), (10.0, 10.0), {"car": 2})
+    assert (none.speed_m_s, none.distance_m, none.objects) == ((0.0, 0.0), (0.0, 0.0), {"car": 0})
+    assert (one.weathers, one.visibility_m, one.lidars) == (("fog",), None, ("lidar",))
+
+
 def test_scenes_of_the_training_are_found_by_manifest_and_by_town_and_seed():
     test = VerificationData("test/data", "c" * 64, "grid", 7, 10, 5)
 
@@ -381,6 +401,12 @@ def test_conditions_change_points_and_nothing_that_is_to_be_found(recorded_frame
         assert all(
             np.array_equal(one, two) for one, two in zip(changed.lidar.values(), again.lidar.values(), strict=True)
         )
+    (points,), (turned,) = (
+        each.lidar.values() for each in (recorded_frame, CONDITIONS["miscalibration"](recorded_frame))
+    )
+    whole = np.c_[points[:, :3], np.ones(len(points))].astype(float)
+    origin = np.linalg.lstsq(whole, turned[:, :3], rcond=None)[0][3]  # of the one LiDAR, seen by the other
+    np.testing.assert_allclose(origin, (0.0, 0.0, -LIFTED_M), atol=0.1 * LIFTED_M)  # which is above it
     late = CONDITIONS["latency"](recorded_frame).annotations.boxes.center - recorded_frame.annotations.boxes.center
     assert np.allclose(late, (2.0, 0.0, 0.0))
 

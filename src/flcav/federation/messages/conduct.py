@@ -72,7 +72,7 @@ class Answered:
         place = requests.index(asked)
         if round_ > self.round and place == 0:
             return Answered(round_, place, self.rounds + 1, NOTHING if masked else digest)
-        if round_ == self.round:
+        if 0 < round_ == self.round:
             again = masked and place == 0 and requests[self.place] != UNMASK
             if place == self.place + 1 or again:
                 if asked == MASKED and self.digest not in (NOTHING, digest):

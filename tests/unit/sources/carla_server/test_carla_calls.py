@@ -104,6 +104,8 @@ def test_bodies_of_blueprints_are_shapes_of_the_town():
         if blueprint.category in SHAPES:
             assert 0 <= blueprint.shape < len(SHAPES[blueprint.category])
             assert min(blueprint.size) > 0.3
+        elif not blueprint.category:
+            assert blueprint.size == (0.0, 0.0, 0.0)
 
 
 def test_two_wheelers_are_as_wide_as_their_riders():
@@ -115,6 +117,7 @@ def test_two_wheelers_are_as_wide_as_their_riders():
     ("name", "attribute", "told"),
     [
         ("sensor.camera.rgb", ("image_size_x", "0"), "'image_size_x' = 0 is not within 16 and 4096"),
+        ("sensor.camera.rgb", ("fov", "180"), "'fov' = 180 is not within"),
         ("sensor.camera.rgb", ("fov", "wide"), "'fov' = 'wide' is no number"),
         ("sensor.lidar.ray_cast", ("channels", "1e3"), "'channels' = 1e3 is not within 1 and 512"),
         ("sensor.lidar.ray_cast", ("range", "nan"), "'range' = nan is not within"),
@@ -152,6 +155,12 @@ def test_unknown_blueprints_are_refused_with_a_suggestion():
 def test_refusals(calls, method, arguments, told):
     with pytest.raises((Refused, InputError), match=told):
         invoke(calls, method, arguments)
+
+
+@pytest.mark.parametrize("dt_s", [0.001, 0.05, 10.0])
+def test_steps_of_time_within_the_limits_are_taken(dt_s, calls):
+    invoke(calls, "set_episode_settings", (wire.Settings(fixed_dt_s=dt_s).packed(),))
+    assert wire.read(wire.Settings, invoke(calls, "get_episode_settings", ())).fixed_dt_s == dt_s
 
 
 def test_wrong_arguments_name_the_version_that_is_served(calls):

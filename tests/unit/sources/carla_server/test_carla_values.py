@@ -22,6 +22,7 @@ from flcav.sources.carla.server.maps import OPENDRIVE_MAP, SPAWN_POINTS, Maps
 from flcav.sources.carla.server.sensing.cameras import sense_rgb
 from flcav.sources.carla.server.wire import VehicleControl
 from flcav.world import static
+from flcav.world.dynamics.blueprints import blueprint
 from flcav.world.dynamics.obstacles import list_obstacles
 from flcav.world.opendrive.importing import ImportedTown
 
@@ -52,6 +53,22 @@ def tick(calls, count=1):
 def drive(calls, car, **pedals):
     control = [*VehicleControl(**pedals)]
     invoke(calls, "apply_control_to_vehicle", (car.id, control))
+
+
+def test_wheels_are_where_the_car_is_driven_by(calls):
+    car = spawn(calls, "vehicle.tesla.model3", place(calls))
+    made = blueprint(car.category, 0, car.size)
+    places = [wheel[-1] for wheel in invoke(calls, "get_physics_control", (car.id,))[-2]]  # [cm]
+    wheels = 0.01 * np.array(places).reshape(2, 2, 3)  # front and rear, left and right
+    assert np.linalg.norm(wheels[0] - wheels[1], axis=1) == pytest.approx(made.wheelbase_m)
+    assert 0.6 < np.linalg.norm(wheels[:, 0] - wheels[:, 1], axis=1).max() / car.size[1] < 1.0
+    assert wheels.mean(axis=(0, 1))[:2] == pytest.approx(car.transform.location[:2], abs=1e-3)
+
+
+def test_a_car_far_from_all_lights_names_none(calls):
+    car = spawn(calls, "vehicle.tesla.model3", place(calls))
+    *_, at_light, number, _ = wire.VEHICLE.unpack(calls.episode._union(car, {car.id: -1}))
+    assert (at_light, number) == (False, 0)
 
 
 @pytest.mark.parametrize(("sticky", "ticks"), [("True", 60), ("False", 1), ("false", 1), ("0", 1), ("1", 60)])
