@@ -17,11 +17,6 @@ def _group() -> None:
     pass
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.add_typer(carla, name="carla")
-
-
 @carla.command()
 def serve(
     town: str = typer.Argument(help="A town's name or folder, or a map of --maps."),

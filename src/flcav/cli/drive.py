@@ -4,17 +4,13 @@ from pathlib import Path
 
 import typer
 
-from flcav.cli.importance import ERRORS, FIRST_SEED, Perceives, read_model
+from flcav.cli.domains.importance import ERRORS, FIRST_SEED, Perceives, read_model
 from flcav.cli.options import JOBS, check_finite, refuse_unused
-from flcav.cli.terminal import echo, print_json
+from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("drive")(drive)
-
-
+@answer_json
 def drive(
     scenario: list[str] = typer.Option(
         [], "--scenario", help="Name of a scenario; may be given several times. By default all of the package."
@@ -46,8 +42,7 @@ def drive(
         None, "--measure", help="JSON file to write: the errors of the networks on these drives."
     ),
     jobs: int = JOBS,
-    as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
-) -> None:
+) -> Answer:
     """Drive through scenarios in closed loop, and print time to collision, hard brakes, progress and collisions."""
     from flcav.config import InputError
     from flcav.driving.driver import Settings
@@ -77,23 +72,20 @@ def drive(
         with show_progress("measure") as report:
             found = measure_errors(chosen, numbers, loop, jobs, report)
         write_json(measure, found.as_json())
-        echo(f"{measure}: errors of the networks in {plural(found.frames, 'frame')}")
+        yield found.as_json()
+        yield f"{measure}: errors of the networks in {plural(found.frames, 'frame')}"
         return
     if pole:
         with show_progress("drive") as report:
             gain = measure_pole_gain(chosen, numbers, pole, loop, report)
-        if as_json:
-            print_json(gain.as_json())
-        else:
-            echo("\n".join(gain.lines()))
+        yield gain.as_json()
+        yield from gain.lines()
         return
     with show_progress("drive") as report:
         tasks = [Job(each, seed, loop=loop) for each in chosen for seed in numbers]
         drives = run_jobs(tasks, Sensed(perception.value, model), jobs, report)
-    if as_json:
-        print_json({"drives": [own.as_json() for own in drives]})
-        return
+    yield {"drives": [own.as_json() for own in drives]}
     for own in drives:
-        echo(own.line())
+        yield own.line()
     faults, hits = sum(own.faults for own in drives), sum(len(own.hits) for own in drives)
-    echo(f"{len(drives)} drives: {faults} collisions at fault, {hits - faults} others")
+    yield f"{len(drives)} drives: {faults} collisions at fault, {hits - faults} others"

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import FLEET, STALE, Runtime, Stale, refuse_unused
-from flcav.cli.terminal import echo, only_writer_of, print_json, when_interrupted
+from flcav.cli.terminal import Answer, answer_json, echo, only_writer_of, wants_json, when_interrupted
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
 
@@ -15,13 +15,9 @@ if TYPE_CHECKING:
     from flcav.pipeline.results.training import StageResult
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(federate)
-
-
 @when_interrupted()
 @only_writer_of("out")
+@answer_json
 def federate(
     recipe: Path = typer.Argument(help="Run recipe (YAML), of which stage II is run; see docs/runs.md."),
     out: Path = typer.Option(
@@ -36,8 +32,7 @@ def federate(
     ),
     fleet: Path | None = FLEET,
     stale: Stale = STALE,
-    as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead of sentences."),
-) -> None:
+) -> Answer:
     """Run stage II of a recipe alone, edge FL in every region; print each round with its scores on validation frames.
 
     Speeds of vehicles, times and the network are the recipe's, as in a run. Writes federation.json, or
@@ -58,21 +53,19 @@ def federate(
     found = find_recipe(recipe)
     asked = load_run_recipe(found)
     with live_steps("federate") as notify:
-        told = notify if as_json else _telling(notify)
+        told = notify if wants_json() else _telling(notify)
         how = {"beside": found.parent, "jobs": jobs, "runtime": runtime.value, "fleet": fleet, "stale": stale.value}
         results = federate_regions(asked, out, arm=arm, notify=told, **how)
     times = measure_times(results, out)
-    if as_json:
-        print_json(results.as_json() | times.as_json())
-        return
+    yield results.as_json() | times.as_json()
     for each in results.federations:
-        echo(f"{out / each.weights}: {_describe(each.result)}")
+        yield f"{out / each.weights}: {_describe(each.result)}"
     for task, seconds in times.train_s.items():
-        echo(f"{task}: train_s {seconds:.3g}, the median CPU time of a vehicle's training in a round [s]")
+        yield f"{task}: train_s {seconds:.3g}, the median CPU time of a vehicle's training in a round [s]"
     if results.privacy is not None:
-        echo(f"{TOGETHER}: {results.privacy.describe()}")
-    echo(f"{out / TRAIN_TIMES}: times and speeds of each vehicle")
-    echo(f"{out / name_results(arm)}: all rounds")
+        yield f"{TOGETHER}: {results.privacy.describe()}"
+    yield f"{out / TRAIN_TIMES}: times and speeds of each vehicle"
+    yield f"{out / name_results(arm)}: all rounds"
 
 
 def _describe(result: "StageResult") -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import check_finite
-from flcav.cli.terminal import echo, print_json
+from flcav.cli.terminal import Answer, answer_json, echo
 from flcav.interface.wording import make_printable, plural
 
 if TYPE_CHECKING:
@@ -22,12 +22,6 @@ DAYS = typer.Option(
     365.0, "--days", min=0.0001, max=3650.0, callback=check_finite, help="Days until the certificate expires."
 )
 CERTIFICATE = typer.Option(..., "--out", help="File of the certificate (PEM), which goes to the vehicle.")
-JSON = typer.Option(False, "--json", help="Print one JSON object instead.")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.add_typer(fleet, name="fleet")
 
 
 @fleet.callback()
@@ -125,11 +119,11 @@ def revoke(
 
 
 @fleet.command("list")
+@answer_json
 def list_vehicles(
     folder: Path = FLEET,
     audit: bool = typer.Option(False, "--audit", help="List the changes of the registry instead."),
-    as_json: bool = JSON,
-) -> None:
+) -> Answer:
     """List the registered vehicles with the state and expiry of their certificates."""
     from dataclasses import asdict
 
@@ -138,41 +132,36 @@ def list_vehicles(
     registry = open_registry(folder)
     if audit:
         entries = registry.list_audit()
-        if as_json:
-            print_json({"audit": [asdict(each) for each in entries]})
-            return
+        yield {"audit": [asdict(each) for each in entries]}
         for each in entries:
             told = f"{_date(each.time)} {each.action} {each.vehicle} {each.fingerprint[:16]} {each.reason}"
-            echo(make_printable(told.rstrip(), 600))
+            yield make_printable(told.rstrip(), 600)
         return
     found = registry.list_vehicles()
-    if as_json:
-        rows = [
-            {
-                "name": own.name,
-                "state": own.describe_state(),
-                "fingerprint": own.fingerprint,
-                "issued": own.issued,
-                "expires": own.expires,
-                "node": own.node,
-            }
-            for own in found
-        ]
-        print_json({"vehicles": rows})
-        return
-    for own in found:
-        echo(_describe(own))
-    echo(plural(len(found), "vehicle"))
+    rows = [
+        {
+            "name": own.name,
+            "state": own.describe_state(),
+            "fingerprint": own.fingerprint,
+            "issued": own.issued,
+            "expires": own.expires,
+            "node": own.node,
+        }
+        for own in found
+    ]
+    yield {"vehicles": rows}
+    yield from map(_describe, found)
+    yield plural(len(found), "vehicle")
 
 
 @fleet.command()
+@answer_json
 def status(
     folder: Path = FLEET,
     page: int | None = typer.Option(
         None, "--page", min=0, max=65535, help="Serve a page that follows the fleet, on this port of this host; 0: any."
     ),
-    as_json: bool = JSON,
-) -> None:
+) -> Answer:
     """Tell who is in, the rounds of the federation, bytes against budgets, failures and refusals."""
     from flcav.federation.fleet.status import LEAST_ROOM, read_status
 
@@ -182,26 +171,24 @@ def status(
         serve_page(folder, page, echo)
         return
     found = read_status(folder)
-    if as_json:
-        print_json(found.as_json())
-        return
-    echo("not up" if found.proxy is None else f"up at {found.proxy}, processes: {len(found.processes)}")
+    yield found.as_json()
+    yield "not up" if found.proxy is None else f"up at {found.proxy}, processes: {len(found.processes)}"
     for own in found.vehicles:
         there = "online" if own.online else "offline"
-        echo(
+        yield (
             f"{own.name}: {own.state}, {there}; {own.socket_up} bytes up and {own.socket_down} down crossed its "
             f"sockets, {own.content_up} and {own.content_down} of them content"
         )
         if own.release is not None:
-            echo(f"    {own.release.describe()}")
+            yield f"    {own.release.describe()}"
     if found.federation is not None:
-        echo(found.federation.describe())
+        yield found.federation.describe()
     for asked in found.requests:
-        echo(asked.describe())
+        yield asked.describe()
     for each in found.refused:
-        echo(f"refused: {each}")
+        yield f"refused: {each}"
     if found.free < LEAST_ROOM:
-        echo(f"{folder}: no room on its disk, {found.free} bytes are free")
+        yield f"{folder}: no room on its disk, {found.free} bytes are free"
 
 
 @fleet.command()

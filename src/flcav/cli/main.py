@@ -11,16 +11,27 @@ import click
 import typer
 
 from flcav import __version__
-from flcav.cli import carla, drive, federate, fleet, odd, release, reproduce, towns
-from flcav.cli import (
-    run as run_command,
-)
-from flcav.cli.data import birdseye, camera, export, import_, record, validate, view
+from flcav.cli import run as run_command
+from flcav.cli.carla import carla
+from flcav.cli.data import export, import_, record, validate
+from flcav.cli.domains.importance import importance
+from flcav.cli.domains.odd import odd
+from flcav.cli.domains.sampling import sample
+from flcav.cli.drive import drive
+from flcav.cli.federate import federate
+from flcav.cli.fleet import fleet
 from flcav.cli.network import radio, rounds
 from flcav.cli.options import escape_markup
 from flcav.cli.perception import errors, evaluate, infer, train
-from flcav.cli.planning import allocate, fit, history, place
+from flcav.cli.pictures import birdseye, camera, view
+from flcav.cli.planning.allocate import allocate, replan
+from flcav.cli.planning.fit import fit
+from flcav.cli.planning.history import history
+from flcav.cli.planning.place import place
+from flcav.cli.releases.release import release
+from flcav.cli.reproduce import reproduce
 from flcav.cli.terminal import Interrupted, echo, one_line
+from flcav.cli.towns import towns
 from flcav.config import InputError
 from flcav.interface.wording import describe_number, suggest
 
@@ -53,34 +64,17 @@ def _main(
 
 
 for command in (
-    run_command,
-    federate,
-    towns,
-    record,
-    validate,
-    birdseye,
-    camera,
-    view,
-    export,
-    import_,
-    train,
-    evaluate,
-    infer,
-    errors,
-    allocate,
-    place,
-    fit,
-    history,
-    radio,
-    rounds,
-    drive,
-    odd,
-    carla,
-    fleet,
-    release,
-    reproduce,
+    *(run_command.run, run_command.demo, run_command.compare, federate),
+    *(record, validate, birdseye, camera, view, export, import_),
+    *(train, evaluate, infer, errors),
+    *(allocate, replan, place, fit, history),
+    *(radio, rounds, drive, reproduce),
 ):
-    command.register(app)
+    app.command(command.__name__.rstrip("_"))(command)
+odd.command("sample")(sample)
+odd.command("importance")(importance)
+for name, group in {"towns": towns, "odd": odd, "carla": carla, "fleet": fleet, "release": release}.items():
+    app.add_typer(group, name=name)
 
 
 def run(arguments: list[str] | None = None) -> None:

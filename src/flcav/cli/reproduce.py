@@ -68,8 +68,3 @@ def reproduce(
         echo(sentence)
     if "seeds" in experiment.takes:
         echo(f"{out / 'result.json'}: the numbers of {plural(count, 'seed')}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command()(reproduce)

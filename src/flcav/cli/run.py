@@ -1,14 +1,14 @@
 """`flcav run`, `flcav demo`, `flcav compare`: run a recipe through the three stages, and compare two runs."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from flcav.cli.options import AGENTS, ENGINE, FLEET, JOBS, STALE, EngineName, Runtime, Stale, refuse_unused
-from flcav.cli.terminal import echo, only_writer_of, print_json, when_interrupted
+from flcav.cli.terminal import Answer, answer_json, echo, only_writer_of, when_interrupted
 from flcav.config import InputError
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
@@ -22,18 +22,11 @@ RUNTIME = typer.Option(
 )
 SEEDS = typer.Option(1, "--seeds", min=1, help="Number of seeds, from the recipe's on; above 1, a folder each.")
 DRY = typer.Option(False, "--dry", help="Say what the run would take, and do nothing of it.")
-AS_JSON = typer.Option(False, "--json", help="Print one JSON object instead of sentences.")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(run)
-    app.command()(demo)
-    app.command()(compare)
 
 
 @when_interrupted()
 @only_writer_of("out")
+@answer_json
 def run(
     recipe: Path = typer.Argument(help="Run recipe (YAML): tasks, regions, budgets, arms; see docs/runs.md."),
     out: Path | None = typer.Option(None, "--out", help="Folder of the run; the same command goes on after a stop."),
@@ -44,21 +37,19 @@ def run(
     runtime: Runtime = RUNTIME,
     fleet: Path | None = FLEET,
     stale: Stale = STALE,
-    as_json: bool = AS_JSON,
-) -> None:
+) -> Answer:
     """Run a recipe through the three stages; write report.html, results.json and history.csv."""
     if runtime is not Runtime.flower:
         refuse_unused(f"--runtime {runtime.value}", "fleet")
     if dry:
-        _forecast(recipe, as_json)
-    elif out is None:
+        return _forecast(recipe)
+    if out is None:
         raise InputError("--out is missing: the folder of the run; --dry says what it would take")
-    else:
-        how = {"jobs": jobs, "stale": stale.value, "engine": engine.value, "runtime": runtime.value, "fleet": fleet}
-        _run(recipe, None, out, seeds, as_json, "run", how)
+    how = {"jobs": jobs, "stale": stale.value, "engine": engine.value, "runtime": runtime.value, "fleet": fleet}
+    return _run(recipe, None, out, seeds, "run", how)
 
 
-def _forecast(path: Path, as_json: bool) -> None:
+def _forecast(path: Path) -> Answer:
     use_threads(1)
     from flcav.interface.progress import show_progress
     from flcav.pipeline.forecast import forecast_run
@@ -68,11 +59,8 @@ def _forecast(path: Path, as_json: bool) -> None:
     found = find_recipe(path)
     with show_progress(f"forecast {path}") as report:
         forecast = forecast_run(load_run_recipe(found), beside=found.parent, progress=report)
-    if as_json:
-        print_json(forecast.as_json())
-        return
-    for line in forecast.lines():
-        echo(line)
+    yield forecast.as_json()
+    yield from forecast.lines()
 
 
 @when_interrupted()
@@ -89,18 +77,12 @@ def demo(
     stale: Stale = STALE,
 ) -> None:
     """Run recipes/runs/demo.yaml: pretraining, roadside sensors, edge FL and cloud FL on three towns."""
-    _run(recipe, seed, out, seeds, False, "demo", {"jobs": jobs, "stale": stale.value, "engine": engine.value})
+    answer = _run(recipe, seed, out, seeds, "demo", {"jobs": jobs, "stale": stale.value, "engine": engine.value})
+    for line in [*answer][1:]:
+        echo(line)
 
 
-def _run(
-    path: Path,
-    seed: int | None,
-    out: Path,
-    seeds: int,
-    as_json: bool,
-    title: str,
-    how: Mapping[str, Any],
-) -> None:
+def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, how: Mapping[str, Any]) -> Answer:
     """Run a recipe; `how`: arguments of `flcav.run`."""
     use_threads(1)
     from flcav.cli.steps import live_steps
@@ -127,53 +109,49 @@ def _run(
             results = {out / f"seed{each.recipe.seed}": each for each in runs}
             write_bytes(out / "seeds.png", draw_seeds(runs))
     reports = [write_report(result, folder) for folder, result in results.items()]
-    if as_json:
-        first = next(iter(results.values()))
-        print_json((summary or first).as_json())
-        return
-    _tell(list(results.values()), summary)
+    yield (summary or next(iter(results.values()))).as_json()
+    yield from _list_lines(list(results.values()), summary)
     for report, result in zip(reports, results.values(), strict=True):
         took = f", in {result.elapsed_s / 60:.1f} minutes" if result.elapsed_s else ""
-        echo(f"{report}: the report{took}")
+        yield f"{report}: the report{took}"
 
 
-def _tell(results: "list[Run]", summary: "Summary | None") -> None:
+def _list_lines(results: "list[Run]", summary: "Summary | None") -> Iterator[str]:
     from flcav.pipeline.analysis.caveats import PLACED_BARE
     from flcav.pipeline.analysis.costs import tell_gain
     from flcav.pipeline.results.training import TOGETHER
 
     if summary is None:
-        for sentence in tell_gain(results[0]):
-            echo(sentence)
+        yield from tell_gain(results[0])
         for finding in results[0].findings:
-            echo(f"{finding.question}: {finding.decision}. {finding.sentence}")
+            yield f"{finding.question}: {finding.decision}. {finding.sentence}"
         for name, arm in results[0].arms.items():
             if arm.privacy is not None:
-                echo(f"{name}, {TOGETHER}: {arm.privacy.describe()}")
+                yield f"{name}, {TOGETHER}: {arm.privacy.describe()}"
         for arm in results[0].lifelong or ():
-            echo(f"lifelong, {arm.task}, {arm.describe()}")
+            yield f"lifelong, {arm.task}, {arm.describe()}"
         if PLACED_BARE in results[0].caveats:
-            echo(f"privacy: {PLACED_BARE}")
+            yield f"privacy: {PLACED_BARE}"
         return
     for row in (*summary.measures, *summary.differences):
         kind = f" ({row.kind} claim)" if row.kind else ""
         judged = f": {row.judged.verdict}{kind}, {row.judged.describe()}" if row.judged else ""
-        echo(f"{row.name}: {row.estimate.describe()} over {plural(len(summary.seeds), 'seed')}{judged}")
+        yield f"{row.name}: {row.estimate.describe()} over {plural(len(summary.seeds), 'seed')}{judged}"
     for claim in summary.claims:
-        echo(claim.describe())
+        yield claim.describe()
 
 
+@answer_json
 def compare(
     first: Path = typer.Argument(help="Folder of a run, of one seed or several; with --data, a file of weights."),
     second: Path = typer.Argument(help="Folder of another, with the same test frames; or a file of weights."),
     data: Path | None = typer.Option(None, "--data", help="Dataset that two networks are compared on."),
     task: str | None = typer.Option(None, "--task", help="Task of the networks, if not that of the first one's card."),
     agents: str | None = AGENTS,
-    as_json: bool = AS_JSON,
-) -> None:
+) -> Answer:
     """Compare two runs, or two networks on a dataset: differences, second minus first, on the same frames."""
     if data is not None:
-        _compare_networks(first, second, data, task, agents, as_json)
+        yield from _compare_networks(first, second, data, task, agents)
         return
     for option, value in (("--task", task), ("--agents", agents)):
         if value is not None:
@@ -181,22 +159,18 @@ def compare(
     from flcav.pipeline.comparing import compare as compare_runs
 
     rows = compare_runs(first, second)
-    if as_json:
-        print_json({"compared": [dataclasses.asdict(row) for row in rows]})
-        return
+    yield {"compared": [dataclasses.asdict(row) for row in rows]}
     for row in rows:
         change = row.difference
         interval = "no interval: one scene" if change.low is None else f"{change.low:+.3f} to {change.high:+.3f}"
         arm = "" if row.arm == "main" else f" ({row.arm})"
-        echo(
+        yield (
             f"{row.region}, {row.task}, {row.stage}{arm}: {row.measure} {row.first:.3f} -> {row.second:.3f}, "
             f"{change.mean:+.3f} ({interval}): {row.verdict}{f', p {row.judged.p_cell}' if row.judged else ''}"
         )
 
 
-def _compare_networks(
-    first: Path, second: Path, data: Path, task: str | None, agents: str | None, as_json: bool
-) -> None:
+def _compare_networks(first: Path, second: Path, data: Path, task: str | None, agents: str | None) -> Answer:
     from flcav.interface.progress import show_progress
     from flcav.perception.networks import compare_networks
     from flcav.perception.weights import read_card
@@ -206,8 +180,5 @@ def _compare_networks(
     with show_progress(f"compare on {data}") as report:
         asked = task or read_card(first).task
         found = compare_networks(asked, data, first, second, agents=agents, progress=report)
-    if as_json:
-        print_json(found.as_json())
-        return
-    for line in found.lines():
-        echo(line)
+    yield found.as_json()
+    yield from found.lines()

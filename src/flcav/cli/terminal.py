@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import inspect
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+import typer
 
 from flcav.config import Json
 from flcav.interface.wording import escape_invisible, make_printable
@@ -17,7 +19,9 @@ from flcav.machine.locks import only_writer
 if TYPE_CHECKING:
     from rich.console import Console
 
+Answer = Iterator[Any]  # a JSON value, then lines: strings, tables, texts to be wrapped
 LONGEST = 1000  # characters of a message
+AS_JSON = typer.Option(False, "--json", help="Print one JSON object.")
 GOES_ON = "the same command goes on where it stopped"
 
 
@@ -44,6 +48,36 @@ def plain_console() -> "Console":
 def print_json(value: Json) -> None:
     """Print one JSON object on stdout; numbers that JSON does not have, inf and nan, are null."""
     echo(json.dumps(_finite(value), allow_nan=False))
+
+
+def answer_json(command: Callable[..., Answer]) -> Callable[..., None]:
+    """Decorate a command that yields its answer as a JSON value, and then the lines of its answer, texts or Rich's.
+
+    It gets the option `--json`, by which the value is printed in place of the lines.
+    """
+
+    @functools.wraps(command)
+    def answer(*, as_json: bool, **options: Any) -> None:
+        answers = command(**options)
+        value = next(answers)
+        if as_json:
+            print_json(value)
+        for line in answers:
+            if not as_json:
+                echo(line) if isinstance(line, str) else plain_console().print(line)
+
+    given = inspect.signature(command)
+    option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=AS_JSON, annotation=bool)
+    answer.__signature__ = given.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        parameters=[*given.parameters.values(), option], return_annotation=None
+    )
+    answer.__annotations__ = {**command.__annotations__, "as_json": bool, "return": None}
+    return answer
+
+
+def wants_json() -> bool:
+    """Return whether the command that runs was given `--json`."""
+    return bool(click.get_current_context().params.get("as_json"))
 
 
 def _finite(value: Json) -> Json:

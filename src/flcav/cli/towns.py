@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import check_png
-from flcav.cli.terminal import echo, print_json
+from flcav.cli.terminal import Answer, answer_json, echo
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
@@ -17,26 +17,20 @@ if TYPE_CHECKING:
 towns = typer.Typer(help="Towns: list them, draw their maps, import new ones from OpenDRIVE.", no_args_is_help=True)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.add_typer(towns, name="towns")
-
-
 @towns.command("list")
-def list_towns(as_json: bool = typer.Option(False, "--json", help="Print one JSON object instead.")) -> None:
+@answer_json
+def list_towns() -> Answer:
     """List the towns that come with flcav, and what they have."""
     from flcav.world.map.census import summarise_town
     from flcav.world.map.town import PACKAGED, load_town
 
     found = {name: load_town(name) for name in PACKAGED}
     counts = {name: summarise_town(town) for name, town in found.items()}
-    if as_json:
-        rows = [{"name": name, "description": found[name].parameters.description, **counts[name]} for name in PACKAGED]
-        print_json({"towns": rows})
-        return
+    rows = [{"name": name, "description": found[name].parameters.description, **counts[name]} for name in PACKAGED]
+    yield {"towns": rows}
     for name, town in found.items():
-        echo(f"{name}: {town.parameters.description}")
-        echo(f"    {summary(counts[name])}")
+        yield f"{name}: {town.parameters.description}"
+        yield f"    {summary(counts[name])}"
 
 
 @towns.command()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flcav.cli.importance import set_weights
+from flcav.cli.domains.importance import set_weights
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.driving import jobs as driven

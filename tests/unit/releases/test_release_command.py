@@ -156,7 +156,7 @@ def test_wrong_inputs_get_one_sentence(parties: Parties, call: Call, tmp_path: P
 
 
 def test_without_the_extra_the_command_to_install_it_is_named(call: Call, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("flcav.cli.release.find_spec", lambda name: None)
+    monkeypatch.setattr("flcav.cli.releases.release.find_spec", lambda name: None)
     code, said = call("status", "nowhere")
     assert code == 2
     assert said.startswith("flcav: releases need tuf, which is in: ")

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from flcav.cli.options import join_choices
-from flcav.cli.terminal import print_json
+from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from flcav.optimization.allocation.budget_sweep import Saving
     from flcav.optimization.allocation.vehicles import Shares
     from flcav.optimization.problem import Problem
-    from flcav.optimization.verification.record import Verification
 
 SHOWN = "#.2g"  # predictions: trainings on the same frames differ in the second digit
 
@@ -35,16 +34,9 @@ class BaselineName(StrEnum):
     article = "article"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to `app`."""
-    app.command("allocate")(allocate)
-    app.command("replan")(replan)
-
-
 PROBLEM = typer.Argument(
     ..., help="YAML: budgets, sizes, limits and learning curves of every task; or a three-layer graph."
 )
-AS_JSON = typer.Option(False, "--json", help="Print one JSON object.")
 BASELINE = typer.Option(
     None, "--baseline", metavar="PLAN", help=f"A plan to compare with, in the same call: {join_choices(BaselineName)}."
 )
@@ -55,37 +47,39 @@ VERIFY = typer.Option(
 OUT = typer.Option(None, "--out", help="Write a page about the plan (HTML): where megabytes go, why.")
 
 
+@answer_json
 def allocate(
     problem: Path = PROBLEM,
-    as_json: bool = AS_JSON,
     baseline: BaselineName | None = BASELINE,
     progress: Path | None = typer.Option(None, "--progress", help=f"{PROGRESS} As `flcav replan`."),
     out: Path | None = OUT,
     verify: bool = VERIFY,
-) -> None:
+) -> Answer:
     """Split both uplink budgets over tasks and training stages to minimise the weighted error."""
-    _plan(problem, progress, as_json, baseline, out, verify)
+    return _plan(problem, progress, baseline, out, verify)
 
 
+@answer_json
 def replan(
     problem: Path = PROBLEM,
     progress: Path = typer.Argument(..., help=PROGRESS),
-    as_json: bool = AS_JSON,
     baseline: BaselineName | None = BASELINE,
     out: Path | None = OUT,
     verify: bool = VERIFY,
-) -> None:
+) -> Answer:
     """Plan the rest of a training that is under way, from what it has spent and reached; counts include what is done.
 
     Finished stages stay as they are, learning curves are scaled to pass through the accuracies reached, and what was
     not spent goes back to the budgets.
     """
-    _plan(problem, progress, as_json, baseline, out, verify)
+    return _plan(problem, progress, baseline, out, verify)
 
 
 def _plan(
-    problem: Path, progress: Path | None, as_json: bool, baseline: BaselineName | None, out: Path | None, verify: bool
-) -> None:
+    problem: Path, progress: Path | None, baseline: BaselineName | None, out: Path | None, verify: bool
+) -> Answer:
+    from rich.text import Text
+
     from flcav.config import read_config
     from flcav.optimization.allocation.baselines import baseline as compared
     from flcav.optimization.allocation.budget_sweep import compute_savings
@@ -103,8 +97,7 @@ def _plan(
     try:
         plan, shares = allocate_fleet(asked)
     except Infeasible as error:
-        if as_json:
-            print_json({"status": "infeasible", "message": str(error)})
+        yield {"status": "infeasible", "message": str(error)}
         raise
     more = compute_savings(asked, plan)
     if out is not None:
@@ -116,16 +109,18 @@ def _plan(
         write_bytes(out, page.encode())
     beside = None if baseline is None else compared(asked, baseline.value)
     verified = verify_allocation(asked.model_dump_json(), json.dumps(_plain(plan))) if verify else None
-    if as_json:
-        beside_it = {} if beside is None else {"baseline": _plain(beside)}
-        beside_it |= {} if verified is None else {"verification": dataclasses.asdict(verified)}
-        print_json(_as_json(plan, shares, more) | beside_it)
-    else:
-        _show(asked, plan, more)
-        _show_vehicles(shares)
-        if beside is not None:
-            _show_baseline(beside, plan)
-        _show_verification(verified)
+    beside_it = {} if beside is None else {"baseline": _plain(beside)}
+    beside_it |= {} if verified is None else {"verification": dataclasses.asdict(verified)}
+    yield _as_json(plan, shares, more) | beside_it
+    yield _table(plan)
+    yield from map(Text, _describe(asked, plan, more))
+    if shares:
+        yield _table_vehicles(shares)
+    if beside is not None:
+        yield _table(beside)
+        yield Text(_describe_baseline(beside, plan))
+    if verified is not None:
+        yield from map(Text, verified.lines())
     if verified is not None and verified.faults:
         raise typer.Exit(1)
 
@@ -152,53 +147,39 @@ def _given(values: dict[str, Any], *optional: str) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name not in optional or value}
 
 
-def _show(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") -> None:
-    from flcav.cli.terminal import plain_console
+def _describe(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") -> Iterator[str]:
     from flcav.optimization.allocation.problem_file import MEASURES, explain_objective
 
-    console, measure = plain_console(), MEASURES[problem.objective]
-    console.print(_table(plan))
+    measure = MEASURES[problem.objective]
     for task in plan.tasks:
         if task.called is not None:
             told = plural(task.called, "vehicle")
-            console.print(f"{task.name}: {told} at most of each edge server in its edge rounds")
+            yield (f"{task.name}: {told} at most of each edge server in its edge rounds")
     curves = "the fitted curves" if len(plan.tasks) > 1 else "the fitted curve"
-    console.print(f"{measure} {plan.objective:{SHOWN}}, {plan.status} for {curves} ({_proven(plan.gap)})")
-    console.print(f"{measure.capitalize()}: {explain_objective(problem, plan.objective)}")
+    yield (f"{measure} {plan.objective:{SHOWN}}, {plan.status} for {curves} ({_proven(plan.gap)})")
+    yield (f"{measure.capitalize()}: {explain_objective(problem, plan.objective)}")
     verb = "adds" if problem.objective == "area" else "saves"
     for link in ("wireless", "wireline"):
         used, budget = getattr(plan.used_mb, f"{link}_mb"), getattr(problem.budgets_mb, link)
-        console.print(f"{link}: {used:.1f} of {budget:.6g} MB")
+        yield (f"{link}: {used:.1f} of {budget:.6g} MB")
         for each in (each for each in more if each.link == link):
             saved = f"{each.saved:{SHOWN}}" if each.saved else "nothing"
             budget = f"{each.added:.0%} more ({each.added_mb:.6g} MB)"
-            console.print(f"  {budget}, solved anew: {verb} {saved} ({_proven(each.gap)})")
+            yield (f"  {budget}, solved anew: {verb} {saved} ({_proven(each.gap)})")
     if plan.busy_s is not None:
-        console.print(f"time: {plan.busy_s:.1f} of {problem.horizon_s:.6g} s on the busiest vehicle")
-    for sentence in filter(None, (plan.note, *plan.warnings)):
-        console.print(sentence)
+        yield (f"time: {plan.busy_s:.1f} of {problem.horizon_s:.6g} s on the busiest vehicle")
+    yield from filter(None, (plan.note, *plan.warnings))
 
 
 def _proven(gap: float | None) -> str:
     return "no certificate" if gap is None else f"proven within {gap:.2%}"
 
 
-def _show_baseline(beside: "Baseline", plan: "Allocation") -> None:
-    from flcav.cli.terminal import plain_console
-
-    console = plain_console()
-    console.print(_table(beside))
+def _describe_baseline(beside: "Baseline", plan: "Allocation") -> str:
     note = f" ({beside.note})" if beside.note else ""
     one, other = f"{beside.objective:{SHOWN}}", f"{plan.objective:{SHOWN}}"
     apart = f", {abs(plan.objective - beside.objective):{SHOWN}} apart" if one == other else ""
-    console.print(f"{beside.name}: {one}{note}; the plan above: {other}{apart}")
-
-
-def _show_verification(verified: "Verification | None") -> None:
-    from flcav.cli.terminal import plain_console
-
-    for line in () if verified is None else verified.lines():
-        plain_console().print(line)
+    return f"{beside.name}: {one}{note}; the plan above: {other}{apart}"
 
 
 def _table(plan: "Allocation | Baseline") -> "Table":
@@ -215,16 +196,12 @@ def _table(plan: "Allocation | Baseline") -> "Table":
     return table
 
 
-def _show_vehicles(shares: "Shares") -> None:
+def _table_vehicles(shares: "Shares") -> "Table":
     from rich.table import Table
 
-    from flcav.cli.terminal import plain_console
-
-    if not shares:
-        return
     table = Table("task", "vehicle", "samples", "rounds joined", "wireless MB")
     for task, own in shares.items():
         for share in own:
             cells = (str(share.samples), str(len(share.rounds)), f"{share.wireless_mb:.1f}")
             table.add_row(task, share.vehicle, *cells)
-    plain_console().print(table)
+    return table

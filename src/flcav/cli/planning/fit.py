@@ -1,6 +1,7 @@
 """`flcav fit`: learning curves from a history of training runs."""
 
 import dataclasses
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from flcav.cli.options import check_all_finite, check_finite, refuse_unused
-from flcav.cli.terminal import echo, only_writer_of, print_json
+from flcav.cli.terminal import Answer, answer_json, only_writer_of
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
@@ -37,12 +38,8 @@ ROUNDS = {  # by model: the letters of its formula
 }
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("fit")(fit)
-
-
 @only_writer_of("problem")
+@answer_json
 def fit(
     history: Path = typer.Argument(
         ..., help="CSV: task, stage (pretrain, edge, cloud), resource, accuracy[, weight]; or [task,] samples, "
@@ -52,7 +49,6 @@ def fit(
         None, "--problem", help="YAML: put the curves into this problem for `flcav allocate`; where there is no such "
         "file, write one with the rest to fill in."
     ),
-    as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
     model: CurveForm = typer.Option(CurveForm.additive, "--model", help="How the stages add up; best: additive or "
         "federated, whichever has the smaller AICc, as runs are planned."),
     at: list[str] = typer.Option(
@@ -84,7 +80,7 @@ def fit(
         False, "--held-out", help="Also predict each run (column run) by the curve of all other runs, and each seed "
         "by that of the others."
     ),
-) -> None:  # fmt: skip
+) -> Answer:  # fmt: skip
     """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
     from flcav.cli.tables import read_table
     from flcav.config import InputError
@@ -118,12 +114,10 @@ def fit(
         found_of[task] = collect_fitted_fields(found, points.resources, upper)
     if problem is not None:
         _write(problem, held, found_of, k, history.name)
-    if as_json:
-        print_json({"curves": answers})
-        return
-    _show(answers, shown)
+    yield {"curves": answers}
+    yield from _list_lines(answers, shown)
     if problem is not None:
-        echo(_next(problem, list(found_of)))
+        yield _next(problem, list(found_of))
 
 
 def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:
@@ -211,18 +205,16 @@ def _answer(
     }
 
 
-def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
+def _list_lines(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> Iterator[Any]:
     from rich.table import Table
+    from rich.text import Text
 
-    from flcav.cli.terminal import plain_console
-
-    console = plain_console()
     rounds = dict.fromkeys(ROUNDS[fit.curve.model] for fit in fits)
     table = Table("task", f"error after x samples, {' or '.join(rounds)}", "rmse", "R²", "points")
     for answer, fit in zip(answers, fits):
         explained = "–" if fit.r_squared is None else f"{fit.r_squared:.3f}"
         table.add_row(answer["task"], str(fit.curve), f"{fit.rmse:.4f}", explained, str(fit.points))
-    console.print(table)
+    yield table
     for answer in answers:
         for row in answer["asked"]:
             between = (
@@ -231,7 +223,7 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
                 else f", {answer['band']['level']:.0%} band {row['low']:.4f} to {row['high']:.4f}"
             )
             counts = f"{row['samples']:g} samples, {row['edge_rounds']:g} edge, {row['cloud_rounds']:g} cloud rounds"
-            console.print(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}")
+            yield Text(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}")
         if "held_out" in answer:
             checked = answer["held_out"]
             told = (
@@ -254,6 +246,6 @@ def _show(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> None:
                     f"{new['rank_correlation_pretrained']:.3f}",
                 )
             for line in told:
-                console.print(f"{answer['task']}: {line}")
+                yield Text(f"{answer['task']}: {line}")
         for warning in answer["warnings"]:
-            console.print(f"{answer['task']}: {warning}")
+            yield Text(f"{answer['task']}: {warning}")

@@ -11,11 +11,6 @@ from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(history)
-
-
 @when_interrupted()
 @only_writer_of("out")
 def history(

@@ -1,6 +1,7 @@
 """`flcav place`: roadside sensors that cover most of the registered errors (VRCSP)."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import Method, check_finite, check_png
-from flcav.cli.terminal import echo, print_json
+from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
@@ -24,11 +25,7 @@ if TYPE_CHECKING:
 MAP_IN = 6.4  # width of the map [inch]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to `app`."""
-    app.command("place")(place)
-
-
+@answer_json
 def place(
     errors: Path = typer.Option(
         ..., help="CSV or Parquet of errors: x, y, z [m], optionally weight, severity, exposure, class, kind."
@@ -61,11 +58,10 @@ def place(
     driving: bool = typer.Option(
         False, "--driving", help="Count who is hidden from the dataset's vehicles, from every chosen pole, from both."
     ),
-    as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
     verify: bool = typer.Option(
         False, "--verify", help="Recompute coverage, cost and bound with no code of the solver; exit 1 if one is wrong."
     ),
-) -> None:
+) -> Answer:
     """Choose the poles whose sensors cover most of the errors.
 
     An error is covered where a chosen sensor is within its range, in three dimensions.
@@ -125,63 +121,59 @@ def place(
         hidden = count_hidden(here, traces, sites, ranges_m)
     cost = given.cost_of(result)
     verified = _verify(given, seen, result, least, count, budget, cover) if verify else None
-    if as_json:
-        random = place_at_random(candidates, limit)
-        print_json(
-            {
-                "chosen": _name(given, result),
-                "covered": result.covered,
-                "covered_weight": result.covered_weight,
-                "upper_bound": result.upper_bound,
-                "optimal": result.optimal,
-                "cost": cost,
-                "cost_lower_bound": least,
-                "marginal_gain": result.marginal_gain,
-                "certificate": None if result.certificate is None else asdict(result.certificate),
-                **({} if hidden is None else {"hidden": hidden.as_json()}),
-                **({} if verified is None else {"verification": asdict(verified)}),
-                "baselines": {
-                    **{name: _tell(given, placed) for name, placed in conventional.items()},
-                    "random": {"covered": random.covered, "covered_weight": random.covered_weight},
-                },
-            }
-        )
-    else:
-        _show(given, np.diff(candidates.covers.indptr).tolist(), result, conventional, least)
-        for line in [] if hidden is None else hidden.lines():
-            echo(line)
-        told = [] if verified is None else verified.lines(counted=count is not None or not given.priced)
-        echo("\n".join(told), nl=verified is not None)
+    random = place_at_random(candidates, limit)
+    yield {
+        "chosen": _name(given, result),
+        "covered": result.covered,
+        "covered_weight": result.covered_weight,
+        "upper_bound": result.upper_bound,
+        "optimal": result.optimal,
+        "cost": cost,
+        "cost_lower_bound": least,
+        "marginal_gain": result.marginal_gain,
+        "certificate": None if result.certificate is None else asdict(result.certificate),
+        **({} if hidden is None else {"hidden": hidden.as_json()}),
+        **({} if verified is None else {"verification": asdict(verified)}),
+        "baselines": {
+            **{name: _tell(given, placed) for name, placed in conventional.items()},
+            "random": {"covered": random.covered, "covered_weight": random.covered_weight},
+        },
+    }
+    yield from _list_lines(given, np.diff(candidates.covers.indptr).tolist(), result, conventional, least)
+    if hidden is not None:
+        yield from hidden.lines()
+    if verified is not None:
+        yield from verified.lines(counted=count is not None or not given.priced)
     if verified is not None and verified.faults:
         raise typer.Exit(1)
 
 
-def _show(
+def _list_lines(
     given: "Given",
     near: list[int],
     result: "Placement",
     conventional: "dict[str, Placement | None]",
     least: float | None,
-) -> None:
-    """Print the placement; `near` are the numbers of errors within range of each candidate."""
+) -> Iterator[str]:
+    """Yield the placement in words; `near` are the numbers of errors within range of each candidate."""
     cost, by_range = given.cost_of(result), given.names == (None,)
     chosen = [f"{each['pole']}" + ("" if by_range else f" ({each['sensor']})") for each in _name(given, result)]
-    echo(f"poles {', '.join(chosen)}")
+    yield (f"poles {', '.join(chosen)}")
     if by_range:
         for number, (pole, errors_near) in enumerate(zip(given.ids, near, strict=True)):
             placed = ", placed" if number in result.chosen else ""
-            echo(f"    pole {pole}: {plural(errors_near, 'error')} within {given.ranges_m[0]:g} m{placed}")
+            yield (f"    pole {pole}: {plural(errors_near, 'error')} within {given.ranges_m[0]:g} m{placed}")
     proof = "optimal" if result.optimal else f"at most {result.upper_bound:.10g} can be covered"
     if least is not None and not result.optimal:
         proof = f"at least {least:.10g} has to be spent for that"
     told = "" if cost is None else f", cost {cost:.10g}"
-    echo(
+    yield (
         f"cover {result.covered} of {plural(len(given.errors), 'error')}, "
         f"weight {result.covered_weight:.10g}{told} ({proof})"
     )
     for name, placed in conventional.items():
         if placed is not None:
-            echo(f"by {name.replace('-', ' ')}: weight {placed.covered_weight:.10g}")
+            yield (f"by {name.replace('-', ' ')}: weight {placed.covered_weight:.10g}")
 
 
 def _verify(

@@ -1,13 +1,56 @@
 """`flcav release propose` and `verify`: a candidate, and its tests beside the network that drives."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from flcav.cli.options import check_finite, parse_axes
-from flcav.cli.releases.options import AS_JSON, CANDIDATE, DRIVING, NUMBER, TASK, draw_page
-from flcav.cli.terminal import echo, only_writer_of, print_json, when_interrupted
+from flcav.cli.terminal import Answer, answer_json, echo, only_writer_of, when_interrupted
 from flcav.interface.wording import plural
+
+if TYPE_CHECKING:
+    from flcav.releases.candidates.candidate import Candidate
+    from flcav.releases.repositories.repository import Staged
+
+CANDIDATE = typer.Argument(metavar="CANDIDATE", help="Folder of the candidate.")
+DRIVING = typer.Option(..., "--driving", help="Weights of the network that drives (safetensors).")
+NUMBER = typer.Option(..., "--release", min=1, max=10**9, help="Number of the release; it rises, roll-backs included.")
+KEYS = typer.Option(..., "--key", help="Private key of the party (PEM); several of different owners may sign at once.")
+REVOKE = typer.Option([], "--revoke", help="Vehicle that installs nothing any more; may be repeated.")
+TASK = typer.Option("objects", "--task", help="Perception task of the network.")
+AS_JSON = typer.Option(False, "--json", help="Print one JSON object.")
+
+
+def describe_candidate(folder: Path) -> "Candidate":
+    """Return the description of a candidate whose files are as it says."""
+    from flcav.releases.candidates.candidate import check_files, read_candidate
+
+    described = read_candidate(folder)
+    check_files(folder, described)
+    return described
+
+
+def tell_signatures(repository: Path, state: "Staged") -> None:
+    """Print how many signatures a party's next metadata have."""
+    more = "publish it" if state.complete else "another owner's is missing"
+    echo(
+        f"{repository}: {state.signatures} of {plural(state.threshold, 'signature')} of version {state.version}; {more}"
+    )
+
+
+def draw_page(folder: Path, repositories: list[Path]) -> None:
+    """Draw the candidate's page with the signatures of the repositories' parties."""
+    from flcav.releases.candidates.candidate import REPORT, read_candidate, write_report
+    from flcav.releases.repositories.status import read_acknowledgements
+    from flcav.releases.verification.verify import read_verification
+    from flcav.report.pages.release_page import release_page
+    from flcav.storage.files import sha256
+
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and path.name != REPORT]
+    hashes = {path.name: sha256(path) for path in files}
+    signed = read_acknowledgements(folder, repositories)
+    write_report(folder, release_page(read_candidate(folder), read_verification(folder), hashes, signed))
 
 
 def propose(
@@ -36,6 +79,7 @@ def propose(
 
 @when_interrupted()
 @only_writer_of("candidate")
+@answer_json
 def verify(
     candidate: Path = CANDIDATE,
     driving: Path = DRIVING,
@@ -53,8 +97,7 @@ def verify(
         "junction,visibility", "--by", metavar="X,Y", help="Two attributes of the domain, whose cells are slices."
     ),
     jobs: int = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each."),
-    as_json: bool = AS_JSON,
-) -> None:
+) -> Answer:
     """Verify a candidate beside the network that drives; exit 1 where it is refused, or the frames do not tell.
 
     Writes verification.json and report.html into the candidate's folder.
@@ -79,9 +122,7 @@ def verify(
         )
     write_verification(candidate, found)
     draw_page(candidate, [])
-    if as_json:
-        print_json(found.as_json())
-    else:
-        echo("\n".join(found.lines()))
+    yield found.as_json()
+    yield from found.lines()
     if not found.accepted:
         raise typer.Exit(1)

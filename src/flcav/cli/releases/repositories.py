@@ -6,8 +6,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import check_finite
-from flcav.cli.releases.options import (
-    AS_JSON,
+from flcav.cli.releases.candidates import (
     CANDIDATE,
     KEYS,
     REVOKE,
@@ -16,7 +15,7 @@ from flcav.cli.releases.options import (
     draw_page,
     tell_signatures,
 )
-from flcav.cli.terminal import echo, only_writer_of, print_json
+from flcav.cli.terminal import Answer, answer_json, echo, only_writer_of
 from flcav.config import InputError, parse_config
 from flcav.interface.wording import plural
 
@@ -162,22 +161,20 @@ def equip(
     echo(f"{folder}: follows the releases of its fleet")
 
 
+@answer_json
 def status(
     repository: list[Path] = typer.Argument(help="Folders of parties."),
     candidate: Path | None = typer.Option(
         None, "--candidate", help="Folder of a candidate: its page is drawn anew with the signatures of these parties."
     ),
     task: str = TASK,
-    as_json: bool = AS_JSON,
-) -> None:
+) -> Answer:
     """Show what repositories name: releases, the customer's directive, signatures on their way, times of expiry."""
     from flcav.releases.repositories.status import read_status
 
     found = [read_status(folder, task) for folder in repository]
     if candidate is not None:
         draw_page(candidate, repository)
-    if as_json:
-        print_json({"repositories": [each.as_json() for each in found]})
-        return
+    yield {"repositories": [each.as_json() for each in found]}
     for each in found:
-        echo("\n".join(each.lines()))
+        yield "\n".join(each.lines())

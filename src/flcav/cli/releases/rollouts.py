@@ -5,8 +5,7 @@ from pathlib import Path
 import typer
 
 from flcav.cli.options import check_finite
-from flcav.cli.releases.options import (
-    AS_JSON,
+from flcav.cli.releases.candidates import (
     CANDIDATE,
     DRIVING,
     KEYS,
@@ -17,7 +16,7 @@ from flcav.cli.releases.options import (
     draw_page,
     tell_signatures,
 )
-from flcav.cli.terminal import echo, only_writer_of, print_json, when_interrupted
+from flcav.cli.terminal import Answer, answer_json, echo, only_writer_of, when_interrupted
 from flcav.config import InputError
 from flcav.interface.wording import plural
 
@@ -148,6 +147,7 @@ def _widen(
         raise typer.Exit(1)
 
 
+@answer_json
 def deliver(
     candidate: Path = CANDIDATE,
     data: Path = typer.Option(..., "--data", help="Dataset whose traffic drives through the radio's coverage."),
@@ -156,8 +156,7 @@ def deliver(
     network: Path | None = NETWORK,
     seed: int = SEED,
     out: Path | None = typer.Option(None, "--out", help="Ledger of the delivery (Parquet)."),
-    as_json: bool = AS_JSON,
-) -> None:
+) -> Answer:
     """Simulate who gets a release when, over the radio of a recording, and price the downlink in a ledger."""
     from dataclasses import asdict
 
@@ -177,17 +176,16 @@ def deliver(
     found = deliver_release(links, links.vehicle, described.release, size, settings, ledger, described.task)
     if out is not None:
         ledger.save(out)
-    if as_json:
-        print_json({"vehicles": [asdict(each) for each in found], "bytes": size})
-        return
+    yield {"vehicles": [asdict(each) for each in found], "bytes": size}
     for each in found:
         said = f"has it at {each.at_s:.2f} s" if each.at_s is not None else f"has it not: {each.reason}"
-        echo(f"{each.vehicle}: {said}, {plural(each.attempts, 'attempt')}, {each.bytes / 1e6:.2f} MB")
+        yield f"{each.vehicle}: {said}, {plural(each.attempts, 'attempt')}, {each.bytes / 1e6:.2f} MB"
     down = {link: ledger.used_mb(link, direction="down") for link in ("wireless", "wireline")}
-    echo(f"downlink: {down['wireless']:.2f} MB wireless, {down['wireline']:.2f} MB wireline")
+    yield f"downlink: {down['wireless']:.2f} MB wireless, {down['wireline']:.2f} MB wireline"
 
 
 @when_interrupted()
+@answer_json
 def rehearse(
     candidate: Path = CANDIDATE,
     earlier: Path = typer.Option(..., "--earlier", help="Folder of the candidate that drives now."),
@@ -197,8 +195,7 @@ def rehearse(
     pole: list[int] = POLES,
     network: Path | None = NETWORK,
     seed: int = SEED,
-    as_json: bool = AS_JSON,
-) -> None:
+) -> Answer:
     """Rehearse a roll-out on a simulated fleet; exit 1 where it is stopped and rolled back, or not complete.
 
     Vehicles download over the radio of their drives and install as real ones do; shadow runs decide on each share.
@@ -229,10 +226,8 @@ def rehearse(
         )
     ledger.save(out / "ledger.parquet")
     write_json(out / "rehearsal.json", found.as_json(), sort=False)
-    if as_json:
-        print_json(found.as_json())
-    else:
-        echo("\n".join(found.lines()))
+    yield found.as_json()
+    yield from found.lines()
     if found.stopped or not found.complete:
         raise typer.Exit(1)
 

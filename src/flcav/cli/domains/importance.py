@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import typer
 
 from flcav.cli.options import JOBS, check_finite
-from flcav.cli.terminal import echo, print_json
+from flcav.cli.terminal import Answer, answer_json
+from flcav.config import Json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -44,11 +45,7 @@ FIRST_SEED = typer.Option(1, "--first-seed", min=0, help="The first seed.")
 LASTS = typer.Option(12.0, "--lasts", min=1.0, max=600.0, callback=check_finite, help="Length of a drive [s].")
 
 
-def register(group: typer.Typer) -> None:
-    """Add the command to the group `odd`."""
-    group.command("importance")(importance)
-
-
+@answer_json
 def importance(
     scenarios: int = typer.Option(20, "--scenarios", min=1, max=32, help="How many scenarios, of all towns in turn."),
     seeds: int = typer.Option(3, "--seeds", min=1, max=100, help="Seeds of each."),
@@ -67,8 +64,7 @@ def importance(
         None, "--keep", help="File of the drives that are done: the same command goes on after a stop."
     ),
     jobs: int = JOBS,
-    as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
-) -> None:
+) -> Answer:
     """Leave each task of perception out of closed-loop drives, and weigh it by the driving score that is lost.
 
     Drives are paired over scenarios and seeds. Beside it: the article's own rule, the loss of the joint objective.
@@ -102,10 +98,8 @@ def importance(
 
         weights = {each.task: max(each.weight, LEAST) for each in found.tasks[coupling or CouplingName.bare]}
         write_bytes(out, yaml.safe_dump(set_weights(document, weights, str(weigh)), sort_keys=False).encode())
-    if as_json:
-        print_json(found.as_json())
-        return
-    echo("\n".join(found.lines()))
+    yield found.as_json()
+    yield "\n".join(found.lines())
 
 
 def read_model(perception: Perceives, errors: Path | None):

@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli import importance, sampling
+from flcav.cli.domains.sampling import ODD
 from flcav.cli.options import Device, check_finite
-from flcav.cli.sampling import JSON, ODD
 from flcav.cli.tables import numbers, read_table
-from flcav.cli.terminal import echo, print_json
+from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
 
@@ -24,22 +23,15 @@ odd = typer.Typer(
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    sampling.register(odd)
-    importance.register(odd)
-    app.add_typer(odd, name="odd")
-
-
 @odd.command()
+@answer_json
 def check(
     domain: str = ODD,
     town: str | None = typer.Option(
         None, "--town", help="Town, by name or folder, whose places are checked; default: flcav's four."
     ),
     data: Path | None = typer.Option(None, "--data", help="Dataset folder: what its frames realise."),
-    as_json: bool = JSON,
-) -> None:
+) -> Answer:
     """Check which parts of a domain are realised, and which are unknown.
 
     Each attribute that the domain tests is taken alone, the others left open. What nothing measures is unknown, never
@@ -60,22 +52,20 @@ def check(
         parts = check_frames(found, measure(Dataset.open(data)))
     else:
         parts = check_towns(found, [Scenery(load_town(name)) for name in (TOWNS if town is None else (town,))])
-    if as_json:
-        rows = [part.as_json() | {"realised": part.realised} for part in parts]
-        print_json({"domain": found.name, "revision": found.definition.revision, "parts": rows})
-        return
+    rows = [part.as_json() | {"realised": part.realised} for part in parts]
+    yield {"domain": found.name, "revision": found.definition.revision, "parts": rows}
     where = f"frames of {data}" if data else f"places of {town or ', '.join(TOWNS)}"
-    echo(f"{found.name}: {plural(len(parts), 'attribute')} tested, against {where}")
+    yield f"{found.name}: {plural(len(parts), 'attribute')} tested, against {where}"
     for part in parts:
-        echo(f"    {part.attribute:<32}{part.sentence}")
+        yield f"    {part.attribute:<32}{part.sentence}"
 
 
 @odd.command("of")
+@answer_json
 def of_(
     data: Path = typer.Argument(help="Dataset folder."),
     out: Path | None = typer.Option(None, "--out", help="Folder for OpenODD's tables: a COD per run."),
-    as_json: bool = JSON,
-) -> None:
+) -> Answer:
     """Describe the domain that a recording covers, by its ground truth: the current operational domain (COD)."""
     from flcav.dataset.store import Dataset
     from flcav.odd.coverage import collect_runs, write_cod
@@ -91,17 +81,16 @@ def of_(
     rows = None
     if out is not None:
         rows = write_cod(collect_runs(everything(), recorded, measured), out)
-    if as_json:
-        print_json({"frames": len(measured), "rows": rows, "attributes": [span.as_json() for span in spans]})
-        return
-    echo(f"{data}: {plural(len(measured), 'frame')} of vehicles")
+    yield {"frames": len(measured), "rows": rows, "attributes": [span.as_json() for span in spans]}
+    yield f"{data}: {plural(len(measured), 'frame')} of vehicles"
     for span in spans:
-        echo(f"    {span.attribute:<20}{span.sentence}")
+        yield f"    {span.attribute:<20}{span.sentence}"
     if rows is not None:
-        echo(f"{out}: {plural(rows, 'row')} of COD tables")
+        yield f"{out}: {plural(rows, 'row')} of COD tables"
 
 
 @odd.command()
+@answer_json
 def inside(
     data: Path = typer.Argument(help="Dataset folder."),
     domain: str = ODD,
@@ -114,8 +103,7 @@ def inside(
     objects: Path | None = typer.Option(None, "--objects", help="Weights of the detector; default: the package's."),
     device: Device = typer.Option(Device.auto, "--device", help="Where the networks run; auto: a GPU if there is one."),
     frames: Path | None = typer.Option(None, "--frames", help="Table to write, .csv or .parquet: a frame's verdict."),
-    as_json: bool = JSON,
-) -> None:
+) -> Answer:
     """Judge every frame of a recording's vehicles by a domain: inside, outside, or unknown.
 
     A verdict that rests on a missing value is unknown.
@@ -159,20 +147,19 @@ def inside(
         agreement = compare_verdicts(truth.verdict.tolist(), seen.verdict.tolist())
     if frames is not None:
         write_verdicts(recorded, truth, seen, frames)
-    if as_json:
-        told = None if agreement is None else agreement.as_json()
-        print_json({"domain": found.name, **truth.as_json(), "frames_per_s": rate, "perceived": told})
-        return
-    echo(f"{found.name}: {truth.sentence}, by ground truth ({rate:,.0f} a second)")
+    told = None if agreement is None else agreement.as_json()
+    yield {"domain": found.name, **truth.as_json(), "frames_per_s": rate, "perceived": told}
+    yield f"{found.name}: {truth.sentence}, by ground truth ({rate:,.0f} a second)"
     for module, count in truth.failed.items():
-        echo(f"    {module} puts {plural(count, 'frame')} outside")
+        yield f"    {module} puts {plural(count, 'frame')} outside"
     if seen is not None and agreement is not None:
-        echo(f"{found.name}: {seen.sentence}, as perceived")
+        yield f"{found.name}: {seen.sentence}, as perceived"
         for line in describe_agreement(agreement):
-            echo(f"    {line}")
+            yield f"    {line}"
 
 
 @odd.command()
+@answer_json
 def cover(
     domain: str = ODD,
     data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
@@ -190,8 +177,7 @@ def cover(
     device: Device = typer.Option(
         Device.auto, "--device", help="Where the detector runs; auto: a GPU if there is one."
     ),
-    as_json: bool = JSON,
-) -> None:
+) -> Answer:
     """Measure how much of a domain recordings cover, and with --detect where in it the detector errs.
 
     From a domain to where the network errs to where to look: a cell is a bucket of each of two attributes.
@@ -220,19 +206,18 @@ def cover(
             device=device.value,
             progress=report,
         )
-    if as_json:
-        print_json(result.as_json())
-        return
-    echo(f"{found.name}: {plural(result.runs, 'run')}, mean coverage {result.grade:.0%} of buckets inside")
+    yield result.as_json()
+    yield f"{found.name}: {plural(result.runs, 'run')}, mean coverage {result.grade:.0%} of buckets inside"
     for row in result.attributes:
         holes = f"; not covered: {', '.join(row.holes)}" if row.holes else ""
-        echo(f"    {row.attribute:<32}{row.grade:>4.0%}{holes}")
+        yield f"    {row.attribute:<32}{row.grade:>4.0%}{holes}"
     for row in result.cells:
-        echo(_describe_cell(row))
-    echo(f"{out / 'matrix.html'}: {by}")
+        yield _describe_cell(row)
+    yield f"{out / 'matrix.html'}: {by}"
 
 
 @odd.command()
+@answer_json
 def tasks(
     data: list[Path] = typer.Option(..., "--data", help="Dataset folder; may be given several times."),
     out: Path = typer.Option(..., "--out", help="The run recipe to write (.yaml): flcav run reads it."),
@@ -242,8 +227,7 @@ def tasks(
     pretrain: str = typer.Option("suburb", "--pretrain", help="Town of stage I; the other recorded towns federate."),
     wireless: float = typer.Option(180.0, "--wireless", min=0.001, callback=check_finite, help="Wireless budget [MB]."),
     wireline: float = typer.Option(110.0, "--wireline", min=0.001, callback=check_finite, help="Wireline budget [MB]."),
-    as_json: bool = JSON,
-) -> None:
+) -> Answer:
     """Generate tasks, {data, labels, network}, for the scenarios of recordings: more where a scenario is complex.
 
     The result is a run recipe, in which a task weighs as many of the scenarios as have it.
@@ -268,16 +252,14 @@ def tasks(
     towns = {name_region(town): town for town in map(town_of, data)}
     recipe = make_run(scenarios, towns, pretrain, wireless, wireline)
     write_bytes(out, yaml.safe_dump(recipe, sort_keys=False).encode())
-    if as_json:
-        rows = [each.as_json() | {"total": each.complexity.total} for each in scenarios]
-        print_json({"scenarios": rows, "recipe": recipe})
-        return
+    rows = [each.as_json() | {"total": each.complexity.total} for each in scenarios]
+    yield {"scenarios": rows, "recipe": recipe}
     for each in scenarios:
         parts = ", ".join(f"{name} {value:.2f}" for name, value in each.complexity.as_json().items())
         named = ", ".join(task.task for task in each.tasks)
-        echo(f"{each.town}, {each.kind}: complexity {each.complexity.total:.2f} ({parts})")
-        echo(f"    {plural(len(each.tasks), 'task')}: {named}")
-    echo(f"{out}: run recipe of {plural(len({task.task for each in scenarios for task in each.tasks}), 'task')}")
+        yield f"{each.town}, {each.kind}: complexity {each.complexity.total:.2f} ({parts})"
+        yield f"    {plural(len(each.tasks), 'task')}: {named}"
+    yield f"{out}: run recipe of {plural(len({task.task for each in scenarios for task in each.tasks}), 'task')}"
 
 
 def _describe_cell(row: "CellErrors") -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.terminal import echo, print_json
+from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
 
@@ -30,11 +30,7 @@ class Draw(StrEnum):
     failures = "failures"
 
 
-def register(group: typer.Typer) -> None:
-    """Add the command to the group `odd`."""
-    group.command("sample")(sample)
-
-
+@answer_json
 def sample(
     domain: str = ODD,
     out: Path = typer.Option(..., "--out", help="New folder for the recipes, and samples.json about them."),
@@ -56,8 +52,7 @@ def sample(
     openscenario: bool = typer.Option(
         False, "--openscenario", help="Also each scenario as OpenSCENARIO XML 1.2, and the towns' maps; extra `towns`."
     ),
-    as_json: bool = JSON,
-) -> None:
+) -> Answer:
     """Draw recipes of scenarios inside a domain: straight roads, T-junctions, cross-roads and roundabouts of towns.
 
     Each has a corner case at its place, in weather of the domain. `flcav record` reads the recipes. The method failures
@@ -107,23 +102,19 @@ def sample(
         write_bytes(out / f"{name}.xodr", text.encode())
     cells = {failure.cell for each in searched for failure in each.failures}
     frames = sum(len(each.tested) for each in searched)
-    if as_json:
-        pairs = {"pairwise": drawn.pairwise, "pairs": drawn.pairs, "possible": drawn.possible}
-        print_json(
-            {
-                "recipes": len(paths),
-                **pairs,
-                **({"frames": frames, "distinct_failures": len(cells)} if searched else {}),
-            }
-        )
-        return
+    pairs = {"pairwise": drawn.pairwise, "pairs": drawn.pairs, "possible": drawn.possible}
+    yield {
+        "recipes": len(paths),
+        **pairs,
+        **({"frames": frames, "distinct_failures": len(cells)} if searched else {}),
+    }
     kinds = Counter(each.place.kind for each in drawn.samples)
-    echo(f"{out}: {plural(len(paths), 'recipe')} in {found.name}, by {method.value}")
-    echo(f"    {', '.join(f'{kind}: {number}' for kind, number in kinds.most_common())}")
-    echo(f"    pairwise coverage {drawn.pairwise:.0%}: {drawn.pairs} of {drawn.possible} pairs of buckets")
+    yield f"{out}: {plural(len(paths), 'recipe')} in {found.name}, by {method.value}"
+    yield f"    {', '.join(f'{kind}: {number}' for kind, number in kinds.most_common())}"
+    yield f"    pairwise coverage {drawn.pairwise:.0%}: {drawn.pairs} of {drawn.possible} pairs of buckets"
     if searched:
         failing = plural(sum(bool(each.failures) for each in searched), "scenario")
-        echo(f"    {plural(len(cells), 'distinct failure')} in {plural(frames, 'frame')}, of {failing}")
+        yield f"    {plural(len(cells), 'distinct failure')} in {plural(frames, 'frame')}, of {failing}"
 
 
 def _search(

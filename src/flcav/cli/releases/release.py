@@ -33,8 +33,3 @@ for command in (
 def _group() -> None:
     if missing := [name for name in ("tuf", "model_signing") if find_spec(name) is None]:
         raise InputError(f"releases need {missing[0]}, which is in: {format_install_command('releases')}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.add_typer(release, name="release")

@@ -1,22 +1,88 @@
-"""`flcav rounds`: the time of federated rounds over the radio of a recording."""
+"""`flcav radio` and `flcav rounds`: rates of a recording's vehicles by radio, and federated rounds over it."""
 
 from pathlib import Path
 
 import typer
 
-from flcav.cli.network.radio import NETWORK, POLES, SCENE, SEED
 from flcav.cli.options import check_all_finite, check_finite, check_png
-from flcav.cli.terminal import echo, print_json
+from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
+
+POLES = typer.Option(
+    [],
+    "--pole",
+    help="Number of a pole with a roadside unit; may be given several times. By default the recorded poles.",
+)
+SCENE = typer.Option(None, "--scene", help="Scene of the dataset; else the first.")
+NETWORK = typer.Option(
+    None, "--network", help="YAML of the network's settings: radio, wireline, rounds; see docs/network.md."
+)
+SEED = typer.Option(0, "--seed", min=0, help="Seed of shadowing and of the losses by vehicles.")
+
+
+@answer_json
+def radio(
+    folder: Path = typer.Argument(metavar="DIR", help="A dataset."),
+    pole: list[int] = POLES,
+    scene: str | None = SCENE,
+    network: Path | None = NETWORK,
+    seed: int = SEED,
+    map_: Path | None = typer.Option(
+        None, "--map", callback=check_png, help="PNG file: rate by place, line of sight, drives."
+    ),
+) -> Answer:
+    """Compute the radio rates of a recording's connected vehicles at roadside units.
+
+    Path loss, blockage and shadowing by 3GPP TR 37.885, line of sight through the town's buildings and traffic. A rate
+    is that of a vehicle that has the band to itself.
+    """
+    from dataclasses import asdict
+
+    from flcav.config import read_config
+    from flcav.dataset.store import Dataset
+    from flcav.network.clock.rounds import NetworkSettings
+    from flcav.network.radio.coverage import cover_town
+    from flcav.network.radio.propagation import PathState
+    from flcav.network.radio.recorded import link_scene, summarise_links
+    from flcav.storage.files import check_writable, write_bytes
+
+    if map_ is not None:
+        check_writable(map_.parent)
+    settings = NetworkSettings() if network is None else read_config(NetworkSettings, network)
+    recorded = link_scene(Dataset.open(folder), settings.radio, pole, scene, seed)
+    links, found = recorded.links, summarise_links(recorded.links)
+    if map_ is not None:
+        from flcav.report import style
+        from flcav.report.pictures.coverage import coverage_map
+
+        covered = cover_town(recorded.town, recorded.units, settings.radio)
+        write_bytes(map_, style.png(coverage_map(recorded.town, covered, recorded.paths, links)))
+    rates = links.rate_bps / 1e6
+    states = {-1: None, **{int(state): state.name for state in PathState}}
+    rows = []
+    for row in found:
+        at = (slice(None), links.vehicle.index(row.vehicle), links.unit.index(row.unit))
+        series = {
+            "rate_mbps": rates[at].tolist(),
+            "distance_m": links.distance_m[at].tolist(),
+            "state": [states[state] for state in links.state[at].tolist()],
+        }
+        rows.append({**asdict(row), **series})
+    yield {"scene": recorded.scene, "town": recorded.town.name, "time_s": links.time_s.tolist(), "links": rows}
+    span_s = links.time_s[-1] - links.time_s[0]
+    yield f"{recorded.scene}: {len(links.time_s)} instants over {span_s:g} s in {recorded.town.name}"
+    for row in found:
+        rate = f"{row.mean_mbps:.1f} Mbit/s on average, {row.least_mbps:.1f} to {row.most_mbps:.1f}"
+        shares = f"LOS {row.los:.0%}, NLOSv {row.nlosv:.0%}, NLOS {row.nlos:.0%}"
+        yield f"    {row.vehicle} at {row.unit}: {rate}; {shares}; {row.nearest_m:.0f} to {row.farthest_m:.0f} m"
+    if map_ is not None:
+        yield f"{map_}: rate by place in {recorded.town.name}"
+
 
 BYTES_PER_MB = 1_000_000
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(rounds)
-
-
+@answer_json
 def rounds(
     folder: Path = typer.Argument(metavar="DIR", help="A dataset."),
     model_mb: float = typer.Option(
@@ -53,8 +119,7 @@ def rounds(
     seed: int = SEED,
     out: Path | None = typer.Option(None, "--out", help="Parquet file: a row per vehicle and round."),
     timeline: Path | None = typer.Option(None, "--timeline", callback=check_png, help="PNG file: who did what when."),
-    as_json: bool = typer.Option(False, "--json", help="Print one JSON object."),
-) -> None:
+) -> Answer:
     """Simulate the clock of federated rounds among a recording's connected vehicles.
 
     Each vehicle downloads the model from the nearest roadside unit, trains, and uploads its update, at the rate that it
@@ -92,13 +157,11 @@ def rounds(
         from flcav.report.charts.timeline import timeline_of_rounds
 
         write_bytes(timeline, style.png(timeline_of_rounds(records)))
-    if as_json:
-        print_json({"rounds": [asdict(record) for record in records]})
-        return
+    yield {"rounds": [asdict(record) for record in records]}
     for record in records:
         wire = record.wireline_down_s + record.wireline_up_s
         last = "nobody's update arrived" if record.straggler is None else f"{record.straggler.client} was last"
-        echo(
+        yield (
             f"round {record.round}: {record.end_s - record.start_s:.2f} s"
             + (f", {wire:.2f} s of them wireline" if wire else "")
             + f"; {len(record.finished)} of {len(record.clients)} updates arrived, {last}"
@@ -108,7 +171,7 @@ def rounds(
                 f"download {client.download_s:.2f} s, compute {client.compute_s:.2f} s, upload {client.upload_s:.2f} s"
             )
             lost = f"; dropped at {client.end_s:.2f} s, {client.dropped}" if client.dropped else ""
-            echo(f"    {client.client} at {client.server}: {spent}{lost}")
+            yield f"    {client.client} at {client.server}: {spent}{lost}"
     for path in (out, timeline):
         if path is not None:
-            echo(f"{path}: {plural(len(records), 'round')}")
+            yield f"{path}: {plural(len(records), 'round')}"

@@ -1,1 +1,0 @@
-"""Commands about datasets: record, validate, view, draw, export."""

@@ -1,0 +1,1 @@
+"""Commands about operational design domains, and about drives in them."""

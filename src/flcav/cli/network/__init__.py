@@ -1,1 +1,0 @@
-"""Commands about the network between vehicles, edge servers and the cloud."""

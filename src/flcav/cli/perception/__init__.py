@@ -1,1 +1,0 @@
-"""Commands about perception tasks: train, evaluate, infer, register errors."""
