@@ -26,16 +26,16 @@ from flwr.proto.fleet_pb2 import PullMessagesRequest
 from flwr.proto.message_pb2 import PushObjectRequest
 from flwr.proto.node_pb2 import Node
 
-from flcav.federation.fleet.authority import found_authority, open_registry
-from flcav.federation.fleet.forwarder import vehicle_tls
-from flcav.federation.fleet.keys import AUTHORITY, KEY, LOOPBACK, load_key, request_certificate
-from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.fleet.up import VEHICLES
-from flcav.federation.fleet.vehicle import load_settings
 from flcav.federation.messages.records import to_arrays
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.deployed import Deployment, start_fleet
 from flcav.federation.trainable import LocalUpdate
+from flcav.fleet.authority import found_authority, open_registry
+from flcav.fleet.forwarder import vehicle_tls
+from flcav.fleet.keys import AUTHORITY, KEY, LOOPBACK, load_key, request_certificate
+from flcav.fleet.supervisor import read_processes
+from flcav.fleet.up import VEHICLES
+from flcav.fleet.vehicle import load_settings
 
 REGISTERED, CALLS, ROUNDS = 10_000, 30, 6
 MEGABYTES = 4.0  # of the model
@@ -64,7 +64,7 @@ def measure_registry(folder: Path) -> None:
     """Print what a register, a revoke and a list take as the registry grows to `REGISTERED` vehicles."""
     authority = found_authority(folder / "fleet")
     requests = [request_certificate(folder / f"{number}", f"v{number:05d}") for number in range(50)]
-    from flcav.federation.fleet.registry import Vehicle
+    from flcav.fleet.registry import Vehicle
 
     end = int(time.time()) + 10**6
     with authority.registry._change() as cursor:

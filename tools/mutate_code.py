@@ -32,7 +32,7 @@ FLEET = [f"{FEDERATION}/test_fleet_*.py", f"{FEDERATION}/test_vehicle_app.py", f
 PACKAGES: dict[str, tuple[list[str], list[str]]] = {  # name: (sources, tests)
     "messages": (["federation/messages"], [FEDERATION, "tests/contract/test_strategies.py"]),
     "secure": (["federation/secure", "federation/masked_rounds.py"], [FEDERATION]),
-    "fleet": (["federation/fleet"], FLEET),
+    "fleet": (["fleet"], FLEET),
     "runtimes": (["federation/runtimes"], [FEDERATION]),
     "privacy": (["federation/privacy.py", "federation/noise.py"], [FEDERATION]),
     "releases": (["releases"], ["tests/unit/releases"]),

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from waiting import LONGEST_S, wait_for
 
-from flcav.federation.fleet.authority import open_authority
-from flcav.federation.fleet.bundle import TRUSTED
-from flcav.federation.fleet.install import install_vehicle
-from flcav.federation.fleet.keys import AUTHORITY, request_certificate
-from flcav.federation.fleet.status import read_status
-from flcav.federation.fleet.up import read_ready
+from flcav.fleet.authority import open_authority
+from flcav.fleet.bundle import TRUSTED
+from flcav.fleet.install import install_vehicle
+from flcav.fleet.keys import AUTHORITY, request_certificate
+from flcav.fleet.status import read_status
+from flcav.fleet.up import read_ready
 
 HERE = Path(__file__).parent
 NAME = "without-clock"  # after all others: no federation of other tests has it

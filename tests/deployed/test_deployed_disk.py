@@ -10,11 +10,11 @@ import pytest
 from run_walkers import walk
 from waiting import LONGEST_S
 
-from flcav.federation.fleet.authority import found_authority
-from flcav.federation.fleet.status import LEAST_ROOM, read_status
-from flcav.federation.fleet.supervisor import LOGS
-from flcav.federation.fleet.up import VEHICLES
 from flcav.federation.runtimes.deployed import Deployment, fleet_up
+from flcav.fleet.authority import found_authority
+from flcav.fleet.status import LEAST_ROOM, read_status
+from flcav.fleet.supervisor import LOGS
+from flcav.fleet.up import VEHICLES
 
 COUNT, FULL_S = 2, 6.0
 LATE = "vehicle-002"

@@ -22,10 +22,11 @@ from flwr.proto.node_pb2 import Node
 from waiting import LONGEST_S, wait_for
 
 from flcav.config import InputError
-from flcav.federation.fleet import bundle
-from flcav.federation.fleet.authority import found_authority, open_authority
-from flcav.federation.fleet.forwarder import send_request
-from flcav.federation.fleet.keys import (
+from flcav.fleet import bundle
+from flcav.fleet.authority import found_authority, open_authority
+from flcav.fleet.fl_request import PATH, make_request
+from flcav.fleet.forwarder import send_request
+from flcav.fleet.keys import (
     AUTHORITY,
     CERTIFICATE,
     KEY,
@@ -33,11 +34,10 @@ from flcav.federation.fleet.keys import (
     request_certificate,
     take_certificate,
 )
-from flcav.federation.fleet.status import read_status
-from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.fleet.traffic import read_traffic
-from flcav.federation.fleet.up import VEHICLES, read_ready
-from flcav.federation.messages.fl_request import PATH, make_request
+from flcav.fleet.status import read_status
+from flcav.fleet.supervisor import read_processes
+from flcav.fleet.traffic import read_traffic
+from flcav.fleet.up import VEHICLES, read_ready
 
 PROTOBUF = {"content-type": "application/protobuf", "accept": "application/protobuf"}
 
@@ -193,7 +193,7 @@ def test_unregistered(deployment, authority, tmp_path):
     """A certificate that the authority has signed, and that is in no registry: as after a loss of the registry."""
     other = found_authority(tmp_path / "other")
     request = request_certificate(tmp_path / "v", "unknown")
-    from flcav.federation.fleet.authority import Authority
+    from flcav.fleet.authority import Authority
 
     forged = Authority(tmp_path / "other", authority.key, authority.certificate, other.registry)
     take_certificate(tmp_path / "v", forged.register(request), (deployment.folder / AUTHORITY).read_bytes())

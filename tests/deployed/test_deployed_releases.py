@@ -17,14 +17,14 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.federation.fleet.authority import open_authority
-from flcav.federation.fleet.keys import AUTHORITY, request_certificate, take_certificate
-from flcav.federation.fleet.releases.offer import LARGEST_FILE, read_reports
-from flcav.federation.fleet.status import read_status
-from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.fleet.up import VEHICLES, read_ready
-from flcav.federation.fleet.vehicle import VehicleSettings
-from flcav.federation.messages.release_report import LARGEST, RELEASES, REPORT, ReleaseReport, ShadowReport
+from flcav.fleet.authority import open_authority
+from flcav.fleet.keys import AUTHORITY, request_certificate, take_certificate
+from flcav.fleet.release_report import LARGEST, RELEASES, REPORT, ReleaseReport, ShadowReport
+from flcav.fleet.releases.offer import LARGEST_FILE, read_reports
+from flcav.fleet.status import read_status
+from flcav.fleet.supervisor import read_processes
+from flcav.fleet.up import VEHICLES, read_ready
+from flcav.fleet.vehicle import VehicleSettings
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network

@@ -13,16 +13,16 @@ from fleet_clients import Walker
 from test_deployed_refusals import activate, reach
 from waiting import wait_for
 
-from flcav.federation.fleet.authority import REGISTRY, open_authority
-from flcav.federation.fleet.keys import KEY, load_key
-from flcav.federation.fleet.status import read_status
-from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.fleet.up import VEHICLES
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import ReplyLimits, Rules
 from flcav.federation.runtimes import deployed_grid
 from flcav.federation.runtimes.deployed import start_fleet
 from flcav.federation.state import FederationState
+from flcav.fleet.authority import REGISTRY, open_authority
+from flcav.fleet.keys import KEY, load_key
+from flcav.fleet.status import read_status
+from flcav.fleet.supervisor import read_processes
+from flcav.fleet.up import VEHICLES
 
 SCHEDULE = Schedule(3, 2, 0.1, 0.05, 7)
 

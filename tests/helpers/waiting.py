@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from flcav.federation.fleet.traffic import TRAFFIC, Traffic, read_traffic
+from flcav.fleet.traffic import TRAFFIC, Traffic, read_traffic
 
 Found = TypeVar("Found")
 LONGEST_S = 900.0  # that anything takes on a busy machine

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from waiting import read_all_traffic
 
-from flcav.federation.fleet.status import read_status
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.deployed import start_fleet
 from flcav.federation.runtimes.metered import Account
+from flcav.fleet.status import read_status
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 CLIENTS = Path(__file__).parents[1] / "deployed"  # `make test-deployed` has the other tests of a fleet

@@ -15,8 +15,6 @@ from flwr.app import ConfigRecord, Context, Error, Message, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.federation.attendance import ClientFailed
-from flcav.federation.fleet.authority import found_authority, open_registry
-from flcav.federation.fleet.keys import AUTHORITY, request_certificate, take_certificate
 from flcav.federation.messages.records import ASK, LOST_BY_NETWORK, OVER_BUDGET, to_arrays
 from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
@@ -33,6 +31,8 @@ from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.strategy import Strategy
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.fleet.authority import found_authority, open_registry
+from flcav.fleet.keys import AUTHORITY, request_certificate, take_certificate
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 
 START = {"w": np.zeros((4, 3), np.float32), "b": np.zeros(700)}

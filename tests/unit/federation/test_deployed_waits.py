@@ -11,14 +11,14 @@ import pytest
 from flwr.app import ArrayRecord, ConfigRecord, Error, Message, MessageType, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.fleet.authority import found_authority
-from flcav.federation.fleet.keys import request_certificate
-from flcav.federation.fleet.status import PROGRESS, Followed, FollowedRound
 from flcav.federation.messages.records import LOST_BY_NETWORK
 from flcav.federation.runtimes import deployed_grid
 from flcav.federation.runtimes.deployed_grid import ALLOWANCE_S, RAISED, DeployedGrid
 from flcav.federation.runtimes.embedded import keep_identity
 from flcav.federation.runtimes.metered import open_account
+from flcav.fleet.authority import found_authority
+from flcav.fleet.keys import request_certificate
+from flcav.fleet.status import PROGRESS, Followed, FollowedRound
 
 NAMES = {1: "town/cav1", 2: "town/cav2", 3: "town/cav3"}
 SILENT = 2

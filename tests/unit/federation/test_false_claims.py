@@ -8,14 +8,14 @@ import pytest
 from flwr.app import Array, ConfigRecord, RecordDict
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import AUTHORITY, REGISTRY, found_authority
-from flcav.federation.fleet.relay import Refused
-from flcav.federation.fleet.releases.service import RELEASES, answer_release
 from flcav.federation.messages.acceptance import ReplyRefused
 from flcav.federation.messages.records import to_numpy
-from flcav.federation.messages.release_report import MOST, ShadowReport
 from flcav.federation.secure.messages import ASK, CIPHERS, MASKS, NAMES, SHARES, read_keys, read_shares
 from flcav.federation.secure.parties import SecureClient
+from flcav.fleet.authority import AUTHORITY, REGISTRY, found_authority
+from flcav.fleet.relay import Refused
+from flcav.fleet.release_report import MOST, ShadowReport
+from flcav.fleet.releases.service import RELEASES, answer_release
 
 
 @pytest.mark.parametrize("bad", [CIPHERS, MASKS])

@@ -10,8 +10,8 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import found_authority, open_authority, open_registry
-from flcav.federation.fleet.keys import (
+from flcav.fleet.authority import found_authority, open_authority, open_registry
+from flcav.fleet.keys import (
     AUTHORITY,
     CERTIFICATE,
     FLOWER_KEY,
@@ -22,7 +22,7 @@ from flcav.federation.fleet.keys import (
     request_certificate,
     take_certificate,
 )
-from flcav.federation.fleet.registry import Vehicle
+from flcav.fleet.registry import Vehicle
 
 
 @pytest.fixture

@@ -18,15 +18,15 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from flcav.cli.main import run as command
-from flcav.federation.fleet import authority
-from flcav.federation.fleet.authority import open_authority, open_registry
-from flcav.federation.fleet.keys import request_certificate, take_certificate
-from flcav.federation.fleet.page import make_page
-from flcav.federation.fleet.releases.offer import KeptReport
-from flcav.federation.fleet.status import Followed, FollowedRound, read_status
-from flcav.federation.fleet.traffic import Traffic
-from flcav.federation.fleet.vehicle import VehicleSettings
-from flcav.federation.messages.release_report import ReleaseReport
+from flcav.fleet import authority
+from flcav.fleet.authority import open_authority, open_registry
+from flcav.fleet.keys import request_certificate, take_certificate
+from flcav.fleet.page import make_page
+from flcav.fleet.release_report import ReleaseReport
+from flcav.fleet.releases.offer import KeptReport
+from flcav.fleet.status import Followed, FollowedRound, read_status
+from flcav.fleet.traffic import Traffic
+from flcav.fleet.vehicle import VehicleSettings
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 
-from flcav.federation.fleet.authority import found_authority
-from flcav.federation.fleet.keys import CERTIFICATE, load_key, public_der, request_certificate, take_certificate
-from flcav.federation.fleet.proxy import describe_clock, find_caller, node_key
-from flcav.federation.fleet.registry import Vehicle
+from flcav.fleet.authority import found_authority
+from flcav.fleet.keys import CERTIFICATE, load_key, public_der, request_certificate, take_certificate
+from flcav.fleet.proxy import describe_clock, find_caller, node_key
+from flcav.fleet.registry import Vehicle
 
 
 @pytest.fixture

@@ -3,8 +3,8 @@
 import httpx
 import pytest
 
-from flcav.federation.fleet.proxy import FleetProxy
-from flcav.federation.fleet.traffic import Traffic, read_traffic
+from flcav.fleet.proxy import FleetProxy
+from flcav.fleet.traffic import Traffic, read_traffic
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import found_authority
-from flcav.federation.fleet.up import READY, Ready
-from flcav.federation.messages.fl_request import make_request
 from flcav.federation.runtimes import deployed
 from flcav.federation.runtimes.deployed import Deployment, RegionalDeployment
+from flcav.fleet.authority import found_authority
+from flcav.fleet.fl_request import make_request
+from flcav.fleet.up import READY, Ready
 from flcav.storage.files import write_json
 
 

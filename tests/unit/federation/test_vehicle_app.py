@@ -15,9 +15,6 @@ from flwr.common.serde import recorddict_to_proto
 from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import SERVER, SERVER_KEY, found_authority
-from flcav.federation.fleet.keys import AUTHORITY, load_key, request_certificate, take_certificate
-from flcav.federation.fleet.vehicle import VehicleSettings
 from flcav.federation.messages.conduct import recall_answered
 from flcav.federation.messages.records import (
     ARRAYS,
@@ -40,6 +37,9 @@ from flcav.federation.secure.parties import SecureClient
 from flcav.federation.strategies import strategy_named
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import LocalUpdate
+from flcav.fleet.authority import SERVER, SERVER_KEY, found_authority
+from flcav.fleet.keys import AUTHORITY, load_key, request_certificate, take_certificate
+from flcav.fleet.vehicle import VehicleSettings
 from flcav.perception.distillation import SentOutputs
 
 TRAINED: list[int] = []

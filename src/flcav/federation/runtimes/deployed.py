@@ -17,13 +17,6 @@ from flwr.app import Message
 
 from flcav.config import InputError
 from flcav.federation.client import client_app
-from flcav.federation.fleet.authority import found_authority, open_registry
-from flcav.federation.fleet.keys import AUTHORITY
-from flcav.federation.fleet.registry import Vehicle
-from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost, locked
-from flcav.federation.fleet.supervisor import LOGS, end_with_parent
-from flcav.federation.fleet.up import READY, VEHICLES, read_ready
-from flcav.federation.messages.fl_request import parse_request
 from flcav.federation.noise import Secret
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.deployed_grid import POLL_S, STARTING_S, DeployedGrid
@@ -34,6 +27,13 @@ from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.federation.state import ClientStates
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable
+from flcav.fleet.authority import found_authority, open_registry
+from flcav.fleet.fl_request import parse_request
+from flcav.fleet.keys import AUTHORITY
+from flcav.fleet.registry import Vehicle
+from flcav.fleet.superlink import SuperLink, SuperLinkLost, locked
+from flcav.fleet.supervisor import LOGS, end_with_parent
+from flcav.fleet.up import READY, VEHICLES, read_ready
 
 SERVING = "serving.lock"  # in a fleet's folder: held by the federation that it serves
 STARTING_VEHICLE_S = 15.0  # more for each vehicle, which may all be on a busy machine

@@ -20,16 +20,16 @@ from flwr.app import ConfigRecord, Error, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import load_certificate, open_registry
-from flcav.federation.fleet.registry import Vehicle
-from flcav.federation.fleet.status import Followed, FollowedRound
-from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
-from flcav.federation.fleet.traffic import read_traffic
 from flcav.federation.messages.records import GRANT, GRANTED, LOST_BY_NETWORK, OVER_BUDGET, read_arrays
 from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.federation.state import ClientStates, RoundRecord
+from flcav.fleet.authority import load_certificate, open_registry
+from flcav.fleet.registry import Vehicle
+from flcav.fleet.status import Followed, FollowedRound
+from flcav.fleet.superlink import SuperLink, SuperLinkLost
+from flcav.fleet.traffic import read_traffic
 from flcav.interface.wording import make_printable
 from flcav.network.ledger import BudgetExceeded
 

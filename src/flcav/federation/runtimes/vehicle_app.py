@@ -21,8 +21,6 @@ from flwr.proto.recorddict_pb2 import RecordDict as ProtoRecordDict
 
 from flcav.config import InputError
 from flcav.federation.client import OWN, OWN_DIGESTS, PARTITION, client_app
-from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, KEY, check_certificate, load_key, write_private
-from flcav.federation.fleet.vehicle import FOLDER, SETTINGS, load_settings
 from flcav.federation.messages.conduct import Requests
 from flcav.federation.messages.records import GRANT, GRANTED, OVER_BUDGET, read_arrays, to_arrays
 from flcav.federation.noise import Secret
@@ -32,6 +30,8 @@ from flcav.federation.runtimes.embedded import wire_bytes
 from flcav.federation.secure.certified import Identity
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable, Weights
+from flcav.fleet.keys import AUTHORITY, CERTIFICATE, KEY, check_certificate, load_key, write_private
+from flcav.fleet.vehicle import FOLDER, SETTINGS, load_settings
 from flcav.plugins import load_named
 
 ASSIGNMENT, STATE = "assignment.pickle", "state.bin"

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.federation.fleet.authority import open_registry
-from flcav.federation.fleet.releases.offer import KeptReport, Offer, read_reports
-from flcav.federation.fleet.traffic import read_traffic
-from flcav.federation.fleet.up import VEHICLES, read_ready
+from flcav.fleet.authority import open_registry
+from flcav.fleet.releases.offer import KeptReport, Offer, read_reports
+from flcav.fleet.traffic import read_traffic
+from flcav.fleet.up import VEHICLES, read_ready
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.releases.candidates.candidate import Candidate

@@ -19,11 +19,11 @@ from pathlib import Path
 import httpx
 
 from flcav.config import InputError, read_json
-from flcav.federation.fleet.forwarder import vehicle_tls
-from flcav.federation.fleet.keys import REQUEST, read_request, requested_name
-from flcav.federation.fleet.supervisor import end_with_parent
-from flcav.federation.fleet.vehicle import load_settings
-from flcav.federation.messages.release_report import RELEASES, REPORT, ReleaseReport, ShadowReport
+from flcav.fleet.forwarder import vehicle_tls
+from flcav.fleet.keys import REQUEST, read_request, requested_name
+from flcav.fleet.release_report import RELEASES, REPORT, ReleaseReport, ShadowReport
+from flcav.fleet.supervisor import end_with_parent
+from flcav.fleet.vehicle import load_settings
 from flcav.releases.vehicles.checking import Sources, trust_roots, trusts_roots
 from flcav.releases.vehicles.fetching import CertifiedFetcher
 from flcav.releases.vehicles.installation import (

@@ -36,9 +36,9 @@ from flwr.supercore.runtime import RuntimeHttpClient
 from flwr.supercore.task_identity import TaskIdentity
 from flwr.superlink.grid import HttpGrid
 
-from flcav.federation.fleet.bundle import build_bundle, sign_bundle
-from flcav.federation.fleet.keys import AUTHORITY, public_pem
-from flcav.federation.fleet.registry import Registry
+from flcav.fleet.bundle import build_bundle, sign_bundle
+from flcav.fleet.keys import AUTHORITY, public_pem
+from flcav.fleet.registry import Registry
 
 SECRET, DATABASE = "executor.secret", "superlink.sqlite"  # in the fleet's folder
 ACQUIRE = frozenset({"/flwr.proto.Runtime/AcquireTask"})

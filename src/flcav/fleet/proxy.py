@@ -23,11 +23,13 @@ from cryptography.hazmat.primitives.serialization import load_pem_public_key
 from starlette.types import Message, Receive, Scope, Send
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import REGISTRY, SERVER, SERVER_KEY, open_registry
-from flcav.federation.fleet.keys import AUTHORITY, public_der
-from flcav.federation.fleet.mutual_tls import CERTIFICATE, CONNECTION, IN_ALL, Connection, serve_https
-from flcav.federation.fleet.registry import Registry, Vehicle
-from flcav.federation.fleet.relay import (
+from flcav.fleet.authority import REGISTRY, SERVER, SERVER_KEY, open_registry
+from flcav.fleet.fl_request import LARGEST, check_age, parse_request
+from flcav.fleet.fl_request import PATH as REQUEST_PATH
+from flcav.fleet.keys import AUTHORITY, public_der
+from flcav.fleet.mutual_tls import CERTIFICATE, CONNECTION, IN_ALL, Connection, serve_https
+from flcav.fleet.registry import Registry, Vehicle
+from flcav.fleet.relay import (
     CALLS,
     FLEET,
     NODE_KEY,
@@ -45,11 +47,9 @@ from flcav.federation.fleet.relay import (
     read_body,
     relay,
 )
-from flcav.federation.fleet.releases.service import answer_release
-from flcav.federation.fleet.traffic import Traffic, read_traffic
-from flcav.federation.messages.fl_request import LARGEST, check_age, parse_request
-from flcav.federation.messages.fl_request import PATH as REQUEST_PATH
-from flcav.federation.messages.release_report import RELEASES
+from flcav.fleet.release_report import RELEASES
+from flcav.fleet.releases.service import answer_release
+from flcav.fleet.traffic import Traffic, read_traffic
 from flcav.interface.wording import make_printable
 
 OLDEST_S = 300.0  # of a signature that Flower accepts

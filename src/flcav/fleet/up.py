@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import SERVER, SERVER_KEY, VEHICLE_DAYS, Authority, open_authority, open_registry
-from flcav.federation.fleet.bundle import PUBLISHER_KEY, TRUSTED, make_publisher
-from flcav.federation.fleet.keys import (
+from flcav.fleet.authority import SERVER, SERVER_KEY, VEHICLE_DAYS, Authority, open_authority, open_registry
+from flcav.fleet.bundle import PUBLISHER_KEY, TRUSTED, make_publisher
+from flcav.fleet.keys import (
     AUTHORITY,
     CERTIFICATE,
     REQUEST,
@@ -23,10 +23,10 @@ from flcav.federation.fleet.keys import (
     take_certificate,
     write_private,
 )
-from flcav.federation.fleet.proxy import run_proxy
-from flcav.federation.fleet.superlink import DATABASE, SECRET, SuperLink, SuperLinkLost
-from flcav.federation.fleet.supervisor import LOGS, supervise
-from flcav.federation.fleet.vehicle import SETTINGS, Prepare, VehicleSettings, vehicle_processes
+from flcav.fleet.proxy import run_proxy
+from flcav.fleet.superlink import DATABASE, SECRET, SuperLink, SuperLinkLost
+from flcav.fleet.supervisor import LOGS, supervise
+from flcav.fleet.vehicle import SETTINGS, Prepare, VehicleSettings, vehicle_processes
 from flcav.interface.wording import plural
 from flcav.storage.files import write_bytes, write_json
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flcav.config import read_json
-from flcav.federation.messages.release_report import ReleaseReport
+from flcav.fleet.release_report import ReleaseReport
 from flcav.interface.wording import make_printable
 from flcav.storage.files import write_json
 from flcav.storage.records import Record

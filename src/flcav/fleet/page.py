@@ -13,8 +13,8 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 from starlette.routing import Route
 
-from flcav.federation.fleet.status import read_status
-from flcav.federation.fleet.up import check_port
+from flcav.fleet.status import read_status
+from flcav.fleet.up import check_port
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self'"
 PAGE = """<!doctype html>

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from starlette.types import Receive, Scope, Send
 
-from flcav.federation.fleet.relay import Refused, answer, read_body, send_file
-from flcav.federation.fleet.releases.offer import KeptReport, find_offered
-from flcav.federation.messages.release_report import LARGEST, RELEASES, REPORT, parse_report
+from flcav.fleet.relay import Refused, answer, read_body, send_file
+from flcav.fleet.release_report import LARGEST, RELEASES, REPORT, parse_report
+from flcav.fleet.releases.offer import KeptReport, find_offered
 
 
 async def answer_release(

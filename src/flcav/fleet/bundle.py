@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ed25519
 from flwr.cli.build import build_fab_from_files
 
 from flcav.config import InputError
-from flcav.federation.fleet.keys import write_private
+from flcav.fleet.keys import write_private
 from flcav.storage.files import write_bytes
 
 PUBLISHER_KEY, TRUSTED = "publisher.key", "trusted.yaml"

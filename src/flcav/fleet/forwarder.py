@@ -11,9 +11,10 @@ import httpx
 from starlette.types import Receive, Scope, Send
 
 from flcav.config import InputError
-from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, KEY, LOOPBACK, LOOPBACK_KEY
-from flcav.federation.fleet.mutual_tls import serve_https
-from flcav.federation.fleet.relay import (
+from flcav.fleet.fl_request import PATH, FLRequest
+from flcav.fleet.keys import AUTHORITY, CERTIFICATE, KEY, LOOPBACK, LOOPBACK_KEY
+from flcav.fleet.mutual_tls import serve_https
+from flcav.fleet.relay import (
     CALLS,
     FLEET,
     NODE_KEY,
@@ -28,7 +29,6 @@ from flcav.federation.fleet.relay import (
     read_body,
     relay,
 )
-from flcav.federation.messages.fl_request import PATH, FLRequest
 from flcav.interface.wording import make_printable
 
 LIMITS = httpx.Limits(max_connections=8)  # to the proxy, which lets a vehicle have twice as many

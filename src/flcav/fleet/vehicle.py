@@ -14,10 +14,10 @@ from functools import partial
 from pathlib import Path
 
 from flcav.config import InputError
-from flcav.federation.fleet.bundle import TRUSTED
-from flcav.federation.fleet.keys import FLOWER_KEY, LOOPBACK, LOOPBACK_KEY, make_loopback, write_private
-from flcav.federation.fleet.superlink import ACQUIRE, SECRET
-from flcav.federation.fleet.supervisor import end_with_parent
+from flcav.fleet.bundle import TRUSTED
+from flcav.fleet.keys import FLOWER_KEY, LOOPBACK, LOOPBACK_KEY, make_loopback, write_private
+from flcav.fleet.superlink import ACQUIRE, SECRET
+from flcav.fleet.supervisor import end_with_parent
 from flcav.storage.files import write_json
 
 SETTINGS, FOLDER = "vehicle.json", "FLCAV_VEHICLE"  # the second: environment variable of the app
@@ -62,7 +62,7 @@ def vehicle_processes(
     own = load_settings(folder)
 
     def forward() -> None:
-        from flcav.federation.fleet.forwarder import run_forwarder
+        from flcav.fleet.forwarder import run_forwarder
 
         run_forwarder(folder, own.forwarder_port, own.server)
 

@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from flcav.config import InputError
-from flcav.federation.fleet.keys import (
+from flcav.fleet.keys import (
     AUTHORITY,
     certificate_of,
     load_key,
@@ -25,7 +25,7 @@ from flcav.federation.fleet.keys import (
     requested_name,
     write_private,
 )
-from flcav.federation.fleet.registry import BUSY_S, Registry, Vehicle
+from flcav.fleet.registry import BUSY_S, Registry, Vehicle
 from flcav.storage.files import write_bytes
 
 AUTHORITY_KEY, REGISTRY = "ca.key", "registry.sqlite"

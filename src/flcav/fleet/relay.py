@@ -28,8 +28,8 @@ from flwr.proto.run_pb2 import GetRunRequest
 from google.protobuf.message import DecodeError, Message
 from starlette.types import Receive, Scope, Send
 
-from flcav.federation.fleet.keys import public_pem
-from flcav.federation.fleet.registry import Vehicle
+from flcav.fleet.keys import public_pem
+from flcav.fleet.registry import Vehicle
 
 FLEET = "/v1/fleet/"
 CALLS: Mapping[str, type[Message]] = {

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Annotated
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import open_registry
-from flcav.federation.fleet.releases.offer import read_reports
-from flcav.federation.fleet.superlink import SuperLink, SuperLinkLost
-from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.fleet.traffic import Crossed, read_traffic
-from flcav.federation.fleet.up import read_ready
-from flcav.federation.messages.fl_request import FLRequest, parse_request
-from flcav.federation.messages.release_report import ReleaseReport
+from flcav.fleet.authority import open_registry
+from flcav.fleet.fl_request import FLRequest, parse_request
+from flcav.fleet.release_report import ReleaseReport
+from flcav.fleet.releases.offer import read_reports
+from flcav.fleet.superlink import SuperLink, SuperLinkLost
+from flcav.fleet.supervisor import read_processes
+from flcav.fleet.traffic import Crossed, read_traffic
+from flcav.fleet.up import read_ready
 from flcav.interface.wording import make_printable, plural
 from flcav.storage.files import write_bytes
 from flcav.storage.records import LEFT_OUT, WHERE_TRUE, Record

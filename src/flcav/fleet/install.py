@@ -6,10 +6,10 @@ from pathlib import Path
 import yaml
 
 from flcav.config import InputError
-from flcav.federation.fleet.bundle import TRUSTED
-from flcav.federation.fleet.keys import take_certificate
-from flcav.federation.fleet.up import check_port
-from flcav.federation.fleet.vehicle import VehicleSettings
+from flcav.fleet.bundle import TRUSTED
+from flcav.fleet.keys import take_certificate
+from flcav.fleet.up import check_port
+from flcav.fleet.vehicle import VehicleSettings
 from flcav.plugins import PLACE
 from flcav.storage.files import write_bytes
 
