@@ -26,10 +26,10 @@ from flwr.proto.fleet_pb2 import PullMessagesRequest
 from flwr.proto.message_pb2 import PushObjectRequest
 from flwr.proto.node_pb2 import Node
 
-from flcav.federation.messages.records import to_arrays
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.deployed import Deployment, start_fleet
+from flcav.federation.links.flower import Deployment, start_fleet
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
+from flcav.federation.wire import to_arrays
 from flcav.fleet.authority import found_authority, open_registry
 from flcav.fleet.forwarder import vehicle_tls
 from flcav.fleet.keys import AUTHORITY, KEY, LOOPBACK, load_key, request_certificate
@@ -145,7 +145,7 @@ def main() -> None:
     record = RecordDict({"arrays": to_arrays(weights)})
     turn = lambda: recorddict_from_proto(recorddict_to_proto(record))  # noqa: E731
     print(f"serialise {MEGABYTES:g} MB and read it: {1e3 * seconds(turn, 5):.0f} ms")
-    start = [sys.executable, "-c", "import flcav.federation.runtimes.vehicle_app, flwr.supernode.runtime.run_clientapp"]
+    start = [sys.executable, "-c", "import flcav.federation.links.vehicle_app, flwr.supernode.runtime.run_clientapp"]
     took = seconds(lambda: subprocess.run(start, check=True), 3)
     print(f"a process of Flower's for a message, without torch: {took:.1f} s")
     with start_fleet(1) as deployment:

@@ -31,10 +31,10 @@ FEDERATION = "tests/unit/federation"
 FLEET = [f"{FEDERATION}/test_fleet_*.py", f"{FEDERATION}/test_vehicle_app.py", f"{FEDERATION}/test_deadline.py"]
 PACKAGES: dict[str, tuple[list[str], list[str]]] = {  # name: (sources, tests)
     "messages": (["federation/messages"], [FEDERATION, "tests/contract/test_strategies.py"]),
-    "secure": (["federation/secure", "federation/masked_rounds.py"], [FEDERATION]),
+    "secure": (["federation/secure", "federation/modes/masked.py"], [FEDERATION]),
     "fleet": (["fleet"], FLEET),
     "runtimes": (["federation/runtimes"], [FEDERATION]),
-    "privacy": (["federation/privacy.py", "federation/noise.py"], [FEDERATION]),
+    "privacy": (["federation/privacy.py", "federation/privacy.py"], [FEDERATION]),
     "releases": (["releases"], ["tests/unit/releases"]),
     "carla": (["sources/carla/server"], ["tests/unit/sources/carla_server", "tests/integration/test_carla_server.py"]),
     "driving": (

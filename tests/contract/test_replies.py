@@ -8,18 +8,18 @@ import pytest
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 from pydantic import ValidationError
 
-from flcav.federation.messages.records import ARRAYS, ASK, METRICS, NORM, SHARES, VECTOR, to_arrays
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links import link as links
+from flcav.federation.links.metered import Account, BudgetedGrid
+from flcav.federation.links.wrapped import WrappedGrid
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes import link as links
-from flcav.federation.runtimes.metered import Account, BudgetedGrid
-from flcav.federation.runtimes.wrapped import WrappedGrid
-from flcav.federation.secure.shamir import SHARE_BYTES
+from flcav.federation.secure.primitives import SHARE_BYTES
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
-from flcav.federation.strategies.median import Median
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.corrections import Scaffold
+from flcav.federation.strategies.robust import Median
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.wire import ARRAYS, ASK, METRICS, NORM, SHARES, VECTOR, to_arrays
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 START = {"w": np.zeros((4, 3), np.float32), "g": np.zeros((64, 1), np.float32), "count": np.array(2)}

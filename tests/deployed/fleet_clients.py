@@ -44,8 +44,8 @@ class Liar(Walker):
 
     def train(self, weights, *, steps, learning_rate, seed, proximal=0.0, shift=None, centre=None, layers=()):
         from flcav.federation import client
-        from flcav.federation.messages.records import LOST_BY_NETWORK
-        from flcav.federation.runtimes import vehicle_app
+        from flcav.federation.links import vehicle_app
+        from flcav.federation.wire import LOST_BY_NETWORK
 
         if self.lie == "raises":
             raise OSError("no power")

@@ -10,7 +10,7 @@ import pytest
 from run_walkers import walk
 from waiting import LONGEST_S
 
-from flcav.federation.runtimes.deployed import Deployment, fleet_up
+from flcav.federation.links.flower import Deployment, fleet_up
 from flcav.fleet.authority import found_authority
 from flcav.fleet.status import LEAST_ROOM, read_status
 from flcav.fleet.supervisor import LOGS

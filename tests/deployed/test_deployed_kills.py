@@ -11,7 +11,7 @@ from fleet_clients import Walker
 from flwr.proto.control_pb2 import StartRunRequest
 from flwr.proto.fab_pb2 import Fab
 
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.strategies import strategy_named
 from flcav.fleet.bundle import build_bundle
 from flcav.fleet.superlink import DATABASE

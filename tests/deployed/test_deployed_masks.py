@@ -9,18 +9,18 @@ import pytest
 from fleet_clients import Imitator, Liar, Walker
 from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 
-from flcav.federation.messages.acceptance import Expected, read_masked
-from flcav.federation.messages.records import ARRAYS, ASK, CONFIG, LocalWork, to_arrays
-from flcav.federation.noise import draw_secret
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.acceptance import Expected, read_masked
+from flcav.federation.links.flower import Agreement
+from flcav.federation.links.flower_grid import DeployedGrid
+from flcav.federation.links.metered import Account, open_account
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.privacy import draw_secret
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.deployed import Agreement
-from flcav.federation.runtimes.deployed_grid import DeployedGrid
-from flcav.federation.runtimes.metered import Account, open_account
 from flcav.federation.secure.messages import SecureSum
 from flcav.federation.secure.parties import SecureClient
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, strategy_named
+from flcav.federation.wire import ARRAYS, ASK, CONFIG, LocalWork, to_arrays
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 NOISY = {"secure": {}, "privacy": {"where": "local", "clip": 1, "noise": 4}}

@@ -324,7 +324,7 @@ def test_tampered_app(deployment, tmp_path):
 
 def test_signed_app_runs(deployment, clients, weights):
     """What the tests before have refused does not keep the vehicles from their publisher's app."""
-    from flcav.federation.rounds import Schedule, federate
+    from flcav.federation.loop import Schedule, federate
 
     schedule = Schedule(1, 1, 0.1, 0.1, 3)
     expected, found = (federate(clients, weights, schedule, runtime=each).weights for each in (None, deployment))

@@ -13,10 +13,10 @@ from fleet_clients import Walker
 from test_deployed_refusals import activate, reach
 from waiting import wait_for
 
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links import flower_grid
+from flcav.federation.links.flower import start_fleet
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import ReplyLimits, Rules
-from flcav.federation.runtimes import deployed_grid
-from flcav.federation.runtimes.deployed import start_fleet
 from flcav.federation.state import FederationState
 from flcav.fleet.authority import REGISTRY, open_authority
 from flcav.fleet.keys import KEY, load_key
@@ -57,7 +57,7 @@ def follow(fleet, weights, clients, log, rules, in_second_round):
 
 def test_a_vehicle_that_hangs(fleet, weights, tmp_path, monkeypatch):
     """All its processes stop, so that it cannot keep the limit itself; the server's own ends the wait for it."""
-    monkeypatch.setattr(deployed_grid, "ALLOWANCE_S", 30.0)
+    monkeypatch.setattr(flower_grid, "ALLOWANCE_S", 30.0)
     log = tmp_path / "log"
     clients = {f"town/cav{n}": Walker(n + 1, log, lasts_s=2.0) for n in range(3)}
     stopped = []

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from waiting import read_all_traffic
 
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.deployed import start_fleet
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.flower import start_fleet
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.fleet.status import read_status
 from flcav.network.ledger import Ledger, LinkMegabytes
 

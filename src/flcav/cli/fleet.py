@@ -234,7 +234,7 @@ def up(
     port: int = typer.Option(0, "--port", min=0, max=65535, help="Port of the proxy; 0: a free one."),
 ) -> None:
     """Run the SuperLink and the proxy of a fleet until interrupted, and vehicles on this machine."""
-    from flcav.federation.runtimes.vehicle_app import prepare
+    from flcav.federation.links.vehicle_app import prepare
     from flcav.fleet.up import run_fleet
 
     run_fleet(folder, host, port, vehicles or 0, prepare, echo, _updater())
@@ -243,7 +243,7 @@ def up(
 @fleet.command("vehicle")
 def run_vehicle(folder: Path = typer.Argument(help="Folder of the vehicle, on the vehicle.")) -> None:
     """On a vehicle: run its forwarder, its node and its app until interrupted."""
-    from flcav.federation.runtimes.vehicle_app import prepare
+    from flcav.federation.links.vehicle_app import prepare
     from flcav.fleet.up import run_vehicle as run
 
     run(folder, prepare, _updater())

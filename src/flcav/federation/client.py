@@ -9,8 +9,8 @@ from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
-from flcav.federation.messages.acceptance import Expected, extra_forms, is_usable
-from flcav.federation.messages.conduct import (
+from flcav.federation.acceptance import Expected, extra_forms, is_usable
+from flcav.federation.conduct import (
     ANSWERED,
     RequestRefused,
     Requests,
@@ -18,8 +18,26 @@ from flcav.federation.messages.conduct import (
     keep_answered,
     recall_answered,
 )
-from flcav.federation.messages.encoding import encode, flatten, is_local
-from flcav.federation.messages.records import (
+from flcav.federation.privacy import Secret, change_norm, derive_key
+from flcav.federation.rules import RegionalModels, Rules
+from flcav.federation.secure.messages import answer_secretly, complain, mask_update
+from flcav.federation.secure.parties import Identity
+from flcav.federation.secure.primitives import to_integers
+from flcav.federation.strategies.fedmd import FedMD
+from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
+from flcav.federation.trainable import (
+    Accounts,
+    Correction,
+    LocalUpdate,
+    Trainable,
+    Update,
+    Weights,
+    answer_question,
+    count_samples,
+    learned_names,
+)
+from flcav.federation.upload import Arrays, subtract
+from flcav.federation.wire import (
     ARRAYS,
     ASK,
     CENTRE,
@@ -38,6 +56,9 @@ from flcav.federation.messages.records import (
     VECTOR,
     LocalWork,
     NoCount,
+    encode,
+    flatten,
+    is_local,
     read_arrays,
     refuse,
     reply,
@@ -45,26 +66,6 @@ from flcav.federation.messages.records import (
     to_arrays,
     to_metrics,
 )
-from flcav.federation.noise import Secret, derive_key
-from flcav.federation.privacy import change_norm
-from flcav.federation.rules import RegionalModels, Rules
-from flcav.federation.secure.certified import Identity
-from flcav.federation.secure.masks import to_integers
-from flcav.federation.secure.messages import answer_secretly, complain, mask_update
-from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
-from flcav.federation.trainable import (
-    Accounts,
-    Correction,
-    LocalUpdate,
-    Trainable,
-    Update,
-    Weights,
-    answer_question,
-    count_samples,
-    learned_names,
-)
-from flcav.federation.upload import Arrays, subtract
 from flcav.network.ledger import BudgetExceeded
 from flcav.statistics.streams import derive_seed
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flcav.federation.buffered_rounds import Buffers
+from flcav.federation.links.link import Runtime
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import EVERYBODY, Schedule, federate
+from flcav.federation.modes.buffered import Buffers
 from flcav.federation.privacy import count_affordable
-from flcav.federation.rounds import EVERYBODY, Schedule, federate
 from flcav.federation.rules import RegionalModels, Rules
-from flcav.federation.runtimes.link import Runtime
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.trainable import Distiller, LocalUpdate, Trainable, Weights

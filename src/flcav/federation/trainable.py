@@ -128,7 +128,7 @@ def count_samples(client: Trainable, steps: int) -> int:
 class Accounts(Protocol):
     """A client with a link of its own to clients, whose budget its training may exceed: an edge server."""
 
-    account: Any  # of that link, `flcav.federation.runtimes.metered.Account`
+    account: Any  # of that link, `flcav.federation.links.metered.Account`
 
 
 @runtime_checkable

@@ -34,7 +34,7 @@ serverapp = "flcav_vehicle.server:app"
 clientapp = "flcav_vehicle.client:app"
 [tool.flwr.app.config]
 """
-CLIENT = "from flcav.federation.runtimes.vehicle_app import make_vehicle_app\n\napp = make_vehicle_app()\n"
+CLIENT = "from flcav.federation.links.vehicle_app import make_vehicle_app\n\napp = make_vehicle_app()\n"
 SERVER = '''"""The server of a federation is the process that asks for it: flcav federate --runtime flower."""
 from flwr.serverapp import ServerApp
 

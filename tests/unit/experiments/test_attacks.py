@@ -32,8 +32,8 @@ from flcav.experiments.attacks.withstood import (
     run_rounds,
     train_clients,
 )
-from flcav.federation.reading import read_round
-from flcav.federation.rounds import Schedule
+from flcav.federation.curious_server import read_round
+from flcav.federation.loop import Schedule
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.statistics.seeds import OWN_SCENES
 

@@ -27,7 +27,7 @@ from flcav.experiments.exchanges.run import (
 )
 from flcav.experiments.exchanges.tables import tables
 from flcav.experiments.scales import shrink_recipe
-from flcav.federation.divergence import Divergence, RoundDivergence
+from flcav.federation.state import Divergence, RoundDivergence
 from flcav.federation.upload import name_like
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.network.radio.budget import Radio

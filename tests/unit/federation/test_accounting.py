@@ -17,16 +17,16 @@ from dp_accounting.pld import PLDAccountant
 from flwr.app import Context, Message
 
 from flcav.federation import client
-from flcav.federation.buffered_rounds import Buffers, take_turns
-from flcav.federation.messages.conduct import ANSWERED
-from flcav.federation.messages.records import VECTOR, read_arrays
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.conduct import ANSWERED
+from flcav.federation.links.metered import Account, Outage
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.modes.buffered import Buffers, take_turns
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.secure.parties import SecureClient
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.trainable import LocalUpdate, Update, Weights
+from flcav.federation.wire import VECTOR, read_arrays
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from flwr.app import Array, ArrayRecord
 
-from flcav.federation.messages.records import to_arrays, to_weights
-from flcav.federation.runtimes.blocks import SharedBlock
+from flcav.federation.links.processes import SharedBlock
 from flcav.federation.strategies.fedavg import BLOCK, RunningMean
+from flcav.federation.wire import to_arrays, to_weights
 
 RNG = np.random.default_rng(0)
 WEIGHTS = {

@@ -8,14 +8,14 @@ import pytest
 from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
-from flcav.federation.buffered_rounds import OVER_BUDGET, BrokenUpdate, BufferedRound, Buffers, take_turns
 from flcav.federation.edge_server import EdgeServer
+from flcav.federation.links.in_process import update_bytes
+from flcav.federation.links.metered import Account
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.modes.buffered import OVER_BUDGET, BrokenUpdate, BufferedRound, Buffers, take_turns
 from flcav.federation.privacy import Privacy, account_epsilon
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import of_servers, strategy_named

@@ -13,24 +13,22 @@ from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 from flwr.common.serde import recorddict_to_proto
 
 from flcav.federation.client import client_app
-from flcav.federation.messages.conduct import ANSWERED
-from flcav.federation.messages.records import ARRAYS, ASK, CONFIG, LOST, VECTOR, read_arrays, to_arrays
-from flcav.federation.noise import draw_secret
-from flcav.federation.privacy import Privacy, account_epsilon
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.conduct import ANSWERED
+from flcav.federation.links.in_process import EmbeddedGrid
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.privacy import Privacy, account_epsilon, draw_secret
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import EmbeddedGrid
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.secure.masks import agree, to_values
 from flcav.federation.secure.messages import SecureSum, TooFewClients
 from flcav.federation.secure.parties import PublicKeys, SecureClient, add_mask
-from flcav.federation.secure.shamir import SHARE_BYTES, join_shares
+from flcav.federation.secure.primitives import SHARE_BYTES, agree, join_shares, to_values
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.strategies.corrections import Scaffold
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.wire import ARRAYS, ASK, CONFIG, LOST, VECTOR, read_arrays, to_arrays
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.distillation import SentOutputs
 from flcav.statistics.streams import derive_seed

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.in_process import ClientLate, TimedClients
+from flcav.federation.links.metered import Account
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import ReplyLimits, Rules
-from flcav.federation.runtimes.deadline import ClientLate, TimedClients
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes

@@ -14,23 +14,23 @@ import pytest
 from flwr.app import ConfigRecord, Context, Error, Message, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.attendance import ClientFailed
-from flcav.federation.messages.records import ASK, LOST_BY_NETWORK, OVER_BUDGET, to_arrays
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.exchange import ClientFailed
+from flcav.federation.links.flower import Agreement
+from flcav.federation.links.flower_grid import DeployedGrid
+from flcav.federation.links.in_process import keep_identity, wire_bytes
+from flcav.federation.links.link import open_link
+from flcav.federation.links.metered import Account
+from flcav.federation.links.vehicle_app import Assignment, VehicleApp, load_identity
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.deployed import Agreement
-from flcav.federation.runtimes.deployed_grid import DeployedGrid
-from flcav.federation.runtimes.embedded import keep_identity, wire_bytes
-from flcav.federation.runtimes.link import open_link
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.vehicle_app import Assignment, VehicleApp, load_identity
-from flcav.federation.secure.masks import draw_keys
 from flcav.federation.secure.parties import PublicKeys
+from flcav.federation.secure.primitives import draw_keys
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.strategy import Strategy
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.wire import ASK, LOST_BY_NETWORK, OVER_BUDGET, to_arrays
 from flcav.fleet.authority import found_authority, open_registry
 from flcav.fleet.keys import AUTHORITY, request_certificate, take_certificate
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes

@@ -8,10 +8,10 @@ import pytest
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.messages.records import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
-from flcav.federation.runtimes.embedded import wire_bytes
-from flcav.federation.runtimes.metered import Account, MeteredGrid, Outage
-from flcav.federation.runtimes.outages import LossyGrid
+from flcav.federation.links.in_process import wire_bytes
+from flcav.federation.links.metered import Account, MeteredGrid, Outage
+from flcav.federation.links.outages import LossyGrid
+from flcav.federation.wire import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 NAMES = {1: "a", 2: "b", 3: "c"}

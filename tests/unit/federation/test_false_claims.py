@@ -8,10 +8,10 @@ import pytest
 from flwr.app import Array, ConfigRecord, RecordDict
 
 from flcav.config import InputError
-from flcav.federation.messages.acceptance import ReplyRefused
-from flcav.federation.messages.records import to_numpy
+from flcav.federation.acceptance import ReplyRefused
 from flcav.federation.secure.messages import ASK, CIPHERS, MASKS, NAMES, SHARES, read_keys, read_shares
 from flcav.federation.secure.parties import SecureClient
+from flcav.federation.wire import to_numpy
 from flcav.fleet.authority import AUTHORITY, REGISTRY, found_authority
 from flcav.fleet.relay import Refused
 from flcav.fleet.release_report import MOST, ShadowReport

@@ -11,13 +11,13 @@ from line_task import Line, LineTask, Slope
 from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
-from flcav.federation.attendance import ClientFailed
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.exchange import ClientFailed
+from flcav.federation.links.link import open_link
+from flcav.federation.links.metered import Account, open_account
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.link import open_link
-from flcav.federation.runtimes.metered import Account, open_account
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedmd import FedMD

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from flcav.config import InputError
-from flcav.federation.runtimes import deployed
-from flcav.federation.runtimes.deployed import Deployment, RegionalDeployment
+from flcav.federation.links import flower
+from flcav.federation.links.flower import Deployment, RegionalDeployment
 from flcav.fleet.authority import found_authority
 from flcav.fleet.fl_request import make_request
 from flcav.fleet.up import READY, Ready
@@ -73,9 +73,9 @@ class Fleet:
 @pytest.fixture
 def one(fleets, monkeypatch):
     fleet: Any = Fleet()
-    monkeypatch.setattr(deployed, "open_registry", lambda _: fleet)
-    monkeypatch.setattr(deployed, "STARTING_S", 0.0)
-    monkeypatch.setattr(deployed, "STARTING_VEHICLE_S", 0.0)
+    monkeypatch.setattr(flower, "open_registry", lambda _: fleet)
+    monkeypatch.setattr(flower, "STARTING_S", 0.0)
+    monkeypatch.setattr(flower, "STARTING_VEHICLE_S", 0.0)
     deployment: Any = Deployment(fleets)
     deployment.link = fleet
     return deployment, fleet

@@ -10,19 +10,30 @@ from flwr.common.serde import recorddict_to_proto
 
 from flcav.config import InputError
 from flcav.federation.checks import check_federation
+from flcav.federation.links.metered import Account, MeteredGrid
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import Privacy, account_epsilon
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules, SecureAggregation
-from flcav.federation.runtimes.metered import Account, MeteredGrid
-from flcav.federation.secure.masks import add_vectors, agree, draw_keys, expand, seal, to_integers, to_values, unseal
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.secure.parties import SecureClient, SumLost, add_mask, settle_complaints, unmask_sum
-from flcav.federation.secure.shamir import find_wrong_shares, join_shares, split_secret
+from flcav.federation.secure.primitives import (
+    add_vectors,
+    agree,
+    draw_keys,
+    expand,
+    find_wrong_shares,
+    join_shares,
+    seal,
+    split_secret,
+    to_integers,
+    to_values,
+    unseal,
+)
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
-from flcav.federation.strategies.fedadam import FedAdam
-from flcav.federation.strategies.median import Median
+from flcav.federation.strategies.fedopt import FedAdam
+from flcav.federation.strategies.robust import Median
 from flcav.federation.trainable import LocalUpdate
 from flcav.federation.upload import Upload
 from flcav.network.ledger import Ledger, LinkMegabytes

@@ -12,17 +12,17 @@ from regression import START, ledger, vehicles
 
 from flcav.config import InputError
 from flcav.federation.checks import check_federation
+from flcav.federation.links.metered import Account
+from flcav.federation.links.processes import RemoteClients
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import Privacy
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import RemoteClients
 from flcav.federation.selection import Selection, optimal_probabilities
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
+from flcav.federation.strategies.corrections import Scaffold
 from flcav.federation.strategies.fedavg import average_inversely
-from flcav.federation.strategies.krum import Krum
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.robust import Krum
 from flcav.federation.trainable import LocalUpdate, count_samples
 from flcav.statistics.streams import derive_seed
 

@@ -11,17 +11,16 @@ from regression import ledger
 from safetensors.numpy import load, save
 
 from flcav.config import InputError
+from flcav.federation.acceptance import Expected, ReplyRefused, read_update
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.messages.acceptance import Expected, ReplyRefused, read_update
-from flcav.federation.messages.encoding import encode
-from flcav.federation.messages.records import update_content
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.in_process import update_bytes
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import SCALES, VALUES, Upload, compress, decompress
+from flcav.federation.wire import encode, update_content
 
 SCHEDULE = Schedule(rounds=5, steps=3, learning_rate=0.5, final_learning_rate=0.5, seed=3)
 SIZE = (64, 50)

@@ -15,8 +15,17 @@ from flwr.common.serde import recorddict_to_proto
 from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.config import InputError
-from flcav.federation.messages.conduct import recall_answered
-from flcav.federation.messages.records import (
+from flcav.federation.conduct import recall_answered
+from flcav.federation.links.in_process import keep_identity, wire_bytes
+from flcav.federation.links.vehicle_app import Assignment, VehicleApp, load_assignment, load_identity
+from flcav.federation.privacy import draw_secret
+from flcav.federation.rules import Rules
+from flcav.federation.secure import parties
+from flcav.federation.secure.parties import Identity, SecureClient
+from flcav.federation.strategies import strategy_named
+from flcav.federation.strategies.fedmd import FedMD
+from flcav.federation.trainable import LocalUpdate
+from flcav.federation.wire import (
     ARRAYS,
     ASK,
     CONFIG,
@@ -27,16 +36,6 @@ from flcav.federation.messages.records import (
     read_arrays,
     to_arrays,
 )
-from flcav.federation.noise import draw_secret
-from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import keep_identity, wire_bytes
-from flcav.federation.runtimes.vehicle_app import Assignment, VehicleApp, load_assignment, load_identity
-from flcav.federation.secure import certified
-from flcav.federation.secure.certified import Identity
-from flcav.federation.secure.parties import SecureClient
-from flcav.federation.strategies import strategy_named
-from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.trainable import LocalUpdate
 from flcav.fleet.authority import SERVER, SERVER_KEY, found_authority
 from flcav.fleet.keys import AUTHORITY, load_key, request_certificate, take_certificate
 from flcav.fleet.vehicle import VehicleSettings
@@ -335,7 +334,7 @@ def test_a_certificate_that_is_not_in_force_is_no_peer_s(masked, monkeypatch: py
     keys = {name: keys_of(own) for name, own in masked.items()}
     for days in (-1, 400):
         later = SimpleNamespace(now=lambda zone, days=days: datetime.now(zone) + timedelta(days=days))
-        monkeypatch.setattr(certified, "datetime", later)
+        monkeypatch.setattr(parties, "datetime", later)
         with pytest.raises(ValueError, match="the certificate is not in force"):
             answer(masked["town/cav1"], roster(keys))
 

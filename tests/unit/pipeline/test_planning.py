@@ -15,8 +15,8 @@ from flwr.common.serde import recorddict_to_proto
 
 from flcav.config import InputError
 from flcav.experiments.fig6a.run import BUDGETS
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.network.plan import MessageSizes, price

@@ -17,9 +17,9 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.asynchrony.schedules import Rival, Scheduled, schedule_buffers, schedule_rounds
 from flcav.experiments.attacks.drives import Drives, Vehicle, draw_head, find_right, record_drives, spread_over_scenes
 from flcav.experiments.differences import Differences, name_differences, tell_differences
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.in_process import update_bytes
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.trainable import Trainable, Weights
 from flcav.interface.progress import Report, ignore_progress

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flcav.federation.buffered_rounds import Buffers
+from flcav.federation.links.metered import Outage
+from flcav.federation.modes.buffered import Buffers
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Outage
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.network.clock.buffers import BufferTiming, chain_links

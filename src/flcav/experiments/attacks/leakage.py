@@ -28,11 +28,11 @@ from flcav.experiments.attacks.inference import (
     membership_auc,
     name_nearest,
 )
+from flcav.federation.curious_server import read_round
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import SEEDED, Privacy, account_epsilon
-from flcav.federation.reading import read_round
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules, SecureAggregation
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import Weights
 from flcav.interface.progress import Report, ignore_progress

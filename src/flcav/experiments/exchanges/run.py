@@ -18,7 +18,7 @@ import numpy as np
 from flcav.config import Json
 from flcav.experiments.cloud_rounds import span_divergence
 from flcav.experiments.exchanges.clock import link_regions, mean_round_s
-from flcav.federation.divergence import RoundDivergence
+from flcav.federation.state import RoundDivergence
 from flcav.network.ledger import Ledger
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe

@@ -24,9 +24,9 @@ from flcav.experiments.attacks.drives import (
 )
 from flcav.experiments.differences import Differences, name_differences, tell_differences
 from flcav.experiments.groups.vehicles import Fleet, make_offer, open_fleet
-from flcav.federation.rounds import EVERYBODY, Schedule, federate
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import EVERYBODY, Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import Weights
 from flcav.interface.progress import Report, ignore_progress

@@ -9,8 +9,22 @@ from cryptography import x509
 from flwr.app import ConfigRecord, Context, Message, RecordDict
 
 from flcav.config import shorten
-from flcav.federation.messages.acceptance import ReplyRefused, read_entry
-from flcav.federation.messages.records import (
+from flcav.federation.acceptance import ReplyRefused, read_entry
+from flcav.federation.rules import SecureAggregation
+from flcav.federation.secure.parties import (
+    SEALED_BYTES,
+    Identity,
+    PublicKeys,
+    SecureClient,
+    SignedKeys,
+    check_certified,
+    find_liars,
+    find_vehicle,
+    unmask_sum,
+)
+from flcav.federation.secure.primitives import SHARE_BYTES, Vector, add_vectors, is_public_key
+from flcav.federation.trainable import Weights
+from flcav.federation.wire import (
     ASK,
     CERTIFICATES,
     CIPHERS,
@@ -22,12 +36,6 @@ from flcav.federation.messages.records import (
     SIGNATURES,
     UNMASK,
 )
-from flcav.federation.rules import SecureAggregation
-from flcav.federation.secure.certified import Identity, SignedKeys, check_certified, find_vehicle
-from flcav.federation.secure.masks import Vector, add_vectors, is_public_key
-from flcav.federation.secure.parties import SEALED_BYTES, PublicKeys, SecureClient, find_liars, unmask_sum
-from flcav.federation.secure.shamir import SHARE_BYTES
-from flcav.federation.trainable import Weights
 
 SURVIVORS, DROPPED, THRESHOLD = "survivors", "dropped", "threshold"  # entries of the server's messages
 SECRETS = "secrets"  # record of a node's state: the client's own part of a round

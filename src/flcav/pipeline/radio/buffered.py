@@ -8,7 +8,7 @@ full and the models have gone up and down by wireline. Meanwhile vehicles go on,
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from flcav.federation.buffered_rounds import BrokenUpdate, BufferedRound, Buffers
+from flcav.federation.modes.buffered import BrokenUpdate, BufferedRound, Buffers
 from flcav.federation.rules import Rules
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.network.clock.buffers import BufferClock, BufferTiming

@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flcav.federation.runtimes.link import open_fleet, open_questions
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.link import open_fleet, open_questions
+from flcav.federation.links.metered import Account
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.network.ledger import Ledger

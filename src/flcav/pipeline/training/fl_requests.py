@@ -13,7 +13,7 @@ from flcav.fleet.fl_request import FLRequest, parse_request
 from flcav.pipeline.results.saved import Saved
 
 if TYPE_CHECKING:
-    from flcav.federation.runtimes.deployed import RegionalDeployment
+    from flcav.federation.links.flower import RegionalDeployment
 
 
 @dataclass(frozen=True)

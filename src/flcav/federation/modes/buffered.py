@@ -1,0 +1,195 @@
+"""Rounds of buffered asynchronous aggregation: a round is a buffer, filled by clients in the order of a clock.
+
+Who is how fast does not depend on what is learned. So a clock comes first (`flcav.network.clock.buffers`), and its
+buffers say which version of the weights each update began with; here clients train on those versions. The same
+clock and seed give the same bytes.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from flwr.app import RecordDict
+
+from flcav.config import InputError
+from flcav.federation.acceptance import Expected, read_update
+from flcav.federation.exchange import Attendance, Intake
+from flcav.federation.links.metered import Account
+from flcav.federation.privacy import Privacy, account_epsilon
+from flcav.federation.rules import Rules
+from flcav.federation.selection import Selection
+from flcav.federation.state import Arrays, FederationState
+from flcav.federation.strategies.fedbuff import FedBuff
+from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.wire import ARRAYS, CONFIG, LocalWork, to_arrays
+from flcav.network.ledger import BudgetExceeded, Direction
+
+Work = Callable[[int], LocalWork]  # local training of a round, by its number
+OVER_BUDGET = "over the budget, not sent"
+
+
+@dataclass(frozen=True)
+class BrokenUpdate:
+    """An update that broke off on the network."""
+
+    client: str
+    reason: str  # e.g. "out of coverage"
+    down_bytes: int  # as far as the weights and the update came
+    up_bytes: int
+
+
+@dataclass(frozen=True)
+class BufferedRound:
+    """A round of buffered aggregation: whose updates fill the buffer, and what broke off while it filled."""
+
+    versions: Mapping[str, int]  # that each update began with, by client: weights after so many rounds
+    broken: tuple[BrokenUpdate, ...] = ()
+
+
+@dataclass(frozen=True)
+class Buffers:
+    """The rounds of a federation by a clock, and how often clients took part in federations before it."""
+
+    rounds: tuple[BufferedRound, ...]
+    before: Mapping[str, int] = field(default_factory=dict)  # by client
+
+    def participations(self, rounds: int) -> int:
+        """Return how many updates the client began to send that sent most, in the first `rounds` rounds and before."""
+        times = Counter(self.before)
+        for each in self.rounds[:rounds]:
+            times.update([*each.versions])
+            times.update(broken.client for broken in each.broken if broken.up_bytes)
+        return max(times.values(), default=0)
+
+    def epsilon(self, privacy: Privacy, rounds: int) -> float:
+        """Return epsilon after so many rounds, of the client that sent most."""
+        return account_epsilon(privacy, Selection(), ["one"], self.participations(rounds))
+
+    @property
+    def least_before(self) -> int:
+        """Return how often each client at least took part in federations before: 0 where one is not known."""
+        return min(self.before.values(), default=0)
+
+
+def afford_buffers(buffers: Buffers, privacy: Privacy | None) -> int:
+    """Return how many of the first rounds the privacy budget affords, without one all.
+
+    Raises `InputError` where it is 0 of some, and clients took part in no federation before.
+    """
+    if privacy is None or privacy.epsilon is None or not buffers.rounds:
+        return len(buffers.rounds)
+    spent = (buffers.epsilon(privacy, number) for number in range(1, len(buffers.rounds) + 1))
+    afforded = next((number for number, each in enumerate(spent) if each > privacy.epsilon), len(buffers.rounds))
+    if not afforded and not buffers.before:
+        told = f"{buffers.epsilon(privacy, 1):.4g} at delta = {privacy.delta:g}"
+        raise InputError(f"privacy: a first buffer comes to epsilon = {told}, above the budget of {privacy.epsilon:g}")
+    return afforded
+
+
+def take_turns(clients: Sequence[str], size: int, rounds: int) -> Buffers:
+    """Return `rounds` rounds, and some more, of clients that are equally fast, and whose messages take no time.
+
+    All that train are ready at once and fill buffers in their order; who is in a full buffer begins with its version.
+    The further rounds are those in which everybody who trains at the end is ready.
+    """
+    ready: list[tuple[str, int]] = [(name, 0) for name in clients]
+    waiting: list[tuple[str, int]] = []
+    found = []
+    for number in range(rounds + len(clients)):
+        while len(waiting) < size:
+            waiting.append(ready.pop(0))
+        full, waiting = waiting[:size], waiting[size:]
+        found.append(BufferedRound(dict(full)))
+        ready += [(name, number + 1) for name, _ in full]
+    return Buffers(tuple(found))
+
+
+def count_participations(records: Sequence[tuple[Sequence[str], Sequence[str]]]) -> dict[str, int]:
+    """Return by client in how many rounds it took part or failed; records: of each, its clients, and those that did."""
+    return dict(Counter(name for clients, failed in records for name in {*clients, *failed}))
+
+
+def is_spent(state: FederationState) -> bool:
+    """Return whether an update of the last round was not sent, since it would have exceeded a budget."""
+    return bool(state.records) and OVER_BUDGET in state.records[-1].failed.values()
+
+
+class Ask(Protocol):
+    """A server's way to send requests, by client, and to yield what is read of the replies."""
+
+    def __call__(
+        self,
+        here: Attendance,
+        requests: Mapping[str, RecordDict],
+        read: Callable[[str, RecordDict], LocalUpdate],
+    ) -> Iterator[tuple[str, LocalUpdate]]:
+        """Yield client and answer, in the order of the requests."""
+        ...
+
+
+@dataclass(frozen=True)
+class Buffering:
+    """Buffered rounds of a server: the strategy, the clock's rounds, and the ledger."""
+
+    strategy: FedBuff
+    buffers: Buffers
+    account: Account
+
+    def attend(self, number: int, clients: Sequence[str]) -> Attendance:
+        """Return who takes part in a round, in the order of all clients."""
+        chosen = [name for name in clients if name in self.buffers.rounds[number - 1].versions]
+        return Attendance(chosen, chosen)
+
+    def keep_version(self, number: int, start: Weights, kept: Arrays) -> Arrays:
+        """Return the versions that updates from round `number` on began with: `start`, and of those `kept` before."""
+        needed = {version for later in self.buffers.rounds[number - 1 :] for version in later.versions.values()}
+        own = {_key(number - 1, name): np.asarray(array) for name, array in start.items()}
+        return {key: array for key, array in (kept | own).items() if int(key.partition("|")[0]) in needed}
+
+    def collect(
+        self, number: int, here: Attendance, start: Weights, kept: Arrays, rules: Rules, work: Work, ask: Ask
+    ) -> Intake:
+        """Return the updates of round `number` that count, rebased on `start`, the weights that it begins with.
+
+        Clients are sent the version that they began with, of those `kept`, and the local `work` of the round after it.
+        Where an update would exceed a budget, it and those after it are not sent, and the round's record says so.
+        """
+        round_ = self.buffers.rounds[number - 1]
+        begun = {version: {name: kept[_key(version, name)] for name in start} for version in round_.versions.values()}
+        arrays = {version: to_arrays(weights) for version, weights in begun.items()}
+        expected = {version: Expected(rules, weights, {}) for version, weights in begun.items()}
+        requests = {}
+        for name in here.chosen:
+            version = round_.versions[name]
+            local = replace(work(version + 1), round=number)
+            requests[name] = RecordDict({ARRAYS: arrays[version], CONFIG: local.record()})
+        updates = Intake(self.strategy if rules.privacy is None else None)
+        try:
+            self._enter_broken(number, here)
+            for name, update in ask(here, requests, lambda name, c: read_update(c, expected[round_.versions[name]])):
+                version = round_.versions[name]
+                updates.add(name, self.strategy.rebase(start, begun[version], update, number - 1 - version))
+        except BudgetExceeded:
+            here.spent = True
+            for name in here.chosen:
+                if name not in updates.samples and name not in here.failed:
+                    here.failed[name] = OVER_BUDGET
+                    here.lost.add(name)
+        return updates
+
+    def _enter_broken(self, number: int, here: Attendance) -> None:
+        """Enter what was sent of updates that broke off."""
+        for each in self.buffers.rounds[number - 1].broken:
+            sizes: tuple[tuple[Direction, int], ...] = (("down", each.down_bytes), ("up", each.up_bytes))
+            for direction, size in sizes:
+                self.account.ledger.enter(self.account.describe(direction, number, each.client, size))
+            if each.client not in here.chosen:  # others came through at another attempt
+                here.failed[each.client] = each.reason
+                here.lost.add(each.client)
+
+
+def _key(version: int, name: str) -> str:
+    """Return the key of an array of a version in the server's state."""
+    return f"{version}|{name}"
