@@ -10,11 +10,11 @@ import pytest
 from waiting import LONGEST_S, wait_for
 
 from flcav.fleet.authority import open_authority
-from flcav.fleet.bundle import TRUSTED
-from flcav.fleet.install import install_vehicle
 from flcav.fleet.keys import AUTHORITY, request_certificate
 from flcav.fleet.status import read_status
+from flcav.fleet.superlink import TRUSTED
 from flcav.fleet.up import read_ready
+from flcav.fleet.vehicle import install_vehicle
 
 HERE = Path(__file__).parent
 NAME = "without-clock"  # after all others: no federation of other tests has it

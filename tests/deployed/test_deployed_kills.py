@@ -13,8 +13,7 @@ from flwr.proto.fab_pb2 import Fab
 
 from flcav.federation.loop import Schedule, federate
 from flcav.federation.strategies import strategy_named
-from flcav.fleet.bundle import build_bundle
-from flcav.fleet.superlink import DATABASE
+from flcav.fleet.superlink import DATABASE, build_bundle
 from flcav.fleet.supervisor import read_processes
 
 SCHEDULE = Schedule(3, 2, 0.1, 0.05, 7)

@@ -22,7 +22,7 @@ from flwr.proto.node_pb2 import Node
 from waiting import LONGEST_S, wait_for
 
 from flcav.config import InputError
-from flcav.fleet import bundle
+from flcav.fleet import superlink
 from flcav.fleet.authority import found_authority, open_authority
 from flcav.fleet.fl_request import PATH, make_request
 from flcav.fleet.forwarder import send_request
@@ -309,12 +309,12 @@ def ask(deployment, app, signature):
 def test_tampered_app(deployment, tmp_path):
     """An app whose signature is of another one, one without a signature, and one that somebody else has signed."""
     mark = tmp_path / "ran"
-    evil = bundle.build_bundle(f"open({str(mark)!r}, 'w').close()\n{bundle.CLIENT}")
-    bundle.make_publisher(tmp_path)
+    evil = superlink.build_bundle(f"open({str(mark)!r}, 'w').close()\n{superlink.CLIENT}")
+    superlink.make_publisher(tmp_path)
     for signature in (
-        bundle.sign_bundle(deployment.folder, bundle.build_bundle()),
+        superlink.sign_bundle(deployment.folder, superlink.build_bundle()),
         {},
-        bundle.sign_bundle(tmp_path, evil),
+        superlink.sign_bundle(tmp_path, evil),
     ):
         answer = ask(deployment, evil, signature)
         assert answer.has_error()

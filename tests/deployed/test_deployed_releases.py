@@ -19,8 +19,7 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.fleet.authority import open_authority
 from flcav.fleet.keys import AUTHORITY, request_certificate, take_certificate
-from flcav.fleet.release_report import LARGEST, RELEASES, REPORT, ReleaseReport, ShadowReport
-from flcav.fleet.releases.offer import LARGEST_FILE, read_reports
+from flcav.fleet.releases import LARGEST_REPORT, LARGEST_FILE, RELEASES, REPORT, ReleaseReport, ShadowReport, read_reports
 from flcav.fleet.status import read_status
 from flcav.fleet.supervisor import read_processes
 from flcav.fleet.up import VEHICLES, read_ready
@@ -274,7 +273,7 @@ def test_messages_that_are_no_reports(parties, client):
         replace(before, task="../x").as_bytes(),
         replace(before, shadow=replace(shadow, agreed=6)).as_bytes(),  # would outweigh the disagreement of others
         replace(before, shadow=replace(shadow, candidate="1")).as_bytes(),
-        replace(before, refused="x" * LARGEST).as_bytes(),
+        replace(before, refused="x" * LARGEST_REPORT).as_bytes(),
         bytes(10**7),
     ):
         assert client.post(REPORT, content=content).status_code == 400

@@ -47,7 +47,7 @@ def init(
 ) -> None:
     """Make the authority of a new fleet: its key and certificate, its registry, and the servers' certificate."""
     from flcav.fleet.authority import found_authority
-    from flcav.fleet.bundle import make_publisher
+    from flcav.fleet.superlink import make_publisher
 
     found_authority(folder, tuple(host))
     make_publisher(folder)
@@ -105,7 +105,7 @@ def install(
     ),
 ) -> None:
     """On a vehicle: put its certificate to use, and set where the fleet is reached."""
-    from flcav.fleet.install import install_vehicle
+    from flcav.fleet.vehicle import install_vehicle
 
     install_vehicle(folder, certificate, authority, trusted, server, client)
     echo(f"{folder}: ready; flcav fleet vehicle {folder} runs it")

@@ -14,7 +14,7 @@ from starlette.responses import HTMLResponse, Response
 from starlette.routing import Route
 
 from flcav.fleet.status import read_status
-from flcav.fleet.up import check_port
+from flcav.fleet.vehicle import check_port
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self'"
 PAGE = """<!doctype html>

@@ -13,6 +13,8 @@ import contextlib
 import hashlib
 import time
 from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -46,9 +48,9 @@ from flcav.fleet.relay import (
     name_key,
     read_body,
     relay,
+    send_file,
 )
-from flcav.fleet.release_report import RELEASES
-from flcav.fleet.releases.service import answer_release
+from flcav.fleet.releases import LARGEST_REPORT, RELEASES, REPORT, KeptReport, find_offered, parse_report
 from flcav.fleet.traffic import Traffic, read_traffic
 from flcav.interface.wording import make_printable
 
@@ -260,3 +262,40 @@ def run_proxy(folder: Path, host: str, port: int, superlink: str) -> None:
     app = FleetProxy(client, folder)
     keys = folder / SERVER, folder / SERVER_KEY, folder / AUTHORITY
     serve_https(app, host, port, *keys, app.find_owner).run()
+
+
+async def answer_release(
+    fleet: Path, vehicle: str, scope: Scope, receive: Receive, send: Send, count: Callable[[], int]
+) -> None:
+    """Answer a registered vehicle's call; raises `Refused`.
+
+    count: called for each piece that was sent; returns the bytes that this vehicle's releases took so far.
+    """
+    asked, method = scope["path"].removeprefix(RELEASES), scope["method"]
+    if method == "POST" and asked == REPORT:
+        await _take_report(fleet, vehicle, await read_body(scope, receive, LARGEST_REPORT), count)
+        await answer(send, 200, "the report is taken")
+        return
+    if method != "GET":
+        raise Refused(403, f"{method} {scope['path'][:100]} is no call of a vehicle's")
+    try:
+        path = await asyncio.to_thread(find_offered, fleet, asked)
+    except ValueError as error:
+        raise Refused(403, f"{scope['path'][:100]} {error}") from None
+    if path is None:
+        await answer(send, 404, "no such file is on offer")
+    else:
+        await send_file(send, path, count)
+
+
+async def _take_report(fleet: Path, vehicle: str, content: bytes, count: Callable[[], int]) -> None:
+    try:
+        report = parse_report(content)
+    except ValueError as error:
+        raise Refused(400, str(error)) from None
+    if report.shadow is not None:  # the certificate says whose it is
+        report = replace(report, shadow=replace(report.shadow, vehicle=vehicle))
+    try:
+        await asyncio.to_thread(KeptReport(vehicle, time.time(), count(), report).save, fleet)
+    except OSError as error:
+        raise Refused(503, f"the report cannot be kept: {error}") from None

@@ -12,8 +12,7 @@ from typing import Annotated
 from flcav.config import InputError
 from flcav.fleet.authority import open_registry
 from flcav.fleet.fl_request import FLRequest, parse_request
-from flcav.fleet.release_report import ReleaseReport
-from flcav.fleet.releases.offer import read_reports
+from flcav.fleet.releases import ReleaseReport, read_reports
 from flcav.fleet.superlink import SuperLink, SuperLinkLost
 from flcav.fleet.supervisor import read_processes
 from flcav.fleet.traffic import Crossed, read_traffic

@@ -6,6 +6,7 @@ The control side asks nobody for a credential, so the SuperLink listens on the l
 secret of the executor is in a file that its owner alone can read.
 """
 
+import base64
 import contextlib
 import fcntl
 import hashlib
@@ -19,6 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ed25519
+from flwr.cli.build import build_fab_from_files
 from flwr.common.constant import SubStatus
 from flwr.common.serde import run_from_proto
 from flwr.proto.control_pb2 import ListNodesRequest, RegisterNodeRequest, StartRunRequest, UnregisterNodeRequest
@@ -36,9 +40,10 @@ from flwr.supercore.runtime import RuntimeHttpClient
 from flwr.supercore.task_identity import TaskIdentity
 from flwr.superlink.grid import HttpGrid
 
-from flcav.fleet.bundle import build_bundle, sign_bundle
-from flcav.fleet.keys import AUTHORITY, public_pem
+from flcav.config import InputError
+from flcav.fleet.keys import AUTHORITY, public_pem, write_private
 from flcav.fleet.registry import Registry
+from flcav.storage.files import write_bytes
 
 SECRET, DATABASE = "executor.secret", "superlink.sqlite"  # in the fleet's folder
 ACQUIRE = frozenset({"/flwr.proto.Runtime/AcquireTask"})
@@ -172,3 +177,65 @@ def locked(path: Path) -> Iterator[None]:
     with path.open("a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
+
+
+PUBLISHER_KEY, TRUSTED = "publisher.key", "trusted.yaml"
+PROJECT = """[build-system]
+requires = ["hatchling"]
+build-backend = "hatchling.build"
+[project]
+name = "flcav-vehicle"
+version = "1.0.0"
+license = "MIT"
+dependencies = []
+[tool.flwr.app]
+publisher = "flcav"
+[tool.flwr.app.components]
+serverapp = "flcav_vehicle.server:app"
+clientapp = "flcav_vehicle.client:app"
+[tool.flwr.app.config]
+"""
+CLIENT = "from flcav.federation.links.vehicle_app import make_vehicle_app\n\napp = make_vehicle_app()\n"
+SERVER = '''"""The server of a federation is the process that asks for it: flcav federate --runtime flower."""
+from flwr.serverapp import ServerApp
+
+app = ServerApp()
+'''
+
+
+def build_bundle(client: str = CLIENT) -> bytes:
+    """Return the bundle (FAB) of the vehicles' app; `client` is the source of its client module."""
+    files: dict[str, bytes | Path] = {
+        "pyproject.toml": PROJECT.encode(),
+        "flcav_vehicle/__init__.py": b"",
+        "flcav_vehicle/client.py": client.encode(),
+        "flcav_vehicle/server.py": SERVER.encode(),
+    }
+    return build_fab_from_files(files)[0]
+
+
+def make_publisher(folder: Path) -> None:
+    """Make the publisher's key in `folder`, and beside it the file of keys that vehicles trust."""
+    key = ed25519.Ed25519PrivateKey.generate()
+    openssh = serialization.PrivateFormat.OpenSSH
+    write_private(
+        folder / PUBLISHER_KEY, key.private_bytes(serialization.Encoding.PEM, openssh, serialization.NoEncryption())
+    )
+    line = key.public_key().public_bytes(serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH).decode()
+    write_bytes(folder / TRUSTED, f"{_name_key(key.public_key())}: '{line}'\n".encode())
+
+
+def sign_bundle(folder: Path, bundle: bytes) -> dict[str, str]:
+    """Return the publisher's signature of a bundle as Flower stores it, by the name of the key."""
+    key = serialization.load_ssh_private_key((folder / PUBLISHER_KEY).read_bytes(), None)
+    if not isinstance(key, ed25519.Ed25519PrivateKey):
+        raise InputError(f"{folder / PUBLISHER_KEY}: an Ed25519 key is wanted")
+    now = int(time.time())
+    signature = key.sign(now.to_bytes(8, "big") + hashlib.sha256(bundle).digest())
+    told = json.dumps({"signed_at": now, "signature": base64.urlsafe_b64encode(signature).decode().rstrip("=")})
+    return {"valid_license": "Valid", _name_key(key.public_key()): told}
+
+
+def _name_key(key: ed25519.Ed25519PublicKey) -> str:
+    raw = key.public_bytes(serialization.Encoding.Raw, serialization.PublicFormat.Raw)
+    return f"fpk_{hashlib.sha256(raw).hexdigest()[:32]}"

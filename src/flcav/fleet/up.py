@@ -5,7 +5,6 @@ import fcntl
 import gc
 import json
 import os
-import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -13,7 +12,6 @@ from pathlib import Path
 
 from flcav.config import InputError
 from flcav.fleet.authority import SERVER, SERVER_KEY, VEHICLE_DAYS, Authority, open_authority, open_registry
-from flcav.fleet.bundle import PUBLISHER_KEY, TRUSTED, make_publisher
 from flcav.fleet.keys import (
     AUTHORITY,
     CERTIFICATE,
@@ -24,9 +22,9 @@ from flcav.fleet.keys import (
     write_private,
 )
 from flcav.fleet.proxy import run_proxy
-from flcav.fleet.superlink import DATABASE, SECRET, SuperLink, SuperLinkLost
+from flcav.fleet.superlink import DATABASE, PUBLISHER_KEY, SECRET, TRUSTED, SuperLink, SuperLinkLost, make_publisher
 from flcav.fleet.supervisor import LOGS, supervise
-from flcav.fleet.vehicle import SETTINGS, Prepare, VehicleSettings, vehicle_processes
+from flcav.fleet.vehicle import SETTINGS, Prepare, VehicleSettings, check_port, vehicle_processes
 from flcav.interface.wording import plural
 from flcav.storage.files import write_bytes, write_json
 
@@ -216,17 +214,6 @@ class _Enrolment:
         except (*SuperLinkLost, InputError, ValueError, TypeError) as error:  # not there yet, or not now; or damaged
             self.wrong = str(error)
         return self._seen >= 0
-
-
-def check_port(host: str, port: int) -> int:
-    """Return a port that can be listened on, `port` or, for 0, a free one; raises `InputError` where it is in use."""
-    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as door:
-        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            door.bind((host, port))
-        except (OSError, OverflowError) as error:
-            raise InputError(f"{host}:{port}: cannot be listened on ({getattr(error, 'strerror', error)})") from None
-        return door.getsockname()[1]
 
 
 @contextlib.contextmanager

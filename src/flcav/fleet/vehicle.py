@@ -3,9 +3,12 @@
 Flower starts a process for every message, which imports everything anew. Here the executor imports once, and forks.
 """
 
+import contextlib
 import json
 import os
+import re
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -13,12 +16,14 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
+import yaml
+
 from flcav.config import InputError
-from flcav.fleet.bundle import TRUSTED
-from flcav.fleet.keys import FLOWER_KEY, LOOPBACK, LOOPBACK_KEY, make_loopback, write_private
-from flcav.fleet.superlink import ACQUIRE, SECRET
+from flcav.fleet.keys import FLOWER_KEY, LOOPBACK, LOOPBACK_KEY, make_loopback, take_certificate, write_private
+from flcav.fleet.superlink import ACQUIRE, SECRET, TRUSTED
 from flcav.fleet.supervisor import end_with_parent
-from flcav.storage.files import write_json
+from flcav.plugins import PLACE
+from flcav.storage.files import write_bytes, write_json
 
 SETTINGS, FOLDER = "vehicle.json", "FLCAV_VEHICLE"  # the second: environment variable of the app
 POLL_S = 0.1  # between looks for a message
@@ -132,3 +137,38 @@ def _fork(node: str, token: str) -> int:
         code = end.code if isinstance(end.code, int) else 1
     finally:
         os._exit(code)
+
+
+def check_port(host: str, port: int) -> int:
+    """Return a port that can be listened on, `port` or, for 0, a free one; raises `InputError` where it is in use."""
+    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as door:
+        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            door.bind((host, port))
+        except (OSError, OverflowError) as error:
+            raise InputError(f"{host}:{port}: cannot be listened on ({getattr(error, 'strerror', error)})") from None
+        return door.getsockname()[1]
+
+
+def install_vehicle(
+    folder: Path, certificate: Path, authority: Path, trusted: Path, server: str, client: str = ""
+) -> None:
+    """Install the authority's files in a vehicle's folder; raises `InputError` for a file of another kind.
+
+    server: host:port of the proxy. client: module:NAME of the vehicle's own part in a federation, an `Assignment`
+    of `runtimes.vehicle_app`; "": the one that is put into its folder.
+    """
+    if client and not PLACE.fullmatch(client):
+        raise InputError(f"--client {client[:80]}: a module, a colon and a name in it are wanted")
+    if not re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[A-Za-z0-9.-]+):[0-9]{1,5}", server):
+        raise InputError(f"--server {server[:80]}: HOST:PORT is wanted")
+    keys = trusted.read_bytes()
+    try:
+        named = yaml.safe_load(keys)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        named = None
+    if not isinstance(named, dict) or not named:
+        raise InputError(f"{trusted}: names no key that apps are signed by")
+    take_certificate(folder, certificate.read_bytes(), authority.read_bytes())
+    write_bytes(folder / TRUSTED, keys)
+    VehicleSettings(server, check_port("127.0.0.1", 0), check_port("127.0.0.1", 0), client).save(folder)

@@ -13,9 +13,9 @@ from flcav.federation.secure.messages import ASK, CIPHERS, MASKS, NAMES, SHARES,
 from flcav.federation.secure.parties import SecureClient
 from flcav.federation.wire import to_numpy
 from flcav.fleet.authority import AUTHORITY, REGISTRY, found_authority
+from flcav.fleet.proxy import RELEASES, answer_release
 from flcav.fleet.relay import Refused
-from flcav.fleet.release_report import MOST, ShadowReport
-from flcav.fleet.releases.service import RELEASES, answer_release
+from flcav.fleet.releases import MOST, ShadowReport
 
 
 @pytest.mark.parametrize("bad", [CIPHERS, MASKS])

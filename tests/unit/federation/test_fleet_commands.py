@@ -22,8 +22,7 @@ from flcav.fleet import authority
 from flcav.fleet.authority import open_authority, open_registry
 from flcav.fleet.keys import request_certificate, take_certificate
 from flcav.fleet.page import make_page
-from flcav.fleet.release_report import ReleaseReport
-from flcav.fleet.releases.offer import KeptReport
+from flcav.fleet.releases import KeptReport, ReleaseReport
 from flcav.fleet.status import Followed, FollowedRound, read_status
 from flcav.fleet.traffic import Traffic
 from flcav.fleet.vehicle import VehicleSettings

@@ -9,7 +9,7 @@ import pytest
 from release_parties import ALL, Parties
 
 from flcav.config import InputError
-from flcav.fleet.release_report import ShadowReport
+from flcav.fleet.releases import ShadowReport
 from flcav.geometry import Boxes
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger, LinkMegabytes

@@ -14,7 +14,7 @@ from pathlib import Path
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.fleet.authority import open_registry
-from flcav.fleet.releases.offer import KeptReport, Offer, read_reports
+from flcav.fleet.releases import KeptReport, Offer, read_reports
 from flcav.fleet.traffic import read_traffic
 from flcav.fleet.up import VEHICLES, read_ready
 from flcav.interface.progress import Report, ignore_progress

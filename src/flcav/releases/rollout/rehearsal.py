@@ -12,7 +12,7 @@ from pathlib import Path
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.fleet.release_report import ShadowReport
+from flcav.fleet.releases import ShadowReport
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger, LinkMegabytes

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from flcav.config import InputError, read_json
-from flcav.fleet.release_report import ShadowReport
+from flcav.fleet.releases import ShadowReport
 from flcav.geometry import Boxes
 from flcav.interface.wording import plural
 from flcav.perception.errors import THRESHOLD

@@ -21,7 +21,7 @@ import httpx
 from flcav.config import InputError, read_json
 from flcav.fleet.forwarder import vehicle_tls
 from flcav.fleet.keys import REQUEST, read_request, requested_name
-from flcav.fleet.release_report import RELEASES, REPORT, ReleaseReport, ShadowReport
+from flcav.fleet.releases import RELEASES, REPORT, ReleaseReport, ShadowReport
 from flcav.fleet.supervisor import end_with_parent
 from flcav.fleet.vehicle import load_settings
 from flcav.releases.vehicles.checking import Sources, trust_roots, trusts_roots

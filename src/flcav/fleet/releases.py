@@ -6,16 +6,18 @@ Uptane Standard for Design and Implementation 2.1.0, section 5.4.2.1.1, without 
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
-from flcav.config import InputError
-from flcav.interface.wording import plural
+from flcav.config import InputError, read_json
+from flcav.interface.wording import make_printable, plural
+from flcav.storage.files import write_json
 from flcav.storage.records import LEFT_OUT, Record
 
 RELEASES = "/v1/flcav/release/"  # at the proxy: of the repositories' files, and of reports
 REPORT = "report"
-LARGEST = 4096  # bytes of a report
+LARGEST_REPORT = 4096  # bytes of a report
 MOST = 10**9  # of any number in it
 TASK, SHA256 = re.compile("[a-z][a-z0-9_]{0,31}"), re.compile("[0-9a-f]{64}")
 
@@ -84,3 +86,64 @@ def parse_report(data: bytes) -> ReleaseReport:
     if not all(0 <= each < MOST for each in (found.release, found.verified)) or not TASK.fullmatch(found.task):
         raise ValueError("the message is no release report")
     return found
+
+
+OFFER, REPORTS = "releases/offer.json", "releases/vehicles"
+FILE = re.compile(r"(image|director)/((?:metadata|targets)(?:/[a-z0-9_]+(?:\.[a-z0-9]+)*)+)")  # no name has two dots
+LARGEST_FILE = 1_000_000_000  # bytes
+
+
+@dataclass(frozen=True)
+class Offer(Record):
+    """Folders of the published repositories, each with metadata and targets in it."""
+
+    image: str  # the provider's
+    director: str  # the customer's
+
+    def save(self, fleet: Path) -> None:
+        """Write it to a fleet's folder: its vehicles find the repositories from now on."""
+        write_json(fleet / OFFER, self.as_json())
+
+
+@dataclass(frozen=True)
+class KeptReport(Record):
+    """The latest report of a vehicle, and the time of its arrival."""
+
+    vehicle: str  # by its certificate
+    time: float  # [s since 1970]
+    down_bytes: int  # that crossed the vehicle's sockets for releases until then, TLS included
+    report: ReleaseReport
+
+    def save(self, fleet: Path) -> None:
+        """Write it to a fleet's folder, in the place of the one before."""
+        write_json(fleet / REPORTS / f"{self.vehicle}.json", self.as_json())
+
+
+def read_reports(fleet: Path) -> dict[str, KeptReport]:
+    """Return the latest report of each vehicle, by name; its words are fit for a terminal."""
+    paths = sorted((fleet / REPORTS).glob("[!.]*.json"))
+    found = [KeptReport.from_json(read_json(path), str(path)) for path in paths]
+    plain = [replace(each.report, refused=make_printable(each.report.refused)) for each in found]
+    return {each.vehicle: replace(each, report=report) for each, report in zip(found, plain, strict=True)}
+
+
+def find_offered(fleet: Path, asked: str) -> Path | None:
+    """Return the file of a repository on offer that is asked for as image/… or director/…; None: there is none.
+
+    Raises ValueError, in words, for a path that is no repository's, leads out of it, or has a file that is too large.
+    """
+    found = FILE.fullmatch(asked)
+    if found is None:
+        raise ValueError("is no file of a repository")
+    if not (fleet / OFFER).is_file():
+        return None
+    offer = Offer.from_json(read_json(fleet / OFFER), str(fleet / OFFER))
+    root = Path(offer.image if found[1] == "image" else offer.director).resolve()
+    path = (root / found[2]).resolve()
+    if not path.is_relative_to(root):
+        raise ValueError("leads out of the repository")
+    if not path.is_file():
+        return None
+    if path.stat().st_size > LARGEST_FILE:
+        raise ValueError(f"is larger than {LARGEST_FILE} bytes")
+    return path
