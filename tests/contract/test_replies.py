@@ -9,8 +9,8 @@ from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, Re
 from pydantic import ValidationError
 
 from flcav.federation.links import link as links
-from flcav.federation.links.metered import Account, BudgetedGrid
-from flcav.federation.links.wrapped import WrappedGrid
+from flcav.federation.links.in_process import LinkGrid
+from flcav.federation.links.metered import Account, MeteredGrid
 from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.secure.primitives import SHARE_BYTES
@@ -46,32 +46,26 @@ class Vehicle:
         return 5
 
 
-class LyingGrid(WrappedGrid):
+class LyingGrid(LinkGrid):
     """The link of five clients, one of which lies."""
 
     def __init__(self, grid: Any, names: Mapping[int, str], liar: str, damage: Damage) -> None:
-        self._grid, self._names, self._liar, self._damage = grid, names, liar, damage
+        self._grid, self.names, self._liar, self._damage = grid, names, liar, damage
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
         for reply in self._grid.send_and_receive(messages, timeout=timeout):
-            if self._names[reply.metadata.src_node_id] == self._liar and reply.has_content():
+            if self.names[reply.metadata.src_node_id] == self._liar and reply.has_content():
                 self._damage(reply.content)
             yield reply
-
-    def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
-        return self._grid.push_messages(messages)
-
-    def pull_messages(self, message_ids: Iterable[str]) -> Iterable[Message]:
-        return self._grid.pull_messages(message_ids)
 
 
 def run(
     monkeypatch: pytest.MonkeyPatch, rules: Rules, liar: str, damage: Damage, strategy: Strategy = FEDAVG
 ) -> tuple[Weights, FederationState]:
-    def link(grid: Any, account: Account, names: Mapping[int, str]) -> LyingGrid:
-        return LyingGrid(BudgetedGrid(grid, account, names), names, liar, damage)
+    def link(grid: Any, account: Account, names: Mapping[int, str]) -> MeteredGrid:
+        return MeteredGrid(LyingGrid(grid, names, liar, damage), account, names)
 
-    monkeypatch.setattr(links, "BudgetedGrid", link)
+    monkeypatch.setattr(links, "MeteredGrid", link)
     clients, state = {f"cav{i}": Vehicle() for i in range(5)}, FederationState()
     account = Account(Ledger(LinkMegabytes(999.0, 0.0)), "edge", "toy", "wireless")
     return federate(clients, START, SCHEDULE, account, rules=rules, state=state, strategy=strategy).weights, state

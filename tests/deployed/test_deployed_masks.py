@@ -10,7 +10,7 @@ from fleet_clients import Imitator, Liar, Walker
 from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 
 from flcav.federation.acceptance import Expected, read_masked
-from flcav.federation.links.flower import Agreement
+from flcav.federation.client import Agreement
 from flcav.federation.links.flower_grid import DeployedGrid
 from flcav.federation.links.metered import Account, open_account
 from flcav.federation.loop import Schedule, federate

@@ -19,7 +19,15 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.fleet.authority import open_authority
 from flcav.fleet.keys import AUTHORITY, request_certificate, take_certificate
-from flcav.fleet.releases import LARGEST_REPORT, LARGEST_FILE, RELEASES, REPORT, ReleaseReport, ShadowReport, read_reports
+from flcav.fleet.releases import (
+    LARGEST_FILE,
+    LARGEST_REPORT,
+    RELEASES,
+    REPORT,
+    ReleaseReport,
+    ShadowReport,
+    read_reports,
+)
 from flcav.fleet.status import read_status
 from flcav.fleet.supervisor import read_processes
 from flcav.fleet.up import VEHICLES, read_ready

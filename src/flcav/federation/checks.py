@@ -1,11 +1,11 @@
 """Consistency of a federation's settings: which strategies, rules and clients go together."""
 
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from flcav.config import InputError
-from flcav.federation.client import check_arguments
 from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedbuff import FedBuff
@@ -36,6 +36,19 @@ def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules
                 raise InputError(f"selection: unbiased weights need clients that count their samples, {told}")
     if isinstance(rules.personal, RegionalModels):
         check_arguments(clients, ["proximal", "centre"], "personal:")
+
+
+def check_arguments(trainables: Mapping[str, Trainable], wanted: Iterable[str], why: str) -> None:
+    """Raise `InputError` where a client's `train` does not take the arguments `wanted`; `why` begins the sentence."""
+    for name, trainable in trainables.items():
+        known = inspect.signature(trainable.train).parameters
+        if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in known.values()):
+            continue
+        if lacking := [argument for argument in wanted if argument not in known]:
+            raise InputError(
+                f"{why} needs clients whose training takes '{lacking[0]}', and that of {name} "
+                f"({type(trainable).__name__}) does not"
+            )
 
 
 def check_weights(weights: Weights, told: str) -> None:

@@ -1,8 +1,7 @@
 """The Flower client app of both federated stages: vehicles with their edge server, edge servers with the cloud."""
 
-import inspect
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from flwr.app import Context, Message, MetricRecord, RecordDict
@@ -75,6 +74,16 @@ OWN_DIGESTS = "own-digests"  # record in the place of `OWN` that stays with the 
 OPTIMISER = "optimiser"  # record of it: the state of the client's optimiser
 KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
 HIDDEN = "hidden"  # an update that was masked, until the sum of its round is unmasked
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What server and clients of a federation agree on before it begins."""
+
+    strategy: Strategy
+    rules: Rules
+    secrets: Mapping[str, Secret]  # by client, that it draws local noise by
+    spent: int  # rounds of earlier federations that count against each client's privacy budget
 
 
 def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
@@ -260,16 +269,3 @@ def _recall(context: Context, key: str) -> LocalUpdate:
     metrics = context.state.metric_records[f"{key}-{SAMPLES}"]
     samples, loss = metrics[SAMPLES], metrics[LOSS]
     return LocalUpdate(_recorded(context, key), int(samples), float(loss))  # type: ignore[arg-type]
-
-
-def check_arguments(trainables: Mapping[str, Trainable], wanted: Iterable[str], why: str) -> None:
-    """Raise `InputError` where a client's `train` does not take the arguments `wanted`; `why` begins the sentence."""
-    for name, trainable in trainables.items():
-        known = inspect.signature(trainable.train).parameters
-        if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in known.values()):
-            continue
-        if lacking := [argument for argument in wanted if argument not in known]:
-            raise InputError(
-                f"{why} needs clients whose training takes '{lacking[0]}', and that of {name} "
-                f"({type(trainable).__name__}) does not"
-            )

@@ -7,8 +7,7 @@ from flwr.app import Message
 from flwr.serverapp import Grid
 
 from flcav.federation.client import client_app
-from flcav.federation.links.in_process import EmbeddedGrid
-from flcav.federation.links.wrapped import WrappedGrid
+from flcav.federation.links.in_process import EmbeddedGrid, LinkGrid
 from flcav.federation.loop import Server
 from flcav.federation.privacy import draw_secret
 from flcav.federation.rules import Rules
@@ -19,18 +18,18 @@ from flcav.federation.trainable import Trainable, Weights
 from flcav.federation.wire import ARRAYS, VECTOR, LocalWork, decode, read_arrays, unflatten
 
 
-class ReadGrid(WrappedGrid):
+class ReadGrid(LinkGrid):
     """A grid whose server keeps the arrays of each client's last update as they were sent."""
 
     def __init__(self, grid: Grid, names: Mapping[int, str]) -> None:
-        self._grid, self._names = grid, names
+        self._grid, self.names = grid, names
         self.updates: dict[str, Weights] = {}
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterable[Message]:
         """Yield the replies, and keep those that are updates."""
         for reply in self._grid.send_and_receive(messages, timeout=timeout):
             if reply.has_content() and ARRAYS in reply.content:
-                self.updates[self._names[reply.metadata.src_node_id]] = read_arrays(reply.content, ARRAYS)
+                self.updates[self.names[reply.metadata.src_node_id]] = read_arrays(reply.content, ARRAYS)
             yield reply
 
 

@@ -1,19 +1,37 @@
-"""Attendance of a federated round: clients asked, failures, the number of updates required, and those that arrived."""
+"""The server's exchange of messages with the clients of a round: who takes part, requests, answers, usable updates."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
+from flwr.app import ArrayRecord, ConfigRecord, Message, MessageType, RecordDict
+from flwr.serverapp import Grid
 from numpy.typing import NDArray
 
 from flcav.config import InputError
+from flcav.federation.acceptance import Expected, NoSamples, ReplyRefused
 from flcav.federation.rules import Rules
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import NoShares, RunningMean
 from flcav.federation.strategies.strategy import Averages, Robust
-from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.federation.wire import Lost, TimedOut
+from flcav.federation.trainable import LocalUpdate, Weights, learned_names
+from flcav.federation.wire import (
+    ANSWER_S,
+    ARRAYS,
+    CENTRE,
+    CONFIG,
+    EXTRA,
+    Arrived,
+    LocalWork,
+    Lost,
+    TimedOut,
+    list_events,
+    to_arrays,
+)
+
+AnswerT = TypeVar("AnswerT")
 
 
 class ClientFailed(OSError):
@@ -52,8 +70,10 @@ class Attendance:
         self.failed |= without
         self.idle |= without.keys() if isinstance(error, NoShares) else set()
 
-    def count(self, rules: Rules) -> None:
-        """Note whether too few take part for the rules, by a plan, by chance, or since others are away."""
+    def count(self, rules: Rules) -> bool:
+        """Return whether enough take part for the rules; note it where, by a plan, by chance or since some are away,
+        they are too few.
+        """
         chosen, secure = len(self.chosen), rules.secure
         absent = {name: self.away[name] for name in self.chosen if name in self.away}
         if short := rules.tell_shortage(chosen - len(absent)):
@@ -61,6 +81,7 @@ class Attendance:
             self.failed |= absent
             self.lost |= absent.keys()
         self.few = bool(short) or (secure is not None and secure.needed(chosen) > chosen)
+        return not short
 
     def check(self, rules: Rules, strategy: Strategy, number: int) -> None:
         """Raise `ClientFailed` where in round `number` fewer sent what can be used than are wanted.
@@ -107,6 +128,7 @@ class Intake:
         self.updates: dict[str, LocalUpdate] = {}  # by client, where they are kept
         self.samples: dict[str, int] = {}  # by client
         self.losses: dict[str, float] = {}  # by client
+        self.average: Callable[[], Weights] | None = None  # weights after the round, where a mode averages by itself
 
     def add(self, client: str, update: LocalUpdate) -> None:
         """Add a client's update."""
@@ -128,3 +150,66 @@ class Intake:
     def mean_loss(self) -> float | None:
         """Return the mean loss weighted by samples; None where no update came."""
         return float(np.average([*self.losses.values()], weights=[*self.samples.values()])) if self.samples else None
+
+
+@dataclass
+class OpenRound:
+    """A round under way: its local work, who takes part, what is sent, and what updates must look like."""
+
+    work: LocalWork
+    here: Attendance
+    expected: Expected  # of the updates, with the rules and the weights that the round began with
+    sent: Weights = field(default_factory=dict)  # a strategy's arrays that go with the weights
+    centre: Weights | None = None  # that clients are pulled to
+
+    @property
+    def start(self) -> Weights:
+        """Return the weights that the round began with."""
+        return self.expected.start
+
+    @property
+    def rules(self) -> Rules:
+        """Return the rules of the round."""
+        return self.expected.rules
+
+    def training(self) -> dict[str, ArrayRecord | ConfigRecord]:
+        """Return the records of a request to train: weights, what goes with them, and the local work."""
+        records = {ARRAYS: to_arrays(self.start)} | ({EXTRA: to_arrays(self.sent)} if self.sent else {})
+        if self.centre is not None:
+            records[CENTRE] = to_arrays({name: self.centre[name] for name in learned_names(self.centre)})
+        return {**records, CONFIG: self.work.record()}
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """The server's end of the exchange: a Flower grid, whose nodes are the clients."""
+
+    grid: Grid
+    names: Mapping[int, str]  # of the clients, by node
+
+    def ask(
+        self,
+        here: Attendance,
+        requests: Mapping[str, RecordDict],
+        read: Callable[[str, RecordDict], AnswerT],
+        awaited: Sequence[str] | None = None,
+    ) -> Iterator[tuple[str, AnswerT]]:
+        """Send each client its request, and yield by client, in their order, what `read` makes of its reply.
+
+        Clients that are lost, do not answer or whose reply is refused are noted `here`, with the reason. `awaited`: who
+        is to answer, where that is more than are sent a request.
+        """
+        nodes = {name: node for node, name in self.names.items()}
+        messages = (Message(content, nodes[name], MessageType.TRAIN) for name, content in requests.items())
+        replies = self.grid.send_and_receive(messages, timeout=ANSWER_S)
+        for event in list_events(requests if awaited is None else awaited, replies, self.names):
+            if not isinstance(event, Arrived):
+                here.note(event)
+                continue
+            try:
+                answer = read(event.client, event.content)
+            except ReplyRefused as error:
+                here.failed[event.client] = str(error)
+                here.idle |= {event.client} if isinstance(error, NoSamples) else set()
+            else:
+                yield event.client, answer

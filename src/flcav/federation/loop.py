@@ -6,26 +6,23 @@ its own strategies sample clients from the global random state, multiply integer
 round where one client fails.
 """
 
-import contextlib
 import logging
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypedDict, Unpack
 
 import numpy as np
 from cryptography import x509
-from flwr.app import ConfigRecord, Message, MessageType, RecordDict
-from flwr.serverapp import Grid
 
 from flcav.config import InputError
-from flcav.federation.acceptance import Expected, NoSamples, ReplyRefused, extra_forms, read_norm, read_update
+from flcav.federation.acceptance import Expected, extra_forms
 from flcav.federation.checks import check_federation, check_weights
-from flcav.federation.client import kept_records
-from flcav.federation.exchange import Attendance, ClientFailed, Intake
-from flcav.federation.links.link import ANSWER_S, Ask, Runtime, open_link
+from flcav.federation.client import Agreement, kept_records
+from flcav.federation.exchange import Attendance, ClientFailed, Exchange, Intake, OpenRound
+from flcav.federation.links.link import Ask, Link, Runtime, open_link
 from flcav.federation.links.metered import Account, open_account
+from flcav.federation.modes import buffered, drawn, masked, plain
 from flcav.federation.modes.buffered import Buffering, Buffers, afford_buffers, is_spent, take_turns
-from flcav.federation.modes.masked import SecureRound
 from flcav.federation.privacy import (
     account_epsilon,
     affordable_rounds,
@@ -40,25 +37,12 @@ from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.secure.parties import SumLost
 from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.strategies import FEDAVG, Strategy
-from flcav.federation.strategies.fedavg import NoShares, average_inversely
+from flcav.federation.strategies.fedavg import NoShares
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.strategies.strategy import Exchanges, Stateful, find_weigher
+from flcav.federation.strategies.strategy import Exchanges, Stateful
 from flcav.federation.trainable import Distiller, LocalUpdate, Trainable, Weights, forms_of, learned_names
-from flcav.federation.wire import (
-    ARRAYS,
-    ASK,
-    CENTRE,
-    CONFIG,
-    COUNT,
-    EXTRA,
-    NORM,
-    SEND,
-    Arrived,
-    LocalWork,
-    list_events,
-    to_arrays,
-)
+from flcav.federation.wire import LocalWork
 from flcav.statistics.streams import derive_seed
 
 EVERYBODY = Rules()
@@ -66,7 +50,6 @@ WHOLE = (1, 1.0)  # samples and loss of the one update that a strategy is given 
 BeforeRound = Callable[[int, Weights], None]  # called with the round's number and the weights that it begins with
 AskAfter = Callable[[int, Weights, Ask], None]  # called with number, aggregated weights and a way to ask clients
 OnRound = Callable[[int, Weights, float | None], None]  # called with number, aggregated weights and mean training loss
-AnswerT = TypeVar("AnswerT")
 logging.getLogger("flwr").setLevel(logging.ERROR)  # Flower logs each message; a stage reports its rounds
 
 
@@ -91,24 +74,47 @@ def _do_nothing(*_: object) -> None:
     pass
 
 
+class Options(TypedDict, total=False):
+    """Keyword arguments of `federate`, which describes them; their defaults are those of `Terms`."""
+
+    strategy: Strategy
+    rules: Rules
+    state: FederationState | None
+    done: int
+    earlier: int
+    before_round: BeforeRound
+    ask_after: AskAfter
+    on_round: OnRound
+    runtime: Runtime | None
+    centre: Weights | None
+    distiller: Distiller | None
+    buffers: Buffers | None
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Terms of a federation: its strategy and rules, what came before it, and what is called between its rounds."""
+
+    strategy: Strategy = FEDAVG
+    rules: Rules = EVERYBODY
+    state: FederationState | None = None
+    done: int = 0
+    earlier: int = 0
+    before_round: BeforeRound = _do_nothing
+    ask_after: AskAfter = _do_nothing
+    on_round: OnRound = _do_nothing
+    runtime: Runtime | None = None
+    centre: Weights | None = None
+    distiller: Distiller | None = None
+    buffers: Buffers | None = None
+
+
 def federate(
     clients: Mapping[str, Trainable],
     weights: Weights,
     schedule: Schedule,
     account: Account | None = None,
-    *,
-    strategy: Strategy = FEDAVG,
-    rules: Rules = EVERYBODY,
-    state: FederationState | None = None,
-    done: int = 0,
-    earlier: int = 0,
-    before_round: BeforeRound = _do_nothing,
-    ask_after: AskAfter = _do_nothing,
-    on_round: OnRound = _do_nothing,
-    runtime: Runtime | None = None,
-    centre: Weights | None = None,
-    distiller: Distiller | None = None,
-    buffers: Buffers | None = None,
+    **options: Unpack[Options],
 ) -> LocalUpdate:
     """Run rounds `done + 1 .. schedule.rounds` of a federation, by default of federated averaging.
 
@@ -167,53 +173,74 @@ def federate(
     >>> federate(vehicles, {"w": np.zeros(2)}, schedule).weights["w"]
     array([2.5, 2.5])
     """
-    check_federation(clients, strategy, rules)
+    terms, account, names = Terms(**options), account or open_account(), [*clients]
+    check_federation(clients, terms.strategy, terms.rules)
     check_weights(weights, "weights to begin with")
-    state, account, rounds, names = state or FederationState(), account or open_account(), schedule.rounds, [*clients]
-    sent = _find_sent(weights, state, distiller)
-    rules.upload.check_layers(sent)
-    buffering = None
-    if isinstance(strategy, FedBuff):
-        buffers = buffers or take_turns(names, strategy.buffer, rounds)
-        buffering = Buffering(strategy, buffers, account)
-        rounds = min(rounds, afford_buffers(buffers, rules.privacy))
-    elif rules.privacy is not None:
-        privacy = find_noise(rules.privacy, rules.selection, len(names), earlier + rounds)
-        rules = rules.model_copy(update={"privacy": privacy})
-        rounds = affordable_rounds(privacy, rules.selection, names, rounds, earlier)
-    if rounds <= done or _is_over(state, rules):
+    state = terms.state or FederationState()
+    sent = weights if terms.distiller is None else state.server or terms.distiller.outputs(weights)
+    terms.rules.upload.check_layers(sent)
+    rules, rounds, buffering = _limit_rounds(terms, names, schedule.rounds, account)
+    if rounds <= terms.done or _is_over(state, rules):
         return LocalUpdate(weights, 0, 0.0)
-    kept, account = kept_records(strategy, rules), replace(account, concealed=rules.hides_draws)
-    rules = rules.settle_threshold(names, certified=getattr(runtime, "deployed", False))
+    account = replace(account, concealed=rules.hides_draws)
+    rules = rules.settle_threshold(names, certified=getattr(terms.runtime, "deployed", False))
     secrets = {party: state.keep_secret(party) for party in rules.secret_parties(names) if party in clients}
-    spent = least_participations(rules.selection, len(names), earlier) if buffers is None else buffers.least_before
-    with open_link(clients, runtime, account, strategy, rules, state.clients, secrets, spent) as link:
+    before = (
+        buffering.buffers.least_before
+        if buffering
+        else least_participations(rules.selection, len(names), terms.earlier)
+    )
+    agreed = Agreement(terms.strategy, rules, secrets, before)
+    with open_link(clients, terms.runtime, account, agreed, state.clients) as link:
         server = Server(
-            *(link.grid, link.names, strategy, rules, schedule.work, state, earlier, centre, account.find_away),
-            buffering,
-            link.authority,
+            *(link.grid, link.names, terms.strategy, rules, schedule.work, state, terms.earlier, terms.centre),
+            *(account.find_away, buffering, link.authority),
         )
-        for number in range(done + 1, rounds + 1):
-            before_round(number, weights)
-            try:
-                combined = server.run_round(number, sent)
-            except (ClientFailed, TooFewClients) as error:
-                error.reached = weights
-                raise
-            state.clients = link.read_states(kept) if kept else state.clients
-            if distiller is None:
-                weights = combined
-            elif not state.records[-1].empty:
-                weights = _imitate(distiller, strategy, weights, combined, schedule.work(number))
-                state.server = {name: np.asarray(array) for name, array in combined.items()}
-            link.follow(state.records[-1])
-            ask_after(number, weights, link.ask)
-            on_round(number, weights, state.records[-1].loss)
-            sent = combined
+        for number in range(terms.done + 1, rounds + 1):
+            terms.before_round(number, weights)
+            weights, sent = _run_round(server, link, terms, number, weights, sent)
+            terms.ask_after(number, weights, link.ask)
+            terms.on_round(number, weights, state.records[-1].loss)
             if _is_over(state, rules):
                 break
     last = state.records[-1]
     return LocalUpdate(weights, last.samples, last.loss or 0.0)
+
+
+def _limit_rounds(
+    terms: Terms, names: Sequence[str], rounds: int, account: Account
+) -> tuple[Rules, int, Buffering | None]:
+    """Return the rules with the noise for the planned rounds, how many of these a budget affords, and their buffers."""
+    rules = terms.rules
+    if isinstance(terms.strategy, FedBuff):
+        buffers = terms.buffers or take_turns(names, terms.strategy.buffer, rounds)
+        afforded = min(rounds, afford_buffers(buffers, rules.privacy))
+        return rules, afforded, Buffering(terms.strategy, buffers, account)
+    if rules.privacy is None:
+        return rules, rounds, None
+    privacy = find_noise(rules.privacy, rules.selection, len(names), terms.earlier + rounds)
+    afforded = affordable_rounds(privacy, rules.selection, names, rounds, terms.earlier)
+    return rules.model_copy(update={"privacy": privacy}), afforded, None
+
+
+def _run_round(
+    server: "Server", link: Link, terms: Terms, number: int, weights: Weights, sent: Weights
+) -> tuple[Weights, Weights]:
+    """Return the weights after a round, and what the next one sends down: these, or a distillation's mean outputs."""
+    state, kept = server.state, kept_records(server.strategy, server.rules)
+    try:
+        combined = server.run_round(number, sent)
+    except (ClientFailed, TooFewClients) as error:
+        error.reached = weights
+        raise
+    state.clients = link.read_states(kept) if kept else state.clients
+    if terms.distiller is None:
+        weights = combined
+    elif not state.records[-1].empty:
+        weights = _imitate(terms.distiller, terms.strategy, weights, combined, server.work(number))
+        state.server = {name: np.asarray(array) for name, array in combined.items()}
+    link.follow(state.records[-1])
+    return weights, combined
 
 
 def _is_over(state: FederationState, rules: Rules) -> bool:
@@ -221,11 +248,6 @@ def _is_over(state: FederationState, rules: Rules) -> bool:
     most = rules.empty_rounds
     empty = most is not None and len(state.records) >= most and all(each.empty for each in state.records[-most:])
     return empty or is_spent(state)
-
-
-def _find_sent(weights: Weights, state: FederationState, distiller: Distiller | None) -> Weights:
-    """Return what the first round sends down: the weights, or outputs on shared samples, those of the last round."""
-    return weights if distiller is None else state.server or distiller.outputs(weights)
 
 
 def _imitate(distiller: Distiller, strategy: Strategy, network: Weights, outputs: Weights, work: LocalWork) -> Weights:
@@ -236,27 +258,10 @@ def _imitate(distiller: Distiller, strategy: Strategy, network: Weights, outputs
     return distiller.imitate(network, outputs, steps=strategy.steps, learning_rate=work.learning_rate, seed=seed)
 
 
-@dataclass
-class Round:
-    """A round under way: its local work, what it began with, who takes part, and what updates must look like."""
-
-    work: LocalWork
-    start: Weights
-    here: Attendance
-    expected: Expected  # of the updates
-    sent: Weights  # a strategy's arrays beside the weights
-    shares: dict[str, float] = field(default_factory=dict)  # of unbiased selection: of all samples, by client
-    told: dict[str, float] = field(default_factory=dict)  # norms of updates, by client
-    drawn: dict[str, float] = field(default_factory=dict)  # of unbiased selection: probability of the clients drawn
-    masked: SecureRound | None = None  # of secure aggregation
-
-
 @dataclass(frozen=True)
-class Server:
+class Server(Exchange):
     """Server of a federation: it runs rounds with the clients at the far end of a Flower grid."""
 
-    grid: Grid
-    names: Mapping[int, str]  # of the clients, by node
     strategy: Strategy
     rules: Rules
     work: Callable[[int], LocalWork]  # local training of a round, by its number
@@ -290,107 +295,44 @@ class Server:
         self._keep(round_, updates)  # what is kept
         return weights
 
-    def _call(self, number: int, start: Weights) -> Round:
+    def _call(self, number: int, start: Weights) -> OpenRound:
         """Return the round with the clients that are chosen for it, and those of them that are away."""
         work, selection, clients = self.work(number), self.rules.selection, [*self.names.values()]
         if self.buffering is not None:
             self.state.server = self.buffering.keep_version(number, start, self.state.server)
-            return Round(work, start, self.buffering.attend(number, clients), Expected(self.rules, start, {}), {})
+            return OpenRound(work, self.buffering.attend(number, clients), Expected(self.rules, start))
         sent = self.strategy.send(self.state.server) if isinstance(self.strategy, Exchanges) else {}
         seed = int.from_bytes(self._key("selection", work), "little") if self.rules.hides_draws else work.seed
         chosen = selection.choose(clients, number, seed, self.earlier)
         here = Attendance(clients if selection.unbiased else chosen, chosen, self.away(number))
-        extra = extra_forms(self.strategy, self.rules, start, sent)
-        return Round(work, start, here, Expected(self.rules, start, extra), sent)
+        expected = Expected(self.rules, start, extra_forms(self.strategy, self.rules, start, sent))
+        return OpenRound(work, here, expected, sent, self.centre)
 
     def _key(self, purpose: str, work: LocalWork) -> bytes:
         return derive_key(self.state.keep_secret(SERVER), purpose, work.round, work.seed)
 
-    def _collect(self, round_: Round) -> Intake:
-        """Send the weights and the local work to those who take part; return the updates that count.
-
-        Under importance selection all clients train and report the norm of their update, and those that are drawn are
-        asked to send it. Under other unbiased selections all first report their number of samples. Where fewer take
-        part than `least_clients`, nobody is asked to send an update.
-        """
-        here, selection, local = round_.here, self.rules.selection, {CONFIG: round_.work.record()}
+    def _collect(self, round_: OpenRound) -> Intake:
+        """Return the updates that count, by the mode of the round."""
         if self.buffering is not None:
-            kept, number = self.state.server, round_.work.round
-            return self.buffering.collect(number, here, round_.start, kept, self.rules, self.work, self._ask)
-        records = {ARRAYS: to_arrays(round_.start)} | ({EXTRA: to_arrays(round_.sent)} if round_.sent else {})
-        if self.centre is not None:
-            records[CENTRE] = to_arrays({name: self.centre[name] for name in learned_names(self.centre)})
-        request, wanted = RecordDict({**records, **local}), here.chosen
-        if selection.unbiased:
-            self._read_norms(round_, here.asked, RecordDict({**local, ASK: ConfigRecord({ASK: COUNT})}))
-            wanted = [name for name in here.chosen if name in round_.shares]
-            round_.drawn = dict.fromkeys(wanted, selection.inclusion_probability(len(here.asked)))
-        elif selection.rule == "importance":
-            asking = RecordDict({**records, **local, ASK: ConfigRecord({ASK: NORM})})
-            round_.drawn = selection.draw(self._read_norms(round_, here.chosen, asking), round_.work.seed)
-            here.chosen = wanted = [*round_.drawn]
-            request = RecordDict({ASK: ConfigRecord({ASK: SEND}), **local})
-        here.count(self.rules)
-        if here.shortage is not None:
-            return Intake()
+            return buffered.collect(self, round_, self.buffering, self.state.server, self.work)
         if self.rules.secure is not None:
-            about = self.rules.secure, round_.expected, here, round_.work.round, {**records, **local}, self._ask
-            round_.masked = SecureRound(*about, self.authority)
-            return round_.masked.collect()
-        plain = self.rules.privacy is None and not selection.weighs
-        updates = Intake(find_weigher(self.strategy) if plain else None)
-        told = round_.told if selection.rule == "importance" else {}
-        read = lambda name, content: read_update(content, round_.expected, told.get(name))  # noqa: E731
-        for name, update in self._ask(here, dict.fromkeys(wanted, request), read):
-            with self._refusing(round_):
-                updates.add(name, update)
-        return updates
+            return masked.collect(self, round_, self.authority)
+        if self.rules.selection.weighs:
+            return drawn.collect(self, round_)
+        return plain.collect(self, round_, self.strategy)
 
-    def _ask(
-        self,
-        here: Attendance,
-        requests: Mapping[str, RecordDict],
-        read: Callable[[str, RecordDict], AnswerT],
-        awaited: list[str] | None = None,
-    ) -> Iterator[tuple[str, AnswerT]]:
-        """Send each client its request, and yield by client, in their order, what `read` makes of its reply.
-
-        Clients that are lost, do not answer or whose reply is refused are noted `here`, with the reason. `awaited`: who
-        is to answer, where that is more than are sent a request.
-        """
-        nodes = {name: node for node, name in self.names.items()}
-        messages = (Message(content, nodes[name], MessageType.TRAIN) for name, content in requests.items())
-        replies = self.grid.send_and_receive(messages, timeout=ANSWER_S)
-        for event in list_events(requests if awaited is None else awaited, replies, self.names):
-            if not isinstance(event, Arrived):
-                here.note(event)
-                continue
-            try:
-                answer = read(event.client, event.content)
-            except ReplyRefused as error:
-                here.failed[event.client] = str(error)
-                here.idle |= {event.client} if isinstance(error, NoSamples) else set()
-            else:
-                yield event.client, answer
-
-    def _read_norms(self, round_: Round, clients: list[str], request: RecordDict) -> dict[str, float]:
-        """Return the norms of the clients' updates times their shares of all samples, by client in node order."""
-        told = dict(self._ask(round_.here, dict.fromkeys(clients, request), lambda _, c: read_norm(c, self.rules)))
-        total, round_.told = (
-            sum(samples for _, samples in told.values()),
-            {name: own for name, (own, _) in told.items()},
-        )
-        round_.shares = {name: samples / max(total, 1) for name, (_, samples) in told.items()}
-        return {name: norm * round_.shares[name] for name, (norm, _) in told.items()}
-
-    def _combine(self, round_: Round, received: Intake) -> Weights:
+    def _combine(self, round_: OpenRound, received: Intake) -> Weights:
         """Return the weights after a round, and change the strategy's state; raises why there is no update."""
         if round_.here.shortage is not None:
             raise round_.here.shortage
-        start, updates = round_.start, self._average_first(round_, received)
+        start, updates, privacy = round_.start, received.combinable, self.rules.privacy
+        if received.average is not None:
+            updates = [LocalUpdate(received.average(), *WHOLE)]
+        elif privacy is not None and not privacy.local:
+            updates = [LocalUpdate(self._average_privately(round_, updates), *WHOLE)]
         if not updates:
             return start
-        with self._refusing(round_):
+        with plain.refusing(self.strategy, round_.work.round):
             if isinstance(self.strategy, Stateful):
                 weights, after = self.strategy.step(start, updates, self.state.server, len(self.names))
                 self.state.server = {name: np.asarray(array) for name, array in after.items()}
@@ -402,37 +344,19 @@ class Server:
         check_weights(weights, f"strategy {name}, round {round_.work.round}")
         return weights
 
-    @contextlib.contextmanager
-    def _refusing(self, round_: Round) -> Iterator[None]:
-        """Raise `InputError` where the strategy cannot combine updates; `NoShares` where it gives none a weight."""
-        try:
-            yield
-        except NoShares:
-            raise
-        except ValueError as error:
-            name = type(self.strategy).__name__
-            raise InputError(f"strategy {name}, round {round_.work.round}: {error}") from error
+    def _average_privately(self, round_: OpenRound, updates: Sequence[LocalUpdate]) -> Weights:
+        """Return the weights after clipped changes and central noise, of all arrays that are learned and sent."""
+        privacy, selection, work = self.rules.privacy, self.rules.selection, round_.work
+        assert privacy is not None
+        sent = self.rules.upload.exchanged(round_.start)
+        names = [name for name in learned_names(round_.start) if name in sent]
+        expected = float(len(round_.here.chosen))
+        if selection.rule == "poisson":  # by chance more or fewer come
+            expected = expected_clients(selection, [*self.names.values()])
+        key = None if privacy.seeded else self._key("noise", work)
+        return average_privately(round_.start, updates, names, privacy, expected, work.seed, key)
 
-    def _average_first(self, round_: Round, received: Intake) -> list[LocalUpdate]:
-        """Return what the strategy combines: the updates or, under masks, central noise or weights, their one mean."""
-        privacy, start, work = self.rules.privacy, round_.start, round_.work
-        if round_.masked is not None:
-            return [LocalUpdate(round_.masked.average(received.updates), *WHOLE)]
-        if privacy is not None and not privacy.local:
-            sent = self.rules.upload.exchanged(start)
-            names = [name for name in learned_names(start) if name in sent]
-            expected = float(len(round_.here.chosen))
-            if self.rules.selection.rule == "poisson":  # by chance more or fewer come
-                expected = expected_clients(self.rules.selection, [*self.names.values()])
-            key = None if privacy.seeded else self._key("noise", work)
-            mean = average_privately(start, received.combinable, names, privacy, expected, work.seed, key)
-            return [LocalUpdate(mean, *WHOLE)]
-        if self.rules.selection.weighs and received.updates:
-            weights = {name: round_.shares[name] / round_.drawn[name] for name in received.updates}
-            return [LocalUpdate(average_inversely(start, received.updates, weights), *WHOLE)]
-        return received.combinable
-
-    def _keep(self, round_: Round, received: Intake) -> None:
+    def _keep(self, round_: OpenRound, received: Intake) -> None:
         """Add the record of a round to the state; where who was drawn is to stay secret, it has nothing of clients."""
         number, epsilon = round_.work.round, None
         if self.buffering is not None:

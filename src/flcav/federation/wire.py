@@ -36,6 +36,7 @@ KEYS, SHARES, MASKED, UNMASK = "keys", "shares", "masked", "unmask"  # ask, in t
 NAMES, CIPHERS, MASKS = "names", "ciphers", "masks"  # entries of its messages; that of shares is `SHARES`
 CERTIFICATES, SIGNATURES = "certificates", "signatures"  # entries beside keys, of clients with an authority
 SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
+ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere
 
 NUMBERS = {  # types of arrays in messages, by name
     str(np.dtype(code)): np.dtype(code) for code in (*np.typecodes["AllInteger"], *np.typecodes["AllFloat"], "?")

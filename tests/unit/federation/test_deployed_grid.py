@@ -14,8 +14,8 @@ import pytest
 from flwr.app import ConfigRecord, Context, Error, Message, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
+from flcav.federation.client import Agreement
 from flcav.federation.exchange import ClientFailed
-from flcav.federation.links.flower import Agreement
 from flcav.federation.links.flower_grid import DeployedGrid
 from flcav.federation.links.in_process import keep_identity, wire_bytes
 from flcav.federation.links.link import open_link
@@ -209,7 +209,7 @@ def test_a_vehicle_that_claims_does_not_end_questions(folder: Path):
         Account(Ledger(LinkMegabytes(9, 0)), "edge", "t", "wireless"),
     )
     for lies in ({FIRST: with_code(OVER_BUDGET)}, {FIRST: with_code(LOST_BY_NETWORK)}):
-        with open_link(clients, Fleet(folder, lies), account, FEDAVG, Rules(), {}, {}, 0) as link:  # type: ignore[arg-type]
+        with open_link(clients, Fleet(folder, lies), account, Agreement(FEDAVG, Rules(), {}, 0), {}) as link:  # type: ignore[arg-type]
             for asked in (["cav0", "cav1"], ["cav0"]):
                 told = link.ask("offer", asked)
                 assert told.missing.keys() == {"cav0"}

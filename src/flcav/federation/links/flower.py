@@ -16,16 +16,12 @@ from typing import Literal
 from flwr.app import Message
 
 from flcav.config import InputError
-from flcav.federation.client import client_app
+from flcav.federation.client import Agreement, client_app
 from flcav.federation.links.flower_grid import POLL_S, STARTING_S, DeployedGrid
-from flcav.federation.links.in_process import EmbeddedGrid, keep_identity
+from flcav.federation.links.in_process import EmbeddedGrid, LinkGrid, keep_identity
 from flcav.federation.links.metered import Account
 from flcav.federation.links.vehicle_app import Assignment
-from flcav.federation.links.wrapped import WrappedGrid
-from flcav.federation.privacy import Secret
-from flcav.federation.rules import Rules
 from flcav.federation.state import ClientStates
-from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable
 from flcav.fleet.authority import found_authority, open_registry
 from flcav.fleet.fl_request import parse_request
@@ -39,16 +35,6 @@ SERVING = "serving.lock"  # in a fleet's folder: held by the federation that it 
 STARTING_VEHICLE_S = 15.0  # more for each vehicle, which may all be on a busy machine
 LOOK_S = 0.4  # between looks who is in: each is a connection of its own, of some 0.1 s of CPU time
 OPEN_S = 3600.0  # that an FL request waits for a group
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """What all clients of a federation agree on."""
-
-    strategy: Strategy
-    rules: Rules
-    secrets: Mapping[str, Secret]  # of each, that it draws local noise by
-    spent: int
 
 
 class Deployment:
@@ -215,7 +201,7 @@ class PartlyDeployed:
             yield JoinedGrid(far, EmbeddedGrid(app, [*here], states), [*clients])
 
 
-class JoinedGrid(WrappedGrid):
+class JoinedGrid(LinkGrid):
     """Grid of deployed nodes, and of others in this process."""
 
     def __init__(self, far: "DeployedGrid", near: EmbeddedGrid, clients: Sequence[str]) -> None:
@@ -223,10 +209,6 @@ class JoinedGrid(WrappedGrid):
         self._grid, self._far, self._near, self.follow = far, far, near, far.follow
         nodes = {name: node for grid in (far, near) for node, name in grid.names.items()}
         self.names = {nodes[name]: name for name in clients}
-
-    def get_node_ids(self) -> list[int]:
-        """Return the ids of the nodes, in the order of the clients."""
-        return [*self.names]
 
     def read_states(self, keys: Iterable[str]) -> ClientStates:
         """Return the arrays that clients keep between rounds under these records, by client and record."""

@@ -20,9 +20,8 @@ from flwr.app import ConfigRecord, Error, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
 from flcav.config import InputError
-from flcav.federation.links.in_process import wire_bytes
+from flcav.federation.links.in_process import LinkGrid, wire_bytes
 from flcav.federation.links.metered import Account
-from flcav.federation.links.wrapped import WrappedGrid
 from flcav.federation.state import ClientStates, RoundRecord
 from flcav.federation.wire import GRANT, GRANTED, LOST_BY_NETWORK, OVER_BUDGET, read_arrays
 from flcav.fleet.authority import load_certificate, open_registry
@@ -47,7 +46,7 @@ TRANSPORT = (3, 4, 5, 8)  # Flower's error codes of messages and nodes that are 
 SPARE_BYTES, CLIENT_BYTES = 1 << 16, 512  # of the largest answer, beside arrays; of what it has for each client
 
 
-class DeployedGrid(WrappedGrid):
+class DeployedGrid(LinkGrid):
     """Grid of deployed vehicles, which begins another run where Flower has given the one before up."""
 
     def __init__(
@@ -115,10 +114,6 @@ class DeployedGrid(WrappedGrid):
     def end(self, failed: bool = False) -> None:
         """End the run."""
         self._run.end(failed)
-
-    def get_node_ids(self) -> list[int]:
-        """Return the ids of the nodes, in the order of the clients."""
-        return [*self.names]
 
     def read_states(self, keys: Iterable[str]) -> ClientStates:
         """Return the arrays that clients keep between rounds under these records, by client and record."""

@@ -39,6 +39,7 @@ from flcav.network.ledger import BudgetExceeded
 RUN_ID, SERVER_NODE = 1, 1
 FIRST_NODE = 2  # id of the first client
 WHOLE = Upload()  # whole updates
+UNMETERED = "messages of a federation go by send_and_receive"
 
 
 def wire_bytes(content: RecordDict) -> int:
@@ -104,7 +105,41 @@ def _server_identity() -> Iterator[None]:
         yield
 
 
-class EmbeddedGrid(Grid):
+class LinkGrid(Grid):
+    """Flower grid whose nodes are a federation's clients, and whose messages all go by `send_and_receive`."""
+
+    names: Mapping[int, str]  # of the clients, by node
+    _flower_run = Run.create_empty(RUN_ID)
+
+    def get_node_ids(self) -> list[int]:
+        """Return the ids of the nodes, in the order of the clients."""
+        return [*self.names]
+
+    def create_message(
+        self, content: RecordDict, message_type: str, dst_node_id: int, group_id: str, ttl: float | None = None
+    ) -> Message:
+        """Return a message from the server to a node."""
+        return Message(content, dst_node_id, message_type, ttl=ttl, group_id=group_id)
+
+    def set_run(self, run: Run) -> None:
+        """Set Flower's record of the run."""
+        self._flower_run = run
+
+    @property
+    def run(self) -> Run:
+        """Return Flower's record of the run."""
+        return self._flower_run
+
+    def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
+        """Raise NotImplementedError: a message whose answer is fetched later would pass ledger and outages by."""
+        raise NotImplementedError(UNMETERED)
+
+    def pull_messages(self, message_ids: Iterable[str]) -> Iterable[Message]:
+        """Raise NotImplementedError, as `push_messages` does."""
+        raise NotImplementedError(UNMETERED)
+
+
+class EmbeddedGrid(LinkGrid):
     """Flower grid whose nodes are in this process; a context manager.
 
     A node exists while it answers, and what it keeps for later rounds beyond that.
@@ -126,9 +161,7 @@ class EmbeddedGrid(Grid):
         self.names = dict(enumerate(names, FIRST_NODE))
         nodes = {name: node for node, name in self.names.items()}
         self._states = {nodes[name]: _node_state(own) for name, own in states.items() if name in nodes}
-        self._replies: dict[str, Message] = {}
         self._sent = 0
-        self._run = Run.create_empty(RUN_ID)
         self._identity = _server_identity()
 
     def __enter__(self) -> "EmbeddedGrid":
@@ -146,34 +179,6 @@ class EmbeddedGrid(Grid):
                 if key in state:
                     found.setdefault(self.names[node], {})[key] = read_arrays(state, key)
         return found
-
-    def set_run(self, run: Run) -> None:
-        """Set Flower's record of the run."""
-        self._run = run
-
-    @property
-    def run(self) -> Run:
-        """Return Flower's record of the run."""
-        return self._run
-
-    def create_message(
-        self, content: RecordDict, message_type: str, dst_node_id: int, group_id: str, ttl: float | None = None
-    ) -> Message:
-        """Return a message from the server to a node."""
-        return Message(content, dst_node_id, message_type, ttl=ttl, group_id=group_id)
-
-    def get_node_ids(self) -> list[int]:
-        """Return the ids of the registered nodes, in registration order."""
-        return list(self.names)
-
-    def push_messages(self, messages: Iterable[Message]) -> list[str]:
-        """Deliver each message to its node, keep the reply, and return the message ids."""
-        ids = []
-        for message in messages:
-            self._number(message)
-            ids.append(message.metadata.message_id)
-            self._replies[ids[-1]] = self._deliver(message)
-        return ids
 
     def _number(self, message: Message) -> None:
         self._sent += 1
@@ -196,10 +201,6 @@ class EmbeddedGrid(Grid):
             message.content = shared
             if context.state:
                 self._states[node] = context.state
-
-    def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
-        """Return the available replies to these messages and forget them."""
-        return [self._replies.pop(identifier) for identifier in message_ids if identifier in self._replies]
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
         """Yield the replies in the order of the messages, as soon as each is there; raises what a node raises.

@@ -17,17 +17,15 @@ from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
 from flcav.config import InputError
-from flcav.federation.client import client_app
+from flcav.federation.client import Agreement, client_app
 from flcav.federation.links.in_process import EmbeddedGrid, TimedClients
-from flcav.federation.links.metered import Account, BudgetedGrid, MeteredGrid
-from flcav.federation.links.outages import LossyGrid
+from flcav.federation.links.metered import Account, MeteredGrid
 from flcav.federation.links.processes import ClientProcesses, RemoteClients
-from flcav.federation.privacy import Secret
 from flcav.federation.rules import Rules
 from flcav.federation.state import ClientStates, ReadStates, RoundRecord
-from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.strategies import FEDAVG
 from flcav.federation.trainable import Trainable, Weights, answer_question
-from flcav.federation.wire import ARRAYS, ASK, GRANT, Arrived, Lost, list_events, read_arrays, to_arrays
+from flcav.federation.wire import ANSWER_S, ARRAYS, ASK, GRANT, Arrived, Lost, list_events, read_arrays, to_arrays
 from flcav.interface.wording import suggest
 
 if TYPE_CHECKING:
@@ -38,7 +36,6 @@ if TYPE_CHECKING:
 RUNTIMES = "embedded", "ray", "flower"
 NOTHING: Weights = {}  # comes with a question
 UNREADABLE = "an answer that cannot be read"  # why one is missing
-ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere
 # where clients train, and how messages reach them
 Runtime = Union[ClientProcesses, "RaySimulation", "Deployment", "RegionalDeployment", "PartlyDeployed", "RosTopics"]
 
@@ -81,11 +78,8 @@ def open_link(
     clients: Mapping[str, Trainable],
     runtime: Runtime | None,
     account: Account,
-    strategy: Strategy,
-    rules: Rules,
+    agreed: Agreement,
     states: ClientStates,
-    secrets: Mapping[str, Secret],
-    spent: int,
 ) -> Iterator[Link]:
     """Yield the link to `clients`, on which `account` counts and loses messages.
 
@@ -93,13 +87,11 @@ def open_link(
         clients: by name.
         runtime: where they train; None: in this process.
         account: ledger of the messages, and the clients that the network loses.
-        strategy: whose part on the clients they play.
-        rules: what they answer, and in which form.
-        states: what they have kept from earlier rounds.
-        secrets: by which they draw noise that is not seeded.
-        spent: rounds of earlier federations that count against their privacy budget.
+        agreed: strategy, rules and secrets of the federation.
+        states: what clients have kept from earlier rounds.
     """
-    make_app = partial(client_app, strategy=strategy, rules=rules, secrets=secrets, spent=spent)
+    make_app = partial(client_app, **vars(agreed))
+    rules = agreed.rules
     limit_s, names, far = rules.limits.train_s, [*clients], False
     timed = clients if limit_s is None else TimedClients(clients, limit_s)
     if runtime is None:
@@ -107,16 +99,13 @@ def open_link(
     elif isinstance(runtime, ClientProcesses):
         opened = EmbeddedGrid(make_app(RemoteClients(clients, runtime, limit_s)), names, states, runtime.count)
     elif runtime.deployed is True:
-        from flcav.federation.links.flower import Agreement
-
         check_deployable(rules)
-        opened, far = runtime.open(clients, Agreement(strategy, rules, secrets, spent), states, account), True
+        opened, far = runtime.open(clients, agreed, states, account), True
     else:
         timing = (lambda each: each) if limit_s is None else (lambda each: TimedClients(each, limit_s))
         opened = runtime.open(clients, lambda each: make_app(timing(each), simulated=True), states)
     with opened as inner:
-        lossy = LossyGrid(inner, account, inner.names) if account.outages else inner
-        metered = MeteredGrid(BudgetedGrid(lossy, account, inner.names), account, inner.names)
+        metered = MeteredGrid(inner, account, inner.names)
         follow = getattr(inner, "follow", lambda _: None)
         ask = partial(_ask_there, inner, inner.names) if far else partial(_ask_here, clients)
         yield Link(metered, inner.names, ask, inner.read_states, follow, getattr(inner, "authority", None))
@@ -146,7 +135,7 @@ def open_questions(
     if deployed is None or not clients:
         yield partial(_ask_here, clients)
         return
-    with open_link(clients, deployed, account, FEDAVG, Rules(), {}, {}, 0) as link:
+    with open_link(clients, deployed, account, Agreement(FEDAVG, Rules(), {}, 0), {}) as link:
         yield link.ask
 
 

@@ -1,14 +1,13 @@
-"""Flower grids that enforce the budgets of a ledger before a message is sent, and enter it there; they wrap others."""
+"""The metered link: a Flower grid around another one, with the ledger, the budget and the outages of the network."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from flwr.app import Message
+from flwr.app import ConfigRecord, Error, Message, RecordDict
 from flwr.serverapp import Grid
 
-from flcav.federation.links.in_process import wire_bytes
-from flcav.federation.links.wrapped import WrappedGrid
-from flcav.federation.wire import CONFIG
+from flcav.federation.links.in_process import LinkGrid, wire_bytes
+from flcav.federation.wire import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
 from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link, LinkMegabytes
 
 UNDISCLOSED = "undisclosed"  # in the place of a client's name
@@ -53,82 +52,33 @@ def open_account() -> Account:
     return Account(Ledger(LinkMegabytes(UNLIMITED_MB, UNLIMITED_MB)), "edge", "federation", "wireless")
 
 
-class BudgetedGrid(WrappedGrid):
-    """Grid whose nodes keep a reply that is over the budget of the uplink: `BudgetExceeded` is raised in its stead.
+class MeteredGrid(LinkGrid):
+    """Grid that meters another one, holds its nodes to the budget, and loses those that the network loses.
 
-    It stands at the near end of the link, `MeteredGrid` at the far end. Where nodes are elsewhere, as on Ray, both are
-    at the far end.
+    Every message to a node is a downlink entry of the ledger, every reply an uplink entry. A reply over the budget
+    stays with its node: `BudgetExceeded` is raised in its stead. The nodes which `account.outages` has lost in a round
+    are answered for, with the reason as an error. Nothing reaches a node that is not there; the bytes of an update that
+    broke off are entered as far as they came; what comes before training, such as keys, arrives. A node whose update
+    will break off gets a note of it with the message, in the place of the acknowledgement that it would miss later.
     """
 
     def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:
-        """Hold the nodes of `grid` to the budget of `account`; `names` are the clients' names by node id."""
-        self._grid, self._account, self._names = grid, account, names
-        self._round = 0
-
-    def _checked(self, reply: Message) -> Message:
-        if reply.has_content():
-            name = self._names[reply.metadata.src_node_id]
-            if name in self._account.within:
-                return reply
-            self._account.ledger.check(self._account.describe("up", self._round, name, wire_bytes(reply.content)))
-        return reply
-
-    def _noted(self, messages: Iterable[Message]) -> Iterator[Message]:
-        for message in messages:
-            self._round = _round(message)
-            yield message
-
-    def push_messages(self, messages: Iterable[Message]) -> list[str]:
-        """Send messages; return their ids."""
-        return list(self._grid.push_messages(self._noted(messages)))
-
-    def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
-        """Return replies within the budget; raises `BudgetExceeded` for another one."""
-        return [self._checked(reply) for reply in self._grid.pull_messages(message_ids)]
-
-    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
-        """Yield the replies as they come; raises `BudgetExceeded` for one over the budget."""
-        yield from map(self._checked, self._grid.send_and_receive(self._noted(messages), timeout=timeout))
-
-
-class MeteredGrid(WrappedGrid):
-    """Grid that meters another one: a downlink entry for each message to a node, an uplink entry for each reply."""
-
-    def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:
         """Meter `grid` on `account`; `names` are the clients' names by node id."""
-        self._grid, self._account, self._names = grid, account, names
-        self._round = 0
-
-    def _enter(self, direction: Direction, round_: int, size: int, node: int) -> None:
-        account, self._round = self._account, round_
-        if self._names[node] not in account.within:
-            account.ledger.enter(account.describe(direction, round_, self._names[node], size))
-
-    def push_messages(self, messages: Iterable[Message]) -> list[str]:
-        """Send messages, entering each as downlink first; return their ids."""
-        messages = list(messages)
-        for message in messages:
-            self._enter("down", _round(message), wire_bytes(message.content), message.metadata.dst_node_id)
-        return list(self._grid.push_messages(messages))
-
-    def pull_messages(self, message_ids: Iterable[str]) -> list[Message]:
-        """Return replies, entering each as uplink first; raises `BudgetExceeded` where one would exceed a budget."""
-        replies = list(self._grid.pull_messages(message_ids))
-        for message in replies:
-            if message.has_content():
-                self._enter("up", self._round, wire_bytes(message.content), message.metadata.src_node_id)
-        return replies
+        self._grid, self._account, self.names = grid, account, names
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
-        """Yield the replies as they come, entering message and reply; the first reply over a budget ends the round.
+        """Yield the replies as they arrive, then the errors of nodes that are not there.
 
         A message is entered when it is sent or, while another one has no reply yet, with its own reply: so the entries
-        do not depend on how many are under way. Nothing is sent before the first reply is asked for.
+        do not depend on how many are under way. Nothing is sent before the first reply is asked for. The first reply
+        over a budget ends the exchange: raises `BudgetExceeded`.
         """
+        asked: dict[int, Message] = {}
         waiting: dict[int, tuple[int, int]] = {}  # round and bytes of messages that are not entered, by node
         open_: set[int] = set()  # nodes that have not answered
+        away: list[Message] = []
 
-        def noted() -> Iterator[Message]:
+        def sent() -> Iterator[Message]:
             content, size = None, 0
             for message in messages:
                 if message.content is not content:  # many messages share one
@@ -136,20 +86,60 @@ class MeteredGrid(WrappedGrid):
                 node = message.metadata.dst_node_id
                 waiting[node] = _round(message), size
                 if not open_:
-                    self._enter("down", *waiting.pop(node), node)
+                    self._enter("down", node, *waiting.pop(node))
                 open_.add(node)
+                outage = self._find_outage(message)
+                if outage is not None and outage.sent_bytes is None:
+                    away.append(message)
+                    continue
+                if outage is not None:
+                    message.content = RecordDict({**message.content, LOST: ConfigRecord()})  # others share the content
+                asked[node] = message
                 yield message
 
-        for reply in self._grid.send_and_receive(noted(), timeout=timeout):
-            node = reply.metadata.src_node_id
+        def arrived() -> Iterator[Message]:
+            for reply in self._grid.send_and_receive(sent(), timeout=timeout):
+                yield self._cut(reply, asked[reply.metadata.src_node_id])
+            yield from map(self._fail, away)
+
+        for reply in arrived():
+            node, number, size = reply.metadata.src_node_id, 0, 0
+            counts = reply.has_content() and self.names[node] not in self._account.within
+            if counts:
+                number, size = _round(asked[node]), wire_bytes(reply.content)
+                self._account.ledger.check(self._account.describe("up", number, self.names[node], size))
             open_.remove(node)
             if node in waiting:
-                self._enter("down", *waiting.pop(node), node)
-            if reply.has_content():
-                self._enter("up", self._round, wire_bytes(reply.content), node)
+                self._enter("down", node, *waiting.pop(node))
+            if counts:
+                self._enter("up", node, number, size)
             yield reply
         for node, about in waiting.items():
-            self._enter("down", *about, node)
+            self._enter("down", node, *about)
+
+    def _enter(self, direction: Direction, node: int, round_: int, size: int) -> None:
+        if (name := self.names[node]) not in self._account.within:
+            self._account.ledger.enter(self._account.describe(direction, round_, name, size))
+
+    def _find_outage(self, message: Message) -> Outage | None:
+        """Return the outage of the node that a message is to in the message's round."""
+        return self._account.outages.get((_round(message), self.names[message.metadata.dst_node_id]))
+
+    def _fail(self, message: Message) -> Message:
+        """Return an error in the place of the answer to a message, with the reason of the outage."""
+        outage = self._find_outage(message)
+        assert outage is not None
+        return Message(Error(code=LOST_BY_NETWORK, reason=outage.reason), reply_to=message)
+
+    def _cut(self, reply: Message, message: Message) -> Message:
+        """Return a reply as it arrives: an error where it is an update and breaks off."""
+        outage = self._find_outage(message)
+        if outage is None or not reply.has_content() or ARRAYS not in reply.content.array_records:
+            return reply
+        account, size = self._account, min(outage.sent_bytes or 0, wire_bytes(reply.content))
+        name = self.names[message.metadata.dst_node_id]
+        account.ledger.enter(account.describe("up", _round(message), name, size))
+        return self._fail(message)
 
 
 def _round(message: Message) -> int:

@@ -18,8 +18,7 @@ from flwr.serverapp import Grid, ServerApp
 from flwr.simulation import run_simulation
 
 from flcav.federation.client import PARTITION
-from flcav.federation.links.in_process import keep_identity
-from flcav.federation.links.wrapped import WrappedGrid
+from flcav.federation.links.in_process import LinkGrid, keep_identity
 from flcav.federation.state import Arrays, ClientStates
 from flcav.federation.trainable import Trainable
 from flcav.federation.wire import METRICS, read_arrays, to_arrays
@@ -82,7 +81,7 @@ class RaySimulation:
                 simulation.join()
 
 
-class SimulatedGrid(WrappedGrid):
+class SimulatedGrid(LinkGrid):
     """The grid of a simulation, which knows its clients' names by node."""
 
     def __init__(self, grid: Grid, names: Mapping[int, str]) -> None:

@@ -6,23 +6,21 @@ clock and seed give the same bytes.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 from flwr.app import RecordDict
 
 from flcav.config import InputError
 from flcav.federation.acceptance import Expected, read_update
-from flcav.federation.exchange import Attendance, Intake
+from flcav.federation.exchange import Attendance, Exchange, Intake, OpenRound
 from flcav.federation.links.metered import Account
 from flcav.federation.privacy import Privacy, account_epsilon
-from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
 from flcav.federation.state import Arrays, FederationState
 from flcav.federation.strategies.fedbuff import FedBuff
-from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.trainable import Weights
 from flcav.federation.wire import ARRAYS, CONFIG, LocalWork, to_arrays
 from flcav.network.ledger import BudgetExceeded, Direction
 
@@ -116,19 +114,6 @@ def is_spent(state: FederationState) -> bool:
     return bool(state.records) and OVER_BUDGET in state.records[-1].failed.values()
 
 
-class Ask(Protocol):
-    """A server's way to send requests, by client, and to yield what is read of the replies."""
-
-    def __call__(
-        self,
-        here: Attendance,
-        requests: Mapping[str, RecordDict],
-        read: Callable[[str, RecordDict], LocalUpdate],
-    ) -> Iterator[tuple[str, LocalUpdate]]:
-        """Yield client and answer, in the order of the requests."""
-        ...
-
-
 @dataclass(frozen=True)
 class Buffering:
     """Buffered rounds of a server: the strategy, the clock's rounds, and the ledger."""
@@ -148,38 +133,7 @@ class Buffering:
         own = {_key(number - 1, name): np.asarray(array) for name, array in start.items()}
         return {key: array for key, array in (kept | own).items() if int(key.partition("|")[0]) in needed}
 
-    def collect(
-        self, number: int, here: Attendance, start: Weights, kept: Arrays, rules: Rules, work: Work, ask: Ask
-    ) -> Intake:
-        """Return the updates of round `number` that count, rebased on `start`, the weights that it begins with.
-
-        Clients are sent the version that they began with, of those `kept`, and the local `work` of the round after it.
-        Where an update would exceed a budget, it and those after it are not sent, and the round's record says so.
-        """
-        round_ = self.buffers.rounds[number - 1]
-        begun = {version: {name: kept[_key(version, name)] for name in start} for version in round_.versions.values()}
-        arrays = {version: to_arrays(weights) for version, weights in begun.items()}
-        expected = {version: Expected(rules, weights, {}) for version, weights in begun.items()}
-        requests = {}
-        for name in here.chosen:
-            version = round_.versions[name]
-            local = replace(work(version + 1), round=number)
-            requests[name] = RecordDict({ARRAYS: arrays[version], CONFIG: local.record()})
-        updates = Intake(self.strategy if rules.privacy is None else None)
-        try:
-            self._enter_broken(number, here)
-            for name, update in ask(here, requests, lambda name, c: read_update(c, expected[round_.versions[name]])):
-                version = round_.versions[name]
-                updates.add(name, self.strategy.rebase(start, begun[version], update, number - 1 - version))
-        except BudgetExceeded:
-            here.spent = True
-            for name in here.chosen:
-                if name not in updates.samples and name not in here.failed:
-                    here.failed[name] = OVER_BUDGET
-                    here.lost.add(name)
-        return updates
-
-    def _enter_broken(self, number: int, here: Attendance) -> None:
+    def enter_broken(self, number: int, here: Attendance) -> None:
         """Enter what was sent of updates that broke off."""
         for each in self.buffers.rounds[number - 1].broken:
             sizes: tuple[tuple[Direction, int], ...] = (("down", each.down_bytes), ("up", each.up_bytes))
@@ -188,6 +142,40 @@ class Buffering:
             if each.client not in here.chosen:  # others came through at another attempt
                 here.failed[each.client] = each.reason
                 here.lost.add(each.client)
+
+
+def collect(exchange: Exchange, round_: OpenRound, buffering: Buffering, kept: Arrays, work: Work) -> Intake:
+    """Return the updates of a round that count, rebased on the weights that it begins with.
+
+    Clients are sent the version that they began with, of those `kept`, and the local `work` of the round after it.
+    Where an update would exceed a budget, it and those after it are not sent, and the round's record says so.
+    """
+    here, rules, number, strategy = round_.here, round_.rules, round_.work.round, buffering.strategy
+    buffer = buffering.buffers.rounds[number - 1]
+    begun = {
+        version: {name: kept[_key(version, name)] for name in round_.start} for version in buffer.versions.values()
+    }
+    arrays = {version: to_arrays(weights) for version, weights in begun.items()}
+    expected = {version: Expected(rules, weights) for version, weights in begun.items()}
+    requests = {}
+    for name in here.chosen:
+        version = buffer.versions[name]
+        local = replace(work(version + 1), round=number)
+        requests[name] = RecordDict({ARRAYS: arrays[version], CONFIG: local.record()})
+    updates = Intake(strategy if rules.privacy is None else None)
+    try:
+        buffering.enter_broken(number, here)
+        read = lambda name, content: read_update(content, expected[buffer.versions[name]])  # noqa: E731
+        for name, update in exchange.ask(here, requests, read):
+            version = buffer.versions[name]
+            updates.add(name, strategy.rebase(round_.start, begun[version], update, number - 1 - version))
+    except BudgetExceeded:
+        here.spent = True
+        for name in here.chosen:
+            if name not in updates.samples and name not in here.failed:
+                here.failed[name] = OVER_BUDGET
+                here.lost.add(name)
+    return updates
 
 
 def _key(version: int, name: str) -> str:

@@ -1,16 +1,15 @@
-"""Secure aggregation of a round, as the server conducts it: keys and shares, masked updates, the sum of these."""
+"""Masked rounds: secure aggregation as the server conducts it: keys and shares, masked updates, the sum of these."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from cryptography import x509
 from flwr.app import ConfigRecord, RecordDict
 
-from flcav.federation.acceptance import Expected, read_masked
-from flcav.federation.exchange import Attendance, Intake
-from flcav.federation.rules import SecureAggregation
+from flcav.federation.acceptance import read_masked
+from flcav.federation.exchange import Exchange, Intake, OpenRound
 from flcav.federation.secure.messages import SecureSum, TooFewClients
 from flcav.federation.secure.parties import settle_complaints
 from flcav.federation.secure.primitives import to_values
@@ -20,79 +19,61 @@ from flcav.federation.wire import ASK, CONFIG, VECTOR, unflatten
 AnswerT = TypeVar("AnswerT")
 
 
-class Ask(Protocol):
-    """The server's exchange with clients: requests out, answers in, failures noted."""
+def collect(exchange: Exchange, round_: OpenRound, authority: x509.Certificate | None = None) -> Intake:
+    """Agree on masks, and return the masked updates, whose average is of their sum alone.
 
-    def __call__(
-        self,
-        here: Attendance,
-        requests: Mapping[str, RecordDict],
-        read: Callable[[str, RecordDict], AnswerT],
-        awaited: list[str] | None = None,
-    ) -> Iterator[tuple[str, AnswerT]]:
-        """Yield what `read` makes of each client's answer."""
-        ...
+    Where shares that one client sealed for another do not open, the round begins again without the liars. Where too few
+    are left, nobody is asked to train, and the attendance has a shortage.
 
+    authority: that has certified the clients; None: their keys are not signed.
+    """
+    here, secure = round_.here, round_.rules.secure
+    assert secure is not None
+    if not here.count(round_.rules):
+        return Intake()
+    local, training, clients = round_.work.record(), round_.training(), here.chosen
 
-@dataclass
-class SecureRound:
-    """Secure aggregation of one round: the server learns the sum of the clients' changes alone."""
-
-    how: SecureAggregation
-    expected: Expected  # of the updates
-    here: Attendance
-    round: int
-    records: Mapping[str, Any]  # of the training message, the round's local work among them
-    ask: Ask
-    authority: x509.Certificate | None = None  # that has certified the clients; None: their keys are not signed
-    total: SecureSum | None = None  # under the masks that were agreed last
-
-    def collect(self) -> Intake:
-        """Agree on masks, and return the masked updates.
-
-        Where shares that one client sealed for another do not open, the round begins again without the liars. Where too
-        few are left, nobody is asked to train, and the attendance has a shortage.
-        """
-        clients = self.here.chosen
-        while True:
-            needed = self.how.needed(len(self.here.chosen), certified=self.authority is not None)
-            self.total = SecureSum(self._exchange, needed, self.round, self.authority)
-            try:
-                asks = self.total.agree(clients)
-            except TooFewClients as error:
-                self.here.shortage = error
-                return Intake()
-            received, complaints = Intake(), dict[str, Sequence[str]]()
-            requests = {name: RecordDict({**self.records, ASK: ask}) for name, ask in asks.items()}
-            for name, answer in self.ask(self.here, requests, self._read, self.here.chosen):
-                if isinstance(answer, LocalUpdate):
-                    received.add(name, answer)
-                else:
-                    complaints[name] = answer
-            if not complaints:
-                return received
-            self.here.failed |= settle_complaints(complaints)
-            clients = [name for name in self.total.peers if name not in self.here.failed]
-
-    def average(self, updates: Mapping[str, LocalUpdate]) -> Weights:
-        """Return start + (sum of the clients' changes) / their number; the sum is all that is unmasked.
-
-        Raises `TooFewClients`, and `SumLost` where wrong shares leave no way to the sum.
-        """
-        assert self.total is not None
-        masked = {name: np.asarray(update.weights[VECTOR], np.uint32) for name, update in updates.items()}
-        summed, liars = self.total.finish(masked)
-        self.here.failed |= liars
-        total = to_values(summed, self.how.largest, len(self.total.peers))
-        return unflatten(total / len(updates), self.expected.start, self.expected.rules)
-
-    def _exchange(
-        self, asks: Mapping[str, ConfigRecord], read: Callable[[str, RecordDict], AnswerT]
+    def exchange_step(
+        asks: Mapping[str, ConfigRecord], read: Callable[[str, RecordDict], AnswerT]
     ) -> dict[str, AnswerT]:
-        local = self.records[CONFIG]
         requests = {name: RecordDict({CONFIG: local, ASK: ask}) for name, ask in asks.items()}
-        return dict(self.ask(self.here, requests, read))
+        return dict(exchange.ask(here, requests, read))
 
-    def _read(self, name: str, content: RecordDict) -> LocalUpdate | Sequence[str]:
-        assert self.total is not None
-        return read_masked(content, self.expected, [peer for peer in self.total.peers if peer != name])
+    while True:
+        needed = secure.needed(len(here.chosen), certified=authority is not None)
+        total = SecureSum(exchange_step, needed, round_.work.round, authority)
+        try:
+            asks = total.agree(clients)
+        except TooFewClients as error:
+            here.shortage = error
+            return Intake()
+        updates, complaints = Intake(), dict[str, Sequence[str]]()
+        requests = {name: RecordDict({**training, ASK: ask}) for name, ask in asks.items()}
+        for name, answer in exchange.ask(here, requests, partial(_read, round_, total), here.chosen):
+            if isinstance(answer, LocalUpdate):
+                updates.add(name, answer)
+            else:
+                complaints[name] = answer
+        if not complaints:
+            updates.average = partial(_unmask, round_, total, updates.updates)
+            return updates
+        here.failed |= settle_complaints(complaints)
+        clients = [name for name in total.peers if name not in here.failed]
+
+
+def _read(round_: OpenRound, total: SecureSum, name: str, content: RecordDict) -> LocalUpdate | Sequence[str]:
+    return read_masked(content, round_.expected, [peer for peer in total.peers if peer != name])
+
+
+def _unmask(round_: OpenRound, total: SecureSum, updates: Mapping[str, LocalUpdate]) -> Weights:
+    """Return start + (sum of the clients' changes) / their number; the sum is all that is unmasked.
+
+    Raises `TooFewClients`, and `SumLost` where wrong shares leave no way to the sum.
+    """
+    secure = round_.rules.secure
+    assert secure is not None
+    masked = {name: np.asarray(update.weights[VECTOR], np.uint32) for name, update in updates.items()}
+    summed, liars = total.finish(masked)
+    round_.here.failed |= liars
+    values = to_values(summed, secure.largest, len(total.peers))
+    return unflatten(values / len(updates), round_.start, round_.rules)
