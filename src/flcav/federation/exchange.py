@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
-from flwr.app import ArrayRecord, ConfigRecord, Message, MessageType, RecordDict
+from flwr.app import Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 from numpy.typing import NDArray
 
@@ -172,12 +172,12 @@ class OpenRound:
         """Return the rules of the round."""
         return self.expected.rules
 
-    def training(self) -> dict[str, ArrayRecord | ConfigRecord]:
-        """Return the records of a request to train: weights, what goes with them, and the local work."""
+    def training(self) -> RecordDict:
+        """Return a request to train: weights, what goes with them, and the local work."""
         records = {ARRAYS: to_arrays(self.start)} | ({EXTRA: to_arrays(self.sent)} if self.sent else {})
         if self.centre is not None:
             records[CENTRE] = to_arrays({name: self.centre[name] for name in learned_names(self.centre)})
-        return {**records, CONFIG: self.work.record()}
+        return RecordDict({**records, CONFIG: self.work.record()})
 
 
 @dataclass(frozen=True)

@@ -87,6 +87,10 @@ class SimulatedGrid(LinkGrid):
     def __init__(self, grid: Grid, names: Mapping[int, str]) -> None:
         self._grid, self.names = grid, names
 
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterable[Message]:
+        """Return the replies of the simulation's nodes."""
+        return self._grid.send_and_receive(messages, timeout=timeout)
+
     def read_states(self, keys: Iterable[str]) -> ClientStates:
         """Return the arrays that clients keep between rounds under these records, by client and record."""
         found: ClientStates = {}

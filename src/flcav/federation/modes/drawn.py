@@ -18,8 +18,8 @@ def collect(exchange: Exchange, round_: OpenRound) -> Intake:
     are chosen then train. Where fewer take part than the rules want nobody is asked for an update.
     """
     here, rules, work = round_.here, round_.rules, round_.work
-    unbiased, local = rules.selection.unbiased, {CONFIG: work.record()}
-    first = RecordDict(local if unbiased else round_.training())
+    unbiased, local = rules.selection.unbiased, RecordDict({CONFIG: work.record()})
+    first = RecordDict({**local}) if unbiased else round_.training()
     first[ASK] = ConfigRecord({ASK: COUNT if unbiased else NORM})
     asked = dict.fromkeys(here.asked if unbiased else here.chosen, first)
     reports = dict(exchange.ask(here, asked, lambda _, content: read_norm(content, rules)))  # norm, number of samples
@@ -29,7 +29,7 @@ def collect(exchange: Exchange, round_: OpenRound) -> Intake:
     if unbiased:
         probability = rules.selection.inclusion_probability(len(here.asked))
         drawn = {name: probability for name in here.chosen if name in shares}
-        request = RecordDict(round_.training())
+        request = round_.training()
     else:
         norms = {name: norm for name, (norm, _) in reports.items()}
         drawn = rules.selection.draw({name: norm * shares[name] for name, norm in norms.items()}, work.seed)

@@ -3,8 +3,6 @@
 import contextlib
 from collections.abc import Iterator
 
-from flwr.app import RecordDict
-
 from flcav.config import InputError
 from flcav.federation.acceptance import read_update
 from flcav.federation.exchange import Exchange, Intake, OpenRound
@@ -23,7 +21,7 @@ def collect(exchange: Exchange, round_: OpenRound, strategy: Strategy) -> Intake
     if not here.count(round_.rules):
         return Intake()
     updates = Intake(find_weigher(strategy) if round_.rules.privacy is None else None)
-    requests = dict.fromkeys(here.chosen, RecordDict(round_.training()))
+    requests = dict.fromkeys(here.chosen, round_.training())
     for name, update in exchange.ask(here, requests, lambda _, content: read_update(content, round_.expected)):
         with refusing(strategy, round_.work.round):
             updates.add(name, update)
