@@ -18,13 +18,11 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
-from flcav.releases.candidates.candidate import CANDIDATE, CARD_KEY, WEIGHTS, Candidate, hash_card
-from flcav.releases.repositories.creation import create_repository
-from flcav.releases.repositories.directive import MILLION, Directive
-from flcav.releases.repositories.metadata import read_root
-from flcav.releases.repositories.repository import publish, stage_release
-from flcav.releases.vehicles.checking import Refused, Sources, check_release, open_sources, trust_roots
-from flcav.releases.vehicles.installation import CURRENT, read_installed, update_vehicle
+from flcav.releases.candidate import CANDIDATE, CARD_KEY, WEIGHTS, Candidate, hash_card
+from flcav.releases.checking import Refused, Sources, check_release, open_sources, trust_roots
+from flcav.releases.installation import CURRENT, read_installed, update_vehicle
+from flcav.releases.repositories.metadata import MILLION, Directive, read_root
+from flcav.releases.repositories.repository import create_repository, publish, stage_release
 from flcav.storage.files import sha256
 
 

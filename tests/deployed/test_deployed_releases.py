@@ -35,16 +35,14 @@ from flcav.fleet.vehicle import VehicleSettings
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
-from flcav.releases.candidates.candidate import WEIGHTS
-from flcav.releases.candidates.proposal import propose
-from flcav.releases.repositories.creation import create_repository
-from flcav.releases.repositories.directive import MILLION, Directive
-from flcav.releases.repositories.repository import publish, stage_release
+from flcav.releases.candidate import WEIGHTS
+from flcav.releases.installation import Installed, read_installed
+from flcav.releases.proposal import propose
+from flcav.releases.repositories.metadata import MILLION, Directive
+from flcav.releases.repositories.repository import create_repository, publish, stage_release
 from flcav.releases.rollout.deployed import roll_out
-from flcav.releases.rollout.shadow import run_shadow
-from flcav.releases.rollout.stages import read_directive, roll_back
+from flcav.releases.rollout.stages import read_directive, roll_back, run_shadow
 from flcav.releases.rollout.updater import FOLDER, open_client
-from flcav.releases.vehicles.installation import Installed, read_installed
 from flcav.storage.files import sha256
 
 NAMES = [f"vehicle-{number:03d}" for number in (1, 2, 3)]

@@ -1,9 +1,11 @@
-"""Differential privacy of clients: clipped updates, Gaussian noise, and an account of epsilon.
+"""Differential privacy of clients: clipped updates, Gaussian noise, its sources, and an account of epsilon.
 
 Central: a trusted server adds noise to the sum of the clipped changes of a round (McMahan et al., "Learning
 Differentially Private Recurrent Language Models", ICLR 2018, algorithm 1 with the fixed-denominator estimator). Local:
-every client adds noise to its own clipped change, and the server is not trusted. Who adds noise draws it by a secret
-of its own, or, where the noise is `seeded`, by the seed of the round, which all know.
+every client adds noise to its clipped change, and the server is not trusted. Noise hides a change only from those who
+cannot repeat it: it is drawn by a party's secret, 32 bytes of the operating system, or, where it is `seeded`, by the
+seed of the round, which all know. By a secret it is drawn with SHAKE256, so that noise that is seen bare, where a
+weight did not change, reveals nothing of the rest.
 """
 
 import bisect

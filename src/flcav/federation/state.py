@@ -1,4 +1,8 @@
-"""State of a federation between rounds, as arrays for a checkpoint, and the record of each round."""
+"""State of a federation between rounds, as arrays for a checkpoint, and the record of each round.
+
+A cloud round's record has the weight divergence of the regions: the relative L2 distance of their weights from their
+mean (after Zhao et al., "Federated Learning with Non-IID Data", 2018, whose reference is centralised training).
+"""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,4 +1,8 @@
-"""Conversion between weights and updates (NumPy) and the records of Flower's messages."""
+"""Messages on the wire: records of Flower's messages, updates as they are sent, and replies as they arrive.
+
+Weights and updates (NumPy) become the array records of a message and back. An update is sent whole or in the form of
+`Upload`, clipped and with noise where clients add it. Of the replies to requests, `list_events` says which came.
+"""
 
 import math
 from collections import deque

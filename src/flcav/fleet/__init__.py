@@ -1,1 +1,1 @@
-"""A deployed fleet: its authority and registry, mutual TLS in front of Flower's SuperLink, and its processes."""
+"""A deployed fleet: its authority and registry, the proxy before Flower's SuperLink, vehicles, releases, its status."""

@@ -1,7 +1,10 @@
-"""Release report: the message with a vehicle's deployed network and the result of its shadow run.
+"""Releases on a fleet: the repositories on offer, and the reports of vehicles on the network that drives them.
 
-It goes to the proxy of a fleet with the vehicle's certificate, which says whose it is (a vehicle version manifest,
-Uptane Standard for Design and Implementation 2.1.0, section 5.4.2.1.1, without ECUs of their own).
+FLEET/releases/offer.json            where the published repositories of provider and customer are
+FLEET/releases/vehicles/NAME.json    the latest report of a vehicle
+
+A report goes to the proxy with the vehicle's certificate, which says whose it is (a vehicle version manifest, Uptane
+Standard for Design and Implementation 2.1.0, section 5.4.2.1.1, without ECUs of their own).
 """
 
 import json

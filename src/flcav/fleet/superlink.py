@@ -1,7 +1,8 @@
 """Control of Flower's SuperLink: enrolment of nodes, start of runs, and this process as the server app of a run.
 
 Uses private parts of Flower (pinned to 1.42): the clients of its control and runtime interfaces, and its table of app
-bundles; so do `vehicle`, for its node and executor, and `runtimes.vehicle_app` and `runtimes.embedded`, for messages.
+bundles; so do `vehicle`, for its node and executor, and federation's `links.vehicle_app` and `links.in_process`, for
+messages.
 The control side asks nobody for a credential, so the SuperLink listens on the loopback of the operator's host; the
 secret of the executor is in a file that its owner alone can read.
 """

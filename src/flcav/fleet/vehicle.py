@@ -1,6 +1,7 @@
-"""A vehicle's own processes: its forwarder, Flower's SuperNode, and an executor of its app, one fork a message.
+"""A vehicle's processes: its forwarder, Flower's SuperNode, and an executor of its app, one fork a message.
 
 Flower starts a process for every message, which imports everything anew. Here the executor imports once, and forks.
+A vehicle is installed with its certificate, the keys that it trusts, and the address of the fleet.
 """
 
 import contextlib

@@ -16,16 +16,19 @@ from securesystemslib.signer import SSlibKey
 from tuf.api.metadata import Metadata, TargetFile
 
 from flcav.config import InputError
-from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS, Candidate, read_candidate
+from flcav.releases.candidate import CANDIDATE, WEIGHTS, Candidate, read_candidate
+from flcav.releases.checking import Refused, RepositoryFetcher, check_release, trust_roots
+from flcav.releases.installation import read_installed, update_vehicle, weights_path
 from flcav.releases.keys import generate_key, read_private_key
 from flcav.releases.repositories import repository
-from flcav.releases.repositories.creation import create_repository, replace_online_key
-from flcav.releases.repositories.directive import Directive
-from flcav.releases.repositories.metadata import load_targets, read_root, sign_online, target_names
-from flcav.releases.repositories.repository import publish, stage_directive, stage_release
-from flcav.releases.vehicles.checking import Refused, check_release, trust_roots
-from flcav.releases.vehicles.fetching import RepositoryFetcher
-from flcav.releases.vehicles.installation import read_installed, update_vehicle, weights_path
+from flcav.releases.repositories.metadata import Directive, load_targets, read_root, sign_online, target_names
+from flcav.releases.repositories.repository import (
+    create_repository,
+    publish,
+    replace_online_key,
+    stage_directive,
+    stage_release,
+)
 
 EVERYBODY = Directive(release=2, share_ppm=ALL)
 

@@ -12,7 +12,7 @@ import pytest
 from release_parties import Parties
 
 from flcav.cli.main import run
-from flcav.releases.candidates.candidate import (
+from flcav.releases.candidate import (
     ACKNOWLEDGEMENTS,
     CANDIDATE,
     REPORT,

@@ -19,9 +19,8 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import find_shipped, load_network
 from flcav.releases.verification.comparison import Measured, compare, draw_scenes, measure_results
-from flcav.releases.verification.conditions import PLAIN
 from flcav.releases.verification.guards import pair_classes
-from flcav.releases.verification.testing import ConditionResults, choose_test_frames, run_condition
+from flcav.releases.verification.testing import PLAIN, ConditionResults, choose_test_frames, run_condition
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 

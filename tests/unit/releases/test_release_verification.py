@@ -19,13 +19,12 @@ from flcav.perception.objects.evaluate import split_parts
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.weights import load_network
-from flcav.releases.candidates.candidate import CARD, LEDGER, WEIGHTS, DataHash, LedgerSum, read_candidate
+from flcav.releases.candidate import CARD, LEDGER, WEIGHTS, DataHash, LedgerSum, read_candidate
 from flcav.releases.verification import verify
 from flcav.releases.verification.comparison import Limit, Pair, compare, draw_scenes, measure_results, pair_slices
-from flcav.releases.verification.conditions import CONDITIONS, PLAIN
 from flcav.releases.verification.files import find_faults, find_overlap
 from flcav.releases.verification.records import OddCoverage, Verification, VerificationData, VerifiedDomain
-from flcav.releases.verification.testing import ConditionResults, VerificationFrame
+from flcav.releases.verification.testing import CONDITIONS, PLAIN, ConditionResults, VerificationFrame
 from flcav.releases.verification.verify import decide, read_verification, write_verification
 from flcav.report.pages.release_page import release_page
 from flcav.sensors.frame import Frame
@@ -91,7 +90,7 @@ def judge(new: Results, scenes: int = SCENES, margin: float = 0.03) -> Verificat
 
 
 def read_candidate_like():
-    from flcav.releases.candidates.candidate import Candidate
+    from flcav.releases.candidate import Candidate
 
     fields = dict.fromkeys(("weights", "driving", "card"), "b" * 64)
     return Candidate(task="objects", release=2, changes="", audience="", network="pillars", data=(), **fields)

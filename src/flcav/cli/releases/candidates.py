@@ -25,7 +25,7 @@ def propose(
     task: str = TASK,
 ) -> None:
     """Make a candidate of trained weights: hashes of data, recipe and ledger, the card, and what it replaces."""
-    from flcav.releases.candidates.proposal import propose as make_candidate
+    from flcav.releases.proposal import propose as make_candidate
 
     made = make_candidate(
         out, weights, driving, number, changes, audience, task=task, data=data, recipe=recipe, ledger=ledger

@@ -9,7 +9,7 @@ from flcav.cli.terminal import echo
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
-    from flcav.releases.candidates.candidate import Candidate
+    from flcav.releases.candidate import Candidate
     from flcav.releases.repositories.repository import Staged
 
 CANDIDATE = typer.Argument(metavar="CANDIDATE", help="Folder of the candidate.")
@@ -23,7 +23,7 @@ AS_JSON = typer.Option(False, "--json", help="Print one JSON object.")
 
 def describe_candidate(folder: Path) -> "Candidate":
     """Return the description of a candidate whose files are as it says."""
-    from flcav.releases.candidates.candidate import check_files, read_candidate
+    from flcav.releases.candidate import check_files, read_candidate
 
     described = read_candidate(folder)
     check_files(folder, described)
@@ -40,7 +40,7 @@ def tell_signatures(repository: Path, state: "Staged") -> None:
 
 def draw_page(folder: Path, repositories: list[Path]) -> None:
     """Draw the candidate's page with the signatures of the repositories' parties."""
-    from flcav.releases.candidates.candidate import REPORT, read_candidate, write_report
+    from flcav.releases.candidate import REPORT, read_candidate, write_report
     from flcav.releases.repositories.status import read_acknowledgements
     from flcav.releases.verification.verify import read_verification
     from flcav.report.pages.release_page import release_page

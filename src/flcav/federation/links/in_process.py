@@ -1,7 +1,8 @@
 """A Flower grid within one process: a message reaches the client app by a function call, without sockets or daemons.
 
 Uses private parts of Flower (pinned to 1.42): the process-wide task identity, the empty run record, the id of a
-message, and the serialised form of a record and of an array. Those of a deployment are in `fleet.superlink`.
+message, and the serialised form of a record and of an array. Those of a deployment are in `fleet.superlink`. A training
+in this process cannot be interrupted: a client that exceeds its time limit is left behind in a thread (`TimedClients`).
 """
 
 import contextlib

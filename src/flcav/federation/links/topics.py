@@ -4,7 +4,8 @@ What the cloud sends to an edge server is published on a topic of that server, a
 `std_msgs/msg/UInt8MultiArray` with ROS 2's names, types, type hash and quality of service on the wire (the mapping of
 `rmw_cyclonedds_cpp`: topic `/a` is `rt/a`, type `pkg/msg/T` is `pkg::msg::dds_::T_`). The data of an array are a Flower
 message's records as Flower serialises them; the label of its one dimension says what they are. Clients train in this
-process. Needs the extra `ros`.
+process. Messages may be kept in a ROS 2 bag: MCAP with the profile of ROS 2, and its metadata.yaml (rosbag2, version
+9). Needs the extra `ros`.
 """
 
 import contextlib

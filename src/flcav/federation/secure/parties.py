@@ -5,6 +5,11 @@ Keys: clients send public keys. Shares: each sends, sealed for every other clien
 key of masks. Masked: each trains, and sends its update plus the mask of its seed plus masks that it has in common with
 every other client, which cancel in the sum. Unmask: those who are left send their shares of the seeds of clients who
 sent an update, and of the keys of clients who did not, so that no client's both masks can be taken off.
+
+On a fleet a client signs its public keys of a round with the key that the fleet's authority has certified, since a
+server that puts keys of its own in the place of clients' could take off the masks that it then has in common with them.
+So clients share secrets with certified vehicles alone. A signature of an older round does no harm: masks are added for
+those whose shares open, which they have sealed for the keys of this round.
 """
 
 import contextlib

@@ -1,4 +1,7 @@
-"""SCAFFOLD: control variates against client drift (Karimireddy et al., ICML 2020, algorithm 1)."""
+"""Corrections of clients' local steps against client drift: control variates (SCAFFOLD), a proximal term (FedProx).
+
+Karimireddy et al., ICML 2020, algorithm 1; Li et al., MLSys 2020.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

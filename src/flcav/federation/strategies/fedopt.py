@@ -1,4 +1,8 @@
-"""FedAdam: Adam on the server, with the mean change as its gradient (Reddi et al., ICLR 2021, algorithm 2)."""
+"""Server optimisers: the mean change of a round is the gradient of a step on the server.
+
+FedAdam and FedYogi (Reddi et al., "Adaptive Federated Optimization", ICLR 2021, algorithm 2), and FedAvgM, whose server
+has momentum (Hsu et al., 2019).
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,11 @@
-"""Coordinate-wise median of the clients' weights (Yin et al., ICML 2018, option I)."""
+"""Robust aggregation, which withstands arbitrary updates of a minority: median, trimmed mean, Krum, and mixing first.
+
+Median and trimmed mean are coordinate-wise (Yin et al., ICML 2018, options I and II). Krum keeps the updates that are
+nearest to others (Blanchard et al., NeurIPS 2017). Where clients have unlike data, honest updates lie far apart, and a
+rule that keeps few of them is easily led. Nearest-neighbour mixing (Allouah et al., "Fixing by Mixing", AISTATS 2023,
+algorithm 2) first draws each towards those near it: y_i is the mean of the n - f updates nearest to x_i, itself among
+them, of n of which f are Byzantine. Distances are of what is learned, and this alone is mixed.
+"""
 
 import math
 from collections.abc import Callable, Sequence

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from flcav.interface.wording import plural
-from flcav.releases.candidates.acknowledgement import Acknowledgement, find_acknowledgements
+from flcav.releases.candidate import Acknowledgement, find_acknowledgements
 from flcav.releases.repositories.metadata import (
     list_releases,
     load_root,

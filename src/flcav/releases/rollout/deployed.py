@@ -19,18 +19,30 @@ from flcav.fleet.traffic import read_traffic
 from flcav.fleet.up import VEHICLES, read_ready
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
-from flcav.releases.candidates.candidate import Candidate
-from flcav.releases.repositories.directive import MILLION, Directive, is_assigned, place_in_queue
-from flcav.releases.repositories.metadata import read_party, read_released, read_root
+from flcav.releases.candidate import Candidate
+from flcav.releases.checking import trusts_roots
+from flcav.releases.repositories.metadata import (
+    MILLION,
+    Directive,
+    is_assigned,
+    place_in_queue,
+    read_party,
+    read_released,
+    read_root,
+)
 from flcav.releases.repositories.repository import publish
 from flcav.releases.repositories.status import read_status
-from flcav.releases.rollout.delivery import STAGE, Delivered
-from flcav.releases.rollout.fleet import list_drives
-from flcav.releases.rollout.shadow import ShadowDecision, judge_shadows
-from flcav.releases.rollout.stages import STAGES, change_share, read_directive
-from flcav.releases.rollout.turns import Rollout, Turn
+from flcav.releases.rollout.simulated_fleet import STAGE, Delivered, list_drives
+from flcav.releases.rollout.stages import (
+    STAGES,
+    Rollout,
+    ShadowDecision,
+    Turn,
+    change_share,
+    judge_shadows,
+    read_directive,
+)
 from flcav.releases.rollout.updater import FOLDER, TASK, RecordedDrive, equip_vehicle
-from flcav.releases.vehicles.checking import trusts_roots
 
 LEAST = 2  # canaries: shadow runs of one vehicle do not tell
 POLL_S = 0.5  # between looks at the vehicles' reports

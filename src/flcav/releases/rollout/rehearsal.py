@@ -18,13 +18,12 @@ from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
-from flcav.releases.candidates.candidate import WEIGHTS, Candidate, check_files, read_candidate
-from flcav.releases.repositories.creation import create_repository
-from flcav.releases.repositories.directive import MILLION, Directive, is_assigned
-from flcav.releases.repositories.metadata import read_root
-from flcav.releases.repositories.repository import publish, stage_release
-from flcav.releases.rollout.delivery import Delivered
-from flcav.releases.rollout.fleet import (
+from flcav.releases.candidate import WEIGHTS, Candidate, check_files, read_candidate
+from flcav.releases.checking import Sources, open_sources
+from flcav.releases.repositories.metadata import MILLION, Directive, is_assigned, read_root
+from flcav.releases.repositories.repository import create_repository, publish, stage_release
+from flcav.releases.rollout.simulated_fleet import (
+    Delivered,
     Drive,
     SimulatedFleet,
     SimulatedRadio,
@@ -32,10 +31,17 @@ from flcav.releases.rollout.fleet import (
     list_drives,
     update_over_radio,
 )
-from flcav.releases.rollout.shadow import ShadowDecision, judge_shadows, run_shadow
-from flcav.releases.rollout.stages import STAGES, change_share, next_share, roll_back
-from flcav.releases.rollout.turns import Rollout, Turn
-from flcav.releases.vehicles.checking import Sources, open_sources
+from flcav.releases.rollout.stages import (
+    STAGES,
+    Rollout,
+    ShadowDecision,
+    Turn,
+    change_share,
+    judge_shadows,
+    next_share,
+    roll_back,
+    run_shadow,
+)
 
 MOST_TURNS = 12  # of the whole rehearsal; a vehicle drives once a turn
 KEYS = (1, 2)  # of each party, that sign

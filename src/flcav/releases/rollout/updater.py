@@ -24,9 +24,8 @@ from flcav.fleet.keys import REQUEST, read_request, requested_name
 from flcav.fleet.releases import RELEASES, REPORT, ReleaseReport, ShadowReport
 from flcav.fleet.supervisor import end_with_parent
 from flcav.fleet.vehicle import load_settings
-from flcav.releases.vehicles.checking import Sources, trust_roots, trusts_roots
-from flcav.releases.vehicles.fetching import CertifiedFetcher
-from flcav.releases.vehicles.installation import (
+from flcav.releases.checking import CertifiedFetcher, Sources, trust_roots, trusts_roots
+from flcav.releases.installation import (
     Fetched,
     Installed,
     fetch_release,
@@ -144,7 +143,7 @@ def _run_shadow(own: Path, vehicle: str, found: Fetched) -> ShadowReport | None:
     from flcav.machine.threads import use_threads
     from flcav.perception.objects.task import OBJECTS
     from flcav.perception.weights import load_network
-    from flcav.releases.rollout.shadow import run_shadow
+    from flcav.releases.rollout.stages import run_shadow
 
     use_threads(1)
     drive = RecordedDrive.from_json(read_json(own / DRIVE), str(own / DRIVE))

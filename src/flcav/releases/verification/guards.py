@@ -14,8 +14,16 @@ from numpy.typing import NDArray
 from flcav.geometry import Boxes, concatenate, wrap_angle
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.metrics.operating_point import DISTANCES_M
-from flcav.releases.verification.comparison import LEAST_TARGETS, Limit, Measured, Pair, Times, Values
-from flcav.releases.verification.matching import Mask, assign_detections
+from flcav.releases.verification.comparison import (
+    LEAST_TARGETS,
+    Limit,
+    Mask,
+    Measured,
+    Pair,
+    Times,
+    Values,
+    assign_detections,
+)
 
 OVERLAP = 0.5  # IoU in 3D from which a detection finds a target
 SECTORS_DEG = ((-90, -30), (-30, 0), (0, 30), (30, 90))  # of azimuth, counter-clockwise from straight ahead

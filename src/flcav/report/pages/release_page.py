@@ -4,10 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from flcav.releases.candidates.acknowledgement import Acknowledgement
-from flcav.releases.candidates.candidate import Candidate
-from flcav.releases.verification.conditions import WORDS
+from flcav.releases.candidate import Acknowledgement, Candidate
 from flcav.releases.verification.records import Comparison, OddCoverage, Verification
+from flcav.releases.verification.testing import WORDS
 from flcav.report.pages import html
 
 GROUPS = {

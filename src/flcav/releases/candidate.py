@@ -1,11 +1,18 @@
-"""A release candidate: weights with their card, hashes of data and recipe, the ledger, and the network they replace.
+"""A release candidate: weights with their card, hashes of data and recipe, the ledger, and who acknowledges it.
 
 A candidate is a folder. `candidate.json` holds the SHA-256 of every other file that was proposed; `verification.json`
-and `report.html` come with the verification, `acknowledgements` with those who sign it.
+and `report.html` come with the verification, `acknowledgements` with those who sign it: signatures in OpenSSF's format,
+which `model_signing verify key` verifies. A party's key signs the hashes of all files of the folder but the
+acknowledgements and the page (a Sigstore bundle with an in-toto statement; OpenSSF Model Signing v1.0). Keys are
+elliptic, of NIST's curves, in PEM files.
 """
 
+import contextlib
+import io
 import json
 import re
+import tempfile
+from dataclasses import dataclass
 from hashlib import sha256 as sha256_of
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -13,6 +20,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from flcav.config import Config, InputError, Json, check_is_file, parse_config
+from flcav.releases.keys import PublicKey, read_private_key
 from flcav.storage.files import sha256, write_bytes
 
 CANDIDATE = "candidate.json"
@@ -166,3 +174,67 @@ def hash_card(weights: Path) -> str:
 def write_report(folder: Path, page: str) -> None:
     """Write the candidate's page."""
     write_bytes(folder / REPORT, page.encode())
+
+
+UNSIGNED = (ACKNOWLEDGEMENTS, REPORT)  # the page is drawn anew with every acknowledgement, from what is signed
+MOST_BYTES = 1_000_000  # of a signature
+
+
+@dataclass(frozen=True)
+class Acknowledgement:
+    """Signatures of one party: the names of its keys that signed, and how many are wanted."""
+
+    party: str
+    keys: tuple[str, ...]
+    threshold: int
+
+
+def acknowledge(folder: Path, key: Path) -> Path:
+    """Sign the candidate in `folder` with the private key in the PEM file `key`; return the signature's file."""
+    from model_signing import hashing, signing
+
+    path = signature_path(folder, read_private_key(key).public)
+    path.parent.mkdir(exist_ok=True)
+    hashed = hashing.Config().set_ignored_paths(paths=UNSIGNED, ignore_git_paths=False)
+    signing.Config().set_hashing_config(hashed).use_elliptic_key_signer(private_key=key).sign(folder, path)
+    return path
+
+
+def check_acknowledgement(folder: Path, key: PublicKey) -> None:
+    """Raise `InputError` where a key does not sign the candidate in `folder`.
+
+    Its signature is missing, of another format, or of another content than the folder has now.
+    """
+    from model_signing import hashing, verifying
+
+    path = signature_path(folder, key)
+    if not path.is_file():
+        raise InputError(f"{folder}: has no signature of the key {key.short}")
+    if path.stat().st_size > MOST_BYTES:
+        raise InputError(f"{path}: too large for a signature")
+    hashed = hashing.Config().set_ignored_paths(paths=UNSIGNED, ignore_git_paths=False)
+    try:
+        with tempfile.NamedTemporaryFile("w", suffix=".pub") as pem, contextlib.redirect_stdout(io.StringIO()):
+            pem.write(key.pem)
+            pem.flush()
+            verifier = (
+                verifying.Config().set_hashing_config(hashed).use_elliptic_key_verifier(public_key=Path(pem.name))
+            )
+            verifier.verify(folder, path)
+    except Exception as error:  # a damaged bundle raises what its parser raises
+        raise InputError(f"{path}: does not sign this candidate ({str(error)[:200] or type(error).__name__})") from None
+
+
+def find_acknowledgements(folder: Path, party: str, keys: list[PublicKey], threshold: int) -> Acknowledgement:
+    """Return the signatures of a party's keys over the candidate as it is now."""
+    found = []
+    for key in keys:
+        with contextlib.suppress(InputError):
+            check_acknowledgement(folder, key)
+            found.append(key.short)
+    return Acknowledgement(party, tuple(found), threshold)
+
+
+def signature_path(folder: Path, key: PublicKey) -> Path:
+    """Return the file of a key's signature over a candidate."""
+    return folder / ACKNOWLEDGEMENTS / f"{key.short}.sig"

@@ -2,7 +2,9 @@
 
 Every vehicle of every recorded scene is a drive. Vehicle i takes the drive i at first and the next one later, so that
 vehicles beyond the number of drives take the same ones on other days. Folders, metadata, signatures and installation
-are those of `flcav release install`.
+are those of `flcav release install`. A vehicle downloads from the nearest roadside unit at the rate that the trace's
+coverage gives it there; the band is shared, and one that leaves coverage begins anew at its next attempt. Every unit
+fetches the files once over wireline.
 """
 
 import os
@@ -11,16 +13,80 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.network.clock.rounds import NetworkSettings
-from flcav.network.ledger import Ledger
+from flcav.network.clock.rounds import NetworkSettings, time_clients
+from flcav.network.clock.work import ClientWork
+from flcav.network.ledger import Ledger, LedgerEntry
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.recorded import link_scene
 from flcav.perception.agents import kind_of
-from flcav.releases.rollout.delivery import Delivered, deliver
-from flcav.releases.vehicles.checking import Sources, check_release, trust_roots
-from flcav.releases.vehicles.installation import Installed, read_installed, update_vehicle, weights_path
+from flcav.releases.checking import Sources, check_release, trust_roots
+from flcav.releases.installation import Installed, read_installed, update_vehicle, weights_path
+
+STAGE = "release"
+WAIT_S = 1.0  # between two attempts
+
+
+@dataclass(frozen=True)
+class Delivered:
+    """The delivery to one vehicle."""
+
+    vehicle: str
+    at_s: float | None  # on the trace's clock; None: not by its end
+    attempts: int
+    bytes: int  # on the radio, lost attempts included
+    reason: str  # why the last attempt failed; empty where it arrived
+
+
+def deliver(
+    links: RadioLinks,
+    vehicles: Sequence[str],
+    release: int,
+    size_bytes: int,
+    settings: NetworkSettings,
+    ledger: Ledger,
+    task: str = "objects",
+    fetched: set[str] | None = None,
+) -> tuple[Delivered, ...]:
+    """Return when each of `vehicles` has a release of `size_bytes`; what is sent enters the ledger.
+
+    Downlinks count against no budget, but are entered message by message, and those of lost attempts too. fetched:
+    units that have the files already, to which those are added that fetch them now; None: none has.
+    """
+    waiting = dict.fromkeys(vehicles)
+    attempts, moved = dict.fromkeys(vehicles, 0), dict.fromkeys(vehicles, 0)
+    reasons = dict.fromkeys(vehicles, "never in the town")
+    arrived: dict[str, float] = {}
+    units = set() if fetched is None else fetched
+    now, end = float(links.time_s[0]), float(links.time_s[-1])
+    while waiting and now < end:
+        instant = int(np.searchsorted(links.time_s, now, side="right")) - 1
+        here = [
+            name for name, there in zip(links.vehicle, links.present[instant], strict=True) if there and name in waiting
+        ]
+        if here:
+            work = [ClientWork(name, size_bytes, 0.0, 0) for name in here]
+            timings = time_clients(links, work, max(attempts.values()) + 1, now, settings.rounds)
+            for each in timings:
+                attempts[each.client] += 1
+                moved[each.client] += each.downloaded_bytes
+                reasons[each.client] = each.dropped
+                if each.server not in units:
+                    units.add(each.server)
+                    ledger.enter(LedgerEntry(STAGE, task, "wireline", "down", release, each.server, size_bytes))
+                ledger.enter(LedgerEntry(STAGE, task, "wireless", "down", release, each.client, each.downloaded_bytes))
+                if not each.dropped:
+                    arrived[each.client] = each.end_s
+                    del waiting[each.client]
+            now = max(now, *(each.end_s for each in timings))  # attempts begin together
+        now += WAIT_S
+    return tuple(
+        Delivered(name, arrived.get(name), attempts[name], moved[name], "" if name in arrived else reasons[name])
+        for name in vehicles
+    )
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from flcav.perception.card import Card, DataEntry, data_entry, write_card
 from flcav.perception.task import Task
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import load_network, read_card, save_network
-from flcav.releases.candidates.candidate import (
+from flcav.releases.candidate import (
     CANDIDATE,
     CARD,
     LEDGER,

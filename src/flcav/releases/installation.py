@@ -11,8 +11,8 @@ from datetime import datetime
 from pathlib import Path
 
 from flcav.config import InputError, read_json
-from flcav.releases.candidates.candidate import hash_card
-from flcav.releases.vehicles.checking import Approved, Checked, Refused, Sources, check_release, refuse
+from flcav.releases.candidate import hash_card
+from flcav.releases.checking import Approved, Checked, Refused, Sources, check_release, refuse
 from flcav.storage.files import atomic_path, sha256, write_json
 from flcav.storage.records import Record, from_json
 
