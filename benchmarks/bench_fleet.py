@@ -29,7 +29,7 @@ from flwr.proto.node_pb2 import Node
 from flcav.federation.links.flower import Deployment, start_fleet
 from flcav.federation.loop import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
-from flcav.federation.wire import to_arrays
+from flcav.federation.wire import to_array_record
 from flcav.fleet.authority import found_authority, open_registry
 from flcav.fleet.forwarder import vehicle_tls
 from flcav.fleet.keys import AUTHORITY, KEY, LOOPBACK, load_key, request_certificate
@@ -64,12 +64,12 @@ def measure_registry(folder: Path) -> None:
     """Print what a register, a revoke and a list take as the registry grows to `REGISTERED` vehicles."""
     authority = found_authority(folder / "fleet")
     requests = [request_certificate(folder / f"{number}", f"v{number:05d}") for number in range(50)]
-    from flcav.fleet.registry import Vehicle
+    from flcav.fleet.registry import RegisteredVehicle
 
     end = int(time.time()) + 10**6
     with authority.registry._change() as cursor:
         for number in range(REGISTERED - 50):
-            own = Vehicle(f"w{number:05d}", f"{number:064x}", number.to_bytes(8, "big"), 0, end)
+            own = RegisteredVehicle(f"w{number:05d}", f"{number:064x}", number.to_bytes(8, "big"), 0, end)
             authority.registry._insert(cursor, own, "register")
     waiting = iter(requests)
     print(f"register one of {REGISTERED}: {1e3 * seconds(lambda: authority.register(next(waiting)), 50):.1f} ms")
@@ -142,7 +142,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         measure_registry(Path(folder))
     weights = {"w": np.random.default_rng(0).normal(size=int(MEGABYTES * 1e6 / 4)).astype(np.float32)}
-    record = RecordDict({"arrays": to_arrays(weights)})
+    record = RecordDict({"arrays": to_array_record(weights)})
     turn = lambda: recorddict_from_proto(recorddict_to_proto(record))  # noqa: E731
     print(f"serialise {MEGABYTES:g} MB and read it: {1e3 * seconds(turn, 5):.0f} ms")
     start = [sys.executable, "-c", "import flcav.federation.links.vehicle_app, flwr.supernode.runtime.run_clientapp"]

@@ -19,7 +19,7 @@ from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.corrections import Scaffold
 from flcav.federation.strategies.robust import Median
 from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.federation.wire import ARRAYS, ASK, METRICS, NORM, SHARES, VECTOR, to_arrays
+from flcav.federation.wire import ARRAYS, ASK, METRICS, NORM, SHARES, VECTOR, to_array_record
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 START = {"w": np.zeros((4, 3), np.float32), "g": np.zeros((64, 1), np.float32), "count": np.array(2)}
@@ -123,7 +123,7 @@ def with_array(change: Callable[[str, np.ndarray], Mapping[str, Any]], where: st
             own = {name: array.numpy() for name, array in content.array_records[ARRAYS].items()}
             name = next(iter(own)) if where is None else where
             array = own.pop(name)
-            content[ARRAYS] = to_arrays({**own, **change(name, array)})
+            content[ARRAYS] = to_array_record({**own, **change(name, array)})
 
     return damage
 
@@ -154,11 +154,11 @@ ANYWHERE: Mapping[str, Damage] = {
     "deep header": with_header("-" * 5000 + "1"),
     "deep brackets": with_header("(" * 3000),
     **{f"header of {text}": with_header(declared(text)) for text in ("'|O'", "[('a', '<f4')]", "'|V0'", "'>f4'")},
-    "unknown record": with_records(extra=to_arrays({"x": np.zeros(1, np.float32)})),
+    "unknown record": with_records(extra=to_array_record({"x": np.zeros(1, np.float32)})),
     "no metrics": without(METRICS),
     "no arrays": without(ARRAYS),
     "other metrics": with_metrics(more=1),
-    "metrics as arrays": with_records(metrics=to_arrays(START)),
+    "metrics as arrays": with_records(metrics=to_array_record(START)),
     "arrays as settings": with_records(arrays=ConfigRecord({"w": 1})),
     "other shape": with_array(lambda name, array: {name: np.zeros((3, 4, 2), array.dtype)}),
     "other type": with_array(lambda name, array: {name: array.astype(np.complex128)}),
@@ -273,9 +273,9 @@ def test_arrays_beside_updates_are_judged_by_the_server_s_weights_and_not_by_the
     monkeypatch: pytest.MonkeyPatch, liar: str
 ):
     for odd in ({"w": np.ones(2)}, {"odd": np.ones((4, 3), np.float32)}, {"w": START["w"]}):
-        check(*run(monkeypatch, Rules(), liar, with_records(extra=to_arrays(odd)), Scaffold()), liar)
+        check(*run(monkeypatch, Rules(), liar, with_records(extra=to_array_record(odd)), Scaffold()), liar)
     check(*run(monkeypatch, Rules(), liar, without("extra"), Scaffold()), liar)
-    check(*run(monkeypatch, Rules(), liar, with_records(extra=to_arrays({"x": np.ones(1)})), Median()), liar)
+    check(*run(monkeypatch, Rules(), liar, with_records(extra=to_array_record({"x": np.ones(1)})), Median()), liar)
 
 
 def test_limits_of_samples_norm_and_loss_are_those_of_the_rules(monkeypatch: pytest.MonkeyPatch):

@@ -34,7 +34,7 @@ from flcav.fleet.keys import (
     request_certificate,
     take_certificate,
 )
-from flcav.fleet.status import read_status
+from flcav.fleet.status import read_fleet_status
 from flcav.fleet.supervisor import read_processes
 from flcav.fleet.traffic import read_traffic
 from flcav.fleet.up import VEHICLES, read_ready
@@ -156,7 +156,7 @@ def test_fl_request_sent_twice(deployment):
     server = read_ready(deployment.folder).proxy
     one, another = (deployment.folder / VEHICLES / name for name in ("vehicle-001", "vehicle-002"))
     asked = make_request("weather", 2.5, 12, (10.0, -3.0))
-    earlier = read_status(deployment.folder).requests
+    earlier = read_fleet_status(deployment.folder).requests
     send_request(one, server, asked)
     with pytest.raises(InputError, match="a request with this nonce came before"):
         send_request(one, server, asked)
@@ -173,7 +173,7 @@ def test_fl_request_sent_twice(deployment):
 
     wait_for(is_refused)
     assert read_processes(deployment.folder)["proxy"] != before
-    came = [each for each in read_status(deployment.folder).requests if each not in earlier]
+    came = [each for each in read_fleet_status(deployment.folder).requests if each not in earlier]
     assert [(each.vehicle, each.request) for each in came] == [(one.name, asked)]
 
 

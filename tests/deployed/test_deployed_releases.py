@@ -28,7 +28,7 @@ from flcav.fleet.releases import (
     ShadowReport,
     read_reports,
 )
-from flcav.fleet.status import read_status
+from flcav.fleet.status import read_fleet_status
 from flcav.fleet.supervisor import read_processes
 from flcav.fleet.up import VEHICLES, read_ready
 from flcav.fleet.vehicle import VehicleSettings
@@ -205,7 +205,9 @@ def test_shadow_runs_stop_it_and_the_roll_back_has_a_higher_number(parties, caps
     expected = run_shadow("", [data.frame(0)], *networks)
     for name in canaries:
         assert parties.reports()[name].shadow == replace(expected, vehicle=name)
-    told = {own.name: own.release.describe() for own in read_status(parties.fleet).vehicles if own.release is not None}
+    told = {
+        own.name: own.release.describe() for own in read_fleet_status(parties.fleet).vehicles if own.release is not None
+    }
     assert all(told[name].endswith("disagreement 1.000 over 1 frame") for name in canaries)
 
     wait_for(lambda: all(parties.installed(name).weights == sha256(bad) for name in canaries))

@@ -11,7 +11,7 @@ from flcav.cli.terminal import echo, print_json
 from flcav.interface.wording import make_printable, plural
 
 if TYPE_CHECKING:
-    from flcav.fleet.registry import Registry, Vehicle
+    from flcav.fleet.registry import RegisteredVehicle, VehicleRegistry
 
 fleet = typer.Typer(
     help="A deployed fleet: its registered vehicles, its servers, and what they do.", no_args_is_help=True
@@ -174,14 +174,14 @@ def status(
     as_json: bool = JSON,
 ) -> None:
     """Tell who is in, the rounds of the federation, bytes against budgets, failures and refusals."""
-    from flcav.fleet.status import LEAST_ROOM, read_status
+    from flcav.fleet.status import LEAST_ROOM, read_fleet_status
 
     if page is not None:
         from flcav.fleet.page import serve_page
 
         serve_page(folder, page, echo)
         return
-    found = read_status(folder)
+    found = read_fleet_status(folder)
     if as_json:
         print_json(found.as_json())
         return
@@ -234,19 +234,19 @@ def up(
     port: int = typer.Option(0, "--port", min=0, max=65535, help="Port of the proxy; 0: a free one."),
 ) -> None:
     """Run the SuperLink and the proxy of a fleet until interrupted, and vehicles on this machine."""
-    from flcav.federation.links.vehicle_app import prepare
+    from flcav.federation.links.vehicle_app import preload_assignment
     from flcav.fleet.up import run_fleet
 
-    run_fleet(folder, host, port, vehicles or 0, prepare, echo, _updater())
+    run_fleet(folder, host, port, vehicles or 0, preload_assignment, echo, _updater())
 
 
 @fleet.command("vehicle")
 def run_vehicle(folder: Path = typer.Argument(help="Folder of the vehicle, on the vehicle.")) -> None:
     """On a vehicle: run its forwarder, its node and its app until interrupted."""
-    from flcav.federation.links.vehicle_app import prepare
+    from flcav.federation.links.vehicle_app import preload_assignment
     from flcav.fleet.up import run_vehicle as run
 
-    run(folder, prepare, _updater())
+    run(folder, preload_assignment, _updater())
 
 
 def _updater() -> dict[str, Callable[[Path], None]]:
@@ -260,7 +260,7 @@ def _updater() -> dict[str, Callable[[Path], None]]:
     return {"updater": run_updater}
 
 
-def _describe_new(registry: "Registry", certificate: bytes) -> str:
+def _describe_new(registry: "VehicleRegistry", certificate: bytes) -> str:
     from flcav.fleet.keys import fingerprint_of
 
     own = registry.find(fingerprint_of(certificate))
@@ -268,7 +268,7 @@ def _describe_new(registry: "Registry", certificate: bytes) -> str:
     return _describe(own)
 
 
-def _describe(own: "Vehicle") -> str:
+def _describe(own: "RegisteredVehicle") -> str:
     return f"{own.name} {own.describe_state()}, until {_date(own.expires)}, SHA-256 {own.fingerprint[:16]}"
 
 

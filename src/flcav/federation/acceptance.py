@@ -20,7 +20,7 @@ from flcav.federation.rules import Rules
 from flcav.federation.strategies.fedavg import BLOCK
 from flcav.federation.strategies.strategy import Exchanges, Strategy
 from flcav.federation.trainable import Forms, LocalUpdate, Weights, forms_of, learned_names
-from flcav.federation.upload import Arrays, subtract
+from flcav.federation.upload import Arrays, find_change
 from flcav.federation.wire import (
     ARRAYS,
     ASK,
@@ -32,7 +32,7 @@ from flcav.federation.wire import (
     SAMPLES,
     VECTOR,
     count_coordinates,
-    decode,
+    decode_update,
     is_changed,
     is_local,
     sent_forms,
@@ -86,7 +86,7 @@ def read_update(content: RecordDict, expected: Expected, told: float | None = No
     update = LocalUpdate({}, samples, loss, extra=_read_arrays(content, EXTRA, extra) if extra else {})
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # of values that the norm is about to refuse
-            update = replace(update, weights=decode(sent, start, rules))
+            update = replace(update, weights=decode_update(sent, start, rules))
     except ValueError as error:
         raise ReplyRefused(str(error)) from None
     _check_change({name: update.weights[name] for name in rules.upload.exchanged(start)}, start, rules)
@@ -94,7 +94,7 @@ def read_update(content: RecordDict, expected: Expected, told: float | None = No
     if told is not None and not is_changed(rules):  # what is compressed may be longer
         exchanged = rules.upload.exchanged(start)
         names = [name for name in learned_names(start) if name in exchanged]
-        if (norm := change_norm(subtract(update.weights, start, names))) > told * (1 + SAME):
+        if (norm := change_norm(find_change(update.weights, start, names))) > told * (1 + SAME):
             raise ReplyRefused(f"a change of the norm {norm:.3g}, where the client told {told:.3g}")
     return update
 

@@ -11,8 +11,8 @@ from flcav.config import InputError
 from flcav.federation.acceptance import Expected, extra_forms, is_usable
 from flcav.federation.conduct import (
     ANSWERED,
+    RequestDigests,
     RequestRefused,
-    Requests,
     asked_for,
     keep_answered,
     recall_answered,
@@ -35,7 +35,7 @@ from flcav.federation.trainable import (
     count_samples,
     learned_names,
 )
-from flcav.federation.upload import Arrays, subtract
+from flcav.federation.upload import Arrays, find_change
 from flcav.federation.wire import (
     ARRAYS,
     ASK,
@@ -55,14 +55,14 @@ from flcav.federation.wire import (
     VECTOR,
     LocalWork,
     NoCount,
-    encode,
-    flatten,
+    encode_update,
+    flatten_change,
     is_local,
     read_arrays,
-    refuse,
+    refuse_request,
     reply,
     reply_norm,
-    to_arrays,
+    to_array_record,
     to_metrics,
 )
 from flcav.network.ledger import BudgetExceeded
@@ -77,7 +77,7 @@ HIDDEN = "hidden"  # an update that was masked, until the sum of its round is un
 
 
 @dataclass(frozen=True)
-class Agreement:
+class ClientAgreement:
     """What server and clients of a federation agree on before it begins."""
 
     strategy: Strategy
@@ -120,7 +120,7 @@ def client_app(
     use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
     arrives, and so optimisers that are kept.
     """
-    app, clients, requests = ClientApp(), [*trainables], Requests(rules.privacy)
+    app, clients, requests = ClientApp(), [*trainables], RequestDigests(rules.privacy)
 
     def admit(message: Message, context: Context, name: str, work: LocalWork) -> str:
         """Return what is asked for; raises `RequestRefused` where the client is not to answer."""
@@ -140,7 +140,7 @@ def client_app(
         try:
             return answer_training(message, context)
         except NoCount as error:
-            return refuse(message, str(error))
+            return refuse_request(message, str(error))
 
     def answer_training(message: Message, context: Context) -> Message:
         name = clients[int(context.node_config[PARTITION])]
@@ -159,7 +159,7 @@ def client_app(
                 start = read_arrays(message.content, ARRAYS)
                 update, _, _ = _train(trainables[name], message, context, start, work, seed)
                 about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
-                values = flatten(update, start, rules, seed, key)
+                values = flatten_change(update, start, rules, seed, key)
                 _keep(context, HIDDEN, LocalUpdate({VECTOR: values}, *about))
             hidden, peers = _recall(context, HIDDEN), message.content.config_records[ASK][NAMES]
             values = np.asarray(hidden.weights[VECTOR], np.float64)
@@ -172,11 +172,11 @@ def client_app(
             start = read_arrays(message.content, ARRAYS)
             update, extra, own = _train(trainables[name], message, context, start, work, seed)
         if asked == NORM:
-            context.state[KEPT_START] = to_arrays(start)
+            context.state[KEPT_START] = to_array_record(start)
             _keep(context, KEPT, update)
             names = [each for each in learned_names(start) if each in rules.upload.exchanged(start)]
-            return reply_norm(message, change_norm(subtract(update.weights, start, names)), update.samples)
-        encoded, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)
+            return reply_norm(message, change_norm(find_change(update.weights, start, names)), update.samples)
+        encoded, left = encode_update(update, start, rules, _recorded(context, RESIDUAL), seed, key)
         if rules.hides_draws:  # neither the ledger's bytes nor the server's figures are to tell who was drawn
             encoded = replace(encoded, samples=min(encoded.samples, 1), loss=0.0)
         answer = reply(message, encoded, extra)
@@ -191,7 +191,7 @@ def client_app(
     def answer(message: Message, context: Context) -> Message:
         client, arrays = trainables[clients[int(context.node_config[PARTITION])]], _optional(message.content, ARRAYS)
         found = answer_question(client, asked_for(message.content), arrays)
-        return Message(RecordDict({ARRAYS: to_arrays(found)}), reply_to=message)
+        return Message(RecordDict({ARRAYS: to_array_record(found)}), reply_to=message)
 
     @app.query()
     def query(message: Message, context: Context) -> Message:
@@ -204,7 +204,7 @@ def client_app(
         if OWN in found and isinstance(strategy, FedMD) and not simulated:
             now = np.frombuffer(requests.digest(RecordDict({OWN: found.pop(OWN)})), np.uint8)
             before = [each for each in _recorded(context, OWN_DIGESTS).values() if not np.array_equal(each, now)]
-            context.state[OWN_DIGESTS] = to_arrays(dict(zip(("last", "before"), (now, *before), strict=False)))
+            context.state[OWN_DIGESTS] = to_array_record(dict(zip(("last", "before"), (now, *before), strict=False)))
             found[OWN_DIGESTS] = context.state[OWN_DIGESTS]
         place = MetricRecord({PARTITION: int(context.node_config[PARTITION])})
         return Message(RecordDict({**found, METRICS: place}), reply_to=message)
@@ -258,11 +258,11 @@ def _optional(content: RecordDict, key: str) -> Arrays:
 def _record(context: Context, key: str, arrays: Weights) -> None:
     """Keep arrays for the next round; of a training that diverged nothing is kept."""
     if arrays and all(np.isfinite(array).all() for array in arrays.values()):
-        context.state[key] = to_arrays(arrays)
+        context.state[key] = to_array_record(arrays)
 
 
 def _keep(context: Context, key: str, update: Update) -> None:
-    context.state[key], context.state[f"{key}-{SAMPLES}"] = to_arrays(update.weights), to_metrics(update)
+    context.state[key], context.state[f"{key}-{SAMPLES}"] = to_array_record(update.weights), to_metrics(update)
 
 
 def _recall(context: Context, key: str) -> LocalUpdate:

@@ -28,7 +28,7 @@ from flcav.federation.wire import (
     SHARES,
     UNMASK,
     read_arrays,
-    to_arrays,
+    to_array_record,
 )
 
 ANSWERED = "answered"  # record of a node's state
@@ -97,10 +97,12 @@ def recall_answered(context: Context) -> Answered:
 def keep_answered(context: Context, answered: Answered) -> None:
     """Keep what a node answers."""
     numbers = np.array([answered.round, answered.place, answered.rounds], np.int64)
-    context.state[ANSWERED] = to_arrays({ANSWERED: np.concatenate([numbers, np.frombuffer(answered.digest, np.int64)])})
+    context.state[ANSWERED] = to_array_record(
+        {ANSWERED: np.concatenate([numbers, np.frombuffer(answered.digest, np.int64)])}
+    )
 
 
-class Requests:
+class RequestDigests:
     """Requests as the clients of a process see them: in how many rounds they answer, and digests of what is asked.
 
     The clients share the arrays of theirs, which are hashed once.
@@ -112,9 +114,9 @@ class Requests:
         self._last: Mapping[str, tuple[list[bytes], bytes]] = {}  # by record: its data and their digest
         self._lock = threading.Lock()
 
-    def __reduce__(self) -> tuple[type["Requests"], tuple[Privacy | None]]:
+    def __reduce__(self) -> tuple[type["RequestDigests"], tuple[Privacy | None]]:
         """Return how another process makes its own: what is kept here is only for speed."""
-        return Requests, (self._privacy,)
+        return RequestDigests, (self._privacy,)
 
     @cached_property
     def affordable(self) -> int | None:

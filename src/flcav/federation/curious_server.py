@@ -8,14 +8,14 @@ from flwr.serverapp import Grid
 
 from flcav.federation.client import client_app
 from flcav.federation.links.in_process import EmbeddedGrid, LinkGrid
-from flcav.federation.loop import Server
+from flcav.federation.loop import FederationServer
 from flcav.federation.privacy import draw_secret
 from flcav.federation.rules import Rules
 from flcav.federation.secure.primitives import to_values
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.trainable import Trainable, Weights
-from flcav.federation.wire import ARRAYS, VECTOR, LocalWork, decode, read_arrays, unflatten
+from flcav.federation.wire import ARRAYS, VECTOR, LocalWork, decode_update, read_arrays, unflatten
 
 
 class ReadGrid(LinkGrid):
@@ -44,11 +44,11 @@ def read_round(
     secrets = {party: draw_secret() for party in rules.secret_parties([*clients]) if party in clients}
     with EmbeddedGrid(client_app(clients, FEDAVG, rules, secrets), [*clients]) as grid:
         reading = ReadGrid(grid, grid.names)
-        after = dict(Server(reading, grid.names, FEDAVG, rules, work, FederationState()).run_round(1, start))
+        after = dict(FederationServer(reading, grid.names, FEDAVG, rules, work, FederationState()).run_round(1, start))
     seen: dict[str, Weights] = {}
     for name, update in reading.updates.items():
         if rules.secure is None:
-            seen[name] = decode(update, start, rules)
+            seen[name] = decode_update(update, start, rules)
         else:
             vector = np.asarray(update[VECTOR], np.uint32)
             seen[name] = unflatten(to_values(vector, rules.secure.largest, len(clients)), start, rules)

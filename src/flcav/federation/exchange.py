@@ -28,7 +28,7 @@ from flcav.federation.wire import (
     Lost,
     TimedOut,
     list_events,
-    to_arrays,
+    to_array_record,
 )
 
 AnswerT = TypeVar("AnswerT")
@@ -174,9 +174,9 @@ class OpenRound:
 
     def training(self) -> RecordDict:
         """Return a request to train: weights, what goes with them, and the local work."""
-        records = {ARRAYS: to_arrays(self.start)} | ({EXTRA: to_arrays(self.sent)} if self.sent else {})
+        records = {ARRAYS: to_array_record(self.start)} | ({EXTRA: to_array_record(self.sent)} if self.sent else {})
         if self.centre is not None:
-            records[CENTRE] = to_arrays({name: self.centre[name] for name in learned_names(self.centre)})
+            records[CENTRE] = to_array_record({name: self.centre[name] for name in learned_names(self.centre)})
         return RecordDict({**records, CONFIG: self.work.record()})
 
 

@@ -17,12 +17,12 @@ from cryptography import x509
 from flcav.config import InputError
 from flcav.federation.acceptance import Expected, extra_forms
 from flcav.federation.checks import check_federation, check_weights
-from flcav.federation.client import Agreement, kept_records
+from flcav.federation.client import ClientAgreement, kept_records
 from flcav.federation.exchange import Attendance, ClientFailed, Exchange, Intake, OpenRound
 from flcav.federation.links.link import Ask, Link, Runtime, open_link
 from flcav.federation.links.metered import Account, open_account
 from flcav.federation.modes import buffered, drawn, masked, plain
-from flcav.federation.modes.buffered import Buffering, Buffers, afford_buffers, is_spent, take_turns
+from flcav.federation.modes.buffered import Buffering, Buffers, afford_buffers, fill_in_turns, is_spent
 from flcav.federation.privacy import (
     account_epsilon,
     affordable_rounds,
@@ -74,8 +74,8 @@ def _do_nothing(*_: object) -> None:
     pass
 
 
-class Options(TypedDict, total=False):
-    """Keyword arguments of `federate`, which describes them; their defaults are those of `Terms`."""
+class FederationOptions(TypedDict, total=False):
+    """Keyword arguments of `federate`, which describes them; their defaults are those of `FederationTerms`."""
 
     strategy: Strategy
     rules: Rules
@@ -92,7 +92,7 @@ class Options(TypedDict, total=False):
 
 
 @dataclass(frozen=True)
-class Terms:
+class FederationTerms:
     """Terms of a federation: its strategy and rules, what came before it, and what is called between its rounds."""
 
     strategy: Strategy = FEDAVG
@@ -114,7 +114,7 @@ def federate(
     weights: Weights,
     schedule: Schedule,
     account: Account | None = None,
-    **options: Unpack[Options],
+    **options: Unpack[FederationOptions],
 ) -> LocalUpdate:
     """Run rounds `done + 1 .. schedule.rounds` of a federation, by default of federated averaging.
 
@@ -173,7 +173,7 @@ def federate(
     >>> federate(vehicles, {"w": np.zeros(2)}, schedule).weights["w"]
     array([2.5, 2.5])
     """
-    terms, account, names = Terms(**options), account or open_account(), [*clients]
+    terms, account, names = FederationTerms(**options), account or open_account(), [*clients]
     check_federation(clients, terms.strategy, terms.rules)
     check_weights(weights, "weights to begin with")
     state = terms.state or FederationState()
@@ -190,9 +190,9 @@ def federate(
         if buffering
         else least_participations(rules.selection, len(names), terms.earlier)
     )
-    agreed = Agreement(terms.strategy, rules, secrets, before)
+    agreed = ClientAgreement(terms.strategy, rules, secrets, before)
     with open_link(clients, terms.runtime, account, agreed, state.clients) as link:
-        server = Server(
+        server = FederationServer(
             *(link.grid, link.names, terms.strategy, rules, schedule.work, state, terms.earlier, terms.centre),
             *(account.find_away, buffering, link.authority),
         )
@@ -208,12 +208,12 @@ def federate(
 
 
 def _limit_rounds(
-    terms: Terms, names: Sequence[str], rounds: int, account: Account
+    terms: FederationTerms, names: Sequence[str], rounds: int, account: Account
 ) -> tuple[Rules, int, Buffering | None]:
     """Return the rules with the noise for the planned rounds, how many of these a budget affords, and their buffers."""
     rules = terms.rules
     if isinstance(terms.strategy, FedBuff):
-        buffers = terms.buffers or take_turns(names, terms.strategy.buffer, rounds)
+        buffers = terms.buffers or fill_in_turns(names, terms.strategy.buffer, rounds)
         afforded = min(rounds, afford_buffers(buffers, rules.privacy))
         return rules, afforded, Buffering(terms.strategy, buffers, account)
     if rules.privacy is None:
@@ -224,7 +224,7 @@ def _limit_rounds(
 
 
 def _run_round(
-    server: "Server", link: Link, terms: Terms, number: int, weights: Weights, sent: Weights
+    server: "FederationServer", link: Link, terms: FederationTerms, number: int, weights: Weights, sent: Weights
 ) -> tuple[Weights, Weights]:
     """Return the weights after a round, and what the next one sends down: these, or a distillation's mean outputs."""
     state, kept = server.state, kept_records(server.strategy, server.rules)
@@ -259,7 +259,7 @@ def _imitate(distiller: Distiller, strategy: Strategy, network: Weights, outputs
 
 
 @dataclass(frozen=True)
-class Server(Exchange):
+class FederationServer(Exchange):
     """Server of a federation: it runs rounds with the clients at the far end of a Flower grid."""
 
     strategy: Strategy

@@ -26,7 +26,7 @@ from pydantic import Field, model_validator
 from flcav.config import Config, InputError
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.federation.upload import add, subtract
+from flcav.federation.upload import apply_change, find_change
 from flcav.statistics.streams import stream
 
 Arrays = dict[str, NDArray[np.number]]  # by name
@@ -130,10 +130,10 @@ def average_privately(
     """
     total: Arrays = {name: np.zeros(start[name].shape) for name in names}
     for update in updates:
-        for name, array in clip_change(subtract(update.weights, start, names), privacy.clip).items():
+        for name, array in clip_change(find_change(update.weights, start, names), privacy.clip).items():
             total[name] += array
     noisy = add_noise(total, privacy, seed, key)
-    return add(start, {name: array / expected for name, array in noisy.items()})
+    return apply_change(start, {name: array / expected for name, array in noisy.items()})
 
 
 def expected_clients(selection: Selection, names: Sequence[str]) -> float:

@@ -21,7 +21,7 @@ from flcav.config import shorten
 from flcav.federation.privacy import add_noise, clip_change
 from flcav.federation.rules import Rules
 from flcav.federation.trainable import Forms, LocalUpdate, Update, Weights, forms_of, learned_names
-from flcav.federation.upload import VALUES, Arrays, add, compress, compressed_forms, decompress, subtract
+from flcav.federation.upload import VALUES, Arrays, apply_change, compress, compressed_forms, decompress, find_change
 from flcav.statistics.streams import derive_seed
 
 ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"  # records of a message, by key
@@ -70,7 +70,7 @@ class LocalWork:
         return cls(**{name: config[name] for name in cls.__dataclass_fields__})  # type: ignore[arg-type]
 
 
-def to_arrays(weights: Weights) -> ArrayRecord:
+def to_array_record(weights: Weights) -> ArrayRecord:
     """Return weights as a Flower array record, in the same order."""
     record = ArrayRecord()
     for name, value in weights.items():
@@ -150,7 +150,7 @@ def reply(message: Message, update: Update, extra: Weights) -> Message:
 
 def update_content(update: Update, extra: Weights) -> RecordDict:
     """Return the records of `reply`."""
-    records = {ARRAYS: to_arrays(update.weights)} | ({EXTRA: to_arrays(extra)} if extra else {})
+    records = {ARRAYS: to_array_record(update.weights)} | ({EXTRA: to_array_record(extra)} if extra else {})
     return RecordDict({**records, METRICS: to_metrics(update)})
 
 
@@ -179,7 +179,7 @@ def _count(samples: float) -> int:
     return whole
 
 
-def refuse(message: Message, reason: str) -> Message:
+def refuse_request(message: Message, reason: str) -> Message:
     """Return the answer of a client that cannot do what is asked, with the reason."""
     return Message(Error(CLIENT_APP_RAISED, reason), reply_to=message)
 
@@ -189,7 +189,7 @@ def is_changed(rules: Rules) -> bool:
     return rules.upload.compression != "none" or is_local(rules)
 
 
-def encode(
+def encode_update(
     update: Update, start: Weights, rules: Rules, residual: Weights, seed: int, key: bytes | None = None
 ) -> tuple[LocalUpdate, Arrays]:
     """Return an update as it is sent, and what the client keeps for the next round.
@@ -202,7 +202,7 @@ def encode(
     names, learned = upload.exchanged(start), set(learned_names(start))
     if not is_changed(rules):
         return LocalUpdate({name: weights[name] for name in names}, update.samples, update.loss), {}
-    change = _protect(subtract(weights, start, [name for name in names if name in learned]), rules, seed, key)
+    change = _protect(find_change(weights, start, [name for name in names if name in learned]), rules, seed, key)
     sent, kept = compress(upload, change, residual.get(VALUES), derive_seed(seed, "rounding"))
     if is_local(rules):
         return LocalUpdate(sent, 1, 0.0), kept
@@ -211,7 +211,7 @@ def encode(
 
 
 def sent_forms(start: Weights, rules: Rules) -> Forms:
-    """Return shape and type of each array of the message that `encode` makes."""
+    """Return shape and type of each array of the message that `encode_update` makes."""
     names, learned = rules.upload.exchanged(start), set(learned_names(start))
     whole = forms_of({name: start[name] for name in names})
     if not is_changed(rules):
@@ -220,39 +220,41 @@ def sent_forms(start: Weights, rules: Rules) -> Forms:
     return {**change, **({} if is_local(rules) else {name: whole[name] for name in names if name not in learned})}
 
 
-def decode(sent: Weights, start: Weights, rules: Rules) -> Weights:
+def decode_update(sent: Weights, start: Weights, rules: Rules) -> Weights:
     """Return the weights of a client after its local training, as far as its message tells; otherwise those of `start`.
 
-    The arrays have the forms of `sent_forms`. Raises ValueError where they are not those of `encode`.
+    The arrays have the forms of `sent_forms`. Raises ValueError where they are not those of `encode_update`.
     """
     names, learned = rules.upload.exchanged(start), set(learned_names(start))
     if not is_changed(rules):
         return {name: sent.get(name, array) for name, array in start.items()}
     like = {name: start[name] for name in names if name in learned}
-    weights = add(start, decompress(rules.upload, sent, like))
+    weights = apply_change(start, decompress(rules.upload, sent, like))
     rest = () if is_local(rules) else [name for name in names if name not in learned]
     return weights | {name: sent[name] for name in rest}
 
 
-def flatten(update: Update, start: Weights, rules: Rules, seed: int, key: bytes | None = None) -> NDArray[np.float64]:
+def flatten_change(
+    update: Update, start: Weights, rules: Rules, seed: int, key: bytes | None = None
+) -> NDArray[np.float64]:
     """Return the change of all floating arrays that are sent, one after another (coordinates,).
 
-    Under local privacy these are the learned ones, clipped and with noise; `seed` and `key` are as in `encode`.
+    Under local privacy these are the learned ones, clipped and with noise; `seed` and `key` are as in `encode_update`.
     """
-    change = _protect(subtract(update.weights, start, _floating(start, rules)), rules, seed, key)
+    change = _protect(find_change(update.weights, start, _floating(start, rules)), rules, seed, key)
     return np.concatenate([np.ravel(array).astype(np.float64) for array in change.values()])
 
 
 def count_coordinates(start: Weights, rules: Rules) -> int:
-    """Return the number of values of which `flatten` makes a vector."""
+    """Return the number of values of which `flatten_change` makes a vector."""
     return sum(start[name].size for name in _floating(start, rules))
 
 
 def unflatten(change: NDArray[np.float64], start: Weights, rules: Rules) -> Weights:
-    """Return the weights `start` with a change of their floating arrays added: the inverse of `flatten`."""
+    """Return the weights `start` with a change of their floating arrays added: the inverse of `flatten_change`."""
     names = _floating(start, rules)
     parts = np.split(change, np.cumsum([start[name].size for name in names])[:-1])
-    return add(start, {name: part.reshape(start[name].shape) for name, part in zip(names, parts, strict=True)})
+    return apply_change(start, {name: part.reshape(start[name].shape) for name, part in zip(names, parts, strict=True)})
 
 
 def _floating(start: Weights, rules: Rules) -> list[str]:

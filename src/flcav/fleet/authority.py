@@ -25,7 +25,7 @@ from flcav.fleet.keys import (
     requested_name,
     write_private,
 )
-from flcav.fleet.registry import BUSY_S, Registry, Vehicle
+from flcav.fleet.registry import BUSY_S, RegisteredVehicle, VehicleRegistry
 from flcav.storage.files import write_bytes
 
 AUTHORITY_KEY, REGISTRY = "ca.key", "registry.sqlite"
@@ -42,7 +42,7 @@ class Authority:
     folder: Path
     key: ec.EllipticCurvePrivateKey
     certificate: x509.Certificate
-    registry: Registry
+    registry: VehicleRegistry
 
     def register(self, request: Path, days: float = VEHICLE_DAYS) -> bytes:
         """Return the certificate (PEM) of a new vehicle, by its signing request; it is in the registry.
@@ -86,10 +86,10 @@ class Authority:
         return made.sign(self.key, hashes.SHA384())
 
 
-def _describe(made: x509.Certificate, asked: x509.CertificateSigningRequest) -> Vehicle:
+def _describe(made: x509.Certificate, asked: x509.CertificateSigningRequest) -> RegisteredVehicle:
     spki = asked.public_key().public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
     begin, end = int(made.not_valid_before_utc.timestamp()), int(made.not_valid_after_utc.timestamp())
-    return Vehicle(requested_name(asked), made.fingerprint(hashes.SHA256()).hex(), spki, begin, end)
+    return RegisteredVehicle(requested_name(asked), made.fingerprint(hashes.SHA256()).hex(), spki, begin, end)
 
 
 def found_authority(folder: Path, hosts: tuple[str, ...] = ()) -> Authority:
@@ -120,7 +120,7 @@ def found_authority(folder: Path, hosts: tuple[str, ...] = ()) -> Authority:
     folder.chmod(0o700)
     write_private(folder / AUTHORITY_KEY, private_pem(key))
     write_bytes(folder / AUTHORITY, certificate.public_bytes(serialization.Encoding.PEM))
-    registry = Registry.create(folder / REGISTRY, certificate.fingerprint(hashes.SHA256()).hex())
+    registry = VehicleRegistry.create(folder / REGISTRY, certificate.fingerprint(hashes.SHA256()).hex())
     authority = Authority(folder, key, certificate, registry)
     authority.certify_server((*LOOPBACK_HOSTS, *hosts))
     return authority
@@ -142,12 +142,12 @@ def open_authority(folder: Path) -> Authority:
     return Authority(folder, key, certificate, registry)
 
 
-def open_registry(folder: Path, busy_s: float = BUSY_S) -> Registry:
+def open_registry(folder: Path, busy_s: float = BUSY_S) -> VehicleRegistry:
     """Return the registry of the authority in `folder`; raises `InputError` where it is another one's.
 
     busy_s: time that its calls wait for another process.
     """
-    return Registry.open(folder / REGISTRY, load_certificate(folder).fingerprint(hashes.SHA256()).hex(), busy_s)
+    return VehicleRegistry.open(folder / REGISTRY, load_certificate(folder).fingerprint(hashes.SHA256()).hex(), busy_s)
 
 
 def load_certificate(folder: Path) -> x509.Certificate:

@@ -20,7 +20,7 @@ from flcav.fleet.relay import (
     NODE_KEY,
     SENT,
     TIMEOUT,
-    Refused,
+    CallRefused,
     answer,
     check_headers,
     choose_headers,
@@ -49,10 +49,10 @@ class Forwarder:
         call = scope["path"].removeprefix(FLEET)
         try:
             if scope["method"] != "POST" or scope["path"] != FLEET + call or call not in CALLS:
-                raise Refused(403, "no call of a node")
+                raise CallRefused(403, "no call of a node")
             headers = choose_headers(check_headers(scope["headers"]), (NODE_KEY, *SENT))
             body = await read_body(scope, receive, largest_body(call))
-        except Refused as refused:
+        except CallRefused as refused:
             await answer(send, refused.status, refused.why)
             return
         await relay(self._client, FLEET + call, headers, body, send)

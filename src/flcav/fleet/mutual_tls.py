@@ -38,7 +38,7 @@ BUFFER = 1 << 15  # bytes that each connection of asyncio's TLS has from its beg
 Key = TypeVar("Key")
 
 
-class Connection:
+class ClientConnection:
     """A client's connection, and how many of its bytes were counted already."""
 
     def __init__(self, transport: Any) -> None:
@@ -124,7 +124,7 @@ class CertifiedProtocol(H11Protocol):
         self._door.let_in(transport.get_extra_info("socket"))
         tls = transport.get_extra_info("ssl_object")
         certificate = tls.getpeercert(binary_form=True) if tls is not None else None
-        self.app_state = {**self.app_state, CERTIFICATE: certificate, CONNECTION: Connection(transport)}
+        self.app_state = {**self.app_state, CERTIFICATE: certificate, CONNECTION: ClientConnection(transport)}
         self._inside[self] = self._find_owner(certificate)
         if (odd := find_superfluous(self._inside, OF_EACH, IN_ALL)) is not None:
             del self._inside[odd]

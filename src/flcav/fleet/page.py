@@ -13,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 from starlette.routing import Route
 
-from flcav.fleet.status import read_status
+from flcav.fleet.status import read_fleet_status
 from flcav.fleet.vehicle import check_port
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self'"
@@ -78,7 +78,7 @@ def make_page(folder: Path) -> Starlette:
         return HTMLResponse(PAGE, headers={"content-security-policy": POLICY})
 
     async def status(_: Request) -> Response:
-        found = await asyncio.to_thread(read_status, folder)
+        found = await asyncio.to_thread(read_fleet_status, folder)
         told = "" if found.federation is None else found.federation.describe()
         asked = [each.describe() for each in found.requests]
         networks = {own.name: own.release.describe() for own in found.vehicles if own.release is not None}
@@ -92,7 +92,7 @@ def make_page(folder: Path) -> Starlette:
 
 def serve_page(folder: Path, port: int, report: Callable[[str], None]) -> None:
     """Serve the page on the loopback until interrupted; raises `InputError` where there is no fleet, or no port."""
-    read_status(folder)
+    read_fleet_status(folder)
     port = check_port("127.0.0.1", port)
     report(f"http://127.0.0.1:{port}/ follows {folder}")
     uvicorn.run(make_page(folder), host="127.0.0.1", port=port, log_level="warning", log_config=None)

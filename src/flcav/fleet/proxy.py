@@ -29,8 +29,8 @@ from flcav.fleet.authority import REGISTRY, SERVER, SERVER_KEY, open_registry
 from flcav.fleet.fl_request import LARGEST, check_age, parse_request
 from flcav.fleet.fl_request import PATH as REQUEST_PATH
 from flcav.fleet.keys import AUTHORITY, public_der
-from flcav.fleet.mutual_tls import CERTIFICATE, CONNECTION, IN_ALL, Connection, serve_https
-from flcav.fleet.registry import Registry, Vehicle
+from flcav.fleet.mutual_tls import CERTIFICATE, CONNECTION, IN_ALL, ClientConnection, serve_https
+from flcav.fleet.registry import RegisteredVehicle, VehicleRegistry
 from flcav.fleet.relay import (
     CALLS,
     FLEET,
@@ -38,7 +38,7 @@ from flcav.fleet.relay import (
     QUIET_S,
     SIGNED_AT,
     TIMEOUT,
-    Refused,
+    CallRefused,
     answer,
     check_body,
     check_headers,
@@ -51,7 +51,7 @@ from flcav.fleet.relay import (
     send_file,
 )
 from flcav.fleet.releases import LARGEST_REPORT, RELEASES, REPORT, KeptReport, find_offered, parse_report
-from flcav.fleet.traffic import Traffic, read_traffic
+from flcav.fleet.traffic import ProxyTraffic, read_traffic
 from flcav.interface.wording import make_printable
 
 OLDEST_S = 300.0  # of a signature that Flower accepts
@@ -66,7 +66,7 @@ class FleetProxy:
 
     def __init__(self, client: httpx.AsyncClient, folder: Path) -> None:
         self._client, self._folder = client, folder
-        self._registry: Registry | None = None
+        self._registry: VehicleRegistry | None = None
         self._file: tuple[int, int] | None = None  # device and number of the registry's file
         self._objects = defaultdict[str, asyncio.Semaphore](lambda: asyncio.Semaphore(AT_ONCE))
         self._traffic, self._changed = read_traffic(folder), True
@@ -81,7 +81,7 @@ class FleetProxy:
             saving.cancel()
             self._traffic.save(self._folder)
             return
-        connection: Connection = scope["state"][CONNECTION]
+        connection: ClientConnection = scope["state"][CONNECTION]
         certificate: bytes | None = scope["state"][CERTIFICATE]
         caller: str | bytes | None = certificate
 
@@ -94,12 +94,12 @@ class FleetProxy:
                 vehicle = self.find(certificate)
                 caller = vehicle.name
                 await self._answer(vehicle, scope, receive, soon)
-            except Refused as refused:
+            except CallRefused as refused:
                 await self._refuse(soon, refused.status, caller, refused.why)
         except TimeoutError:  # whoever does not read
             connection.abort()
 
-    async def _answer(self, vehicle: Vehicle, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _answer(self, vehicle: RegisteredVehicle, scope: Scope, receive: Receive, send: Send) -> None:
         path, headers, came = scope["path"], check_headers(scope["headers"]), time.time()
         if path == REQUEST_PATH and scope["method"] == "POST":
             await self._take_request(vehicle.name, scope, receive, send)
@@ -109,11 +109,11 @@ class FleetProxy:
             return
         call = path.removeprefix(FLEET)
         if scope["method"] != "POST" or path != FLEET + call or call not in CALLS:
-            raise Refused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
+            raise CallRefused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
         if node_key(headers.get(NODE_KEY, b"")) != vehicle.public_key:
-            raise Refused(401, "the node's key is not the certificate's")
+            raise CallRefused(401, "the node's key is not the certificate's")
         passed, gone = [*choose_headers(headers), name_key(vehicle)], False
-        connection: Connection = scope["state"][CONNECTION]
+        connection: ClientConnection = scope["state"][CONNECTION]
 
         async def checked(event: Message) -> None:
             nonlocal gone
@@ -130,8 +130,8 @@ class FleetProxy:
         self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), done.status, gone)
         self._changed = True
 
-    def find(self, certificate: bytes | None) -> Vehicle:
-        """Return the vehicle whose certificate (DER) is in force; raises `Refused` where it is nobody's.
+    def find(self, certificate: bytes | None) -> RegisteredVehicle:
+        """Return the vehicle whose certificate (DER) is in force; raises `CallRefused` where it is nobody's.
 
         The registry is opened anew where its file is another one, or it could not be read.
         """
@@ -144,9 +144,9 @@ class FleetProxy:
             vehicle = find_caller(self._registry, certificate)
         except (InputError, OSError, ValueError, TypeError):
             self._close()
-            raise Refused(503, "the fleet's registry cannot be read") from None
+            raise CallRefused(503, "the fleet's registry cannot be read") from None
         if isinstance(vehicle, str):
-            raise Refused(401, vehicle)
+            raise CallRefused(401, vehicle)
         return vehicle
 
     def _close(self) -> None:
@@ -158,7 +158,7 @@ class FleetProxy:
         """Return the vehicle that a connection counts for; all whose certificate is not in force are one."""
         try:
             return self.find(certificate).name
-        except Refused:
+        except CallRefused:
             return ""
 
     async def _take_request(self, vehicle: str, scope: Scope, receive: Receive, send: Send) -> None:
@@ -167,16 +167,16 @@ class FleetProxy:
         try:
             request = parse_request(content)
         except ValueError as error:
-            raise Refused(400, str(error)) from None
+            raise CallRefused(400, str(error)) from None
         now = time.time()
         if (odd := check_age(request, now)) is not None:
-            raise Refused(400, odd)
+            raise CallRefused(400, odd)
         try:
             why = await asyncio.to_thread(self._keep_request, vehicle, request.nonce, content, now)
         except (InputError, OSError) as error:
-            raise Refused(503, f"the registry cannot be written: {error}") from None
+            raise CallRefused(503, f"the registry cannot be written: {error}") from None
         if why is not None:
-            raise Refused(409, why)
+            raise CallRefused(409, why)
         await answer(send, 200, "the request is taken")
 
     def _keep_request(self, *about: Any) -> str | None:
@@ -188,7 +188,7 @@ class FleetProxy:
 
     async def _answer_release(self, vehicle: str, scope: Scope, receive: Receive, send: Send) -> None:
         """Send a file of the repositories on offer, keep a vehicle's report, or refuse its call."""
-        connection: Connection = scope["state"][CONNECTION]
+        connection: ClientConnection = scope["state"][CONNECTION]
 
         def count() -> int:
             self._changed = True
@@ -212,13 +212,15 @@ class FleetProxy:
             if self._changed:
                 self._changed = False
                 try:
-                    now = Traffic(dict(self._traffic.vehicles), self._traffic.refused)
+                    now = ProxyTraffic(dict(self._traffic.vehicles), self._traffic.refused)
                     await asyncio.to_thread(now.save, self._folder)
                 except OSError:  # no room: what was counted is written later
                     self._changed = True
 
 
-def find_caller(registry: Registry, certificate: bytes | None, now: float | None = None) -> Vehicle | str:
+def find_caller(
+    registry: VehicleRegistry, certificate: bytes | None, now: float | None = None
+) -> RegisteredVehicle | str:
     """Return the vehicle whose certificate (DER) is in force, or in words why nobody's is."""
     if certificate is None:
         return "a certificate is wanted"
@@ -267,7 +269,7 @@ def run_proxy(folder: Path, host: str, port: int, superlink: str) -> None:
 async def answer_release(
     fleet: Path, vehicle: str, scope: Scope, receive: Receive, send: Send, count: Callable[[], int]
 ) -> None:
-    """Answer a registered vehicle's call; raises `Refused`.
+    """Answer a registered vehicle's call; raises `CallRefused`.
 
     count: called for each piece that was sent; returns the bytes that this vehicle's releases took so far.
     """
@@ -277,11 +279,11 @@ async def answer_release(
         await answer(send, 200, "the report is taken")
         return
     if method != "GET":
-        raise Refused(403, f"{method} {scope['path'][:100]} is no call of a vehicle's")
+        raise CallRefused(403, f"{method} {scope['path'][:100]} is no call of a vehicle's")
     try:
         path = await asyncio.to_thread(find_offered, fleet, asked)
     except ValueError as error:
-        raise Refused(403, f"{scope['path'][:100]} {error}") from None
+        raise CallRefused(403, f"{scope['path'][:100]} {error}") from None
     if path is None:
         await answer(send, 404, "no such file is on offer")
     else:
@@ -292,10 +294,10 @@ async def _take_report(fleet: Path, vehicle: str, content: bytes, count: Callabl
     try:
         report = parse_report(content)
     except ValueError as error:
-        raise Refused(400, str(error)) from None
+        raise CallRefused(400, str(error)) from None
     if report.shadow is not None:  # the certificate says whose it is
         report = replace(report, shadow=replace(report.shadow, vehicle=vehicle))
     try:
         await asyncio.to_thread(KeptReport(vehicle, time.time(), count(), report).save, fleet)
     except OSError as error:
-        raise Refused(503, f"the report cannot be kept: {error}") from None
+        raise CallRefused(503, f"the report cannot be kept: {error}") from None

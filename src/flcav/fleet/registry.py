@@ -72,7 +72,7 @@ def _told(path: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Vehicle:
+class RegisteredVehicle:
     """A vehicle's certificate as it is registered."""
 
     name: str  # unique identifier
@@ -101,7 +101,7 @@ class AuditEntry:
     reason: str
 
 
-class Registry:
+class VehicleRegistry:
     """The registry in a file; every call is a transaction of its own, so several processes may use it.
 
     All calls raise `RegistryLost` where the file cannot be used.
@@ -113,7 +113,7 @@ class Registry:
             self._connection = sqlite3.connect(path, timeout=busy_s, isolation_level=None, check_same_thread=False)
 
     @classmethod
-    def create(cls, path: Path, authority: str) -> "Registry":
+    def create(cls, path: Path, authority: str) -> "VehicleRegistry":
         """Return a new, empty registry of the authority with this fingerprint."""
         made = cls(path)
         with _told(path):
@@ -125,7 +125,7 @@ class Registry:
         return made
 
     @classmethod
-    def open(cls, path: Path, authority: str, busy_s: float = BUSY_S) -> "Registry":
+    def open(cls, path: Path, authority: str, busy_s: float = BUSY_S) -> "VehicleRegistry":
         """Return the registry at `path`; raises `InputError` where it is none, or that of another authority.
 
         busy_s: time that its calls wait for another process.
@@ -158,7 +158,7 @@ class Registry:
         """Close the file."""
         self._connection.close()
 
-    def register(self, vehicle: Vehicle) -> None:
+    def register(self, vehicle: RegisteredVehicle) -> None:
         """Enter a new vehicle; raises `InputError` where its identifier or its key is in the registry."""
         with self._change() as cursor:
             known = cursor.execute("SELECT 1 FROM certificates WHERE vehicle = ?", (vehicle.name,)).fetchone()
@@ -168,7 +168,7 @@ class Registry:
                 )
             self._insert(cursor, vehicle, "register")
 
-    def rotate(self, vehicle: Vehicle) -> None:
+    def rotate(self, vehicle: RegisteredVehicle) -> None:
         """Enter the certificate of a vehicle's new key in the place of the one in force, or of a revoked one.
 
         Raises `InputError` where the vehicle is not registered, or the key is known.
@@ -204,17 +204,17 @@ class Registry:
             ]
             self._note(cursor, "enrol" if node is not None else "strike", name, fingerprint, "")
 
-    def find(self, fingerprint: str) -> Vehicle | None:
+    def find(self, fingerprint: str) -> RegisteredVehicle | None:
         """Return whose certificate has this SHA-256 fingerprint; None: nobody's here."""
         found = [*self._select("WHERE fingerprint = ?", (fingerprint,))]
         return found[0] if found else None
 
-    def list_vehicles(self) -> list[Vehicle]:
+    def list_vehicles(self) -> list[RegisteredVehicle]:
         """Return the latest certificate of each vehicle, by identifier."""
         latest = "WHERE rowid IN (SELECT max(rowid) FROM certificates GROUP BY vehicle) ORDER BY vehicle"
         return [*self._select(latest)]
 
-    def list_enrolled(self) -> list[Vehicle]:
+    def list_enrolled(self) -> list[RegisteredVehicle]:
         """Return every certificate whose key has a node at the SuperLink, in force or not."""
         return [*self._select("WHERE node IS NOT NULL")]
 
@@ -260,10 +260,10 @@ class Registry:
         rows = self._read("SELECT * FROM audit WHERE ?1 IS NULL OR vehicle = ?1 ORDER BY number", (vehicle,))
         return [AuditEntry(*row) for row in rows]
 
-    def _select(self, where: str, values: tuple[str, ...] = ()) -> Iterator[Vehicle]:
+    def _select(self, where: str, values: tuple[str, ...] = ()) -> Iterator[RegisteredVehicle]:
         columns = "vehicle, fingerprint, public_key, issued, expires, state, node"
         for *row, node in self._read(f"SELECT {columns} FROM certificates {where}", values):
-            yield Vehicle(*row, node=None if node is None else int(node))
+            yield RegisteredVehicle(*row, node=None if node is None else int(node))
 
     def _read(self, sql: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         with _told(self.path):
@@ -282,7 +282,7 @@ class Registry:
                     cursor.execute("ROLLBACK")
                 raise
 
-    def _insert(self, cursor: sqlite3.Cursor, own: Vehicle, action: str) -> None:
+    def _insert(self, cursor: sqlite3.Cursor, own: RegisteredVehicle, action: str) -> None:
         row = (own.fingerprint, own.name, own.public_key, own.issued, own.expires, "registered", None)
         try:
             cursor.execute("INSERT INTO certificates VALUES (?, ?, ?, ?, ?, ?, ?)", row)

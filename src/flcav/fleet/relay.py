@@ -29,7 +29,7 @@ from google.protobuf.message import DecodeError, Message
 from starlette.types import Receive, Scope, Send
 
 from flcav.fleet.keys import public_pem
-from flcav.fleet.registry import Vehicle
+from flcav.fleet.registry import RegisteredVehicle
 
 FLEET = "/v1/fleet/"
 CALLS: Mapping[str, type[Message]] = {
@@ -61,7 +61,7 @@ QUIET_S, BODY_S = 20.0, 300.0  # that a body may pause, and take in all
 Headers = Sequence[tuple[bytes, bytes]]
 
 
-class Refused(Exception):
+class CallRefused(Exception):
     """A request is refused with an HTTP status and a sentence."""
 
     def __init__(self, status: int, why: str) -> None:
@@ -104,12 +104,12 @@ async def send_file(send: Send, path: Path, sent: Callable[[], object]) -> None:
 async def read_body(scope: Scope, receive: Receive, most: int) -> bytes:
     """Return the body of a request.
 
-    Raises `Refused` where it is longer than `most` bytes, pauses for more than `QUIET_S`, takes more than `BODY_S`, or
-    breaks off.
+    Raises `CallRefused` where it is longer than `most` bytes, pauses for more than `QUIET_S`, takes more than `BODY_S`,
+    or breaks off.
     """
     told = next((value for name, value in scope["headers"] if name == b"content-length"), b"0")
     if int(told) > most:
-        raise Refused(400, f"the message has more than {most} bytes")
+        raise CallRefused(400, f"the message has more than {most} bytes")
     body, more = bytearray(), True
     try:
         async with asyncio.timeout(BODY_S):
@@ -117,26 +117,26 @@ async def read_body(scope: Scope, receive: Receive, most: int) -> bytes:
                 async with asyncio.timeout(QUIET_S):
                     event = await receive()
                 if event["type"] == "http.disconnect":
-                    raise Refused(400, "the client has left")
+                    raise CallRefused(400, "the client has left")
                 body += event.get("body", b"")
                 if len(body) > most:
-                    raise Refused(400, f"the message has more than {most} bytes")
+                    raise CallRefused(400, f"the message has more than {most} bytes")
                 more = event.get("more_body", False)
     except TimeoutError:
-        raise Refused(408, "the message does not come") from None
+        raise CallRefused(408, "the message does not come") from None
     return bytes(body)
 
 
 def check_headers(headers: Headers) -> dict[bytes, bytes]:
-    """Return headers by their names in lower case; raises `Refused` for repeated ones, or a body of unknown length."""
+    """Return headers by their names in lower case; raises `CallRefused` for repeated ones, or an unknown length."""
     if len(headers) > MOST_HEADERS:
-        raise Refused(431, f"more than {MOST_HEADERS} headers")
+        raise CallRefused(431, f"more than {MOST_HEADERS} headers")
     name, count = Counter(name.lower() for name, _ in headers).most_common(1)[0] if headers else (b"", 0)
     if count > 1:
-        raise Refused(400, f"the header {name.decode('latin-1')} comes {count} times")
+        raise CallRefused(400, f"the header {name.decode('latin-1')} comes {count} times")
     found = {name.lower(): value for name, value in headers}
     if b"transfer-encoding" in found:
-        raise Refused(411, "the length of the body is wanted before it")
+        raise CallRefused(411, "the length of the body is wanted before it")
     return found
 
 
@@ -146,38 +146,38 @@ def largest_body(call: str) -> int:
 
 
 def choose_headers(headers: Mapping[bytes, bytes], names: Iterable[bytes] = SENT) -> list[tuple[bytes, bytes]]:
-    """Return the headers that are passed on, of these `names`; raises `Refused` for a value that is not plain ASCII."""
+    """Return the headers that are passed on, of these `names`; raises `CallRefused` for one that is no ASCII."""
     if headers.get(b"content-type", b"") != PROTOBUF[0][1]:
-        raise Refused(415, "a body of another type than application/protobuf")
+        raise CallRefused(415, "a body of another type than application/protobuf")
     chosen = [(name, headers[name]) for name in names if name in headers]
     for name, value in chosen:
         if not VALUE.fullmatch(value):
-            raise Refused(400, f"the header {name.decode()} is no plain text, or too long")
+            raise CallRefused(400, f"the header {name.decode()} is no plain text, or too long")
     return [*PROTOBUF, *chosen]
 
 
-def name_key(vehicle: Vehicle) -> tuple[bytes, bytes]:
+def name_key(vehicle: RegisteredVehicle) -> tuple[bytes, bytes]:
     """Return Flower's header of a vehicle's key, as the registry has it."""
     return NODE_KEY, b64encode(public_pem(vehicle.public_key))
 
 
-def check_body(call: str, body: bytes, vehicle: Vehicle) -> bytes:
+def check_body(call: str, body: bytes, vehicle: RegisteredVehicle) -> bytes:
     """Return the body of a vehicle's call written anew.
 
-    Raises `Refused` where it is of another call, or names another node or key than the vehicle's own.
+    Raises `CallRefused` where it is of another call, or names another node or key than the vehicle's own.
     """
     try:
         asked = CALLS[call].FromString(body)
     except DecodeError:
-        raise Refused(400, f"the body is none of {call}") from None
+        raise CallRefused(400, f"the body is none of {call}") from None
     asked.DiscardUnknownFields()
     _check_texts(asked)
     if isinstance(asked, ActivateNodeRequest):
         if asked.public_key != public_pem(vehicle.public_key):
-            raise Refused(401, "the key to activate is not the certificate's")
+            raise CallRefused(401, "the key to activate is not the certificate's")
         return asked.SerializeToString()
     if vehicle.node is None:
-        raise Refused(503, "the vehicle is being enrolled")
+        raise CallRefused(503, "the vehicle is being enrolled")
     node = asked if isinstance(asked, DeactivateNodeRequest) else asked.node  # type: ignore[attr-defined]
     named = {node.node_id}
     if isinstance(asked, PushMessagesRequest):
@@ -185,7 +185,7 @@ def check_body(call: str, body: bytes, vehicle: Vehicle) -> bytes:
             _check_texts(message.metadata)
             named.add(message.metadata.src_node_id)
     if named != {vehicle.node}:
-        raise Refused(401, "the node in the body is not the certificate's")
+        raise CallRefused(401, "the node in the body is not the certificate's")
     return asked.SerializeToString()
 
 
@@ -194,7 +194,7 @@ def _check_texts(message: Message) -> None:
     for field, value in message.ListFields():
         texts = [value] if isinstance(value, str) else value if field.type == field.TYPE_STRING else ()
         if not all(text.isprintable() and len(text) <= LONGEST_NAME for text in texts):
-            raise Refused(400, f"{field.name} is no identifier")
+            raise CallRefused(400, f"{field.name} is no identifier")
 
 
 async def relay(client: httpx.AsyncClient, path: str, headers: Headers, body: bytes, send: Send) -> Relayed:

@@ -97,7 +97,7 @@ LARGEST_FILE = 1_000_000_000  # bytes
 
 
 @dataclass(frozen=True)
-class Offer(Record):
+class ReleaseOffer(Record):
     """Folders of the published repositories, each with metadata and targets in it."""
 
     image: str  # the provider's
@@ -140,7 +140,7 @@ def find_offered(fleet: Path, asked: str) -> Path | None:
         raise ValueError("is no file of a repository")
     if not (fleet / OFFER).is_file():
         return None
-    offer = Offer.from_json(read_json(fleet / OFFER), str(fleet / OFFER))
+    offer = ReleaseOffer.from_json(read_json(fleet / OFFER), str(fleet / OFFER))
     root = Path(offer.image if found[1] == "image" else offer.director).resolve()
     path = (root / found[2]).resolve()
     if not path.is_relative_to(root):

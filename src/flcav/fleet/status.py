@@ -31,7 +31,7 @@ def _print_all(words: Mapping[str, str]) -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class FollowedRound(Record):
+class RoundProgress(Record):
     """One round as its server reports it during the federation."""
 
     round: int
@@ -44,7 +44,7 @@ class FollowedRound(Record):
 
 
 @dataclass(frozen=True)
-class Followed(Record):
+class FederationProgress(Record):
     """The federation that a fleet serves, or has served last."""
 
     stage: str
@@ -52,7 +52,7 @@ class Followed(Record):
     link: str
     used_mb: float  # of the uplink, by the ledger
     left_mb: float
-    rounds: tuple[FollowedRound, ...] = ()
+    rounds: tuple[RoundProgress, ...] = ()
     waits: Mapping[str, str] = field(default_factory=dict)  # by client why it is waited for
     gone: Mapping[str, str] = field(default_factory=dict)  # by client why it is out of the federation
 
@@ -76,7 +76,7 @@ class Followed(Record):
         waits = [f"waits for {name}: {why}" for name, why in self.waits.items()]
         return "; ".join([told, *last, *(f"without {name}: {why}" for name, why in self.gone.items()), *waits])
 
-    def in_plain_words(self) -> "Followed":
+    def in_plain_words(self) -> "FederationProgress":
         """Return it with what vehicles say of themselves fit for a terminal."""
         rounds = tuple(replace(each, failed=_print_all(each.failed)) for each in self.rounds)
         return replace(self, rounds=rounds, waits=_print_all(self.waits), gone=_print_all(self.gone))
@@ -123,11 +123,11 @@ class FleetStatus(Record):
     requests: tuple[Asked, ...]  # for federated learning; the latest last
     refused: tuple[str, ...]  # who, and why; the latest last
     free: int  # room on the disk of the fleet's folder [bytes]
-    federation: Followed | None
+    federation: FederationProgress | None
     time: float  # [s since 1970]
 
 
-def read_status(folder: Path) -> FleetStatus:
+def read_fleet_status(folder: Path) -> FleetStatus:
     """Return the status of the fleet in `folder`; raises `InputError` where there is none."""
     registry = open_registry(folder)
     try:
@@ -151,7 +151,7 @@ def read_status(folder: Path) -> FleetStatus:
         told = own.name, own.describe_state(), own.expires, own.node in online
         vehicles.append(VehicleStatus(*told, *counted, release))
     try:
-        federation = Followed.from_json(json.loads((folder / PROGRESS).read_bytes()), str(folder / PROGRESS))
+        federation = FederationProgress.from_json(json.loads((folder / PROGRESS).read_bytes()), str(folder / PROGRESS))
         federation = federation.in_plain_words()
     except FileNotFoundError:
         federation = None

@@ -43,7 +43,7 @@ from flwr.superlink.grid import HttpGrid
 
 from flcav.config import InputError
 from flcav.fleet.keys import AUTHORITY, public_pem, write_private
-from flcav.fleet.registry import Registry
+from flcav.fleet.registry import VehicleRegistry
 from flcav.storage.files import write_bytes
 
 SECRET, DATABASE = "executor.secret", "superlink.sqlite"  # in the fleet's folder
@@ -85,7 +85,7 @@ class SuperLink:
         with ControlHttpClient.from_server_address(self.address, False, certificate, version) as client:
             yield client
 
-    def enrol(self, registry: Registry) -> None:
+    def enrol(self, registry: VehicleRegistry) -> None:
         """Make the SuperLink's nodes those of the registry's vehicles in force: enrol new ones, strike out others."""
         wanted = {own.fingerprint: own for own in registry.list_vehicles() if own.describe_state() == "registered"}
         with self._control() as control:
@@ -107,7 +107,7 @@ class SuperLink:
         with self._control() as control:
             return {node.node_id for node in control.ListNodes(ListNodesRequest()).nodes_info if node.status == ONLINE}
 
-    def begin(self, bundle: bytes | None = None, signature: dict[str, str] | None = None) -> "Run":
+    def begin(self, bundle: bytes | None = None, signature: dict[str, str] | None = None) -> "ServerRun":
         """Begin a run with a bundle (None: the vehicles' app, signed by the publisher); return its server's end."""
         bundle = build_bundle() if bundle is None else bundle
         signature = sign_bundle(self.folder, bundle) if signature is None else signature
@@ -126,9 +126,9 @@ class SuperLink:
             while True:
                 task = runtime.AcquireTask(AcquireTaskRequest(supported_task_types=[TaskType.SERVER_APP]))
                 if task.token and task.task.run_id == number:
-                    return Run(self.address, certificate, task.token)
+                    return ServerRun(self.address, certificate, task.token)
                 if task.token:  # of a run whose command was killed, or lost the answer, before it had its task
-                    Run(self.address, certificate, task.token).end(failed=True)
+                    ServerRun(self.address, certificate, task.token).end(failed=True)
                 else:
                     time.sleep(0.05)
 
@@ -140,7 +140,7 @@ class SuperLink:
                 raise OSError(f"{self.folder / DATABASE}: is not the database of the SuperLink at {self.address}")
 
 
-class Run:
+class ServerRun:
     """A run under way, whose server app is this process."""
 
     def __init__(self, address: str, certificate: bytes, token: str) -> None:

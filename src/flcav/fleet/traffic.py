@@ -31,7 +31,7 @@ class Crossed:
 
 
 @dataclass
-class Traffic:
+class ProxyTraffic:
     """Bytes by vehicle, and the latest refusals."""
 
     vehicles: dict[str, Crossed] = field(default_factory=dict)
@@ -80,10 +80,10 @@ class Traffic:
         write_bytes(folder / TRAFFIC, json.dumps(asdict(self)).encode())
 
 
-def read_traffic(folder: Path) -> Traffic:
+def read_traffic(folder: Path) -> ProxyTraffic:
     """Return the counts of a fleet's proxy; empty if there are none yet."""
     try:
         found = json.loads((folder / TRAFFIC).read_bytes())
     except FileNotFoundError:
-        return Traffic()
-    return Traffic({name: Crossed(**own) for name, own in found["vehicles"].items()}, found["refused"])
+        return ProxyTraffic()
+    return ProxyTraffic({name: Crossed(**own) for name, own in found["vehicles"].items()}, found["refused"])

@@ -171,7 +171,7 @@ def hash_card(weights: Path) -> str:
         raise InputError(f"{weights}: no safetensors file with a model card") from None
 
 
-def write_report(folder: Path, page: str) -> None:
+def write_candidate_page(folder: Path, page: str) -> None:
     """Write the candidate's page."""
     write_bytes(folder / REPORT, page.encode())
 

@@ -94,7 +94,7 @@ def _read(path: Path) -> Iterator[bytes]:
             yield piece
 
 
-def locate(repository: str) -> str:
+def locate_repository(repository: str) -> str:
     """Return the address of a repository that is given as a folder or an address; raises `InputError` for neither."""
     try:
         scheme = urlsplit(repository).scheme
@@ -113,12 +113,12 @@ CLOCK_SLACK = timedelta(hours=1)
 MOST_METADATA_BYTES = 5_000_000
 
 
-class Refused(InputError):
+class ReleaseRefused(InputError):
     """Raised where a vehicle does not load a release; the message says why."""
 
 
 @dataclass(frozen=True)
-class Sources:
+class RepositorySources:
     """The two repositories as folders or addresses, and how they are fetched."""
 
     image: str
@@ -138,7 +138,7 @@ class Approved:
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckedRelease:
     """What a vehicle found: the release that it is to run, if it is assigned any, and what it downloaded so far."""
 
     approved: Approved | None
@@ -148,9 +148,9 @@ class Checked:
     target: "TargetFile | None"
 
 
-def open_sources(image: str, director: str) -> Sources:
+def open_sources(image: str, director: str) -> RepositorySources:
     """Return the two repositories; raises `InputError` where one is neither a folder nor an address."""
-    return Sources(locate(image), locate(director), RepositoryFetcher())
+    return RepositorySources(locate_repository(image), locate_repository(director), RepositoryFetcher())
 
 
 def trust_roots(folder: Path, image_root: bytes, director_root: bytes) -> None:
@@ -184,12 +184,12 @@ def trusts_roots(folder: Path) -> bool:
 
 
 def check_release(
-    folder: Path, vehicle: str, sources: Sources, task: str = "objects", now: datetime | None = None
-) -> Checked:
+    folder: Path, vehicle: str, sources: RepositorySources, task: str = "objects", now: datetime | None = None
+) -> CheckedRelease:
     """Return the release of a task that `vehicle` is to run by both repositories; nothing is installed.
 
     folder: the vehicle's, see `trust_roots`; the metadata that it trusts are kept there. now: the vehicle's clock.
-    Raises `Refused` for anything that both parties did not sign, and where the clock is off.
+    Raises `ReleaseRefused` for anything that both parties did not sign, and where the clock is off.
     """
     at = now or datetime.now(UTC)
     before = sources.fetcher.received_bytes
@@ -198,19 +198,19 @@ def check_release(
     _check_parties(director, image)
     directive = read_directives(director._trusted_set.targets.targets).get(task)
     if directive is None or not is_assigned(vehicle, task, directive):
-        return Checked(None, directive, sources.fetcher.received_bytes - before, image, None)
+        return CheckedRelease(None, directive, sources.fetcher.received_bytes - before, image, None)
     names = target_names(task, directive.release)
     weights, description = (_same(director, image, name) for name in names)
     candidate = _read_description(image, description, names[1])
     if (candidate.task, candidate.release) != (task, directive.release):
-        raise Refused(f"{names[1]}: describes release {candidate.release} of {candidate.task}")
+        raise ReleaseRefused(f"{names[1]}: describes release {candidate.release} of {candidate.task}")
     if candidate.weights != weights.hashes["sha256"]:
-        raise Refused(f"{names[1]}: a card of other weights than {names[0]}")
+        raise ReleaseRefused(f"{names[1]}: a card of other weights than {names[0]}")
     approved = Approved(task, directive.release, candidate.weights, weights.length, candidate)
-    return Checked(approved, directive, sources.fetcher.received_bytes - before, image, weights)
+    return CheckedRelease(approved, directive, sources.fetcher.received_bytes - before, image, weights)
 
 
-def _refresh(folder: Path, name: str, sources: Sources, at: datetime) -> "Updater":
+def _refresh(folder: Path, name: str, sources: RepositorySources, at: datetime) -> "Updater":
     """Return the updater of a repository after The Update Framework's client workflow."""
     from tuf.ngclient import Updater, UpdaterConfig
 
@@ -220,7 +220,7 @@ def _refresh(folder: Path, name: str, sources: Sources, at: datetime) -> "Update
         raise InputError(f"{folder}: no vehicle's folder, since it has no root of the {REPOSITORIES[name]}")
     address = getattr(sources, name)
     config = UpdaterConfig(targets_max_length=MOST_METADATA_BYTES)
-    with refuse(f"{name} repository"):
+    with refuse_release(f"{name} repository"):
         updater = Updater(
             str(kept),
             f"{address}/metadata/",
@@ -237,55 +237,55 @@ def _refresh(folder: Path, name: str, sources: Sources, at: datetime) -> "Update
 
 
 def _check_clock(updater: "Updater", name: str, at: datetime) -> None:
-    """Raise `Refused` where metadata expire later than any signed now: the clock is behind, or was set back."""
+    """Raise `ReleaseRefused` where metadata expire later than any signed now: the clock is behind, or was set back."""
     timestamp = updater._trusted_set.timestamp
     made = timestamp.expires - LIFETIME["timestamp"]
     if at + CLOCK_SLACK < made:
-        raise Refused(
+        raise ReleaseRefused(
             f"the clock is off: it says {at:%Y-%m-%d %H:%M} UTC, and the {name} repository was signed at "
             f"{made:%Y-%m-%d %H:%M}"
         )
 
 
 def _check_parties(director: "Updater", image: "Updater") -> None:
-    """Raise `Refused` where a key that was added later is among those of both parties, or of one twice."""
+    """Raise `ReleaseRefused` where a key that was added later is among those of both parties, or of one twice."""
     roots: list[Root] = [director._trusted_set.root, image._trusted_set.root]
     try:
         check_distinct([key for root in roots for key in root_keys(root)], "the keys of provider and customer together")
     except InputError as error:
-        raise Refused(str(error)) from None
+        raise ReleaseRefused(str(error)) from None
 
 
 def _same(director: "Updater", image: "Updater", name: str) -> "TargetFile":
     """Return the image repository's entry of a target, which the director's must equal in hashes and length."""
-    with refuse(name):
+    with refuse_release(name):
         wanted, known = director.get_targetinfo(name), image.get_targetinfo(name)
     if wanted is None:
-        raise Refused(f"{name}: the customer's repository does not name it: a partial bundle")
+        raise ReleaseRefused(f"{name}: the customer's repository does not name it: a partial bundle")
     if known is None:
-        raise Refused(f"{name}: the provider's repository does not name it")
+        raise ReleaseRefused(f"{name}: the provider's repository does not name it")
     if (wanted.hashes, wanted.length) != (known.hashes, known.length) or "sha256" not in known.hashes:
-        raise Refused(f"{name}: provider and customer name it with different hashes")
+        raise ReleaseRefused(f"{name}: provider and customer name it with different hashes")
     return known
 
 
 def _read_description(image: "Updater", target: "TargetFile", name: str) -> Candidate:
-    with refuse(name):
+    with refuse_release(name):
         path = Path(image.download_target(target))
     try:
         return parse_candidate(path.read_bytes(), name)
     except InputError as error:
-        raise Refused(str(error)) from None
+        raise ReleaseRefused(str(error)) from None
     finally:
         path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
-def refuse(what: str) -> Iterator[None]:
-    """Turn the errors of The Update Framework's client into `Refused` with what it was about."""
+def refuse_release(what: str) -> Iterator[None]:
+    """Turn the errors of The Update Framework's client into `ReleaseRefused` with what it was about."""
     from tuf.api.exceptions import DownloadError, RepositoryError
 
     try:
         yield
     except (DownloadError, RepositoryError) as error:
-        raise Refused(f"{what}: {type(error).__name__}: {str(error) or 'no answer'}") from None
+        raise ReleaseRefused(f"{what}: {type(error).__name__}: {str(error) or 'no answer'}") from None

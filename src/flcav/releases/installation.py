@@ -12,7 +12,14 @@ from pathlib import Path
 
 from flcav.config import InputError, read_json
 from flcav.releases.candidate import hash_card
-from flcav.releases.checking import Approved, Checked, Refused, Sources, check_release, refuse
+from flcav.releases.checking import (
+    Approved,
+    CheckedRelease,
+    ReleaseRefused,
+    RepositorySources,
+    check_release,
+    refuse_release,
+)
 from flcav.storage.files import atomic_path, sha256, write_json
 from flcav.storage.records import Record, from_json
 
@@ -29,7 +36,7 @@ class Installed(Record):
 
 
 def read_installed(folder: Path) -> Installed | None:
-    """Return the network that drives; None before the first. Raises `Refused` where its file is not what was installed.
+    """Return the network that drives; None before the first. Raises `ReleaseRefused` where its file has changed.
 
     A vehicle calls it when it starts, so that weights that were changed on its disk are not loaded.
     """
@@ -39,7 +46,7 @@ def read_installed(folder: Path) -> Installed | None:
     installed = from_json(Installed, read_json(path), str(path))
     weights = weights_path(folder, installed)
     if not weights.is_file() or sha256(weights) != installed.weights:
-        raise Refused(f"{weights}: is not the network that was installed")
+        raise ReleaseRefused(f"{weights}: is not the network that was installed")
     return installed
 
 
@@ -57,23 +64,23 @@ class Fetched:
 
 
 def update_vehicle(
-    folder: Path, vehicle: str, sources: Sources, task: str = "objects", now: datetime | None = None
+    folder: Path, vehicle: str, sources: RepositorySources, task: str = "objects", now: datetime | None = None
 ) -> Installed | None:
     """Install the release of a task that both parties name for `vehicle`; return the network that drives then.
 
-    Without one that is newer than the installed, that one goes on. Raises `Refused` as `fetch_release`.
+    Without one that is newer than the installed, that one goes on. Raises `ReleaseRefused` as `fetch_release`.
     """
     found = fetch_release(folder, vehicle, sources, task, now)
-    return found.driving if found.newer is None else install(folder, found.newer)
+    return found.driving if found.newer is None else install_release(folder, found.newer)
 
 
 def fetch_release(
-    folder: Path, vehicle: str, sources: Sources, task: str = "objects", now: datetime | None = None
+    folder: Path, vehicle: str, sources: RepositorySources, task: str = "objects", now: datetime | None = None
 ) -> Fetched:
     """Fetch and verify the release of a task that both parties name for `vehicle`; what drives is left as it is.
 
-    Raises `Refused` for anything that both parties did not sign, a number below the installed, and where the clock is
-    off.
+    Raises `ReleaseRefused` for anything that both parties did not sign, a number below the installed, and where the
+    clock is off.
     """
     driving = read_installed(folder)
     checked = check_release(folder, vehicle, sources, task, now)
@@ -81,29 +88,31 @@ def fetch_release(
     if approved is None or driving == Installed(task, approved.release, approved.weights):
         return Fetched(driving, None)
     if driving is not None and driving.task == task and approved.release <= driving.release:
-        raise Refused(f"release {approved.release} of {task}: does not rise above {driving.release}, which drives")
+        raise ReleaseRefused(
+            f"release {approved.release} of {task}: does not rise above {driving.release}, which drives"
+        )
     download(folder, checked, approved)
     return Fetched(driving, approved)
 
 
-def download(folder: Path, checked: Checked, approved: Approved) -> None:
+def download(folder: Path, checked: CheckedRelease, approved: Approved) -> None:
     """Download the weights of an approved release, unless the vehicle keeps them.
 
-    Raises `Refused` where the file is another than was approved, or its card another than its description's.
+    Raises `ReleaseRefused` where the file is another than was approved, or its card another than its description's.
     """
     kept = weights_path(folder, Installed(approved.task, approved.release, approved.weights))
     if kept.is_file() and sha256(kept) == approved.weights:
         return
     assert checked.target is not None
     with atomic_path(kept) as temporary:
-        with refuse(f"weights of release {approved.release}"):
+        with refuse_release(f"weights of release {approved.release}"):
             checked.updater.download_target(checked.target, str(temporary))
         if sha256(temporary) != approved.weights:
-            raise Refused(f"weights of release {approved.release}: have another SHA-256 than was approved")
+            raise ReleaseRefused(f"weights of release {approved.release}: have another SHA-256 than was approved")
         check_card(temporary, approved)
 
 
-def install(folder: Path, approved: Approved) -> Installed:
+def install_release(folder: Path, approved: Approved) -> Installed:
     """Make an approved release, whose weights are in a vehicle's folder, the network that drives."""
     installed = Installed(approved.task, approved.release, approved.weights)
     write_json(folder / CURRENT, installed.as_json())
@@ -111,10 +120,10 @@ def install(folder: Path, approved: Approved) -> Installed:
 
 
 def check_card(weights: Path, approved: Approved) -> None:
-    """Raise `Refused` where the card in the weights is not the one that the parties acknowledged."""
+    """Raise `ReleaseRefused` where the card in the weights is not the one that the parties acknowledged."""
     try:
         known = hash_card(weights)
     except InputError as error:
-        raise Refused(str(error)) from None
+        raise ReleaseRefused(str(error)) from None
     if known != approved.candidate.card:
-        raise Refused(f"weights of release {approved.release}: hold a card of other weights")
+        raise ReleaseRefused(f"weights of release {approved.release}: hold a card of other weights")

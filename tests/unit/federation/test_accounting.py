@@ -20,7 +20,7 @@ from flcav.federation import client
 from flcav.federation.conduct import ANSWERED
 from flcav.federation.links.metered import Account, Outage
 from flcav.federation.loop import Schedule, federate
-from flcav.federation.modes.buffered import Buffers, take_turns
+from flcav.federation.modes.buffered import Buffers, fill_in_turns
 from flcav.federation.rules import Rules
 from flcav.federation.secure.parties import SecureClient
 from flcav.federation.state import FederationState
@@ -153,7 +153,7 @@ def test_buffers(sent: Exposures, rules: dict[str, Any]):
     state, local = FederationState(), rules is LOCAL
     run(rules, state, strategy=FedBuff(2))
     check(last(state), gaussian(sent, local))
-    before = Buffers(take_turns([*map("cav{}".format, range(CLIENTS))], 2, 7).rounds, {"cav0": 4, "cav4": 5})
+    before = Buffers(fill_in_turns([*map("cav{}".format, range(CLIENTS))], 2, 7).rounds, {"cav0": 4, "cav4": 5})
     late = FederationState()
     run(rules, late, strategy=FedBuff(2), buffers=before)
     noise = NOISE / 2 if local else NOISE

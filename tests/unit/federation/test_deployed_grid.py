@@ -14,7 +14,7 @@ import pytest
 from flwr.app import ConfigRecord, Context, Error, Message, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.client import Agreement
+from flcav.federation.client import ClientAgreement
 from flcav.federation.exchange import ClientFailed
 from flcav.federation.links.flower_grid import DeployedGrid
 from flcav.federation.links.in_process import keep_identity, wire_bytes
@@ -30,7 +30,7 @@ from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.strategy import Strategy
 from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.federation.wire import ASK, LOST_BY_NETWORK, OVER_BUDGET, to_arrays
+from flcav.federation.wire import ASK, LOST_BY_NETWORK, OVER_BUDGET, to_array_record
 from flcav.fleet.authority import found_authority, open_registry
 from flcav.fleet.keys import AUTHORITY, request_certificate, take_certificate
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
@@ -97,7 +97,7 @@ class Fleet:
         self.folder, self.link = folder, Apps(folder, lies)
 
     @contextlib.contextmanager
-    def open(self, clients: Any, agreed: Agreement, states: Any, account: Account) -> Iterator[DeployedGrid]:
+    def open(self, clients: Any, agreed: ClientAgreement, states: Any, account: Account) -> Iterator[DeployedGrid]:
         names = dict(enumerate(clients, FIRST))
         for node, name in names.items():
             state = states.get(name, {})
@@ -126,7 +126,7 @@ def with_code(code: int) -> Lie:
 
 
 def enlarge(asked: Message, answer: Message) -> Message:
-    content = RecordDict({**answer.content, "junk": to_arrays({"junk": np.zeros(10**6)})})
+    content = RecordDict({**answer.content, "junk": to_array_record({"junk": np.zeros(10**6)})})
     return Message(content, reply_to=asked)
 
 
@@ -209,7 +209,7 @@ def test_a_vehicle_that_claims_does_not_end_questions(folder: Path):
         Account(Ledger(LinkMegabytes(9, 0)), "edge", "t", "wireless"),
     )
     for lies in ({FIRST: with_code(OVER_BUDGET)}, {FIRST: with_code(LOST_BY_NETWORK)}):
-        with open_link(clients, Fleet(folder, lies), account, Agreement(FEDAVG, Rules(), {}, 0), {}) as link:  # type: ignore[arg-type]
+        with open_link(clients, Fleet(folder, lies), account, ClientAgreement(FEDAVG, Rules(), {}, 0), {}) as link:  # type: ignore[arg-type]
             for asked in (["cav0", "cav1"], ["cav0"]):
                 told = link.ask("offer", asked)
                 assert told.missing.keys() == {"cav0"}

@@ -18,7 +18,7 @@ from flcav.federation.links.metered import open_account
 from flcav.federation.wire import LOST_BY_NETWORK
 from flcav.fleet.authority import found_authority
 from flcav.fleet.keys import request_certificate
-from flcav.fleet.status import PROGRESS, Followed, FollowedRound
+from flcav.fleet.status import PROGRESS, FederationProgress, RoundProgress
 
 NAMES = {1: "town/cav1", 2: "town/cav2", 3: "town/cav3"}
 SILENT = 2
@@ -109,7 +109,7 @@ def test_a_revoked_vehicle_is_not_asked(fleet):
     assert fleet.nodes.pushed == [1, 3]
     assert (
         f"; without town/cav2: {told}"
-        in Followed.from_json(json.loads((fleet.folder / PROGRESS).read_bytes()), "").describe()
+        in FederationProgress.from_json(json.loads((fleet.folder / PROGRESS).read_bytes()), "").describe()
     )
 
 
@@ -139,7 +139,9 @@ def test_words_of_vehicles_are_fit_for_a_terminal(fleet):
     reason = ask(fleet.open())[SILENT].error.reason
     assert reason.isprintable()
     assert len(reason) < 600
-    odd = Followed("edge", "weather", "wireless", 1.0, 2.0, (FollowedRound(1, 0.0, 2, {"cav": "\x1b[31m\n" * 99}),))
+    odd = FederationProgress(
+        "edge", "weather", "wireless", 1.0, 2.0, (RoundProgress(1, 0.0, 2, {"cav": "\x1b[31m\n" * 99}),)
+    )
     told = replace(odd, waits={"cav2": "\x07"}).in_plain_words().describe()
     assert told.isprintable()
     assert "round 1 without cav: \\x1b[31m\\n" in told

@@ -14,7 +14,7 @@ from flcav.federation.secure.parties import SecureClient
 from flcav.federation.wire import to_numpy
 from flcav.fleet.authority import AUTHORITY, REGISTRY, found_authority
 from flcav.fleet.proxy import RELEASES, answer_release
-from flcav.fleet.relay import Refused
+from flcav.fleet.relay import CallRefused
 from flcav.fleet.releases import MOST, ShadowReport
 
 
@@ -68,5 +68,5 @@ def test_releases_are_only_read(tmp_path, method: str):
         scope = {"path": f"{RELEASES}image/metadata/root.json", "method": method}
         await answer_release(tmp_path, "a", scope, None, None, lambda: 0)  # pyright: ignore
 
-    with pytest.raises(Refused, match="is no call of a vehicle's"):
+    with pytest.raises(CallRefused, match="is no call of a vehicle's"):
         asyncio.run(call())

@@ -9,7 +9,7 @@ from cryptography.hazmat.primitives import serialization
 from flcav.fleet.authority import found_authority
 from flcav.fleet.keys import CERTIFICATE, load_key, public_der, request_certificate, take_certificate
 from flcav.fleet.proxy import describe_clock, find_caller, node_key
-from flcav.fleet.registry import Vehicle
+from flcav.fleet.registry import RegisteredVehicle
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def vehicle(tmp_path):
 def test_who_calls(vehicle):
     registry, certificate, _ = vehicle
     found = find_caller(registry, certificate)
-    assert isinstance(found, Vehicle)
+    assert isinstance(found, RegisteredVehicle)
     assert found.name == "cav-1"
     assert find_caller(registry, certificate, found.expires) == "the certificate of cav-1 is expired"
     assert find_caller(registry, certificate + b"\0") == "the certificate is not registered"

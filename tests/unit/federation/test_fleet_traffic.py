@@ -4,7 +4,7 @@ import httpx
 import pytest
 
 from flcav.fleet.proxy import FleetProxy
-from flcav.fleet.traffic import Traffic, read_traffic
+from flcav.fleet.traffic import ProxyTraffic, read_traffic
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ from flcav.fleet.traffic import Traffic, read_traffic
     ],
 )
 def test_losses(call, status, activations, lost, tmp_path):
-    traffic = Traffic()
+    traffic = ProxyTraffic()
     traffic.count("cav-1", call, 1, 2, (10, 20), status)
     traffic.save(tmp_path)
     own = read_traffic(tmp_path).vehicles["cav-1"]
@@ -27,7 +27,7 @@ def test_losses(call, status, activations, lost, tmp_path):
 
 
 def test_answers_that_reach_nobody_and_a_proxy_that_begins_anew_may_lose_a_message(tmp_path):
-    traffic = Traffic()
+    traffic = ProxyTraffic()
     traffic.count("cav-1", "pull-messages", 1, 2, (10, 20), 200)
     traffic.count("cav-2", "pull-messages", 1, 2, (10, 20), 200, gone=True)
     assert [own.lost for own in traffic.vehicles.values()] == [0, 1]

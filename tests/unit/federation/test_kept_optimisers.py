@@ -11,7 +11,7 @@ from line_task import Line, LineTask, Slope
 from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
-from flcav.federation.client import Agreement
+from flcav.federation.client import ClientAgreement
 from flcav.federation.edge_server import EdgeServer
 from flcav.federation.exchange import ClientFailed
 from flcav.federation.links.link import open_link
@@ -157,7 +157,7 @@ def test_who_cannot_keep_it_says_so(tmp_path: Path):
 
     with (
         pytest.raises(InputError, match="keep_optimiser: the server's checkpoint would need the state of each"),
-        open_link(CLIENTS, Far(), open_account(), Agreement(FEDAVG, KEEP, {}, 0), {}),  # type: ignore[arg-type]
+        open_link(CLIENTS, Far(), open_account(), ClientAgreement(FEDAVG, KEEP, {}, 0), {}),  # type: ignore[arg-type]
     ):
         pass
 

@@ -11,7 +11,7 @@ from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.links.link import open_processes
+from flcav.federation.links.link import open_client_processes
 from flcav.federation.links.metered import Account
 from flcav.federation.links.processes import ClientProcesses
 from flcav.federation.loop import Schedule, federate
@@ -99,7 +99,7 @@ def test_edge_servers_whose_vehicles_train_in_two_processes_federate_to_the_same
 
 def test_clients_that_cannot_be_sent_are_refused_or_train_in_this_process():
     clients = {"cav0": Regression(np.zeros((1, 3)), (lambda: 0))}  # type: ignore[arg-type]
-    with open_processes(clients, 2) as processes:
+    with open_client_processes(clients, 2) as processes:
         assert processes is None
     with pytest.raises(InputError, match="clients cannot be sent to processes"):
         ClientProcesses(clients, 2)

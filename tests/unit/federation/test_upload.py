@@ -20,7 +20,7 @@ from flcav.federation.rules import Rules
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import SCALES, VALUES, Upload, compress, decompress
-from flcav.federation.wire import encode, update_content
+from flcav.federation.wire import encode_update, update_content
 
 SCHEDULE = Schedule(rounds=5, steps=3, learning_rate=0.5, final_learning_rate=0.5, seed=3)
 SIZE = (64, 50)
@@ -182,7 +182,7 @@ def test_messages_that_are_no_update_are_told():
         ("layers", {"body.weight": START["body.weight"]}),
     ):
         rules = Rules(upload=Upload(**KINDS[kind]))
-        sent, expected = encode(update, START, rules, {}, 1)[0], Expected(rules, START)
+        sent, expected = encode_update(update, START, rules, {}, 1)[0], Expected(rules, START)
         read_update(update_content(sent, {}), expected)
         with pytest.raises(ReplyRefused):
             read_update(update_content(replace(sent, weights={**sent.weights, **wrong}), {}), expected)
@@ -195,7 +195,7 @@ def test_a_change_that_is_not_finite_is_refused_in_every_form(kind: str, value: 
     weights = START | {"body.weight": START["body.weight"].copy()}
     weights["body.weight"][3, 4] = value
     rules = Rules(upload=Upload(**KINDS[kind]))
-    sent, _ = encode(LocalUpdate(weights, 2, 1.0), START, rules, {}, 1)
+    sent, _ = encode_update(LocalUpdate(weights, 2, 1.0), START, rules, {}, 1)
     with pytest.raises(ReplyRefused, match=r"'body.weight' has values that are not finite"):
         read_update(update_content(sent, {}), Expected(rules, START))
 

@@ -34,7 +34,7 @@ from flcav.federation.wire import (
     OVER_BUDGET,
     LocalWork,
     read_arrays,
-    to_arrays,
+    to_array_record,
 )
 from flcav.fleet.authority import SERVER, SERVER_KEY, found_authority
 from flcav.fleet.keys import AUTHORITY, load_key, request_certificate, take_certificate
@@ -72,8 +72,8 @@ def folder(tmp_path):
 def ask(folder: Path, round_: int, grant: int | None = None, start: float = 0.0) -> Message:
     """Return the answer of a new process's app, with Flower's node having forgotten all."""
     weights = {"w": np.full(4, start, np.float32)}
-    content = {ARRAYS: to_arrays(weights), CONFIG: LocalWork(round_, 1, 0.1, 7 + round_).record()}
-    content["extra"] = to_arrays({"w": np.zeros(4, np.float32)})
+    content = {ARRAYS: to_array_record(weights), CONFIG: LocalWork(round_, 1, 0.1, 7 + round_).record()}
+    content["extra"] = to_array_record({"w": np.zeros(4, np.float32)})
     if grant is not None:
         content[GRANT] = ConfigRecord({GRANTED: grant})
     message = Message(RecordDict(content), 2, MessageType.TRAIN)
@@ -126,7 +126,7 @@ class Talking(Counting):
 
 
 def question(folder: Path, asked: str, arrays: dict[str, np.ndarray], grant: int | None = None) -> Message:
-    content = {ASK: ConfigRecord({ASK: asked}), ARRAYS: to_arrays(arrays)}
+    content = {ASK: ConfigRecord({ASK: asked}), ARRAYS: to_array_record(arrays)}
     if grant is not None:
         content[GRANT] = ConfigRecord({GRANTED: grant})
     message = Message(RecordDict(content), 2, f"{MessageType.QUERY}.{ASK}")
@@ -195,7 +195,10 @@ def train(folder: Path, federation: str, round_: int, state: dict | None = None,
     """Train in a round, of a federation that begins where a state is given."""
     if state is not None:
         Assignment(federation, "town/cav0", Imitating(), FedMD(), Rules(), state=state).save(folder)
-    content = {ARRAYS: to_arrays({"w": np.full(4, start, np.float32)}), CONFIG: LocalWork(round_, 1, 0.1, 7).record()}
+    content = {
+        ARRAYS: to_array_record({"w": np.full(4, start, np.float32)}),
+        CONFIG: LocalWork(round_, 1, 0.1, 7).record(),
+    }
     message = Message(RecordDict(content), 2, MessageType.TRAIN)
     message.metadata.__dict__["_message_id"] = "1"
     assert VehicleApp(folder)(message, Context(1, 2, {}, RecordDict(), {})).has_content()
@@ -235,7 +238,7 @@ def test_the_network_of_fedmd_stays_with_its_vehicle_and_goes_on_in_the_next_fed
     train(tmp_path, "k", 1, {"own": {"net": np.zeros(3, np.float32)}})  # of a run that began within one process
     assert network(tmp_path, "k") == 4
     with pytest.raises(ValueError, match="a client's state is its own"):
-        query(tmp_path, RecordDict({"own": to_arrays({"net": np.zeros(3)})}))
+        query(tmp_path, RecordDict({"own": to_array_record({"net": np.zeros(3)})}))
 
 
 @pytest.fixture(scope="module")
@@ -271,7 +274,10 @@ def assign(clients: dict[str, Path], rules: dict) -> None:
 
 
 def answer(folder: Path, ask: dict, round_: int = 1, seed: int = 7) -> RecordDict:
-    content = {ARRAYS: to_arrays({"w": np.zeros(4, np.float32)}), CONFIG: LocalWork(round_, 1, 0.1, seed).record()}
+    content = {
+        ARRAYS: to_array_record({"w": np.zeros(4, np.float32)}),
+        CONFIG: LocalWork(round_, 1, 0.1, seed).record(),
+    }
     message = Message(RecordDict({**content, ASK: ConfigRecord(ask)}), 2, MessageType.TRAIN)
     message.metadata.__dict__["_message_id"] = "1"
     return VehicleApp(folder)(message, Context(1, 2, {}, RecordDict(), {})).content

@@ -10,7 +10,7 @@ from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
     from flcav.releases.candidate import Candidate
-    from flcav.releases.repositories.repository import Staged
+    from flcav.releases.repositories.repository import StagedTargets
 
 CANDIDATE = typer.Argument(metavar="CANDIDATE", help="Folder of the candidate.")
 DRIVING = typer.Option(..., "--driving", help="Weights of the network that drives (safetensors).")
@@ -30,7 +30,7 @@ def describe_candidate(folder: Path) -> "Candidate":
     return described
 
 
-def tell_signatures(repository: Path, state: "Staged") -> None:
+def tell_signatures(repository: Path, state: "StagedTargets") -> None:
     """Print how many signatures a party's next metadata have."""
     more = "publish it" if state.complete else "another owner's is missing"
     echo(
@@ -40,7 +40,7 @@ def tell_signatures(repository: Path, state: "Staged") -> None:
 
 def draw_page(folder: Path, repositories: list[Path]) -> None:
     """Draw the candidate's page with the signatures of the repositories' parties."""
-    from flcav.releases.candidate import REPORT, read_candidate, write_report
+    from flcav.releases.candidate import REPORT, read_candidate, write_candidate_page
     from flcav.releases.repositories.status import read_acknowledgements
     from flcav.releases.verification.verify import read_verification
     from flcav.report.pages.release_page import release_page
@@ -49,4 +49,4 @@ def draw_page(folder: Path, repositories: list[Path]) -> None:
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and path.name != REPORT]
     hashes = {path.name: sha256(path) for path in files}
     signed = read_acknowledgements(folder, repositories)
-    write_report(folder, release_page(read_candidate(folder), read_verification(folder), hashes, signed))
+    write_candidate_page(folder, release_page(read_candidate(folder), read_verification(folder), hashes, signed))

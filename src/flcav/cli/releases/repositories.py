@@ -170,9 +170,9 @@ def status(
     as_json: bool = AS_JSON,
 ) -> None:
     """Show what repositories name: releases, the customer's directive, signatures on their way, times of expiry."""
-    from flcav.releases.repositories.status import read_status
+    from flcav.releases.repositories.status import read_repository_status
 
-    found = [read_status(folder, task) for folder in repository]
+    found = [read_repository_status(folder, task) for folder in repository]
     if candidate is not None:
         draw_page(candidate, repository)
     if as_json:

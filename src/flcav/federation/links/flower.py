@@ -16,7 +16,7 @@ from typing import Literal
 from flwr.app import Message
 
 from flcav.config import InputError
-from flcav.federation.client import Agreement, client_app
+from flcav.federation.client import ClientAgreement, client_app
 from flcav.federation.links.flower_grid import POLL_S, STARTING_S, DeployedGrid
 from flcav.federation.links.in_process import EmbeddedGrid, LinkGrid, keep_identity
 from flcav.federation.links.metered import Account
@@ -26,7 +26,7 @@ from flcav.federation.trainable import Trainable
 from flcav.fleet.authority import found_authority, open_registry
 from flcav.fleet.fl_request import parse_request
 from flcav.fleet.keys import AUTHORITY
-from flcav.fleet.registry import Vehicle
+from flcav.fleet.registry import RegisteredVehicle
 from flcav.fleet.superlink import SuperLink, SuperLinkLost, locked
 from flcav.fleet.supervisor import LOGS, end_with_parent
 from flcav.fleet.up import READY, VEHICLES, read_ready
@@ -50,7 +50,7 @@ class Deployment:
 
     @contextlib.contextmanager
     def open(
-        self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
+        self, clients: Mapping[str, Trainable], agreed: ClientAgreement, states: ClientStates, account: Account
     ) -> Iterator["DeployedGrid"]:
         """Yield the grid of vehicles that `clients` are assigned to, in the order of the vehicles' identifiers.
 
@@ -70,7 +70,7 @@ class Deployment:
 
     @contextlib.contextmanager
     def _open(
-        self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
+        self, clients: Mapping[str, Trainable], agreed: ClientAgreement, states: ClientStates, account: Account
     ) -> Iterator["DeployedGrid"]:
         vehicles = self.choose_vehicles([*clients])
         federation = os.urandom(8).hex()
@@ -90,7 +90,7 @@ class Deployment:
             raise
         grid.end()
 
-    def choose_vehicles(self, clients: list[str]) -> list[Vehicle]:
+    def choose_vehicles(self, clients: list[str]) -> list[RegisteredVehicle]:
         """Return the vehicle of each client, once it is in: its earlier one, or where that does not come in another.
 
         Raises `InputError` where fewer vehicles are registered, `OSError` where fewer come in.
@@ -159,7 +159,7 @@ class RegionalDeployment:
                 first += count
 
     def open(
-        self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
+        self, clients: Mapping[str, Trainable], agreed: ClientAgreement, states: ClientStates, account: Account
     ) -> contextlib.AbstractContextManager["DeployedGrid"]:
         """Return the grid of a region's `clients`, which are named REGION/VEHICLE, see `Deployment.open`."""
         return self.fleet_of(next(iter(clients))).open(clients, agreed, states, account)
@@ -183,7 +183,7 @@ class PartlyDeployed:
 
     @contextlib.contextmanager
     def open(
-        self, clients: Mapping[str, Trainable], agreed: Agreement, states: ClientStates, account: Account
+        self, clients: Mapping[str, Trainable], agreed: ClientAgreement, states: ClientStates, account: Account
     ) -> Iterator["JoinedGrid"]:
         """Yield the grid of `clients`, of which the vehicles are deployed, see `Deployment.open`.
 

@@ -25,8 +25,8 @@ from flcav.federation.links.metered import Account
 from flcav.federation.state import ClientStates, RoundRecord
 from flcav.federation.wire import GRANT, GRANTED, LOST_BY_NETWORK, OVER_BUDGET, read_arrays
 from flcav.fleet.authority import load_certificate, open_registry
-from flcav.fleet.registry import Vehicle
-from flcav.fleet.status import Followed, FollowedRound
+from flcav.fleet.registry import RegisteredVehicle
+from flcav.fleet.status import FederationProgress, RoundProgress
 from flcav.fleet.superlink import SuperLink, SuperLinkLost
 from flcav.fleet.traffic import read_traffic
 from flcav.interface.wording import make_printable
@@ -54,7 +54,7 @@ class DeployedGrid(LinkGrid):
         folder: Path,
         link: SuperLink,
         names: Mapping[int, str],
-        vehicles: Mapping[int, Vehicle],
+        vehicles: Mapping[int, RegisteredVehicle],
         account: Account,
         limit_s: float | None = None,
     ) -> None:
@@ -65,7 +65,7 @@ class DeployedGrid(LinkGrid):
         self._folder, self._link, self.names, self._vehicles, self._account = folder, link, names, vehicles, account
         self._limit_s, self.authority = limit_s, load_certificate(folder)
         self._largest = 0  # request to train so far [bytes]
-        self._rounds: tuple[FollowedRound, ...] = ()
+        self._rounds: tuple[RoundProgress, ...] = ()
         self._waits: dict[str, str] = {}  # by client why it is waited for
         self._gone: dict[str, str] = {}  # by client why it is out of the federation
         self._silent: set[int] = set()  # nodes that were given up, and have not answered since
@@ -93,13 +93,13 @@ class DeployedGrid(LinkGrid):
     def follow(self, record: RoundRecord) -> None:
         """Write a round that has ended to the fleet's folder, where `flcav fleet status` reads it."""
         about = time.time(), len(record.clients), record.failed, record.loss, record.epsilon, record.empty
-        self._rounds, self._waits = (*self._rounds, FollowedRound(record.round, *about)), {}
+        self._rounds, self._waits = (*self._rounds, RoundProgress(record.round, *about)), {}
         self._tell()
 
     def _tell(self) -> None:
         account, link = self._account, self._account.link
         used, left = account.ledger.used_mb(link), account.ledger.left_mb(link)
-        told = Followed(account.stage, account.task, link, used, left, self._rounds, self._waits, self._gone)
+        told = FederationProgress(account.stage, account.task, link, used, left, self._rounds, self._waits, self._gone)
         with contextlib.suppress(OSError):  # the federation goes on where the disk of its display is full
             told.save(self._folder)
 

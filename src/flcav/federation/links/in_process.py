@@ -34,7 +34,17 @@ from flcav.federation.trainable import (
     learned_names,
 )
 from flcav.federation.upload import Upload
-from flcav.federation.wire import ARRAYS, EXTRA, LOSS, METRICS, SAMPLES, encode, read_arrays, refuse, to_arrays
+from flcav.federation.wire import (
+    ARRAYS,
+    EXTRA,
+    LOSS,
+    METRICS,
+    SAMPLES,
+    encode_update,
+    read_arrays,
+    refuse_request,
+    to_array_record,
+)
 from flcav.network.ledger import BudgetExceeded
 
 RUN_ID, SERVER_NODE = 1, 1
@@ -78,11 +88,11 @@ def update_bytes(weights: Weights, upload: Upload = WHOLE, *, exchanging: bool =
 
     `exchanging`: with an array beside each that is learned, as a strategy's clients send them that `Exchanges` arrays.
     """
-    sent, _ = encode(LocalUpdate(weights, 0, 0.0), weights, Rules(upload=upload), {}, 0)
-    records = {ARRAYS: to_arrays(sent.weights), METRICS: MetricRecord({SAMPLES: 0, LOSS: 0.0})}
+    sent, _ = encode_update(LocalUpdate(weights, 0, 0.0), weights, Rules(upload=upload), {}, 0)
+    records = {ARRAYS: to_array_record(sent.weights), METRICS: MetricRecord({SAMPLES: 0, LOSS: 0.0})}
     if exchanging:
         names = [name for name in learned_names(weights) if name in upload.exchanged(weights)]
-        records[EXTRA] = to_arrays({name: weights[name] for name in names})
+        records[EXTRA] = to_array_record({name: weights[name] for name in names})
     return wire_bytes(RecordDict(records))
 
 
@@ -197,7 +207,7 @@ class EmbeddedGrid(LinkGrid):
         except BudgetExceeded:
             raise
         except Exception as error:
-            return refuse(message, repr(error))
+            return refuse_request(message, repr(error))
         finally:
             message.content = shared
             if context.state:
@@ -229,7 +239,7 @@ class EmbeddedGrid(LinkGrid):
 
 
 def _node_state(arrays: Mapping[str, Weights]) -> RecordDict:
-    return RecordDict({key: to_arrays(weights) for key, weights in arrays.items()})
+    return RecordDict({key: to_array_record(weights) for key, weights in arrays.items()})
 
 
 def _copied(record):

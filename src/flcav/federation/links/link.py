@@ -17,7 +17,7 @@ from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 from flwr.serverapp import Grid
 
 from flcav.config import InputError
-from flcav.federation.client import Agreement, client_app
+from flcav.federation.client import ClientAgreement, client_app
 from flcav.federation.links.in_process import EmbeddedGrid, TimedClients
 from flcav.federation.links.metered import Account, MeteredGrid
 from flcav.federation.links.processes import ClientProcesses, RemoteClients
@@ -25,7 +25,7 @@ from flcav.federation.rules import Rules
 from flcav.federation.state import ClientStates, ReadStates, RoundRecord
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.trainable import Trainable, Weights, answer_question
-from flcav.federation.wire import ANSWER_S, ARRAYS, ASK, GRANT, Arrived, Lost, list_events, read_arrays, to_arrays
+from flcav.federation.wire import ANSWER_S, ARRAYS, ASK, GRANT, Arrived, Lost, list_events, read_arrays, to_array_record
 from flcav.interface.wording import suggest
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def open_link(
     clients: Mapping[str, Trainable],
     runtime: Runtime | None,
     account: Account,
-    agreed: Agreement,
+    agreed: ClientAgreement,
     states: ClientStates,
 ) -> Iterator[Link]:
     """Yield the link to `clients`, on which `account` counts and loses messages.
@@ -135,7 +135,7 @@ def open_questions(
     if deployed is None or not clients:
         yield partial(_ask_here, clients)
         return
-    with open_link(clients, deployed, account, Agreement(FEDAVG, Rules(), {}, 0), {}) as link:
+    with open_link(clients, deployed, account, ClientAgreement(FEDAVG, Rules(), {}, 0), {}) as link:
         yield link.ask
 
 
@@ -160,7 +160,7 @@ def _ask_there(
     counted: bool = True,
 ) -> Replies:
     nodes, records = {name: node for node, name in names.items()}, {ASK: ConfigRecord({ASK: question})}
-    content = RecordDict({**records, **({ARRAYS: to_arrays(arrays)} if arrays else {})})
+    content = RecordDict({**records, **({ARRAYS: to_array_record(arrays)} if arrays else {})})
     if counted:
         content[GRANT] = ConfigRecord()  # filled in as it leaves
     messages = [Message(content, nodes[name], f"{MessageType.QUERY}.{ASK}") for name in clients]
@@ -177,7 +177,7 @@ def _ask_there(
 
 
 @contextlib.contextmanager
-def open_processes(clients: Mapping[str, Trainable], count: int) -> Iterator[ClientProcesses | None]:
+def open_client_processes(clients: Mapping[str, Trainable], count: int) -> Iterator[ClientProcesses | None]:
     """Yield `count` processes for `clients`; None, for this one, where one is enough or they cannot be pickled."""
     try:
         own = ClientProcesses(clients, count) if count > 1 else None
@@ -204,21 +204,21 @@ def open_runtime(
     """
     match name:
         case "embedded":
-            with open_processes(clients, count) as processes:
+            with open_client_processes(clients, count) as processes:
                 yield processes
         case "ray":
             from flcav.federation.links.ray import RaySimulation
 
             yield RaySimulation(count)
         case "flower":
-            with open_fleet(clients, fleet, vehicles) as deployed:
+            with open_deployment(clients, fleet, vehicles) as deployed:
                 yield deployed
         case _:
             raise InputError(f"runtime '{name}': choose one of {', '.join(RUNTIMES)}{suggest(name, RUNTIMES)}")
 
 
 @contextlib.contextmanager
-def open_fleet(
+def open_deployment(
     clients: Collection[str], fleet: Path | None, vehicles: Mapping[str, int]
 ) -> Iterator["RegionalDeployment"]:
     """Yield the vehicles of a deployed `fleet` for clients, or of one that is brought up, see `open_runtime`."""

@@ -21,7 +21,7 @@ from flcav.federation.client import PARTITION
 from flcav.federation.links.in_process import LinkGrid, keep_identity
 from flcav.federation.state import Arrays, ClientStates
 from flcav.federation.trainable import Trainable
-from flcav.federation.wire import METRICS, read_arrays, to_arrays
+from flcav.federation.wire import METRICS, read_arrays, to_array_record
 from flcav.machine.actors import ray_session
 
 STARTING_S = 120.0  # for the nodes to be there
@@ -144,6 +144,8 @@ def _introduce(grid: Grid, names: list[str], states: Mapping[str, Mapping[str, A
 
 def _query(nodes: Iterable[int], kept: Mapping[int, Mapping[str, Arrays]]) -> list[Message]:
     return [
-        Message(RecordDict({key: to_arrays(own) for key, own in kept.get(node, {}).items()}), node, MessageType.QUERY)
+        Message(
+            RecordDict({key: to_array_record(own) for key, own in kept.get(node, {}).items()}), node, MessageType.QUERY
+        )
         for node in nodes
     ]

@@ -31,7 +31,7 @@ from flcav.federation.links.in_process import EmbeddedGrid
 from flcav.federation.links.ros_names import ROS_NAMESPACE, join_names
 from flcav.federation.state import ClientStates
 from flcav.federation.trainable import Trainable
-from flcav.federation.wire import refuse
+from flcav.federation.wire import refuse_request
 from flcav.interface.extras import format_install_command
 from flcav.storage.files import write_bytes
 
@@ -310,7 +310,7 @@ class TopicGrid(EmbeddedGrid):
             self._bag,
         )
         if label == FAILED:
-            return refuse(message, data.decode())
+            return refuse_request(message, data.decode())
         return Message(unpack_records(data), reply_to=message)
 
 

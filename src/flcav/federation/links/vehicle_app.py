@@ -21,14 +21,14 @@ from flwr.proto.recorddict_pb2 import RecordDict as ProtoRecordDict
 
 from flcav.config import InputError
 from flcav.federation.client import OWN, OWN_DIGESTS, PARTITION, client_app
-from flcav.federation.conduct import Requests
+from flcav.federation.conduct import RequestDigests
 from flcav.federation.links.in_process import TimedClients, wire_bytes
 from flcav.federation.privacy import Secret
 from flcav.federation.rules import Rules
 from flcav.federation.secure.parties import Identity
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable, Weights
-from flcav.federation.wire import GRANT, GRANTED, OVER_BUDGET, read_arrays, to_arrays
+from flcav.federation.wire import GRANT, GRANTED, OVER_BUDGET, read_arrays, to_array_record
 from flcav.fleet.keys import AUTHORITY, CERTIFICATE, KEY, check_certificate, load_key, write_private
 from flcav.fleet.vehicle import FOLDER, SETTINGS, load_settings
 from flcav.plugins import load_named
@@ -87,7 +87,7 @@ def load_identity(folder: Path) -> Identity:
     return Identity(load_key(folder / KEY), own, authority)
 
 
-def prepare(folder: Path) -> None:
+def preload_assignment(folder: Path) -> None:
     """Read a vehicle's assignment, if there is one, so that forks of this process have it, and the modules it needs."""
     with contextlib.suppress(Exception):  # the app says what is wrong, in the place of its answer
         load_assignment(folder)
@@ -121,7 +121,7 @@ class VehicleApp(ClientApp):
         if GRANT in content:
             grant = int(content.config_records[GRANT][GRANTED])  # type: ignore[arg-type]
             message.content = RecordDict({key: each for key, each in content.items() if key != GRANT})
-        digest = Requests(None).digest(message.content)
+        digest = RequestDigests(None).digest(message.content)
         last, state, answer = self._read(own)
         answered, told = answer, _digests(state)
         asks_again = message.metadata.message_type == MessageType.TRAIN and last == digest
@@ -145,7 +145,7 @@ class VehicleApp(ClientApp):
         try:
             data = (self._folder / f"{own.federation}.{STATE}").read_bytes()
         except FileNotFoundError:
-            state = RecordDict({key: to_arrays(arrays) for key, arrays in own.state.items()})
+            state = RecordDict({key: to_array_record(arrays) for key, arrays in own.state.items()})
             if digests := _digests(state):
                 network = self._folder / f"{digests[0]}.{NETWORK}"
                 if not network.exists():

@@ -21,7 +21,7 @@ from flcav.federation.selection import Selection
 from flcav.federation.state import Arrays, FederationState
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.trainable import Weights
-from flcav.federation.wire import ARRAYS, CONFIG, LocalWork, to_arrays
+from flcav.federation.wire import ARRAYS, CONFIG, LocalWork, to_array_record
 from flcav.network.ledger import BudgetExceeded, Direction
 
 Work = Callable[[int], LocalWork]  # local training of a round, by its number
@@ -39,7 +39,7 @@ class BrokenUpdate:
 
 
 @dataclass(frozen=True)
-class BufferedRound:
+class FilledBuffer:
     """A round of buffered aggregation: whose updates fill the buffer, and what broke off while it filled."""
 
     versions: Mapping[str, int]  # that each update began with, by client: weights after so many rounds
@@ -50,7 +50,7 @@ class BufferedRound:
 class Buffers:
     """The rounds of a federation by a clock, and how often clients took part in federations before it."""
 
-    rounds: tuple[BufferedRound, ...]
+    rounds: tuple[FilledBuffer, ...]
     before: Mapping[str, int] = field(default_factory=dict)  # by client
 
     def participations(self, rounds: int) -> int:
@@ -86,7 +86,7 @@ def afford_buffers(buffers: Buffers, privacy: Privacy | None) -> int:
     return afforded
 
 
-def take_turns(clients: Sequence[str], size: int, rounds: int) -> Buffers:
+def fill_in_turns(clients: Sequence[str], size: int, rounds: int) -> Buffers:
     """Return `rounds` rounds, and some more, of clients that are equally fast, and whose messages take no time.
 
     All that train are ready at once and fill buffers in their order; who is in a full buffer begins with its version.
@@ -99,7 +99,7 @@ def take_turns(clients: Sequence[str], size: int, rounds: int) -> Buffers:
         while len(waiting) < size:
             waiting.append(ready.pop(0))
         full, waiting = waiting[:size], waiting[size:]
-        found.append(BufferedRound(dict(full)))
+        found.append(FilledBuffer(dict(full)))
         ready += [(name, number + 1) for name, _ in full]
     return Buffers(tuple(found))
 
@@ -155,7 +155,7 @@ def collect(exchange: Exchange, round_: OpenRound, buffering: Buffering, kept: A
     begun = {
         version: {name: kept[_key(version, name)] for name in round_.start} for version in buffer.versions.values()
     }
-    arrays = {version: to_arrays(weights) for version, weights in begun.items()}
+    arrays = {version: to_array_record(weights) for version, weights in begun.items()}
     expected = {version: Expected(rules, weights) for version, weights in begun.items()}
     requests = {}
     for name in here.chosen:

@@ -43,7 +43,7 @@ SECRETS = "secrets"  # record of a node's state: the client's own part of a roun
 AnswerT = TypeVar("AnswerT")
 
 
-class Exchange(Protocol):
+class ExchangeStep(Protocol):
     """Messages of one step: what each client is asked, and what is read of each usable answer."""
 
     def __call__(
@@ -110,7 +110,7 @@ class SecureSum:
     """The server's side of one round: what it has to ask for, and the sum in the end."""
 
     def __init__(
-        self, exchange: Exchange, threshold: int, round_: int, authority: x509.Certificate | None = None
+        self, exchange: ExchangeStep, threshold: int, round_: int, authority: x509.Certificate | None = None
     ) -> None:
         """Ask clients by `exchange`; `threshold` of them have to be left at every step.
 

@@ -1,8 +1,8 @@
 """Primitives of secure aggregation: masks, and Shamir's secret sharing.
 
-Masks: key agreement (X25519), expansion of seeds (SHAKE256), sealed shares, fixed point. Updates are vectors of integers
-modulo 2^32, so that masks cancel exactly and leave no trace in the sum. Shares are of 32-byte secrets over a prime field
-(Shamir, Communications of the ACM 22(11), 1979).
+Masks: key agreement (X25519), expansion of seeds (SHAKE256), sealed shares, fixed point. Updates are vectors of
+integers modulo 2^32, so that masks cancel exactly and leave no trace in the sum. Shares are of 32-byte secrets over a
+prime field (Shamir, Communications of the ACM 22(11), 1979).
 """
 
 import hashlib

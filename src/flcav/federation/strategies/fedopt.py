@@ -1,7 +1,7 @@
 """Server optimisers: the mean change of a round is the gradient of a step on the server.
 
 FedAdam and FedYogi (Reddi et al., "Adaptive Federated Optimization", ICLR 2021, algorithm 2), and FedAvgM, whose server
-has momentum (Hsu et al., 2019).
+has momentum (Hsu, Qi and Brown, arXiv 1909.06335, 2019, section 4.3).
 """
 
 from collections.abc import Callable, Sequence

@@ -1,10 +1,12 @@
 """Robust aggregation, which withstands arbitrary updates of a minority: median, trimmed mean, Krum, and mixing first.
 
 Median and trimmed mean are coordinate-wise (Yin et al., ICML 2018, options I and II). Krum keeps the updates that are
-nearest to others (Blanchard et al., NeurIPS 2017). Where clients have unlike data, honest updates lie far apart, and a
-rule that keeps few of them is easily led. Nearest-neighbour mixing (Allouah et al., "Fixing by Mixing", AISTATS 2023,
-algorithm 2) first draws each towards those near it: y_i is the mean of the n - f updates nearest to x_i, itself among
-them, of n of which f are Byzantine. Distances are of what is learned, and this alone is mixed.
+nearest to others (Blanchard et al., NeurIPS 2017, section 4); its distances are of what is learned, and statistics of
+batch normalisation, of another scale, are the median of all updates, so that they are nobody's choice. Where clients
+have unlike data, honest updates lie far apart, and a rule that keeps few of them is easily led. Nearest-neighbour
+mixing (Allouah et al., "Fixing by Mixing", AISTATS 2023, algorithm 2) first draws each towards those near it: y_i is
+the mean of the n - f updates nearest to x_i, itself among them, of n of which f are Byzantine. It mixes what is
+learned alone.
 """
 
 import math

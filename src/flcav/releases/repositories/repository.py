@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Staged:
+class StagedTargets:
     """Targets metadata on its way: how many of the wanted signatures it has."""
 
     version: int
@@ -58,7 +58,7 @@ class Staged:
 
 def stage_release(
     out: Path, folder: Path, keys: Sequence[Path], directive: Directive | None = None, now: datetime | None = None
-) -> Staged:
+) -> StagedTargets:
     """Add a candidate to the party's next targets metadata and sign it; the provider keeps its files, too.
 
     Args:
@@ -95,7 +95,7 @@ def stage_release(
 
 def stage_directive(
     out: Path, task: str, directive: Directive, keys: Sequence[Path], now: datetime | None = None
-) -> Staged:
+) -> StagedTargets:
     """Change the customer's directive on the release that its repository names already, and sign the change.
 
     Raises `InputError` as `stage_release`, and where the repository names no such release.
@@ -139,7 +139,7 @@ def publish(out: Path, now: datetime | None = None) -> int:
     return version
 
 
-def read_staged(out: Path) -> Staged | None:
+def read_staged(out: Path) -> StagedTargets | None:
     """Return the state of the staged targets metadata; None without one."""
     return _count(out, load_metadata(_staged_path(out))) if _staged_path(out).is_file() else None
 
@@ -151,7 +151,7 @@ def _stage(
     alone: bool,
     keys: Sequence[Path],
     at: datetime,
-) -> Staged:
+) -> StagedTargets:
     """Sign the next targets metadata with `files`; of the customer's, the task's other releases leave (`alone`)."""
     _check_clock(out, at)
     owned = [read_private_key(path) for path in keys]
@@ -216,10 +216,10 @@ def _check_clock(out: Path, at: datetime) -> None:
         )
 
 
-def _count(out: Path, targets: "Metadata[Targets]") -> Staged:
+def _count(out: Path, targets: "Metadata[Targets]") -> StagedTargets:
     root = load_root(out).signed
     result = root.get_verification_result("targets", targets.signed_bytes, targets.signatures)
-    return Staged(targets.signed.version, len(result.signed), root.roles["targets"].threshold)
+    return StagedTargets(targets.signed.version, len(result.signed), root.roles["targets"].threshold)
 
 
 def _staged_path(out: Path) -> Path:

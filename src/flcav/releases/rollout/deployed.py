@@ -14,7 +14,7 @@ from pathlib import Path
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.fleet.authority import open_registry
-from flcav.fleet.releases import KeptReport, Offer, read_reports
+from flcav.fleet.releases import KeptReport, ReleaseOffer, read_reports
 from flcav.fleet.traffic import read_traffic
 from flcav.fleet.up import VEHICLES, read_ready
 from flcav.interface.progress import Report, ignore_progress
@@ -31,7 +31,7 @@ from flcav.releases.repositories.metadata import (
     read_root,
 )
 from flcav.releases.repositories.repository import publish
-from flcav.releases.repositories.status import read_status
+from flcav.releases.repositories.status import read_repository_status
 from flcav.releases.rollout.simulated_fleet import STAGE, Delivered, list_drives
 from flcav.releases.rollout.stages import (
     STAGES,
@@ -81,12 +81,12 @@ def roll_out(
     read_ready(fleet)
     names, directive = list_registered(fleet), read_directive(customer, TASK)
     candidate = read_released(provider, TASK, directive.release)
-    if len(keys) < (threshold := read_status(customer, TASK).threshold):
+    if len(keys) < (threshold := read_repository_status(customer, TASK).threshold):
         raise InputError(f"{len(keys)} of {threshold} keys of the customer: a roll-out that stops by itself needs all")
     if share is None and not directive.share and not directive.vehicles:
         raise InputError(f"release {directive.release} was stopped, or is for nobody; --share begins it")
     equip_fleet(fleet, provider, customer, data)
-    Offer(*(str((party / "repository").resolve()) for party in (provider, customer))).save(fleet)
+    ReleaseOffer(*(str((party / "repository").resolve()) for party in (provider, customer))).save(fleet)
     rollout = _Rollout(fleet, customer, tuple(keys), candidate, names, ledger or Ledger(LinkMegabytes(0, 0)))
     wanted = directive.share if share is None else share
     if len(rollout.assigned(_with_share(directive, wanted))) < min(LEAST, len(names)):

@@ -19,12 +19,12 @@ from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
 from flcav.releases.candidate import WEIGHTS, Candidate, check_files, read_candidate
-from flcav.releases.checking import Sources, open_sources
+from flcav.releases.checking import RepositorySources, open_sources
 from flcav.releases.repositories.metadata import MILLION, Directive, is_assigned, read_root
 from flcav.releases.repositories.repository import create_repository, publish, stage_release
 from flcav.releases.rollout.simulated_fleet import (
     Delivered,
-    Drive,
+    FleetDrive,
     SimulatedFleet,
     SimulatedRadio,
     build_fleet,
@@ -69,7 +69,7 @@ class _Parties:
         change_share(self.folder / "customer", self.task, share, self.keys("customer"))
         publish(self.folder / "customer")
 
-    def sources(self) -> Sources:
+    def sources(self) -> RepositorySources:
         return open_sources(*(str(self.folder / party / "repository") for party in ("provider", "customer")))
 
 
@@ -140,9 +140,9 @@ class _Shadows:
     def __init__(self, data: Dataset, driving: Path, candidate: Path, old: str, new: str) -> None:
         self.data = data
         self.networks = ((load_network(OBJECTS, driving), old), (load_network(OBJECTS, candidate), new))
-        self.reports: dict[Drive, ShadowReport] = {}
+        self.reports: dict[FleetDrive, ShadowReport] = {}
 
-    def run(self, drives: Sequence[Drive]) -> ShadowDecision | None:
+    def run(self, drives: Sequence[FleetDrive]) -> ShadowDecision | None:
         """Return what follows from all drives so far and these; None without any."""
         for drive in drives:
             if drive not in self.reports:

@@ -23,7 +23,7 @@ from flcav.network.ledger import Ledger, LedgerEntry
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.recorded import link_scene
 from flcav.perception.agents import kind_of
-from flcav.releases.checking import Sources, check_release, trust_roots
+from flcav.releases.checking import RepositorySources, check_release, trust_roots
 from flcav.releases.installation import Installed, read_installed, update_vehicle, weights_path
 
 STAGE = "release"
@@ -90,7 +90,7 @@ def deliver(
 
 
 @dataclass(frozen=True)
-class Drive:
+class FleetDrive:
     """What one vehicle of a recording met in one scene."""
 
     scene: str
@@ -125,10 +125,10 @@ class SimulatedFleet:
 
     folder: Path
     names: tuple[str, ...]
-    drives: tuple[Drive, ...]
+    drives: tuple[FleetDrive, ...]
     task: str
 
-    def drive_of(self, vehicle: str, turn: int) -> Drive:
+    def drive_of(self, vehicle: str, turn: int) -> FleetDrive:
         """Return the recorded drive of a vehicle at a turn."""
         return self.drives[(self.names.index(vehicle) + turn) % len(self.drives)]
 
@@ -139,16 +139,21 @@ class SimulatedFleet:
         return found
 
 
-def list_drives(data: Dataset) -> tuple[Drive, ...]:
+def list_drives(data: Dataset) -> tuple[FleetDrive, ...]:
     """Return the drives of a recording; raises `InputError` where no vehicle drives."""
     keys = dict.fromkeys((key.scene, key.agent) for key in data.keys if kind_of(key.agent) == "vehicle")
     if not keys:
         raise InputError(f"{data.folder}: has no vehicle that drives")
-    return tuple(Drive(scene, agent) for scene, agent in keys)
+    return tuple(FleetDrive(scene, agent) for scene, agent in keys)
 
 
 def build_fleet(
-    folder: Path, count: int, drives: Sequence[Drive], roots: tuple[bytes, bytes], sources: Sources, task: str
+    folder: Path,
+    count: int,
+    drives: Sequence[FleetDrive],
+    roots: tuple[bytes, bytes],
+    sources: RepositorySources,
+    task: str,
 ) -> SimulatedFleet:
     """Return a fleet of `count` vehicles in new folders, which trust both roots and drive what both parties name.
 
@@ -168,7 +173,7 @@ def update_over_radio(
     vehicles: Sequence[str],
     turn: int,
     radio: SimulatedRadio,
-    sources: Sources,
+    sources: RepositorySources,
     ledger: Ledger,
     fetched: set[str],
 ) -> list[Delivered]:
@@ -195,7 +200,7 @@ def update_over_radio(
     return found
 
 
-def _ask(fleet: SimulatedFleet, vehicle: str, sources: Sources) -> tuple[int, int]:
+def _ask(fleet: SimulatedFleet, vehicle: str, sources: RepositorySources) -> tuple[int, int]:
     """Return the release that a vehicle is to download, and its size [bytes], without weights that it keeps."""
     checked = check_release(fleet.folder / vehicle, vehicle, sources, fleet.task)
     assert checked.approved is not None

@@ -32,7 +32,7 @@ from flcav.releases.candidate import (
     read_candidate,
 )
 from flcav.releases.repositories.metadata import MILLION, Directive, load_targets, read_directives
-from flcav.releases.repositories.repository import Staged, stage_directive
+from flcav.releases.repositories.repository import StagedTargets, stage_directive
 from flcav.releases.rollout.simulated_fleet import Delivered
 from flcav.sensors.frame import Frame
 from flcav.storage.files import write_json
@@ -139,7 +139,7 @@ def next_share(share: float, decision: ShadowDecision) -> float:
 
 def change_share(
     out: Path, task: str, share: float, keys: Sequence[Path], revoke: Sequence[str] = ()
-) -> tuple[Directive, Staged]:
+) -> tuple[Directive, StagedTargets]:
     """Stage a directive with another share of the fleet, and more revoked vehicles; return it and its signatures.
 
     A share of 0 stops the roll-out for vehicles that were named, too.

@@ -24,12 +24,12 @@ from flcav.fleet.keys import REQUEST, read_request, requested_name
 from flcav.fleet.releases import RELEASES, REPORT, ReleaseReport, ShadowReport
 from flcav.fleet.supervisor import end_with_parent
 from flcav.fleet.vehicle import load_settings
-from flcav.releases.checking import CertifiedFetcher, Sources, trust_roots, trusts_roots
+from flcav.releases.checking import CertifiedFetcher, RepositorySources, trust_roots, trusts_roots
 from flcav.releases.installation import (
     Fetched,
     Installed,
     fetch_release,
-    install,
+    install_release,
     read_installed,
     weights_path,
 )
@@ -103,7 +103,7 @@ def update_in_fleet(folder: Path) -> None:
         left.unlink()
     with open_client(folder) as client:
         base = str(client.base_url)
-        sources = Sources(f"{base}image", f"{base}director", CertifiedFetcher(client))
+        sources = RepositorySources(f"{base}image", f"{base}director", CertifiedFetcher(client))
         told = ReleaseReport(TASK, 0, 0)
         try:
             driving = read_installed(own)
@@ -116,7 +116,7 @@ def update_in_fleet(folder: Path) -> None:
                     write_json(own / SHADOW, shadow.as_json())
                     told = replace(told, shadow=shadow)
                     _report(client, told)
-                told = _describe(own, install(own, found.newer))
+                told = _describe(own, install_release(own, found.newer))
         except InputError as error:
             _report(client, replace(told, refused=str(error)[:500]))
             raise

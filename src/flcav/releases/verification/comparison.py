@@ -85,7 +85,7 @@ def match_overlaps(
     return Matches(score[order], ~np.isnan(turned[order]), turned[order], frame[order], targets)
 
 
-def assign_detections(each: Overlaps, least: float, inside: Mask, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+def match_detections(each: Overlaps, least: float, inside: Mask, rows: NDArray[np.intp]) -> NDArray[np.int64]:
     """Return (R,) the target of each of the detections `rows`, -1 for none, greedily by score.
 
     least: IoU from which a detection finds a target. inside (T,): targets that can be found. rows (R,), rising.
@@ -106,7 +106,7 @@ def _match_frame(
     """Return the scores of one frame's detections that count, their heading errors (NaN: false), and its targets."""
     inside = np.ones(len(each.targets), bool) if wanted is None else wanted[each.targets]
     rows = np.arange(len(each.score)) if kept is None else np.flatnonzero(kept[each.detections])
-    found = assign_detections(each, least, inside, rows)
+    found = match_detections(each, least, inside, rows)
     hit = found >= 0
     turned = np.full(len(rows), np.nan)
     turned[hit] = each.turned[rows[hit], found[hit]]
@@ -147,7 +147,7 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Pair:
+class GuardPair:
     """A measure of both networks on the same frames: (n, F) multiplicities of frames in, (n,) values out."""
 
     by: str
@@ -167,7 +167,7 @@ def draw_scenes(scene: NDArray[np.str_], redraws: int = REDRAWS) -> Times:
     return rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=redraws)[:, index]
 
 
-def compare(pair: Pair, times: Times, guards: int = 1) -> tuple[Comparison, float]:
+def compare_pair(pair: GuardPair, times: Times, guards: int = 1) -> tuple[Comparison, float]:
     """Return the comparison of a pair and the standard error of the difference over scenes.
 
     times (n, F): bootstrap samples, see `draw_scenes`. guards: number of guards that are judged together, by which the
@@ -207,26 +207,28 @@ def compare(pair: Pair, times: Times, guards: int = 1) -> tuple[Comparison, floa
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredNetwork:
     """Results of a network, with the overlaps frame by frame of each class with targets."""
 
     tested: ConditionResults
     overlaps: dict[str, list[Overlaps]]
 
 
-def measure_results(tested: ConditionResults) -> Measured:
+def measure_results(tested: ConditionResults) -> MeasuredNetwork:
     """Return results with the overlaps of all detections, which every slice is matched from."""
     labels = sorted({str(label) for truth in tested.truths for label in truth.targets.label})
     pairs = [*zip(tested.detections, tested.truths, strict=True)]
-    return Measured(tested, {label: [measure_overlaps(*pair, label) for pair in pairs] for label in labels})
+    return MeasuredNetwork(tested, {label: [measure_overlaps(*pair, label) for pair in pairs] for label in labels})
 
 
-def pair_whole(driving: Measured, candidate: Measured, by: str = "whole", name: str = "AP50") -> Pair:
+def pair_whole(
+    driving: MeasuredNetwork, candidate: MeasuredNetwork, by: str = "whole", name: str = "AP50"
+) -> GuardPair:
     """Return the pair of the mean AP50 over classes on all frames."""
     return _pair(by, name, _match(driving), _match(candidate), driving)
 
 
-def pair_slices(driving: Measured, candidate: Measured) -> Iterator[Pair]:
+def pair_slices(driving: MeasuredNetwork, candidate: MeasuredNetwork) -> Iterator[GuardPair]:
     """Yield the pairs by class, distance, occlusion, weather, scenario, town and cell of the domain, and by measure."""
     both = (driving, candidate)
     old, new = (_match(each) for each in both)
@@ -237,7 +239,7 @@ def pair_slices(driving: Measured, candidate: Measured) -> Iterator[Pair]:
         sides = [_match(each, 0.5, wanted, within) for each in both]
         yield _pair(by, name, sides[0], sides[1], driving)
         yield _pair("found", name, sides[0], sides[1], driving, measure=_recall)
-    for by, name, frames in group_frames(candidate.tested):
+    for by, name, frames in list_frame_slices(candidate.tested):
         yield _pair(by, name, old, new, driving, frames)
         if by != "cell":
             yield _pair("found", name, old, new, driving, frames, _recall)
@@ -257,7 +259,7 @@ def _ranges(tested: ConditionResults) -> Iterator[tuple[str, str, list[Mask], tu
         yield "occlusion", f"{low:.0%}-{min(high, 1):.0%}", [_between(share, low, high) for share in hidden], None
 
 
-def group_frames(tested: ConditionResults) -> Iterator[tuple[str, str, NDArray[np.bool_]]]:
+def list_frame_slices(tested: ConditionResults) -> Iterator[tuple[str, str, NDArray[np.bool_]]]:
     """Yield the slices of frames, where there are several of a kind: by, name, which frames (F,)."""
     names = {
         "weather": [truth.weather or "" for truth in tested.truths],
@@ -280,7 +282,7 @@ def _between(value: Values, low: float, high: float) -> Mask:
 
 
 def _match(
-    measured: Measured,
+    measured: MeasuredNetwork,
     least: float = 0.5,
     wanted: Sequence[Mask] | None = None,
     within: tuple[float, float] | None = None,
@@ -295,10 +297,10 @@ def _pair(
     name: str,
     old: dict[str, Matches],
     new: dict[str, Matches],
-    driving: Measured,
+    driving: MeasuredNetwork,
     inside: Mask | None = None,
     measure: Callable[[Matches, Times], Values] = weighted_precision,
-) -> Pair:
+) -> GuardPair:
     """Return a pair over the classes with targets in the slice; inside: (F,) frames that are in it."""
     scene = np.array([truth.scene for truth in driving.tested.truths])
     counted = np.ones(len(scene), np.int64) if inside is None else inside.astype(np.int64)
@@ -307,7 +309,7 @@ def _pair(
         return lambda times: _mean(matches, times * counted, measure)
 
     targets = sum(int((each.targets * counted).sum()) for each in old.values())
-    return Pair(by, name, mean(old), mean(new), scene, len(np.unique(scene[counted > 0])), targets)
+    return GuardPair(by, name, mean(old), mean(new), scene, len(np.unique(scene[counted > 0])), targets)
 
 
 def _mean(matches: dict[str, Matches], times: Times, measure: Callable[[Matches, Times], Values]) -> Values:

@@ -38,7 +38,7 @@ Condition = Callable[[Frame], Frame]
 Points = NDArray[np.float32]
 
 
-def add_noise(frame: Frame) -> Frame:
+def add_range_noise(frame: Frame) -> Frame:
     """Return the frame with Gaussian noise on each coordinate of its points."""
     rng = stream(0, "noise", frame.key)
 
@@ -77,7 +77,7 @@ def move_on(frame: Frame) -> Frame:
 
 
 CONDITIONS: Mapping[str, Condition] = {
-    "noise": add_noise,
+    "noise": add_range_noise,
     "drop-out": drop_returns,
     "miscalibration": turn_mount,
     "latency": move_on,

@@ -27,10 +27,10 @@ from flcav.releases.verification.comparison import (
     LEAST_SCENES,
     LEAST_TARGETS,
     LEVEL,
-    Measured,
-    compare,
+    MeasuredNetwork,
+    compare_pair,
     draw_scenes,
-    group_frames,
+    list_frame_slices,
     measure_results,
     pair_slices,
     pair_whole,
@@ -39,9 +39,9 @@ from flcav.releases.verification.files import describe_data, find_faults
 from flcav.releases.verification.guards import pair_classes
 from flcav.releases.verification.records import (
     LEAST_MEASURE,
+    CandidateVerification,
     Comparison,
     OddCoverage,
-    Verification,
     VerificationData,
     VerifiedDomain,
 )
@@ -139,7 +139,7 @@ def verify(
     jobs: int = 1,
     known: Results | None = None,
     progress: Report = ignore_progress,
-) -> Verification:
+) -> CandidateVerification:
     """Return the verification of a candidate beside the network that drives.
 
     Args:
@@ -169,17 +169,17 @@ def verify(
     tested = [_describe(path, frames) for path in data]
     faults = list(find_faults(folder, candidate, driving, tested))
     if faults:
-        return decide(candidate, None, None, tested, None, margin, faults)
+        return decide_on_candidate(candidate, None, None, tested, None, margin, faults)
     own = [] if known is not None else [driving]
     results = run_tests([*own, folder / WEIGHTS], frames, jobs=jobs, progress=progress)
     old, new = known if known is not None else results[0], results[-1]
     if not any(len(truth.targets) for truth in new[PLAIN].truths):
         raise InputError(f"no object to be found in {', '.join(map(str, data))}")
     domain = describe_domain(frames, new[PLAIN].truths, network.config.classes, coverage)
-    return decide(candidate, old, new, tested, domain, margin)
+    return decide_on_candidate(candidate, old, new, tested, domain, margin)
 
 
-def decide(
+def decide_on_candidate(
     candidate: Candidate,
     driving: Results | None,
     new: Results | None,
@@ -187,7 +187,7 @@ def decide(
     domain: VerifiedDomain | None,
     margin: float = MARGIN,
     faults: Sequence[str] = (),
-) -> Verification:
+) -> CandidateVerification:
     """Return the decision on a candidate by the results of both networks, or by the faults of its files alone."""
     frames, scenes = sum(each.frames for each in data), sum(each.scenes for each in data)
     reasons, open_reasons, wanted = list(faults), [], 0
@@ -196,7 +196,7 @@ def decide(
     if driving is not None and new is not None:
         plain = measure_results(driving[PLAIN]), measure_results(new[PLAIN])
         pair = pair_whole(*plain)
-        whole, error = compare(pair, draw_scenes(pair.scene))
+        whole, error = compare_pair(pair, draw_scenes(pair.scene))
         for guard in _guard(*plain, driving, new):
             guards.append(guard)
             if guard.judgement == "lost":
@@ -220,7 +220,7 @@ def decide(
             enough = _frames(change + margin, error, frames, scenes)
             wanted = max(wanted, enough)
             open_reasons.append(said if enough else f"{said}: no number of frames would accept this")
-    return Verification(
+    return CandidateVerification(
         candidate=candidate.weights,
         driving=candidate.driving,
         accepted=not (reasons or open_reasons),
@@ -238,12 +238,12 @@ def decide(
     )
 
 
-def write_verification(folder: Path, verification: Verification) -> None:
+def write_verification(folder: Path, verification: CandidateVerification) -> None:
     """Write the verification into the candidate's folder."""
     write_json(folder / VERIFICATION, verification.as_json(), sort=False)
 
 
-def read_verification(folder: Path) -> Verification:
+def read_verification(folder: Path) -> CandidateVerification:
     """Return the verification in a candidate's folder.
 
     Raises `InputError` for none, one of other weights, and one whose acceptance its own numbers contradict.
@@ -251,7 +251,7 @@ def read_verification(folder: Path) -> Verification:
     path = folder / VERIFICATION
     if not path.is_file():
         raise InputError(f"{folder}: was not verified")
-    found = Verification.from_json(read_json(path), str(path))
+    found = CandidateVerification.from_json(read_json(path), str(path))
     described = read_candidate(folder)
     if found.candidate != described.weights or sha256(folder / WEIGHTS) != found.candidate:
         raise InputError(f"{path}: is the verification of other weights")
@@ -262,7 +262,7 @@ def read_verification(folder: Path) -> Verification:
     return found
 
 
-def _supports_acceptance(found: Verification) -> bool:
+def _supports_acceptance(found: CandidateVerification) -> bool:
     """Return whether the numbers of a verification allow that the candidate is accepted."""
     whole = found.whole
     if whole is None or found.reasons or found.undecided or found.kept_share != KEPT:
@@ -283,9 +283,9 @@ def _is_kept(guard: Comparison) -> bool:
     return guard.judgement in ("kept", "open") and not (guard.spare is not None and guard.spare < 0)
 
 
-def _guard(old: Measured, new: Measured, driving: Results, candidate: Results) -> list[Comparison]:
+def _guard(old: MeasuredNetwork, new: MeasuredNetwork, driving: Results, candidate: Results) -> list[Comparison]:
     """Return the comparisons of all guards, judged together."""
-    groups = [(name, frames) for by, name, frames in group_frames(new.tested) if by != "cell"]
+    groups = [(name, frames) for by, name, frames in list_frame_slices(new.tested) if by != "cell"]
     pairs = [*pair_slices(old, new), *pair_classes(old, new, groups=groups)]
     for name in CONDITIONS:
         if name in candidate:
@@ -294,7 +294,7 @@ def _guard(old: Measured, new: Measured, driving: Results, candidate: Results) -
     pairs = [pair for pair in pairs if pair.targets >= LEAST_TARGETS]
     drawn = {len(pair.scene): pair.scene for pair in pairs}  # conditions share their frames, which are fewer
     times = {frames: draw_scenes(scene, GUARD_REDRAWS) for frames, scene in drawn.items()}
-    found = [compare(pair, times[len(pair.scene)], len(pairs))[0] for pair in pairs]
+    found = [compare_pair(pair, times[len(pair.scene)], len(pairs))[0] for pair in pairs]
     return [each for each in found if np.isfinite([each.driving, each.candidate]).all()]
 
 
