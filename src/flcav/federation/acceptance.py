@@ -15,30 +15,13 @@ from flwr.app import ArrayRecord, ConfigRecord, MetricRecord, RecordDict
 from numpy.typing import NDArray
 
 from flcav.config import shorten
+from flcav.federation import wire
 from flcav.federation.privacy import change_norm
 from flcav.federation.rules import Rules
 from flcav.federation.strategies.fedavg import BLOCK
 from flcav.federation.strategies.strategy import Exchanges, Strategy
 from flcav.federation.trainable import Forms, LocalUpdate, Weights, forms_of, learned_names
 from flcav.federation.upload import Arrays, find_change
-from flcav.federation.wire import (
-    ARRAYS,
-    ASK,
-    EXTRA,
-    LOSS,
-    METRICS,
-    NAMES,
-    NORM,
-    SAMPLES,
-    VECTOR,
-    count_coordinates,
-    decode_update,
-    is_changed,
-    is_local,
-    sent_forms,
-    to_numpy,
-    type_name,
-)
 
 SAME = 1e-6  # relative: more than two machines differ in the norm of one change
 
@@ -78,20 +61,20 @@ def read_update(content: RecordDict, expected: Expected, told: float | None = No
     told: norm of its change of learned arrays, which the client has told before, and by which it was drawn.
     """
     rules, start, extra = expected.rules, expected.start, expected.extra
-    if METRICS in content:  # of a client without samples the rest may be missing
-        _read_numbers(content, LOSS, rules)
-    _check_records(content, [ARRAYS, METRICS, EXTRA] if extra else [ARRAYS, METRICS])
-    samples, loss = _read_numbers(content, LOSS, rules)
-    sent = _read_arrays(content, ARRAYS, sent_forms(start, rules))
-    update = LocalUpdate({}, samples, loss, extra=_read_arrays(content, EXTRA, extra) if extra else {})
+    if wire.METRICS in content:  # of a client without samples the rest may be missing
+        _read_numbers(content, wire.LOSS, rules)
+    _check_records(content, [wire.ARRAYS, wire.METRICS, wire.EXTRA] if extra else [wire.ARRAYS, wire.METRICS])
+    samples, loss = _read_numbers(content, wire.LOSS, rules)
+    sent = _read_arrays(content, wire.ARRAYS, wire.sent_forms(start, rules))
+    update = LocalUpdate({}, samples, loss, extra=_read_arrays(content, wire.EXTRA, extra) if extra else {})
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # of values that the norm is about to refuse
-            update = replace(update, weights=decode_update(sent, start, rules))
+            update = replace(update, weights=wire.decode_update(sent, start, rules))
     except ValueError as error:
         raise ReplyRefused(str(error)) from None
     _check_change({name: update.weights[name] for name in rules.upload.exchanged(start)}, start, rules)
     _check_change(update.extra, {}, rules)
-    if told is not None and not is_changed(rules):  # what is compressed may be longer
+    if told is not None and not wire.is_changed(rules):  # what is compressed may be longer
         exchanged = rules.upload.exchanged(start)
         names = [name for name in learned_names(start) if name in exchanged]
         if (norm := change_norm(find_change(update.weights, start, names))) > told * (1 + SAME):
@@ -113,28 +96,28 @@ def read_masked(content: RecordDict, expected: Expected, peers: Sequence[str]) -
 
     Masked values cannot be distinguished from others. Raises `ReplyRefused`.
     """
-    if ASK in content:
-        accused = read_entry(content, NAMES)
+    if wire.ASK in content:
+        accused = read_entry(content, wire.NAMES)
         if not isinstance(accused, list) or not accused or not set(accused) <= set(peers):
             raise ReplyRefused(f"shares of {shorten(accused)} that do not open")
         return [name for name in peers if name in accused]
-    _check_records(content, [ARRAYS, METRICS])
-    samples, loss = _read_numbers(content, LOSS, expected.rules)
-    size = count_coordinates(expected.start, expected.rules)
-    return LocalUpdate(_read_arrays(content, ARRAYS, {VECTOR: ((size,), np.dtype(np.uint32))}), samples, loss)
+    _check_records(content, [wire.ARRAYS, wire.METRICS])
+    samples, loss = _read_numbers(content, wire.LOSS, expected.rules)
+    size = wire.count_coordinates(expected.start, expected.rules)
+    return LocalUpdate(_read_arrays(content, wire.ARRAYS, {wire.VECTOR: ((size,), np.dtype(np.uint32))}), samples, loss)
 
 
 def read_norm(content: RecordDict, rules: Rules) -> tuple[float, int]:
     """Return the norm of an update and the number of samples that a client tells; raises `ReplyRefused`."""
-    _check_records(content, [METRICS])
-    samples, norm = _read_numbers(content, NORM, rules)
+    _check_records(content, [wire.METRICS])
+    samples, norm = _read_numbers(content, wire.NORM, rules)
     return norm, samples
 
 
 def read_entry(content: RecordDict, key: str) -> Any:
     """Return an entry of an answer's one record, None where it has none; raises `ReplyRefused` for other records."""
-    _check_records(content, [ASK])
-    record = content[ASK]
+    _check_records(content, [wire.ASK])
+    record = content[wire.ASK]
     return record.get(key) if isinstance(record, ConfigRecord) else None
 
 
@@ -146,14 +129,14 @@ def _check_records(content: RecordDict, wanted: Sequence[str]) -> None:
 
 def _read_numbers(content: RecordDict, key: str, rules: Rules) -> tuple[int, float]:
     """Return the number of samples, and the loss or the norm, of a reply's metrics."""
-    metrics, limits = content[METRICS], rules.limits
-    if not isinstance(metrics, MetricRecord) or set(metrics) != {SAMPLES, key}:
-        raise ReplyRefused(f"metrics that are not {SAMPLES} and {key}")
-    samples, number = metrics[SAMPLES], metrics[key]
+    metrics, limits = content[wire.METRICS], rules.limits
+    if not isinstance(metrics, MetricRecord) or set(metrics) != {wire.SAMPLES, key}:
+        raise ReplyRefused(f"metrics that are not {wire.SAMPLES} and {key}")
+    samples, number = metrics[wire.SAMPLES], metrics[key]
     if not isinstance(samples, int) or not isinstance(number, int | float):
         raise ReplyRefused(f"{shorten(samples)} samples and a {key} of {shorten(number)}")
-    least, most = (0.0, limits.norm) if key == NORM else (-limits.loss, limits.loss)
-    if is_local(rules) and samples != 1:
+    least, most = (0.0, limits.norm) if key == wire.NORM else (-limits.loss, limits.loss)
+    if wire.is_local(rules) and samples != 1:
         raise ReplyRefused(f"{samples} samples, where all clients count the same")
     if samples == 0:  # the loss is then of nothing
         raise NoSamples("0 samples to train on: at least 1 is wanted")
@@ -173,12 +156,12 @@ def _read_arrays(content: RecordDict, key: str, wanted: Forms) -> Arrays:
     found = {}
     for name, (shape, dtype) in wanted.items():
         array = record[name]
-        if (tuple(array.shape), array.dtype) != (shape, type_name(dtype)):
+        if (tuple(array.shape), array.dtype) != (shape, wire.type_name(dtype)):
             raise ReplyRefused(
                 f"'{name}' is {array.dtype[:20]} {shorten(tuple(array.shape))} instead of {dtype} {shape}"
             )
         try:
-            found[name] = to_numpy(array)
+            found[name] = wire.to_numpy(array)
         except (TypeError, ValueError) as error:
             raise ReplyRefused(f"'{name}': {error}") from None
     return found

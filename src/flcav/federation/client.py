@@ -8,6 +8,7 @@ from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
+from flcav.federation import wire
 from flcav.federation.acceptance import Expected, extra_forms, is_usable
 from flcav.federation.conduct import (
     ANSWERED,
@@ -36,35 +37,6 @@ from flcav.federation.trainable import (
     learned_names,
 )
 from flcav.federation.upload import Arrays, find_change
-from flcav.federation.wire import (
-    ARRAYS,
-    ASK,
-    CENTRE,
-    CONFIG,
-    COUNT,
-    EXTRA,
-    LOSS,
-    LOST,
-    MASKED,
-    METRICS,
-    NAMES,
-    NORM,
-    SAMPLES,
-    SEND,
-    UNMASK,
-    VECTOR,
-    LocalWork,
-    NoCount,
-    encode_update,
-    flatten_change,
-    is_local,
-    read_arrays,
-    refuse_request,
-    reply,
-    reply_norm,
-    to_array_record,
-    to_metrics,
-)
 from flcav.network.ledger import BudgetExceeded
 from flcav.statistics.streams import derive_seed
 
@@ -91,7 +63,7 @@ def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
     where it is kept, and under clients' own noise or masks what they have answered.
     """
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"
-    guards = is_local(rules) or rules.secure is not None
+    guards = wire.is_local(rules) or rules.secure is not None
     digests = (OWN_DIGESTS,) if isinstance(strategy, FedMD) else ()
     optimiser = (OPTIMISER,) if rules.keep_optimiser else ()
     return (*((OWN, RESIDUAL) if keeps else ()), *digests, *optimiser, *((ANSWERED,) if guards else ()))
@@ -122,76 +94,79 @@ def client_app(
     """
     app, clients, requests = ClientApp(), [*trainables], RequestDigests(rules.privacy)
 
-    def admit(message: Message, context: Context, name: str, work: LocalWork) -> str:
+    def admit(message: Message, context: Context, name: str, work: wire.LocalWork) -> str:
         """Return what is asked for; raises `RequestRefused` where the client is not to answer."""
         asked, before = asked_for(message.content), recall_answered(context)
         repeatable = rules.secure is None and not {OWN, RESIDUAL, OPTIMISER} & {*context.state}
-        digest = requests.digest(message.content, LOST if rules.secure is None else ASK)
+        digest = requests.digest(message.content, wire.LOST if rules.secure is None else wire.ASK)
         answered = before.admit(work.round, asked, digest, rules, repeatable)
         if (most := requests.affordable) is not None and answered.rounds > most - spent:
             raise RequestRefused(f"a round more than the {most} that the privacy budget of {name} affords")
         keep_answered(context, answered)
-        if HIDDEN in context.state and (asked == UNMASK or answered.round > before.round):
-            del context.state[HIDDEN], context.state[f"{HIDDEN}-{SAMPLES}"]
+        if HIDDEN in context.state and (asked == wire.UNMASK or answered.round > before.round):
+            del context.state[HIDDEN], context.state[f"{HIDDEN}-{wire.SAMPLES}"]
         return asked
 
     @app.train()
     def train(message: Message, context: Context) -> Message:
         try:
             return answer_training(message, context)
-        except NoCount as error:
-            return refuse_request(message, str(error))
+        except wire.NoCount as error:
+            return wire.refuse_request(message, str(error))
 
     def answer_training(message: Message, context: Context) -> Message:
         name = clients[int(context.node_config[PARTITION])]
-        work = LocalWork.from_record(message.content.config_records[CONFIG])
+        work = wire.LocalWork.from_record(message.content.config_records[wire.CONFIG])
         asked = admit(message, context, name, work)
-        if rules.secure is not None and asked != MASKED:
+        if rules.secure is not None and asked != wire.MASKED:
             return answer_secretly(message, context, name, rules.secure, work.round, identity)
         seed = derive_seed(work.seed, name)
         key = derive_key(secrets[name], "noise", work.round, work.seed) if name in secrets else None
-        if asked == COUNT:
-            return reply_norm(message, 0.0, count_samples(trainables[name], work.steps))
+        if asked == wire.COUNT:
+            return wire.reply_norm(message, 0.0, count_samples(trainables[name], work.steps))
         if rules.secure is not None:
             if (complaint := complain(message, context)) is not None:
                 return complaint
             if HIDDEN not in context.state:
-                start = read_arrays(message.content, ARRAYS)
+                start = wire.read_arrays(message.content, wire.ARRAYS)
                 update, _, _ = _train(trainables[name], message, context, start, work, seed)
-                about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
-                values = flatten_change(update, start, rules, seed, key)
-                _keep(context, HIDDEN, LocalUpdate({VECTOR: values}, *about))
-            hidden, peers = _recall(context, HIDDEN), message.content.config_records[ASK][NAMES]
-            values = np.asarray(hidden.weights[VECTOR], np.float64)
+                about = (1, 0.0) if wire.is_local(rules) else (update.samples, update.loss)
+                values = wire.flatten_change(update, start, rules, seed, key)
+                _keep(context, HIDDEN, LocalUpdate({wire.VECTOR: values}, *about))
+            hidden, peers = _recall(context, HIDDEN), message.content.config_records[wire.ASK][wire.NAMES]
+            values = np.asarray(hidden.weights[wire.VECTOR], np.float64)
             integers = to_integers(values, rules.secure.largest, len(peers) + 1)  # type: ignore[arg-type]
-            return reply(message, replace(hidden, weights={VECTOR: mask_update(context, integers)}), {})
-        extra, own, sent = {}, {}, _optional(message.content, EXTRA)
-        if asked == SEND:
+            return wire.reply(message, replace(hidden, weights={wire.VECTOR: mask_update(context, integers)}), {})
+        extra, own, sent = {}, {}, _optional(message.content, wire.EXTRA)
+        if asked == wire.SEND:
             start, update = _recorded(context, KEPT_START), _recall(context, KEPT)
         else:
-            start = read_arrays(message.content, ARRAYS)
+            start = wire.read_arrays(message.content, wire.ARRAYS)
             update, extra, own = _train(trainables[name], message, context, start, work, seed)
-        if asked == NORM:
-            context.state[KEPT_START] = to_array_record(start)
+        if asked == wire.NORM:
+            context.state[KEPT_START] = wire.to_array_record(start)
             _keep(context, KEPT, update)
             names = [each for each in learned_names(start) if each in rules.upload.exchanged(start)]
-            return reply_norm(message, change_norm(find_change(update.weights, start, names)), update.samples)
-        encoded, left = encode_update(update, start, rules, _recorded(context, RESIDUAL), seed, key)
+            return wire.reply_norm(message, change_norm(find_change(update.weights, start, names)), update.samples)
+        encoded, left = wire.encode_update(update, start, rules, _recorded(context, RESIDUAL), seed, key)
         if rules.hides_draws:  # neither the ledger's bytes nor the server's figures are to tell who was drawn
             encoded = replace(encoded, samples=min(encoded.samples, 1), loss=0.0)
-        answer = reply(message, encoded, extra)
-        if (left or own) and LOST not in message.content:
+        answer = wire.reply(message, encoded, extra)
+        if (left or own) and wire.LOST not in message.content:
             expected = Expected(rules, start, extra_forms(strategy, rules, start, sent))
             if is_usable(answer.content, expected):
                 _record(context, RESIDUAL, left)
                 _record(context, OWN, own)
         return answer
 
-    @app.query(ASK)
+    @app.query(wire.ASK)
     def answer(message: Message, context: Context) -> Message:
-        client, arrays = trainables[clients[int(context.node_config[PARTITION])]], _optional(message.content, ARRAYS)
+        client, arrays = (
+            trainables[clients[int(context.node_config[PARTITION])]],
+            _optional(message.content, wire.ARRAYS),
+        )
         found = answer_question(client, asked_for(message.content), arrays)
-        return Message(RecordDict({ARRAYS: to_array_record(found)}), reply_to=message)
+        return Message(RecordDict({wire.ARRAYS: wire.to_array_record(found)}), reply_to=message)
 
     @app.query()
     def query(message: Message, context: Context) -> Message:
@@ -204,19 +179,21 @@ def client_app(
         if OWN in found and isinstance(strategy, FedMD) and not simulated:
             now = np.frombuffer(requests.digest(RecordDict({OWN: found.pop(OWN)})), np.uint8)
             before = [each for each in _recorded(context, OWN_DIGESTS).values() if not np.array_equal(each, now)]
-            context.state[OWN_DIGESTS] = to_array_record(dict(zip(("last", "before"), (now, *before), strict=False)))
+            context.state[OWN_DIGESTS] = wire.to_array_record(
+                dict(zip(("last", "before"), (now, *before), strict=False))
+            )
             found[OWN_DIGESTS] = context.state[OWN_DIGESTS]
         place = MetricRecord({PARTITION: int(context.node_config[PARTITION])})
-        return Message(RecordDict({**found, METRICS: place}), reply_to=message)
+        return Message(RecordDict({**found, wire.METRICS: place}), reply_to=message)
 
     def _train(
-        trainable: Trainable, message: Message, context: Context, start: Weights, work: LocalWork, seed: int
+        trainable: Trainable, message: Message, context: Context, start: Weights, work: wire.LocalWork, seed: int
     ) -> tuple[Update, Weights, Weights]:
         """Return the result of local training, a strategy's arrays beside it, and those to keep if they arrive."""
-        sent, own = _optional(message.content, EXTRA), _recorded(context, OWN)
+        sent, own = _optional(message.content, wire.EXTRA), _recorded(context, OWN)
         correction = strategy.correct(sent, own) if isinstance(strategy, Corrects) else Correction()
-        if isinstance(rules.personal, RegionalModels) and CENTRE in message.content:
-            correction = Correction(rules.personal.pull, centre=read_arrays(message.content, CENTRE))
+        if isinstance(rules.personal, RegionalModels) and wire.CENTRE in message.content:
+            correction = Correction(rules.personal.pull, centre=wire.read_arrays(message.content, wire.CENTRE))
         layers = {"layers": rules.upload.layers} if rules.upload.layers else {}
         how = {**correction.arguments(), **layers}
         if isinstance(strategy, FedMD):
@@ -252,20 +229,23 @@ def _recorded(context: Context, key: str) -> Arrays:
 
 
 def _optional(content: RecordDict, key: str) -> Arrays:
-    return read_arrays(content, key) if key in content else {}
+    return wire.read_arrays(content, key) if key in content else {}
 
 
 def _record(context: Context, key: str, arrays: Weights) -> None:
     """Keep arrays for the next round; of a training that diverged nothing is kept."""
     if arrays and all(np.isfinite(array).all() for array in arrays.values()):
-        context.state[key] = to_array_record(arrays)
+        context.state[key] = wire.to_array_record(arrays)
 
 
 def _keep(context: Context, key: str, update: Update) -> None:
-    context.state[key], context.state[f"{key}-{SAMPLES}"] = to_array_record(update.weights), to_metrics(update)
+    context.state[key], context.state[f"{key}-{wire.SAMPLES}"] = (
+        wire.to_array_record(update.weights),
+        wire.to_metrics(update),
+    )
 
 
 def _recall(context: Context, key: str) -> LocalUpdate:
-    metrics = context.state.metric_records[f"{key}-{SAMPLES}"]
-    samples, loss = metrics[SAMPLES], metrics[LOSS]
+    metrics = context.state.metric_records[f"{key}-{wire.SAMPLES}"]
+    samples, loss = metrics[wire.SAMPLES], metrics[wire.LOSS]
     return LocalUpdate(_recorded(context, key), int(samples), float(loss))  # type: ignore[arg-type]

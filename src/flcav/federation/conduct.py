@@ -14,22 +14,10 @@ from functools import cached_property
 import numpy as np
 from flwr.app import Array, ArrayRecord, Context, RecordDict
 
+from flcav.federation import wire
 from flcav.federation.privacy import Privacy, affordable_rounds
 from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
-from flcav.federation.wire import (
-    ASK,
-    COUNT,
-    KEYS,
-    LOST,
-    MASKED,
-    NORM,
-    SEND,
-    SHARES,
-    UNMASK,
-    read_arrays,
-    to_array_record,
-)
 
 ANSWERED = "answered"  # record of a node's state
 UPDATE = "update"  # asked for where nothing else is
@@ -44,10 +32,10 @@ class RequestRefused(ValueError):
 def agreed_requests(rules: Rules) -> tuple[str, ...]:
     """Return what clients are asked for in a round, in this order."""
     if rules.secure is not None:
-        return KEYS, SHARES, MASKED, UNMASK
+        return wire.KEYS, wire.SHARES, wire.MASKED, wire.UNMASK
     if rules.selection.rule == "importance":
-        return NORM, SEND
-    return (COUNT, UPDATE) if rules.selection.unbiased else (UPDATE,)
+        return wire.NORM, wire.SEND
+    return (wire.COUNT, UPDATE) if rules.selection.unbiased else (UPDATE,)
 
 
 @dataclass(frozen=True)
@@ -73,11 +61,11 @@ class Answered:
         if round_ > self.round and place == 0:
             return Answered(round_, place, self.rounds + 1, NOTHING if masked else digest)
         if round_ == self.round:
-            again = masked and place == 0 and requests[self.place] != UNMASK
+            again = masked and place == 0 and requests[self.place] != wire.UNMASK
             if place == self.place + 1 or again:
-                if asked == MASKED and self.digest not in (NOTHING, digest):
+                if asked == wire.MASKED and self.digest not in (NOTHING, digest):
                     raise RequestRefused(f"another training of round {round_} than that whose update was masked")
-                trained = self.digest if masked and asked != MASKED else digest
+                trained = self.digest if masked and asked != wire.MASKED else digest
                 return Answered(round_, place, self.rounds, trained)
             if place == self.place and digest == self.digest and repeatable:
                 return self
@@ -89,7 +77,7 @@ def recall_answered(context: Context) -> Answered:
     """Return what a node has answered last."""
     if ANSWERED not in context.state:
         return Answered()
-    kept = read_arrays(context.state, ANSWERED)[ANSWERED]
+    kept = wire.read_arrays(context.state, ANSWERED)[ANSWERED]
     round_, place, rounds = kept[:3].tolist()
     return Answered(round_, place, rounds, kept[3:].tobytes())
 
@@ -97,7 +85,7 @@ def recall_answered(context: Context) -> Answered:
 def keep_answered(context: Context, answered: Answered) -> None:
     """Keep what a node answers."""
     numbers = np.array([answered.round, answered.place, answered.rounds], np.int64)
-    context.state[ANSWERED] = to_array_record(
+    context.state[ANSWERED] = wire.to_array_record(
         {ANSWERED: np.concatenate([numbers, np.frombuffer(answered.digest, np.int64)])}
     )
 
@@ -123,7 +111,7 @@ class RequestDigests:
         """Number of rounds in which a client's budget affords an answer, see `affordable_answers`."""
         return affordable_answers(self._privacy)
 
-    def digest(self, content: RecordDict, without: str = LOST) -> bytes:
+    def digest(self, content: RecordDict, without: str = wire.LOST) -> bytes:
         """Return the digest of all that is asked, which is 32 bytes (BLAKE2b); not of the note that nothing arrives.
 
         without: another record that does not count.
@@ -131,7 +119,7 @@ class RequestDigests:
         hashed = hashlib.blake2b(digest_size=32)
         with self._lock:
             for key, record in sorted(content.items()):
-                if key not in (LOST, without):
+                if key not in (wire.LOST, without):
                     hashed.update(f"{key!r} ".encode())
                     hashed.update(
                         self._digest_arrays(key, [*record.items()])
@@ -162,4 +150,4 @@ def affordable_answers(privacy: Privacy | None) -> int | None:
 
 def asked_for(content: RecordDict) -> str:
     """Return what a request asks for."""
-    return str(content.config_records[ASK][ASK]) if ASK in content else UPDATE
+    return str(content.config_records[wire.ASK][wire.ASK]) if wire.ASK in content else UPDATE

@@ -10,6 +10,7 @@ from flwr.serverapp import Grid
 from numpy.typing import NDArray
 
 from flcav.config import InputError
+from flcav.federation import wire
 from flcav.federation.acceptance import Expected, NoSamples, ReplyRefused
 from flcav.federation.rules import Rules
 from flcav.federation.secure.messages import TooFewClients
@@ -17,19 +18,6 @@ from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import NoShares, RunningMean
 from flcav.federation.strategies.strategy import Averages, Robust
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
-from flcav.federation.wire import (
-    ANSWER_S,
-    ARRAYS,
-    CENTRE,
-    CONFIG,
-    EXTRA,
-    Arrived,
-    LocalWork,
-    Lost,
-    TimedOut,
-    list_events,
-    to_array_record,
-)
 
 AnswerT = TypeVar("AnswerT")
 
@@ -54,9 +42,9 @@ class Attendance:
     few: bool = False  # whether fewer take part than the rules need
     spent: bool = False  # whether a budget kept some from sending, in the last round of buffers
 
-    def note(self, event: Lost | TimedOut) -> None:
+    def note(self, event: wire.Lost | wire.TimedOut) -> None:
         """Note a client that is lost, or has not answered: the latter with the reason of an earlier failure, if any."""
-        if isinstance(event, TimedOut):
+        if isinstance(event, wire.TimedOut):
             self.failed.setdefault(event.client, "no answer")
         else:
             self.failed[event.client] = event.reason
@@ -156,7 +144,7 @@ class Intake:
 class OpenRound:
     """A round under way: its local work, who takes part, what is sent, and what updates must look like."""
 
-    work: LocalWork
+    work: wire.LocalWork
     here: Attendance
     expected: Expected  # of the updates, with the rules and the weights that the round began with
     sent: Weights = field(default_factory=dict)  # a strategy's arrays that go with the weights
@@ -174,10 +162,14 @@ class OpenRound:
 
     def training(self) -> RecordDict:
         """Return a request to train: weights, what goes with them, and the local work."""
-        records = {ARRAYS: to_array_record(self.start)} | ({EXTRA: to_array_record(self.sent)} if self.sent else {})
+        records = {wire.ARRAYS: wire.to_array_record(self.start)} | (
+            {wire.EXTRA: wire.to_array_record(self.sent)} if self.sent else {}
+        )
         if self.centre is not None:
-            records[CENTRE] = to_array_record({name: self.centre[name] for name in learned_names(self.centre)})
-        return RecordDict({**records, CONFIG: self.work.record()})
+            records[wire.CENTRE] = wire.to_array_record(
+                {name: self.centre[name] for name in learned_names(self.centre)}
+            )
+        return RecordDict({**records, wire.CONFIG: self.work.record()})
 
 
 @dataclass(frozen=True)
@@ -201,9 +193,9 @@ class Exchange:
         """
         nodes = {name: node for node, name in self.names.items()}
         messages = (Message(content, nodes[name], MessageType.TRAIN) for name, content in requests.items())
-        replies = self.grid.send_and_receive(messages, timeout=ANSWER_S)
-        for event in list_events(requests if awaited is None else awaited, replies, self.names):
-            if not isinstance(event, Arrived):
+        replies = self.grid.send_and_receive(messages, timeout=wire.ANSWER_S)
+        for event in wire.list_events(requests if awaited is None else awaited, replies, self.names):
+            if not isinstance(event, wire.Arrived):
                 here.note(event)
                 continue
             try:

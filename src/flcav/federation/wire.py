@@ -15,6 +15,8 @@ from itertools import chain
 import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, Error, Message, MetricRecord, RecordDict
 from flwr.common.constant import SType
+from flwr.common.serde import recorddict_from_proto, recorddict_to_proto
+from flwr.proto.recorddict_pb2 import RecordDict as ProtoRecordDict
 from numpy.typing import NDArray
 
 from flcav.config import shorten
@@ -325,3 +327,13 @@ def list_events(awaited: Iterable[str], replies: Iterable[Message], names: Mappi
                 yield Lost(client, str(found.error.reason), found.error.code == LOST_BY_NETWORK)
             else:
                 yield Arrived(client, found.content)
+
+
+def pack_records(content: RecordDict) -> bytes:
+    """Return a message's records as Flower serialises them."""
+    return recorddict_to_proto(content).SerializeToString(deterministic=True)
+
+
+def unpack_records(data: bytes) -> RecordDict:
+    """Return the records that `pack_records` serialised."""
+    return recorddict_from_proto(ProtoRecordDict.FromString(data))

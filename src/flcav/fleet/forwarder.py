@@ -11,24 +11,10 @@ import httpx
 from starlette.types import Receive, Scope, Send
 
 from flcav.config import InputError
+from flcav.fleet import relay
 from flcav.fleet.fl_request import PATH, FLRequest
 from flcav.fleet.keys import AUTHORITY, CERTIFICATE, KEY, LOOPBACK, LOOPBACK_KEY
 from flcav.fleet.mutual_tls import serve_https
-from flcav.fleet.relay import (
-    CALLS,
-    FLEET,
-    NODE_KEY,
-    SENT,
-    TIMEOUT,
-    CallRefused,
-    answer,
-    check_headers,
-    choose_headers,
-    keep_alive,
-    largest_body,
-    read_body,
-    relay,
-)
 from flcav.interface.wording import make_printable
 
 LIMITS = httpx.Limits(max_connections=8)  # to the proxy, which lets a vehicle have twice as many
@@ -43,19 +29,19 @@ class Forwarder:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward a node's call to the proxy."""
         if scope["type"] == "lifespan":
-            while not await keep_alive(receive, send):
+            while not await relay.keep_alive(receive, send):
                 pass
             return
-        call = scope["path"].removeprefix(FLEET)
+        call = scope["path"].removeprefix(relay.FLEET)
         try:
-            if scope["method"] != "POST" or scope["path"] != FLEET + call or call not in CALLS:
-                raise CallRefused(403, "no call of a node")
-            headers = choose_headers(check_headers(scope["headers"]), (NODE_KEY, *SENT))
-            body = await read_body(scope, receive, largest_body(call))
-        except CallRefused as refused:
-            await answer(send, refused.status, refused.why)
+            if scope["method"] != "POST" or scope["path"] != relay.FLEET + call or call not in relay.CALLS:
+                raise relay.CallRefused(403, "no call of a node")
+            headers = relay.choose_headers(relay.check_headers(scope["headers"]), (relay.NODE_KEY, *relay.SENT))
+            body = await relay.read_body(scope, receive, relay.largest_body(call))
+        except relay.CallRefused as refused:
+            await relay.answer(send, refused.status, refused.why)
             return
-        await relay(self._client, FLEET + call, headers, body, send)
+        await relay.relay(self._client, relay.FLEET + call, headers, body, send)
 
 
 def vehicle_tls(folder: Path) -> ssl.SSLContext:
@@ -69,7 +55,7 @@ def vehicle_tls(folder: Path) -> ssl.SSLContext:
 def run_forwarder(folder: Path, port: int, server: str) -> None:
     """Run the forwarder of the vehicle in `folder` until the process is ended; `server` is host:port of the proxy."""
     client = httpx.AsyncClient(
-        base_url=f"https://{server}", verify=vehicle_tls(folder), timeout=TIMEOUT, trust_env=False, limits=LIMITS
+        base_url=f"https://{server}", verify=vehicle_tls(folder), timeout=relay.TIMEOUT, trust_env=False, limits=LIMITS
     )
     serve_https(Forwarder(client), "127.0.0.1", port, folder / LOOPBACK, folder / LOOPBACK_KEY).run()
 

@@ -25,31 +25,13 @@ from cryptography.hazmat.primitives.serialization import load_pem_public_key
 from starlette.types import Message, Receive, Scope, Send
 
 from flcav.config import InputError
+from flcav.fleet import relay
 from flcav.fleet.authority import REGISTRY, SERVER, SERVER_KEY, open_registry
 from flcav.fleet.fl_request import LARGEST, check_age, parse_request
 from flcav.fleet.fl_request import PATH as REQUEST_PATH
 from flcav.fleet.keys import AUTHORITY, public_der
 from flcav.fleet.mutual_tls import CERTIFICATE, CONNECTION, IN_ALL, ClientConnection, serve_https
 from flcav.fleet.registry import RegisteredVehicle, VehicleRegistry
-from flcav.fleet.relay import (
-    CALLS,
-    FLEET,
-    NODE_KEY,
-    QUIET_S,
-    SIGNED_AT,
-    TIMEOUT,
-    CallRefused,
-    answer,
-    check_body,
-    check_headers,
-    choose_headers,
-    keep_alive,
-    largest_body,
-    name_key,
-    read_body,
-    relay,
-    send_file,
-)
 from flcav.fleet.releases import LARGEST_REPORT, RELEASES, REPORT, KeptReport, find_offered, parse_report
 from flcav.fleet.traffic import ProxyTraffic, read_traffic
 from flcav.interface.wording import make_printable
@@ -76,7 +58,7 @@ class FleetProxy:
         """Pass a vehicle's call on, or refuse it: 401 for who calls, 403 for what is called."""
         if scope["type"] == "lifespan":
             saving = asyncio.create_task(self._save())
-            while not await keep_alive(receive, send):
+            while not await relay.keep_alive(receive, send):
                 pass
             saving.cancel()
             self._traffic.save(self._folder)
@@ -86,7 +68,7 @@ class FleetProxy:
         caller: str | bytes | None = certificate
 
         async def soon(event: Message) -> None:
-            async with asyncio.timeout(QUIET_S):
+            async with asyncio.timeout(relay.QUIET_S):
                 await send(event)
 
         try:
@@ -94,25 +76,25 @@ class FleetProxy:
                 vehicle = self.find(certificate)
                 caller = vehicle.name
                 await self._answer(vehicle, scope, receive, soon)
-            except CallRefused as refused:
+            except relay.CallRefused as refused:
                 await self._refuse(soon, refused.status, caller, refused.why)
         except TimeoutError:  # whoever does not read
             connection.abort()
 
     async def _answer(self, vehicle: RegisteredVehicle, scope: Scope, receive: Receive, send: Send) -> None:
-        path, headers, came = scope["path"], check_headers(scope["headers"]), time.time()
+        path, headers, came = scope["path"], relay.check_headers(scope["headers"]), time.time()
         if path == REQUEST_PATH and scope["method"] == "POST":
             await self._take_request(vehicle.name, scope, receive, send)
             return
         if path.startswith(RELEASES):
             await self._answer_release(vehicle.name, scope, receive, send)
             return
-        call = path.removeprefix(FLEET)
-        if scope["method"] != "POST" or path != FLEET + call or call not in CALLS:
-            raise CallRefused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
-        if node_key(headers.get(NODE_KEY, b"")) != vehicle.public_key:
-            raise CallRefused(401, "the node's key is not the certificate's")
-        passed, gone = [*choose_headers(headers), name_key(vehicle)], False
+        call = path.removeprefix(relay.FLEET)
+        if scope["method"] != "POST" or path != relay.FLEET + call or call not in relay.CALLS:
+            raise relay.CallRefused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
+        if node_key(headers.get(relay.NODE_KEY, b"")) != vehicle.public_key:
+            raise relay.CallRefused(401, "the node's key is not the certificate's")
+        passed, gone = [*relay.choose_headers(headers), relay.name_key(vehicle)], False
         connection: ClientConnection = scope["state"][CONNECTION]
 
         async def checked(event: Message) -> None:
@@ -122,11 +104,11 @@ class FleetProxy:
 
         slot = self._objects[vehicle.name] if call == "push-object" else contextlib.nullcontext()
         async with slot:
-            body = await read_body(scope, receive, largest_body(call))
+            body = await relay.read_body(scope, receive, relay.largest_body(call))
             vehicle = self.find(scope["state"][CERTIFICATE])  # which may have been revoked meanwhile
-            done = await relay(self._client, path, passed, check_body(call, body, vehicle), checked)
+            done = await relay.relay(self._client, path, passed, relay.check_body(call, body, vehicle), checked)
         if done.status == httpx.codes.UNAUTHORIZED:
-            self._traffic.refuse(vehicle.name, describe_clock(headers.get(SIGNED_AT, b""), came))
+            self._traffic.refuse(vehicle.name, describe_clock(headers.get(relay.SIGNED_AT, b""), came))
         self._traffic.count(vehicle.name, call, done.up, done.down, connection.count_bytes(), done.status, gone)
         self._changed = True
 
@@ -144,9 +126,9 @@ class FleetProxy:
             vehicle = find_caller(self._registry, certificate)
         except (InputError, OSError, ValueError, TypeError):
             self._close()
-            raise CallRefused(503, "the fleet's registry cannot be read") from None
+            raise relay.CallRefused(503, "the fleet's registry cannot be read") from None
         if isinstance(vehicle, str):
-            raise CallRefused(401, vehicle)
+            raise relay.CallRefused(401, vehicle)
         return vehicle
 
     def _close(self) -> None:
@@ -158,26 +140,26 @@ class FleetProxy:
         """Return the vehicle that a connection counts for; all whose certificate is not in force are one."""
         try:
             return self.find(certificate).name
-        except CallRefused:
+        except relay.CallRefused:
             return ""
 
     async def _take_request(self, vehicle: str, scope: Scope, receive: Receive, send: Send) -> None:
         """Keep a vehicle's FL request, or refuse it: 400 for another message, 409 for one that came before."""
-        content = await read_body(scope, receive, LARGEST)
+        content = await relay.read_body(scope, receive, LARGEST)
         try:
             request = parse_request(content)
         except ValueError as error:
-            raise CallRefused(400, str(error)) from None
+            raise relay.CallRefused(400, str(error)) from None
         now = time.time()
         if (odd := check_age(request, now)) is not None:
-            raise CallRefused(400, odd)
+            raise relay.CallRefused(400, odd)
         try:
             why = await asyncio.to_thread(self._keep_request, vehicle, request.nonce, content, now)
         except (InputError, OSError) as error:
-            raise CallRefused(503, f"the registry cannot be written: {error}") from None
+            raise relay.CallRefused(503, f"the registry cannot be written: {error}") from None
         if why is not None:
-            raise CallRefused(409, why)
-        await answer(send, 200, "the request is taken")
+            raise relay.CallRefused(409, why)
+        await relay.answer(send, 200, "the request is taken")
 
     def _keep_request(self, *about: Any) -> str | None:
         registry = open_registry(self._folder)
@@ -204,7 +186,7 @@ class FleetProxy:
         plain = make_printable(why)
         self._traffic.refuse(told, plain)
         self._changed = True
-        await answer(send, status, plain)
+        await relay.answer(send, status, plain)
 
     async def _save(self) -> None:
         while True:
@@ -259,7 +241,11 @@ def node_key(header: bytes) -> bytes:
 def run_proxy(folder: Path, host: str, port: int, superlink: str) -> None:
     """Run the proxy of the fleet in `folder` until the process is ended; `superlink` is host:port of the SuperLink."""
     client = httpx.AsyncClient(
-        base_url=f"https://{superlink}", verify=str(folder / AUTHORITY), timeout=TIMEOUT, trust_env=False, limits=LIMITS
+        base_url=f"https://{superlink}",
+        verify=str(folder / AUTHORITY),
+        timeout=relay.TIMEOUT,
+        trust_env=False,
+        limits=LIMITS,
     )
     app = FleetProxy(client, folder)
     keys = folder / SERVER, folder / SERVER_KEY, folder / AUTHORITY
@@ -275,29 +261,29 @@ async def answer_release(
     """
     asked, method = scope["path"].removeprefix(RELEASES), scope["method"]
     if method == "POST" and asked == REPORT:
-        await _take_report(fleet, vehicle, await read_body(scope, receive, LARGEST_REPORT), count)
-        await answer(send, 200, "the report is taken")
+        await _take_report(fleet, vehicle, await relay.read_body(scope, receive, LARGEST_REPORT), count)
+        await relay.answer(send, 200, "the report is taken")
         return
     if method != "GET":
-        raise CallRefused(403, f"{method} {scope['path'][:100]} is no call of a vehicle's")
+        raise relay.CallRefused(403, f"{method} {scope['path'][:100]} is no call of a vehicle's")
     try:
         path = await asyncio.to_thread(find_offered, fleet, asked)
     except ValueError as error:
-        raise CallRefused(403, f"{scope['path'][:100]} {error}") from None
+        raise relay.CallRefused(403, f"{scope['path'][:100]} {error}") from None
     if path is None:
-        await answer(send, 404, "no such file is on offer")
+        await relay.answer(send, 404, "no such file is on offer")
     else:
-        await send_file(send, path, count)
+        await relay.send_file(send, path, count)
 
 
 async def _take_report(fleet: Path, vehicle: str, content: bytes, count: Callable[[], int]) -> None:
     try:
         report = parse_report(content)
     except ValueError as error:
-        raise CallRefused(400, str(error)) from None
+        raise relay.CallRefused(400, str(error)) from None
     if report.shadow is not None:  # the certificate says whose it is
         report = replace(report, shadow=replace(report.shadow, vehicle=vehicle))
     try:
         await asyncio.to_thread(KeptReport(vehicle, time.time(), count(), report).save, fleet)
     except OSError as error:
-        raise CallRefused(503, f"the report cannot be kept: {error}") from None
+        raise relay.CallRefused(503, f"the report cannot be kept: {error}") from None

@@ -52,7 +52,7 @@ class Walker:
 def sent(monkeypatch: pytest.MonkeyPatch) -> Exposures:
     """Note what leaves each client; of masked updates what the masks hide."""
     found: Exposures = defaultdict(set)
-    reply, mask = client.reply, client.mask_update
+    reply, mask = client.wire.reply, client.mask_update
 
     def noted(message: Message, update: Update, extra: Weights) -> Message:
         if VECTOR not in update.weights:
@@ -63,7 +63,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> Exposures:
         found[context.node_id].add(read_arrays(context.state, client.HIDDEN)[VECTOR].tobytes())
         return mask(context, integers)
 
-    monkeypatch.setattr(client, "reply", noted)
+    monkeypatch.setattr(client.wire, "reply", noted)
     monkeypatch.setattr(client, "mask_update", hidden)
     return found
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.links.in_process import ClientLate, TimedClients
+from flcav.federation.links.in_process import ClientLate, limit_time
 from flcav.federation.links.metered import Account
 from flcav.federation.links.processes import ClientProcesses
 from flcav.federation.loop import Schedule, federate
@@ -86,7 +86,7 @@ def test_a_client_is_asked_again_when_it_has_ended_and_raises_what_it_raises():
             return steps
 
     slow = Vehicle(0.4)
-    clients = TimedClients({"slow": slow, "odd": Odd()}, 0.1)
+    clients = limit_time({"slow": slow, "odd": Odd()}, 0.1)
     assert [*clients] == ["slow", "odd"]
     how: Any = {"steps": 1, "learning_rate": 0.1, "seed": 1}
     for _ in range(2):

@@ -13,8 +13,9 @@ from rosbags.typesys import Stores, get_typestore
 from flcav.config import InputError
 from flcav.federation.edge_server import EdgeServer
 from flcav.federation.links.metered import Account
-from flcav.federation.links.topics import HASH, RECORDS, TYPE, RosTopics, Topic, unpack_records
+from flcav.federation.links.topics import HASH, RECORDS, TYPE, RosTopics, Topic
 from flcav.federation.loop import Schedule, federate
+from flcav.federation.wire import unpack_records
 from flcav.network.ledger import Ledger
 
 pytest.importorskip("cyclonedds")

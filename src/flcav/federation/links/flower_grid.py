@@ -22,8 +22,8 @@ from flwr.serverapp import Grid
 from flcav.config import InputError
 from flcav.federation.links.in_process import LinkGrid, wire_bytes
 from flcav.federation.links.metered import Account
-from flcav.federation.state import ClientStates, RoundRecord
-from flcav.federation.wire import GRANT, GRANTED, LOST_BY_NETWORK, OVER_BUDGET, read_arrays
+from flcav.federation.state import RoundRecord
+from flcav.federation.wire import GRANT, GRANTED, LOST_BY_NETWORK, OVER_BUDGET
 from flcav.fleet.authority import load_certificate, open_registry
 from flcav.fleet.registry import RegisteredVehicle
 from flcav.fleet.status import FederationProgress, RoundProgress
@@ -114,15 +114,6 @@ class DeployedGrid(LinkGrid):
     def end(self, failed: bool = False) -> None:
         """End the run."""
         self._run.end(failed)
-
-    def read_states(self, keys: Iterable[str]) -> ClientStates:
-        """Return the arrays that clients keep between rounds under these records, by client and record."""
-        found: ClientStates = {}
-        for reply in self.send_and_receive(Message(RecordDict(), node, MessageType.QUERY) for node in self.names):
-            if reply.has_content():
-                own = {key: read_arrays(reply.content, key) for key in keys if key in reply.content}
-                found |= {self.names[reply.metadata.src_node_id]: own} if own else {}
-        return {name: found[name] for name in self.names.values() if name in found}
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
         """Yield the replies in the order of the messages, as errors those that are over their grants.

@@ -2,7 +2,7 @@
 
 Uses private parts of Flower (pinned to 1.42): the process-wide task identity, the empty run record, the id of a
 message, and the serialised form of a record and of an array. Those of a deployment are in `fleet.superlink`. A training
-in this process cannot be interrupted: a client that exceeds its time limit is left behind in a thread (`TimedClients`).
+in this process cannot be interrupted: a client that exceeds its time limit is left behind in a thread (`limit_time`).
 """
 
 import contextlib
@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
-import numpy as np
-from flwr.app import Array, ArrayRecord, ConfigRecord, Context, Message, MetricRecord, RecordDict
+from flwr.app import Array, ArrayRecord, ConfigRecord, Context, Message, MessageType, MetricRecord, RecordDict
 from flwr.app.user_config import UserConfig
 from flwr.clientapp import ClientApp
 from flwr.common.serde import recorddict_to_proto
@@ -24,6 +23,7 @@ from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.federation.client import PARTITION
 from flcav.federation.rules import Rules
+from flcav.federation.state import ClientStates
 from flcav.federation.trainable import (
     LocalUpdate,
     Trainable,
@@ -141,6 +141,16 @@ class LinkGrid(Grid):
         """Return Flower's record of the run."""
         return self._flower_run
 
+    def read_states(self, keys: Iterable[str]) -> ClientStates:
+        """Return the arrays that clients keep between rounds under these records, by client and record."""
+        wanted = tuple(keys)
+        found: ClientStates = {}
+        for reply in self.send_and_receive(Message(RecordDict(), node, MessageType.QUERY) for node in self.names):
+            if reply.has_content():
+                own = {key: read_arrays(reply.content, key) for key in wanted if key in reply.content}
+                found |= {self.names[reply.metadata.src_node_id]: own} if own else {}
+        return {name: found[name] for name in self.names.values() if name in found}
+
     def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
         """Raise NotImplementedError: a message whose answer is fetched later would pass ledger and outages by."""
         raise NotImplementedError(UNMETERED)
@@ -182,9 +192,9 @@ class EmbeddedGrid(LinkGrid):
     def __exit__(self, *exception: object) -> None:
         self._identity.__exit__(None, None, None)
 
-    def read_states(self, keys: Iterable[str]) -> dict[str, dict[str, dict[str, np.ndarray]]]:
-        """Return the arrays that nodes have under these records of their state, by node and record."""
-        found: dict[str, dict[str, dict[str, np.ndarray]]] = {}
+    def read_states(self, keys: Iterable[str]) -> ClientStates:
+        """Return the arrays that clients keep between rounds under these records, by client and record."""
+        found: ClientStates = {}
         for node, state in sorted(self._states.items()):
             for key in keys:
                 if key in state:
@@ -258,24 +268,32 @@ class ClientLate(OSError):
         super().__init__(f"it had not trained after {limit_s:g} s")
 
 
-class TimedClients(Mapping[str, Trainable]):
-    """Clients that train in a thread each, and raise `ClientLate` after `limit_s` of wall time.
+class NamedClients(Mapping[str, Trainable]):
+    """Clients by name, each of which `find` returns when it is asked for."""
+
+    def __init__(self, names: Iterable[str], find: Callable[[str], Trainable]) -> None:
+        self._names, self._find = dict.fromkeys(names), find
+
+    def __getitem__(self, name: str) -> Trainable:
+        if name not in self._names:
+            raise KeyError(name)
+        return self._find(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+def limit_time(clients: Mapping[str, Trainable], limit_s: float | None) -> Mapping[str, Trainable]:
+    """Return clients that train in a thread each, and raise `ClientLate` after `limit_s` of wall time; None: as long
+    as they take.
 
     A training that is left behind goes on until it ends, or the program does; until then its client refuses another
     one, so that no client trains twice at a time. What it returns is lost.
     """
-
-    def __init__(self, clients: Mapping[str, Trainable], limit_s: float) -> None:
-        self._clients, self._limit_s = clients, limit_s
-
-    def __getitem__(self, name: str) -> Trainable:
-        return _Timed(self._clients[name], self._limit_s)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._clients)
-
-    def __len__(self) -> int:
-        return len(self._clients)
+    return clients if limit_s is None else NamedClients(clients, lambda name: _Timed(clients[name], limit_s))
 
 
 class _Timed:

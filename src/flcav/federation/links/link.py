@@ -18,9 +18,9 @@ from flwr.serverapp import Grid
 
 from flcav.config import InputError
 from flcav.federation.client import ClientAgreement, client_app
-from flcav.federation.links.in_process import EmbeddedGrid, TimedClients
+from flcav.federation.links.in_process import EmbeddedGrid, limit_time
 from flcav.federation.links.metered import Account, MeteredGrid
-from flcav.federation.links.processes import ClientProcesses, RemoteClients
+from flcav.federation.links.processes import ClientProcesses, train_remotely
 from flcav.federation.rules import Rules
 from flcav.federation.state import ClientStates, ReadStates, RoundRecord
 from flcav.federation.strategies import FEDAVG
@@ -93,17 +93,15 @@ def open_link(
     make_app = partial(client_app, **vars(agreed))
     rules = agreed.rules
     limit_s, names, far = rules.limits.train_s, [*clients], False
-    timed = clients if limit_s is None else TimedClients(clients, limit_s)
     if runtime is None:
-        opened = EmbeddedGrid(make_app(timed), names, states)
+        opened = EmbeddedGrid(make_app(limit_time(clients, limit_s)), names, states)
     elif isinstance(runtime, ClientProcesses):
-        opened = EmbeddedGrid(make_app(RemoteClients(clients, runtime, limit_s)), names, states, runtime.count)
+        opened = EmbeddedGrid(make_app(train_remotely(clients, runtime, limit_s)), names, states, runtime.count)
     elif runtime.deployed is True:
         check_deployable(rules)
         opened, far = runtime.open(clients, agreed, states, account), True
     else:
-        timing = (lambda each: each) if limit_s is None else (lambda each: TimedClients(each, limit_s))
-        opened = runtime.open(clients, lambda each: make_app(timing(each), simulated=True), states)
+        opened = runtime.open(clients, lambda each: make_app(limit_time(each, limit_s), simulated=True), states)
     with opened as inner:
         metered = MeteredGrid(inner, account, inner.names)
         follow = getattr(inner, "follow", lambda _: None)

@@ -9,7 +9,7 @@ import contextlib
 import mmap
 import os
 import pickle
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from flcav.config import InputError
-from flcav.federation.links.in_process import ClientLate
+from flcav.federation.links.in_process import ClientLate, NamedClients
 from flcav.federation.trainable import Trainable, Update, Weights, count_samples
 from flcav.machine.memory import keep_freed_memory
 from flcav.machine.processes import exit_with_parent, start_server
@@ -198,25 +198,14 @@ class _Process:
         self._block.close()
 
 
-class RemoteClients(Mapping[str, Trainable]):
-    """Clients as they are reached from this process: they train in `processes`."""
+def train_remotely(
+    clients: Mapping[str, Trainable], processes: ClientProcesses, limit_s: float | None = None
+) -> Mapping[str, Trainable]:
+    """Return `clients` as they are reached from this process: they train in `processes`, which have them, too.
 
-    def __init__(
-        self, clients: Mapping[str, Trainable], processes: ClientProcesses, limit_s: float | None = None
-    ) -> None:
-        """Stand for `clients`, which `processes` have, too, and which may train for `limit_s` (None: for any time)."""
-        self._names, self._processes, self._limit_s = clients, processes, limit_s
-
-    def __getitem__(self, name: str) -> Trainable:
-        if name not in self._names:
-            raise KeyError(name)
-        return _Remote(name, self._processes, self._names, self._limit_s)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
+    limit_s: time that one may train; None: any.
+    """
+    return NamedClients(clients, lambda name: _Remote(name, processes, clients, limit_s))
 
 
 class _Remote:

@@ -8,7 +8,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from queue import SimpleQueue
 from typing import Any, Literal
 
@@ -18,10 +18,10 @@ from flwr.serverapp import Grid, ServerApp
 from flwr.simulation import run_simulation
 
 from flcav.federation.client import PARTITION
-from flcav.federation.links.in_process import LinkGrid, keep_identity
+from flcav.federation.links.in_process import LinkGrid, NamedClients, keep_identity
 from flcav.federation.state import Arrays, ClientStates
 from flcav.federation.trainable import Trainable
-from flcav.federation.wire import METRICS, read_arrays, to_array_record
+from flcav.federation.wire import METRICS, to_array_record
 from flcav.machine.actors import ray_session
 
 STARTING_S = 120.0  # for the nodes to be there
@@ -60,7 +60,7 @@ class RaySimulation:
                 ended.wait()
 
         with ray_session(self.count, "--runtime ray") as ray, keep_identity():
-            app = make_app(_Stored(names, ray.put({**clients})))
+            app = make_app(NamedClients(names, partial(_fetch_client, ray.put({**clients}))))
             resources = {"client_resources": {"num_cpus": 1, "num_gpus": 0.0}}
 
             def simulate() -> None:
@@ -91,37 +91,16 @@ class SimulatedGrid(LinkGrid):
         """Return the replies of the simulation's nodes."""
         return self._grid.send_and_receive(messages, timeout=timeout)
 
-    def read_states(self, keys: Iterable[str]) -> ClientStates:
-        """Return the arrays that clients keep between rounds under these records, by client and record."""
-        found: ClientStates = {}
-        for reply in self._grid.send_and_receive(_query(self.names, {})):
-            if reply.has_content():
-                own = {key: read_arrays(reply.content, key) for key in keys if key in reply.content}
-                found |= {self.names[reply.metadata.src_node_id]: own} if own else {}
-        return {name: found[name] for name in self.names.values() if name in found}
-
-
-class _Stored(Mapping[str, Trainable]):
-    """Clients in Ray's object store."""
-
-    def __init__(self, names: Iterable[str], stored: Any) -> None:
-        self._names, self._stored = [*names], stored
-
-    def __getitem__(self, name: str) -> Trainable:
-        return _fetch(self._stored)[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
 
 @lru_cache(maxsize=1)
 def _fetch(stored: Any) -> Mapping[str, Trainable]:
     import ray  # pyright: ignore[reportMissingImports]: an extra
 
     return ray.get(stored)
+
+
+def _fetch_client(stored: Any, name: str) -> Trainable:
+    return _fetch(stored)[name]
 
 
 def _introduce(grid: Grid, names: list[str], states: Mapping[str, Mapping[str, Arrays]]) -> dict[int, str]:

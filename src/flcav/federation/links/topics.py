@@ -20,10 +20,8 @@ from types import TracebackType
 from typing import Any, ClassVar, Literal
 
 import yaml
-from flwr.app import Message, RecordDict
+from flwr.app import Message
 from flwr.clientapp import ClientApp
-from flwr.common.serde import recorddict_from_proto, recorddict_to_proto
-from flwr.proto.recorddict_pb2 import RecordDict as ProtoRecords
 from mcap.writer import CompressionType, Writer
 
 from flcav.config import InputError
@@ -31,7 +29,7 @@ from flcav.federation.links.in_process import EmbeddedGrid
 from flcav.federation.links.ros_names import ROS_NAMESPACE, join_names
 from flcav.federation.state import ClientStates
 from flcav.federation.trainable import Trainable
-from flcav.federation.wire import refuse_request
+from flcav.federation.wire import pack_records, refuse_request, unpack_records
 from flcav.interface.extras import format_install_command
 from flcav.storage.files import write_bytes
 
@@ -312,13 +310,3 @@ class TopicGrid(EmbeddedGrid):
         if label == FAILED:
             return refuse_request(message, data.decode())
         return Message(unpack_records(data), reply_to=message)
-
-
-def pack_records(content: RecordDict) -> bytes:
-    """Return a message's records as Flower serialises them."""
-    return recorddict_to_proto(content).SerializeToString(deterministic=True)
-
-
-def unpack_records(data: bytes) -> RecordDict:
-    """Return the records that `pack_records` serialised."""
-    return recorddict_from_proto(ProtoRecords.FromString(data))

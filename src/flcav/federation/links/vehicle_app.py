@@ -16,19 +16,25 @@ from pathlib import Path
 from cryptography import x509
 from flwr.app import Context, Error, Message, MessageType, RecordDict
 from flwr.clientapp import ClientApp
-from flwr.common.serde import recorddict_from_proto, recorddict_to_proto
-from flwr.proto.recorddict_pb2 import RecordDict as ProtoRecordDict
 
 from flcav.config import InputError
 from flcav.federation.client import OWN, OWN_DIGESTS, PARTITION, client_app
 from flcav.federation.conduct import RequestDigests
-from flcav.federation.links.in_process import TimedClients, wire_bytes
+from flcav.federation.links.in_process import limit_time, wire_bytes
 from flcav.federation.privacy import Secret
 from flcav.federation.rules import Rules
 from flcav.federation.secure.parties import Identity
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Trainable, Weights
-from flcav.federation.wire import GRANT, GRANTED, OVER_BUDGET, read_arrays, to_array_record
+from flcav.federation.wire import (
+    GRANT,
+    GRANTED,
+    OVER_BUDGET,
+    pack_records,
+    read_arrays,
+    to_array_record,
+    unpack_records,
+)
 from flcav.fleet.keys import AUTHORITY, CERTIFICATE, KEY, check_certificate, load_key, write_private
 from flcav.fleet.vehicle import FOLDER, SETTINGS, load_settings
 from flcav.plugins import load_named
@@ -111,12 +117,12 @@ class VehicleApp(ClientApp):
         An answer over the bytes that the server grants is kept: it is an error of code `OVER_BUDGET` instead.
         """
         own = load_assignment(self._folder)
-        limit = own.rules.limits.train_s
         clients = {own.client: own.trainable}
         secrets = {} if own.secret is None else {own.client: own.secret}
-        timed = clients if limit is None else TimedClients(clients, limit)
         identity = None if own.rules.secure is None else load_identity(self._folder)
-        app = client_app(timed, own.strategy, own.rules, secrets, own.spent, identity)
+        app = client_app(
+            limit_time(clients, own.rules.limits.train_s), own.strategy, own.rules, secrets, own.spent, identity
+        )
         content, grant = message.content, None
         if GRANT in content:
             grant = int(content.config_records[GRANT][GRANTED])  # type: ignore[arg-type]
@@ -150,11 +156,11 @@ class VehicleApp(ClientApp):
                 network = self._folder / f"{digests[0]}.{NETWORK}"
                 if not network.exists():
                     raise InputError("its network of the last round is no longer in the vehicle's folder") from None
-                state[OWN] = _parse(network.read_bytes())[OWN]
+                state[OWN] = unpack_records(network.read_bytes())[OWN]
             return b"", state, RecordDict()
         digest, size = HEAD.unpack_from(data)
         parts = data[HEAD.size : HEAD.size + size], data[HEAD.size + size :]
-        state, answer = map(_parse, parts)
+        state, answer = map(unpack_records, parts)
         return digest, state, answer
 
     def _keep_network(self, state: RecordDict, told: list[str]) -> None:
@@ -163,23 +169,15 @@ class VehicleApp(ClientApp):
         told: digests before. Of those the last one is kept, too: the server may be stopped before it has a checkpoint.
         """
         digests = _digests(state)
-        write_private(self._folder / f"{digests[0]}.{NETWORK}", _serialise(RecordDict({OWN: state[OWN]})))
+        write_private(self._folder / f"{digests[0]}.{NETWORK}", pack_records(RecordDict({OWN: state[OWN]})))
         for digest in {*told} - {*digests}:
             (self._folder / f"{digest}.{NETWORK}").unlink(missing_ok=True)
 
     def _write(self, own: Assignment, digest: bytes, state: RecordDict, answer: RecordDict) -> None:
-        kept, sent = map(_serialise, (state, answer))
+        kept, sent = map(pack_records, (state, answer))
         write_private(self._folder / f"{own.federation}.{STATE}", HEAD.pack(digest, len(kept)) + kept + sent)
 
 
 def _digests(state: RecordDict) -> list[str]:
     """Return the digests of a client's own networks that the server was told, the last one first."""
     return [each.tobytes().hex() for each in read_arrays(state, OWN_DIGESTS).values()] if OWN_DIGESTS in state else []
-
-
-def _parse(data: bytes) -> RecordDict:
-    return recorddict_from_proto(ProtoRecordDict.FromString(data))
-
-
-def _serialise(records: RecordDict) -> bytes:
-    return recorddict_to_proto(records).SerializeToString()
