@@ -16,13 +16,13 @@ from cryptography import x509
 
 from flcav.config import InputError
 from flcav.federation.acceptance import Expected, extra_forms
-from flcav.federation.checks import check_federation, check_weights
+from flcav.federation.checks import check_federation
 from flcav.federation.client import ClientAgreement, kept_records
 from flcav.federation.exchange import Attendance, ClientFailed, Exchange, Intake, OpenRound
 from flcav.federation.links.link import Ask, Link, Runtime, open_link
 from flcav.federation.links.metered import Account, open_account
 from flcav.federation.modes import buffered, drawn, masked, plain
-from flcav.federation.modes.buffered import Buffering, Buffers, afford_buffers, fill_in_turns, is_spent
+from flcav.federation.modes.buffered import Buffering, Buffers, afford_buffers, fill_in_turns
 from flcav.federation.privacy import (
     account_epsilon,
     affordable_rounds,
@@ -41,7 +41,15 @@ from flcav.federation.strategies.fedavg import NoShares
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Exchanges, Stateful
-from flcav.federation.trainable import Distiller, LocalUpdate, Trainable, Weights, forms_of, learned_names
+from flcav.federation.trainable import (
+    Distiller,
+    LocalUpdate,
+    Trainable,
+    Weights,
+    check_weights,
+    forms_of,
+    learned_names,
+)
 from flcav.federation.wire import LocalWork
 from flcav.statistics.streams import derive_seed
 
@@ -247,7 +255,7 @@ def _is_over(state: FederationState, rules: Rules) -> bool:
     """Return whether a federation ends before its last round: over a budget, or since too many rounds were empty."""
     most = rules.empty_rounds
     empty = most is not None and len(state.records) >= most and all(each.empty for each in state.records[-most:])
-    return empty or is_spent(state)
+    return empty or state.spent
 
 
 def _imitate(distiller: Distiller, strategy: Strategy, network: Weights, outputs: Weights, work: LocalWork) -> Weights:

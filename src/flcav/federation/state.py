@@ -57,6 +57,7 @@ ClientStates = dict[str, dict[str, Arrays]]  # by client and kind
 ReadStates = Callable[[Iterable[str]], ClientStates]  # of what clients keep, by kind
 
 SERVER, CLIENT, PERSONAL = "server", "client", "personal"
+UNSENT = "over the budget, not sent"  # why an update is not there that its client kept
 FAILED = "failed or lost"  # begins what is told of clients without an update
 LONGEST = 500  # characters of a client's words that are told
 
@@ -133,3 +134,8 @@ class FederationState:
                 client, kind, name = rest.split("|", 2)
                 self.clients.setdefault(client, {}).setdefault(kind, {})[name] = array
         self.records = [*records]
+
+    @property
+    def spent(self) -> bool:
+        """Return whether an update of the last round was not sent, since it would have exceeded a budget."""
+        return bool(self.records) and UNSENT in self.records[-1].failed.values()

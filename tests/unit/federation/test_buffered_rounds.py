@@ -13,11 +13,11 @@ from flcav.federation.links.in_process import update_bytes
 from flcav.federation.links.metered import Account
 from flcav.federation.links.processes import ClientProcesses
 from flcav.federation.loop import Schedule, federate
-from flcav.federation.modes.buffered import OVER_BUDGET, BrokenUpdate, Buffers, FilledBuffer, fill_in_turns
+from flcav.federation.modes.buffered import BrokenUpdate, Buffers, FilledBuffer, fill_in_turns
 from flcav.federation.privacy import Privacy, account_epsilon
 from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
-from flcav.federation.state import FederationState
+from flcav.federation.state import UNSENT, FederationState
 from flcav.federation.strategies import of_servers, strategy_named
 from flcav.federation.strategies.fedavg import FedAvg
 from flcav.federation.strategies.fedbuff import FedBuff
@@ -145,7 +145,7 @@ def test_an_update_over_the_budget_is_not_sent_and_ends_the_federation():
     assert rounds == [1, 2]
     assert [len(record.clients) for record in state.records] == [2, 1]
     (late,) = state.records[-1].failed.items()
-    assert late[1] == OVER_BUDGET
+    assert late[1] == UNSENT
     assert late[0] not in {entry.client for entry in ups if entry.round == 2}
     before = book.entries
     assert same(federate(clients, found.weights, SCHEDULE, account(book), **how, done=2).weights, found.weights)

@@ -18,14 +18,13 @@ from flcav.federation.exchange import Attendance, Exchange, Intake, OpenRound
 from flcav.federation.links.metered import Account
 from flcav.federation.privacy import Privacy, account_epsilon
 from flcav.federation.selection import Selection
-from flcav.federation.state import Arrays, FederationState
+from flcav.federation.state import UNSENT, Arrays
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.trainable import Weights
 from flcav.federation.wire import ARRAYS, CONFIG, LocalWork, to_array_record
 from flcav.network.ledger import BudgetExceeded, Direction
 
 Work = Callable[[int], LocalWork]  # local training of a round, by its number
-OVER_BUDGET = "over the budget, not sent"
 
 
 @dataclass(frozen=True)
@@ -109,11 +108,6 @@ def count_participations(records: Sequence[tuple[Sequence[str], Sequence[str]]])
     return dict(Counter(name for clients, failed in records for name in {*clients, *failed}))
 
 
-def is_spent(state: FederationState) -> bool:
-    """Return whether an update of the last round was not sent, since it would have exceeded a budget."""
-    return bool(state.records) and OVER_BUDGET in state.records[-1].failed.values()
-
-
 @dataclass(frozen=True)
 class Buffering:
     """Buffered rounds of a server: the strategy, the clock's rounds, and the ledger."""
@@ -173,7 +167,7 @@ def collect(exchange: Exchange, round_: OpenRound, buffering: Buffering, kept: A
         here.spent = True
         for name in here.chosen:
             if name not in updates.samples and name not in here.failed:
-                here.failed[name] = OVER_BUDGET
+                here.failed[name] = UNSENT
                 here.lost.add(name)
     return updates
 
