@@ -20,8 +20,8 @@ from flcav.federation.privacy import change_norm
 from flcav.federation.rules import Rules
 from flcav.federation.strategies.fedavg import BLOCK
 from flcav.federation.strategies.strategy import Exchanges, Strategy
-from flcav.federation.trainable import Forms, LocalUpdate, Weights, forms_of, learned_names
-from flcav.federation.upload import Arrays, find_change
+from flcav.federation.trainable import Arrays, Forms, LocalUpdate, Weights, forms_of, learned_names
+from flcav.federation.upload import find_change
 
 SAME = 1e-6  # relative: more than two machines differ in the norm of one change
 

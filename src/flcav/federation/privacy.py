@@ -25,11 +25,10 @@ from pydantic import Field, model_validator
 
 from flcav.config import Config, InputError
 from flcav.federation.selection import Selection
-from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.trainable import Arrays, LocalUpdate, Weights
 from flcav.federation.upload import apply_change, find_change
 from flcav.statistics.streams import stream
 
-Arrays = dict[str, NDArray[np.number]]  # by name
 ROUNDING = 1e-12  # relative: more than the sum of squares of a clipped change is off in float64
 MOST_NOISE = 1e6
 SMALLEST = 1e-12  # epsilon, and the inverse of the largest, that noise is sought for

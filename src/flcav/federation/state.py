@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.federation.privacy import Secret, draw_secret
-from flcav.federation.trainable import Weights, learned_names, statistics_names
+from flcav.federation.trainable import Arrays, Weights, learned_names, statistics_names
 from flcav.interface.wording import make_printable
 from flcav.storage.records import LEFT_OUT, WHERE_TRUE, Record
 
@@ -52,7 +52,6 @@ def _mean_distance(models: Sequence[Weights], names: Sequence[str]) -> float:
     return float(np.mean(np.linalg.norm(rows - mean, axis=1)) / (np.linalg.norm(mean) or 1.0))
 
 
-Arrays = dict[str, NDArray[np.number]]  # by name
 ClientStates = dict[str, dict[str, Arrays]]  # by client and kind
 ReadStates = Callable[[Iterable[str]], ClientStates]  # of what clients keep, by kind
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 
+Arrays = dict[str, NDArray[np.number]]  # by name
 Weights = Mapping[str, NDArray[np.number]]  # name -> array, parameters and buffers, in a fixed order
 Forms = Mapping[str, tuple[tuple[int, ...], np.dtype]]  # shape and type of arrays by name
 STATISTICS = (  # of batch normalisation, last part of a name: PyTorch's, and those of the package's own layer

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flcav.config import Config, InputError
-from flcav.federation.trainable import Forms, Weights, forms_of, learned_names
+from flcav.federation.trainable import Arrays, Forms, Weights, forms_of, learned_names
 
-Arrays = dict[str, NDArray[np.number]]  # by name
 INDICES, VALUES, SCALES = "#indices", "#values", "#scales"  # arrays of a compressed change; no parameter is called so
 LEVELS = 127  # of int8, on either side of 0
 

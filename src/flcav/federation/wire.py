@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from flcav.config import shorten
 from flcav.federation.privacy import add_noise, clip_change
 from flcav.federation.rules import Rules
-from flcav.federation.trainable import Forms, LocalUpdate, Update, Weights, forms_of, learned_names
-from flcav.federation.upload import VALUES, Arrays, apply_change, compress, compressed_forms, decompress, find_change
+from flcav.federation.trainable import Arrays, Forms, LocalUpdate, Update, Weights, forms_of, learned_names
+from flcav.federation.upload import VALUES, apply_change, compress, compressed_forms, decompress, find_change
 from flcav.statistics.streams import derive_seed
 
 ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"  # records of a message, by key

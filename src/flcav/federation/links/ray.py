@@ -19,8 +19,8 @@ from flwr.simulation import run_simulation
 
 from flcav.federation.client import PARTITION
 from flcav.federation.links.in_process import LinkGrid, NamedClients, keep_identity
-from flcav.federation.state import Arrays, ClientStates
-from flcav.federation.trainable import Trainable
+from flcav.federation.state import ClientStates
+from flcav.federation.trainable import Arrays, Trainable
 from flcav.federation.wire import METRICS, to_array_record
 from flcav.machine.actors import ray_session
 

@@ -18,9 +18,9 @@ from flcav.federation.exchange import Attendance, Exchange, Intake, OpenRound
 from flcav.federation.links.metered import Account
 from flcav.federation.privacy import Privacy, account_epsilon
 from flcav.federation.selection import Selection
-from flcav.federation.state import UNSENT, Arrays
+from flcav.federation.state import UNSENT
 from flcav.federation.strategies.fedbuff import FedBuff
-from flcav.federation.trainable import Weights
+from flcav.federation.trainable import Arrays, Weights
 from flcav.federation.wire import ARRAYS, CONFIG, LocalWork, to_array_record
 from flcav.network.ledger import BudgetExceeded, Direction
 
