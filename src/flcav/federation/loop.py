@@ -129,7 +129,7 @@ def federate(
     In each round every client trains, unless `rules` say otherwise, and `strategy` combines their updates (McMahan et
     al., AISTATS 2017, algorithm 1). To resume, pass the same strategy and rules, the weights and the number of the last
     round that `on_round` was given, and the state after it. Noise that is not seeded is drawn by secrets, which are
-    kept in `state`: without it no federation can be repeated, nor gone on with to the same weights. Under a privacy
+    kept in `state`: without it a federation cannot be repeated, nor resumed to the same weights. Under a privacy
     budget the last rounds are those that it affords; without noise it is that for all of them. Where epsilon rests on
     secret draws of clients, records and ledger do not name them. A round in which no client has samples leaves the
     weights as they are and is marked `empty`; `rules.empty_rounds` of them in a row are the last.
@@ -140,6 +140,9 @@ def federate(
         weights: of the model that the first round begins with, arrays by name.
         schedule: number of rounds, local steps, learning rates and seed.
         account: the ledger that every message is entered in, and whom the network loses; None: nobody counts.
+        options: by name, each with a default, see below.
+
+    Options:
         strategy: how updates are combined, and how clients correct their training.
         rules: who takes part, what is sent, what is kept private, and how many are needed.
         state: what server and clients keep between rounds, changed in place, with a record of every round.

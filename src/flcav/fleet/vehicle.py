@@ -157,7 +157,7 @@ def install_vehicle(
     """Install the authority's files in a vehicle's folder; raises `InputError` for a file of another kind.
 
     server: host:port of the proxy. client: module:NAME of the vehicle's own part in a federation, an `Assignment`
-    of `runtimes.vehicle_app`; "": the one that is put into its folder.
+    of federation's `links.vehicle_app`; "": the one that is put into its folder.
     """
     if client and not PLACE.fullmatch(client):
         raise InputError(f"--client {client[:80]}: a module, a colon and a name in it are wanted")
