@@ -58,7 +58,7 @@ def extra_forms(strategy: Strategy, rules: Rules, start: Weights, sent: Weights)
 def read_update(content: RecordDict, expected: Expected, told: float | None = None) -> LocalUpdate:
     """Return the update in a reply, with the client's weights for its arrays; raises `ReplyRefused`.
 
-    told: norm of its change of learned arrays, which the client has told before, and by which it was drawn.
+    told: norm of its change of learned arrays, which the client has reported before, and by which it was drawn.
     """
     rules, start, extra = expected.rules, expected.start, expected.extra
     if wire.METRICS in content:  # of a client without samples the rest may be missing

@@ -21,7 +21,7 @@ from flcav.federation.selection import Selection
 
 ANSWERED = "answered"  # record of a node's state
 UPDATE = "update"  # asked for where nothing else is
-NOTHING = bytes(32)  # in the place of a digest
+NOTHING = bytes(32)  # in the place of a digest, before the first request
 MOST_ROUNDS = 10**6  # that a budget is looked up for
 
 

@@ -34,7 +34,7 @@ class Attendance:
 
     asked: list[str] = field(default_factory=list)  # for anything
     chosen: list[str] = field(default_factory=list)  # to send an update, also those that are away
-    away: Mapping[str, str] = field(default_factory=dict)  # who takes no part: by client why it is not there at first
+    away: Mapping[str, str] = field(default_factory=dict)  # clients that are not there at first, with the reason
     failed: dict[str, str] = field(default_factory=dict)  # by client what was wrong
     lost: set[str] = field(default_factory=set)  # those of them whom the network lost
     idle: set[str] = field(default_factory=set)  # those of them without samples, or with no weight for the strategy

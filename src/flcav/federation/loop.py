@@ -139,7 +139,7 @@ def federate(
             strategy needs.
         weights: of the model that the first round begins with, arrays by name.
         schedule: number of rounds, local steps, learning rates and seed.
-        account: the ledger that every message is entered in, and whom the network loses; None: nobody counts.
+        account: the ledger that every message is entered in, and the clients that the network loses; None: no budget.
         options: by name, each with a default, see below.
 
     Options:
@@ -279,21 +279,24 @@ class FederationServer(Exchange):
     state: FederationState  # changed in place
     earlier: int = 0  # rounds of federations before
     centre: Weights | None = None  # that clients are pulled to
-    away: Callable[[int], Mapping[str, str]] = lambda _: {}  # by client why it is not there when a round begins
+    away: Callable[[int], Mapping[str, str]] = lambda _: {}  # clients away when a round begins, with the reason
     buffering: Buffering | None = None  # of a strategy whose rounds are buffers
     authority: x509.Certificate | None = None  # of the clients' fleet
 
     def run_round(self, number: int, start: Weights) -> Weights:
         """Return the weights after round `number`, which begins with `start`; a record is added to the state.
 
-        Where fewer clients are left than the strategy needs, or the network lost clients and fewer are left than secure
-        aggregation needs, or where fewer take part than secure aggregation or `least_clients` asks for and none failed,
-        or where clients revealed shares that leave no way to the sum, the weights stay as they were, and the record
-        names those who were chosen as failed, with the reason; where nobody was drawn it names nobody. So it is where
-        clients have no samples, or no weight for the strategy, and nobody is left. Raises
-        `ClientFailed` where fewer clients than are wanted sent a usable update, or where fewer take part than are
-        wanted and clients failed to report, `TooFewClients` where so few are left for secure aggregation, `InputError`
-        where the strategy refuses the updates or returns arrays of other names, shapes or types.
+        The weights stay as they were, and the record names those who were chosen as failed, with the reason, where
+
+        - fewer clients are left than the strategy needs,
+        - the network lost clients, and fewer are left than secure aggregation needs,
+        - fewer take part than secure aggregation or `least_clients` asks for, and none failed,
+        - clients revealed shares by which the sum cannot be unmasked,
+        - no client with samples, and with a weight for the strategy, is left, or none was drawn.
+
+        Raises `ClientFailed` where fewer clients than are wanted sent a usable update, or where fewer take part than
+        are wanted and clients failed to report, `TooFewClients` where so few are left for secure aggregation,
+        `InputError` where the strategy refuses the updates or returns arrays of other names, shapes or types.
         """
         round_ = self._call(number, start)  # who takes part
         updates = self._collect(round_)  # what is sent, and checked as it arrives

@@ -57,8 +57,8 @@ ReadStates = Callable[[Iterable[str]], ClientStates]  # of what clients keep, by
 
 SERVER, CLIENT, PERSONAL = "server", "client", "personal"
 UNSENT = "over the budget, not sent"  # why an update is not there that its client kept
-FAILED = "failed or lost"  # begins what is told of clients without an update
-LONGEST = 500  # characters of a client's words that are told
+FAILED = "failed or lost"  # begins the list of clients without an update
+LONGEST = 500  # characters of a client's words that are shown
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class RoundRecord(Record):
     clients: tuple[str, ...]  # whose updates were combined, by name
     failed: Mapping[str, str] = field(default_factory=dict)  # by client what was wrong
     epsilon: float | None = None  # of differential privacy, of all rounds so far; None: without noise
-    loss: float | None = None  # mean training loss, weighted by samples; None: of nobody that is known
+    loss: float | None = None  # mean training loss, weighted by samples; None: no client reported one
     samples: int = 0  # of the clients together
     divergence: Annotated[RoundDivergence | None, LEFT_OUT] = None  # of the regions; None: no cloud round of several
     empty: Annotated[bool, WHERE_TRUE] = False  # no update, since clients had no samples: the model is that of before

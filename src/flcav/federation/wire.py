@@ -107,7 +107,7 @@ def _header(shape: tuple[int, ...], dtype: np.dtype, fortran_order: bool) -> byt
 
 
 def to_numpy(array: Array) -> np.ndarray:
-    """Return the numbers of a Flower array, whoever sent it: what `array.numpy()` does, for arrays of numbers.
+    """Return the numbers of a Flower array from any sender: what `array.numpy()` does, for arrays of numbers.
 
     The header of NumPy's file format is not parsed but compared with the one of the array's declared shape and type,
     whose size must be that of the data: so nothing is allocated that was not received. Raises TypeError for another

@@ -1,7 +1,7 @@
 """The authority of a fleet: it certifies the keys of vehicles and servers (X.509), in a folder on the operator's host.
 
-A folder has `ca.crt` and `ca.key`, the registry `registry.sqlite`, and the keys of the servers and of whoever signs
-apps. Only the authority's public certificate leaves it.
+A folder has `ca.crt` and `ca.key`, the registry `registry.sqlite`, and the keys of the servers and of the publisher who
+signs apps. Only the authority's public certificate leaves it.
 """
 
 from dataclasses import dataclass

@@ -63,7 +63,7 @@ def run_forwarder(folder: Path, port: int, server: str) -> None:
 def send_request(folder: Path, server: str, request: FLRequest) -> None:
     """Send a request of the vehicle in `folder` to the proxy at `server` (host:port).
 
-    Raises `InputError` where it is refused, `OSError` where nobody is there.
+    Raises `InputError` where it is refused, `OSError` where the proxy cannot be reached.
     """
     try:
         told = httpx.post(

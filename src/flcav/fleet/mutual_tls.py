@@ -4,7 +4,7 @@
 read where they cross: the kernel counts those of a TCP socket (TCP_INFO, Linux), TLS records included.
 
 A connection that has sent no whole request is closed after some seconds, and where there are too many, the oldest of
-whoever has most gives way: so a crowd of idle connections keeps nobody else out.
+the client with most gives way: so a crowd of idle connections keeps nobody else out.
 """
 
 import asyncio
@@ -65,7 +65,7 @@ class ClientConnection:
 
 
 def find_superfluous(owners: Mapping[Key, Hashable], of_each: int, most: int) -> Key | None:
-    """Return the connection that is to give way: the oldest of whoever has most; None where there are not too many.
+    """Return the connection that is to give way: the oldest of the client with most; None where there are not too many.
 
     owners: of the connections, the oldest first. of_each: connections that one of them may have. most: of all.
     """
@@ -181,7 +181,7 @@ class DoorServer(uvicorn.Server):
         self._door = door
 
     def run(self, sockets: list[socket.socket] | None = None) -> None:
-        """Serve until the process is told to end."""
+        """Serve until the process gets a signal to end."""
         super().run([self._door, *(sockets or [])])
 
 

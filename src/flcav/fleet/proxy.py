@@ -78,7 +78,7 @@ class FleetProxy:
                 await self._answer(vehicle, scope, receive, soon)
             except relay.CallRefused as refused:
                 await self._refuse(soon, refused.status, caller, refused.why)
-        except TimeoutError:  # whoever does not read
+        except TimeoutError:  # the client does not read its answer
             connection.abort()
 
     async def _answer(self, vehicle: RegisteredVehicle, scope: Scope, receive: Receive, send: Send) -> None:
@@ -113,7 +113,7 @@ class FleetProxy:
         self._changed = True
 
     def find(self, certificate: bytes | None) -> RegisteredVehicle:
-        """Return the vehicle whose certificate (DER) is in force; raises `CallRefused` where it is nobody's.
+        """Return the vehicle whose certificate (DER) is in force; raises `CallRefused` where there is none.
 
         The registry is opened anew where its file is another one, or it could not be read.
         """
@@ -203,7 +203,7 @@ class FleetProxy:
 def find_caller(
     registry: VehicleRegistry, certificate: bytes | None, now: float | None = None
 ) -> RegisteredVehicle | str:
-    """Return the vehicle whose certificate (DER) is in force, or in words why nobody's is."""
+    """Return the vehicle whose certificate (DER) is in force, or in words why there is none."""
     if certificate is None:
         return "a certificate is wanted"
     found = registry.find(hashlib.sha256(certificate).hexdigest())

@@ -205,7 +205,7 @@ class VehicleRegistry:
             self._note(cursor, "enrol" if node is not None else "strike", name, fingerprint, "")
 
     def find(self, fingerprint: str) -> RegisteredVehicle | None:
-        """Return whose certificate has this SHA-256 fingerprint; None: nobody's here."""
+        """Return the vehicle whose certificate has this SHA-256 fingerprint; None: it is not registered."""
         found = [*self._select("WHERE fingerprint = ?", (fingerprint,))]
         return found[0] if found else None
 

@@ -22,7 +22,7 @@ from flcav.storage.files import write_bytes
 from flcav.storage.records import LEFT_OUT, WHERE_TRUE, Record
 
 SHOWN = 20  # of requests and refusals, the latest
-LEAST_ROOM = 1_000_000  # bytes on the fleet's disk below which is said so
+LEAST_ROOM = 1_000_000  # bytes on the fleet's disk below which the status warns
 PROGRESS = "federation.json"  # in the fleet's folder, written by the server of a federation
 
 
@@ -36,7 +36,7 @@ class RoundProgress(Record):
 
     round: int
     time: float  # when it ended [s since 1970]
-    clients: int  # whose updates were combined; 0 where nobody is to know who was drawn
+    clients: int  # whose updates were combined; 0 where the draw of clients is secret
     failed: Mapping[str, str] = field(default_factory=dict)  # by client what was wrong
     loss: float | None = None
     epsilon: float | None = None  # of all rounds so far

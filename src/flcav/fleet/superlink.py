@@ -3,7 +3,7 @@
 Uses private parts of Flower (pinned to 1.42): the clients of its control and runtime interfaces, and its table of app
 bundles; so do `vehicle`, for its node and executor, and federation's `links.vehicle_app` and `links.in_process`, for
 messages.
-The control side asks nobody for a credential, so the SuperLink listens on the loopback of the operator's host; the
+The control side wants no credential, so the SuperLink listens on the loopback of the operator's host; the
 secret of the executor is in a file that its owner alone can read.
 """
 

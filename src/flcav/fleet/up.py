@@ -29,7 +29,7 @@ from flcav.interface.wording import plural
 from flcav.storage.files import write_bytes, write_json
 
 READY, VEHICLES, LOCK = "ready.json", "vehicles", "up.lock"
-SILENT_S = 60.0  # after which is said that something is wrong
+SILENT_S = 60.0  # without an answer of the SuperLink, after which a warning is printed
 CHECK_S = 1.0  # between looks at the registry
 MOST_VEHICLES = 64  # on this machine
 
@@ -108,7 +108,7 @@ def run_fleet(
     report: Callable[[str], None],
     others: Mapping[str, Callable[[Path], None]] = {},
 ) -> None:
-    """Run a fleet until this process is told to end; see `prepare_fleet`.
+    """Run a fleet until this process gets a signal to end; see `prepare_fleet`.
 
     prepare: of the vehicles' executors. report: called with a sentence when the fleet is up. others: further processes
     of each vehicle, by name.
@@ -147,7 +147,7 @@ def run_fleet(
 
 
 def run_vehicle(folder: Path, prepare: Prepare, others: Mapping[str, Callable[[Path], None]] = {}) -> None:
-    """Run the vehicle in `folder`, with `others` of its processes, until this process is told to end.
+    """Run the vehicle in `folder`, with `others` of its processes, until a signal ends it.
 
     Raises `InputError` where the vehicle's certificate is not in force.
     """

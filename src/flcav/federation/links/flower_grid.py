@@ -104,7 +104,7 @@ class DeployedGrid(LinkGrid):
             told.save(self._folder)
 
     def _wait_for(self, exchange: "_Exchange", node: int, reason: str) -> None:
-        """Ask a node again later, and tell why."""
+        """Ask a node again later, and report why."""
         exchange.lost(node)
         name = self.names[node]
         if self._waits.get(name) != reason:

@@ -1,7 +1,7 @@
 """Links of a federation's server to its clients, by runtime: this process, client processes, Ray, or a deployed fleet.
 
 What crosses a link is lost where the network loses it, held to the budget where it leaves, and entered in the ledger.
-Questions beside training are asked over it, too; whoever asks enters the answers that count.
+Questions outside training go over it, too; the caller enters the answers that count in the ledger.
 """
 
 import contextlib

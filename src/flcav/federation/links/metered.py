@@ -11,7 +11,7 @@ from flcav.federation.wire import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
 from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link, LinkMegabytes
 
 UNDISCLOSED = "undisclosed"  # in the place of a client's name
-UNLIMITED_MB = 1e12  # budget of whoever does not count
+UNLIMITED_MB = 1e12  # budget of a federation whose bytes nobody limits
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class Account:
     link: Link  # wireless or wireline
     outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by round and client
     within: frozenset[str] = frozenset()  # clients in the server itself, whose messages cross no link
-    concealed: bool = False  # whether nobody is to know who was drawn: entries have a client's region alone
+    concealed: bool = False  # whether it stays secret who was drawn: entries have a client's region alone
 
     def find_away(self, round_: int) -> dict[str, str]:
-        """Return by client why it is not there when a round begins: all that take no part in it."""
+        """Return the clients that are away when a round begins and take no part in it, each with the reason."""
         lost = self.outages.items()
         return {name: each.reason for (number, name), each in lost if number == round_ and each.sent_bytes is None}
 

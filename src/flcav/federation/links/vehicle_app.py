@@ -1,7 +1,7 @@
 """The app of a deployed vehicle: the client app of `federation.client`, with the assignment in the vehicle's folder.
 
 Every message may find another process, and Flower's node forgets all when it is killed. So what the client keeps is in
-the vehicle's folder, with its last answer: where the same request comes again, after a stop of whoever was on the way,
+the vehicle's folder, with its last answer: where the same request comes again, after a process on its way was stopped,
 the same answer goes out, and nothing is trained or spent twice.
 """
 
@@ -164,7 +164,7 @@ class VehicleApp(ClientApp):
         return digest, state, answer
 
     def _keep_network(self, state: RecordDict, told: list[str]) -> None:
-        """Write the client's own network, whose digest the server is told, for later federations that go on with it.
+        """Write the client's network, of which the server gets the digest, for later federations that resume with it.
 
         told: digests before. Of those the last one is kept, too: the server may be stopped before it has a checkpoint.
         """
@@ -179,5 +179,5 @@ class VehicleApp(ClientApp):
 
 
 def _digests(state: RecordDict) -> list[str]:
-    """Return the digests of a client's own networks that the server was told, the last one first."""
+    """Return the digests of a client's networks that the server has got, the last one first."""
     return [each.tobytes().hex() for each in read_arrays(state, OWN_DIGESTS).values()] if OWN_DIGESTS in state else []

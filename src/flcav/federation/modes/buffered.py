@@ -66,7 +66,7 @@ class Buffers:
 
     @property
     def least_before(self) -> int:
-        """Return how often each client at least took part in federations before: 0 where one is not known."""
+        """Return the least number of updates that a client sent in federations before; 0 where none is known."""
         return min(self.before.values(), default=0)
 
 

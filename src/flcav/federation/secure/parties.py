@@ -112,10 +112,10 @@ class SecureClient:
 
     def mask(self, update: Vector) -> Vector:
         """Return the update with its masks: its own, and those in common with the clients whose shares it has."""
-        total = update + expand(self.seed, len(update))
+        total = update + expand(self.seed, len(update))  # its own mask, whose seed is shared with all others
         for name in self.opened:
             common = agree(self.private, self.peers[name].mask, "mask")
-            total = add_mask(total, common, self.name < name)
+            total = add_mask(total, common, self.name < name)  # of each pair one adds and one subtracts it
         return total
 
     def reveal(self, survivors: Sequence[str], dropped: Sequence[str]) -> dict[str, bytes]:
@@ -169,7 +169,7 @@ def unmask_sum(
 
     for name in survivors:
         total = add_mask(total, joined(name), plus=False)
-    for name in dropped:
+    for name in dropped:  # the masks that survivors have in common with it have no counterpart in the sum
         private = joined(name)
         if public_key(private) != keys[name].mask:
             raise SumLost(f"{name} dropped out, and had shared a key that is not its own")

@@ -97,7 +97,7 @@ MOST_TRIED = 256  # sets of shares
 
 
 def split_secret(secret: bytes, threshold: int, shares: int) -> list[bytes]:
-    """Return `shares` shares of a secret, of which any `threshold` determine it and fewer tell nothing.
+    """Return `shares` shares of a secret, of which any `threshold` determine it and fewer reveal nothing.
 
     The share of place i (from 0) is the value at i + 1 of a random polynomial of degree threshold - 1 whose value at 0
     is the secret.

@@ -68,7 +68,7 @@ def roll_out(
         fleet: folder of the fleet's authority.
         provider: folder of the provider, whose published repository is offered.
         customer: that of the customer.
-        keys: private keys of the customer, as many as its targets want, so that a stop waits for nobody.
+        keys: private keys of the customer, as many as its targets want, so that a stop can be signed at once.
         ledger: where every downlink is entered; None: nowhere.
         share: of the fleet, to begin with; None: as the customer has signed it, or more for two canaries.
         data: dataset whose drives stand for what the vehicles of this machine meet; None: as before.

@@ -2,7 +2,7 @@
 
 In a shadow run a vehicle runs the candidate on the frames that it drives with, and its detections are compared with
 those of the network that drives. A roll-back is a release with a number of its own: earlier weights under a number that
-rises, so that no vehicle ever takes an older number, whoever signs it.
+rises, so that no vehicle ever takes an older number, even a signed one.
 """
 
 import shutil

@@ -331,7 +331,7 @@ def _is_finite(boxes: Boxes) -> bool:
 
 
 def _frames(effect: float, error: float, frames: int, scenes: int) -> int:
-    """Return the number of frames that tell an effect; 0 where no number does."""
+    """Return the number of frames by which an effect is significant at `LEVEL`; 0 where no number is enough."""
     enough = plan_scenes(effect, error, scenes, LEVEL)
     return 0 if enough is None else int(np.ceil(enough * frames / scenes))
 
