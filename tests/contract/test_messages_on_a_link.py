@@ -115,7 +115,7 @@ def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
     found = Wire()
     monkeypatch.setattr(messages, "carry", found.carry)
     monkeypatch.setattr(
-        links, "MeteredGrid", lambda grid, account, names: MeteredGrid(WiredGrid(grid, found), account, names)
+        links, "MeteredGrid", lambda grid, account, names: WiredGrid(MeteredGrid(grid, account, names), found)
     )
     return found
 
