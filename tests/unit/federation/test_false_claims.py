@@ -9,9 +9,9 @@ from flwr.app import Array, ConfigRecord, RecordDict
 
 from flcav.config import InputError
 from flcav.federation.acceptance import ReplyRefused
-from flcav.federation.secure.messages import ASK, CIPHERS, MASKS, NAMES, SHARES, read_keys, read_shares
+from flcav.federation.secure.messages import read_keys, read_shares
 from flcav.federation.secure.parties import SecureClient
-from flcav.federation.wire import to_numpy
+from flcav.federation.wire import ASK, CIPHERS, MASKS, NAMES, SHARES, to_numpy
 from flcav.fleet.authority import AUTHORITY, REGISTRY, found_authority
 from flcav.fleet.proxy import RELEASES, answer_release
 from flcav.fleet.relay import CallRefused
