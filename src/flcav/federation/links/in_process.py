@@ -181,7 +181,11 @@ class EmbeddedGrid(LinkGrid):
         self._app, self._at_once = app, at_once
         self.names = dict(enumerate(names, FIRST_NODE))
         nodes = {name: node for node, name in self.names.items()}
-        self._states = {nodes[name]: _node_state(own) for name, own in states.items() if name in nodes}
+        self._states = {
+            nodes[name]: RecordDict({key: to_array_record(arrays) for key, arrays in own.items()})
+            for name, own in states.items()
+            if name in nodes
+        }
         self._sent = 0
         self._identity = _server_identity()
 
@@ -246,10 +250,6 @@ class EmbeddedGrid(LinkGrid):
             finally:
                 for each in under_way:
                     each.cancel()
-
-
-def _node_state(arrays: Mapping[str, Weights]) -> RecordDict:
-    return RecordDict({key: to_array_record(weights) for key, weights in arrays.items()})
 
 
 def _copied(record):

@@ -232,10 +232,6 @@ def _number(value: Any) -> int:
     return int(value)
 
 
-def _bytes(value: Any) -> bytes:
-    return bytes(value)
-
-
 def read_keys(content: RecordDict) -> SignedKeys:
     """Return a client's public keys of a round, with a certificate and a signature that are not checked here.
 

@@ -54,11 +54,9 @@ def check_mixing(mixing: Mixing, clients: int) -> None:
 
 def flatten_updates(updates: Sequence[Update], names: Sequence[str]) -> NDArray[np.float64]:
     """Return the arrays `names` of each update, one after another (updates, coordinates)."""
-    return np.stack([_flatten(update.weights, names) for update in updates])
-
-
-def _flatten(weights: Weights, names: Sequence[str]) -> NDArray[np.float64]:
-    return np.concatenate([weights[name].astype(np.float64).ravel() for name in names])
+    return np.stack(
+        [np.concatenate([update.weights[name].astype(np.float64).ravel() for name in names]) for update in updates]
+    )
 
 
 def combine_coordinates(
