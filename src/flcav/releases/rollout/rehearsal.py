@@ -206,8 +206,8 @@ class _Rehearsal:
         sources = self.parties.sources()
         arrivals = update_over_radio(self.fleet, lacking, number, self.radio, sources, self.ledger, fetched)
         reached = sum(self.fleet.installed(name).release == release for name in assigned)
-        moved = (now - then for now, then in zip(self._megabytes(), before, strict=True))
-        return release, share, len(assigned), reached, tuple(arrivals), *moved
+        after = self._megabytes()
+        return release, share, len(assigned), reached, tuple(arrivals), after[0] - before[0], after[1] - before[1]
 
     def _megabytes(self) -> tuple[float, float]:
         """Return what went down so far, over wireless and over wireline [MB]."""
