@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import ClientProcesses
+from flcav.federation.links.metered import Account
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.trainable import Update, Weights
 from flcav.machine.threads import use_threads

@@ -15,8 +15,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.task import build_network

@@ -26,16 +26,16 @@ from flwr.proto.fleet_pb2 import PullMessagesRequest
 from flwr.proto.message_pb2 import PushObjectRequest
 from flwr.proto.node_pb2 import Node
 
-from flcav.federation.fleet.authority import found_authority, open_registry
-from flcav.federation.fleet.forwarder import vehicle_tls
-from flcav.federation.fleet.keys import AUTHORITY, KEY, LOOPBACK, load_key, request_certificate
-from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.fleet.up import VEHICLES
-from flcav.federation.fleet.vehicle import load_settings
-from flcav.federation.messages.records import to_arrays
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.deployed import Deployment, start_fleet
+from flcav.federation.links.flower import Deployment, start_fleet
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
+from flcav.federation.wire import to_array_record
+from flcav.fleet.authority import found_authority, open_registry
+from flcav.fleet.forwarder import vehicle_tls
+from flcav.fleet.keys import AUTHORITY, KEY, LOOPBACK, load_key, request_certificate
+from flcav.fleet.supervisor import read_processes
+from flcav.fleet.up import VEHICLES
+from flcav.fleet.vehicle import load_settings
 
 REGISTERED, CALLS, ROUNDS = 10_000, 30, 6
 MEGABYTES = 4.0  # of the model
@@ -64,12 +64,12 @@ def measure_registry(folder: Path) -> None:
     """Print what a register, a revoke and a list take as the registry grows to `REGISTERED` vehicles."""
     authority = found_authority(folder / "fleet")
     requests = [request_certificate(folder / f"{number}", f"v{number:05d}") for number in range(50)]
-    from flcav.federation.fleet.registry import Vehicle
+    from flcav.fleet.registry import RegisteredVehicle
 
     end = int(time.time()) + 10**6
     with authority.registry._change() as cursor:
         for number in range(REGISTERED - 50):
-            own = Vehicle(f"w{number:05d}", f"{number:064x}", number.to_bytes(8, "big"), 0, end)
+            own = RegisteredVehicle(f"w{number:05d}", f"{number:064x}", number.to_bytes(8, "big"), 0, end)
             authority.registry._insert(cursor, own, "register")
     waiting = iter(requests)
     print(f"register one of {REGISTERED}: {1e3 * seconds(lambda: authority.register(next(waiting)), 50):.1f} ms")
@@ -142,10 +142,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         measure_registry(Path(folder))
     weights = {"w": np.random.default_rng(0).normal(size=int(MEGABYTES * 1e6 / 4)).astype(np.float32)}
-    record = RecordDict({"arrays": to_arrays(weights)})
+    record = RecordDict({"arrays": to_array_record(weights)})
     turn = lambda: recorddict_from_proto(recorddict_to_proto(record))  # noqa: E731
     print(f"serialise {MEGABYTES:g} MB and read it: {1e3 * seconds(turn, 5):.0f} ms")
-    start = [sys.executable, "-c", "import flcav.federation.runtimes.vehicle_app, flwr.supernode.runtime.run_clientapp"]
+    start = [sys.executable, "-c", "import flcav.federation.links.vehicle_app, flwr.supernode.runtime.run_clientapp"]
     took = seconds(lambda: subprocess.run(start, check=True), 3)
     print(f"a process of Flower's for a message, without torch: {took:.1f} s")
     with start_fleet(1) as deployment:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flcav.federation.fleet.supervisor import LOGS, read_processes
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.deployed import start_fleet
+from flcav.federation.links.flower import start_fleet
+from flcav.federation.loop import Schedule, federate
+from flcav.fleet.supervisor import LOGS, read_processes
 from flcav.storage.markdown import format_table
 
 WEIGHTS = 250_000  # numbers of the model, of 4 bytes

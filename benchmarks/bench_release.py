@@ -18,13 +18,11 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
-from flcav.releases.candidates.candidate import CANDIDATE, CARD_KEY, WEIGHTS, Candidate, hash_card
-from flcav.releases.repositories.creation import create_repository
-from flcav.releases.repositories.directive import MILLION, Directive
-from flcav.releases.repositories.metadata import read_root
-from flcav.releases.repositories.repository import publish, stage_release
-from flcav.releases.vehicles.checking import Refused, Sources, check_release, open_sources, trust_roots
-from flcav.releases.vehicles.installation import CURRENT, read_installed, update_vehicle
+from flcav.releases.candidate import CANDIDATE, CARD_KEY, WEIGHTS, Candidate, hash_card
+from flcav.releases.checking import ReleaseRefused, RepositorySources, check_release, open_sources, trust_roots
+from flcav.releases.installation import CURRENT, read_installed, update_vehicle
+from flcav.releases.repositories.metadata import MILLION, Directive, read_root
+from flcav.releases.repositories.repository import create_repository, publish, stage_release
 from flcav.storage.files import sha256
 
 
@@ -57,7 +55,7 @@ def release(parties: Path, candidate: Path, number: int) -> None:
         publish(parties / party)
 
 
-def start_update(folder: Path, name: str, sources: Sources) -> int:
+def start_update(folder: Path, name: str, sources: RepositorySources) -> int:
     """Start the update of a vehicle in a process of its own, and return its number."""
     process = os.fork()
     if process:
@@ -97,7 +95,7 @@ def main() -> None:
         shutil.rmtree(out)
 
 
-def measure_checks(car: Path, sources: Sources, times: int) -> None:
+def measure_checks(car: Path, sources: RepositorySources, times: int) -> None:
     """Print how long a vehicle checks a release that it has not installed: metadata of both parties, anew."""
     walls, cpus = [], []
     for _ in range(times):
@@ -110,7 +108,7 @@ def measure_checks(car: Path, sources: Sources, times: int) -> None:
     print(f"check: median {np.median(walls):.1f} ms (CPU {np.median(cpus):.1f} ms), 95 % below {most:.1f} ms")
 
 
-def update_fleet(out: Path, sources: Sources, vehicles: int, kills: int, signed: set[str]) -> None:
+def update_fleet(out: Path, sources: RepositorySources, vehicles: int, kills: int, signed: set[str]) -> None:
     """Update the fleet, kill updates until `kills` were hit, restart these, and print what drives before and after."""
     rng = np.random.default_rng(0)
     first, began = out / "fleet" / "0", time.perf_counter()
@@ -133,7 +131,7 @@ def update_fleet(out: Path, sources: Sources, vehicles: int, kills: int, signed:
 
 
 def start_and_wait(
-    out: Path, first: Path, sources: Sources, name: str, kill_after_s: float | None
+    out: Path, first: Path, sources: RepositorySources, name: str, kill_after_s: float | None
 ) -> tuple[Path, int, float]:
     """Return the folder of a vehicle that updated, or was killed, how its process ended, and after what time [s]."""
     folder = out / "fleet" / name
@@ -150,7 +148,7 @@ def is_signed(folder: Path, signed: set[str]) -> bool:
     """Return whether the network that drives is one that both parties signed, by its own bytes."""
     try:
         installed = read_installed(folder)
-    except Refused:
+    except ReleaseRefused:
         return False
     return installed is not None and installed.weights in signed
 

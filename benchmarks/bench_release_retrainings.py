@@ -27,8 +27,8 @@ from flcav.perception.objects.model import Second, pillars_config, second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.training.loop import train
 from flcav.perception.weights import load_network
-from flcav.releases.candidates.candidate import read_candidate
-from flcav.releases.candidates.proposal import propose
+from flcav.releases.candidate import read_candidate
+from flcav.releases.proposal import propose
 from flcav.releases.verification.testing import choose_test_frames, run_tests
 from flcav.releases.verification.verify import verify
 from flcav.sources.embedded import EmbeddedSource

@@ -41,9 +41,8 @@ from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.training.loop import train
 from flcav.perception.weights import load_network, save_network
-from flcav.releases.candidates.proposal import propose
-from flcav.releases.verification.conditions import CONDITIONS, PLAIN
-from flcav.releases.verification.testing import choose_test_frames, run_tests
+from flcav.releases.proposal import propose
+from flcav.releases.verification.testing import CONDITIONS, PLAIN, choose_test_frames, run_tests
 from flcav.releases.verification.verify import verify
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

@@ -30,11 +30,14 @@ LIMIT_S = 600.0  # of the tests of a mutant, after which it counts as killed: it
 FEDERATION = "tests/unit/federation"
 FLEET = [f"{FEDERATION}/test_fleet_*.py", f"{FEDERATION}/test_vehicle_app.py", f"{FEDERATION}/test_deadline.py"]
 PACKAGES: dict[str, tuple[list[str], list[str]]] = {  # name: (sources, tests)
-    "messages": (["federation/messages"], [FEDERATION, "tests/contract/test_strategies.py"]),
-    "secure": (["federation/secure", "federation/masked_rounds.py"], [FEDERATION]),
-    "fleet": (["federation/fleet"], FLEET),
-    "runtimes": (["federation/runtimes"], [FEDERATION]),
-    "privacy": (["federation/privacy.py", "federation/noise.py"], [FEDERATION]),
+    "messages": (
+        ["federation/wire.py", "federation/acceptance.py", "federation/conduct.py"],
+        [FEDERATION, "tests/contract/test_strategies.py"],
+    ),
+    "secure": (["federation/secure", "federation/modes/masked.py"], [FEDERATION]),
+    "fleet": (["fleet"], FLEET),
+    "links": (["federation/links"], [FEDERATION]),
+    "privacy": (["federation/privacy.py"], [FEDERATION]),
     "releases": (["releases"], ["tests/unit/releases"]),
     "carla": (["sources/carla/server"], ["tests/unit/sources/carla_server", "tests/integration/test_carla_server.py"]),
     "driving": (

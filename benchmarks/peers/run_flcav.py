@@ -9,10 +9,10 @@ import torch
 from torch import nn
 from work import COHORT, POINTS, RATE, USERS, Turns, build, train
 
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.metered import Account
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes

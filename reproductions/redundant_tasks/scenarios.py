@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from flcav.config import InputError, Json
 from flcav.dataset.store import Dataset
 from flcav.experiments.study import open_split
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes
 from flcav.odd.measure import measure

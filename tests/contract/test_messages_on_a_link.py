@@ -18,11 +18,11 @@ from task_drives import Drives
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links import link as links
+from flcav.federation.links.in_process import wire_bytes
+from flcav.federation.links.metered import Account, MeteredGrid
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes import link as links
-from flcav.federation.runtimes.embedded import wire_bytes
-from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.strategies import FEDAVG, STRATEGIES, Strategy, of_servers, strategy_named
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.fusion.road import RoadView
@@ -115,7 +115,7 @@ def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
     found = Wire()
     monkeypatch.setattr(messages, "carry", found.carry)
     monkeypatch.setattr(
-        links, "MeteredGrid", lambda grid, account, names: MeteredGrid(WiredGrid(grid, found), account, names)
+        links, "MeteredGrid", lambda grid, account, names: WiredGrid(MeteredGrid(grid, account, names), found)
     )
     return found
 

@@ -8,18 +8,18 @@ import pytest
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 from pydantic import ValidationError
 
-from flcav.federation.messages.records import ARRAYS, ASK, METRICS, NORM, SHARES, VECTOR, to_arrays
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links import link as links
+from flcav.federation.links.in_process import LinkGrid
+from flcav.federation.links.metered import Account, MeteredGrid
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes import link as links
-from flcav.federation.runtimes.metered import Account, BudgetedGrid
-from flcav.federation.runtimes.wrapped import WrappedGrid
-from flcav.federation.secure.shamir import SHARE_BYTES
+from flcav.federation.secure.primitives import SHARE_BYTES
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
-from flcav.federation.strategies.median import Median
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.corrections import Scaffold
+from flcav.federation.strategies.robust import Median
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.wire import ARRAYS, ASK, METRICS, NORM, SHARES, VECTOR, to_array_record
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 START = {"w": np.zeros((4, 3), np.float32), "g": np.zeros((64, 1), np.float32), "count": np.array(2)}
@@ -46,32 +46,26 @@ class Vehicle:
         return 5
 
 
-class LyingGrid(WrappedGrid):
+class LyingGrid(LinkGrid):
     """The link of five clients, one of which lies."""
 
     def __init__(self, grid: Any, names: Mapping[int, str], liar: str, damage: Damage) -> None:
-        self._grid, self._names, self._liar, self._damage = grid, names, liar, damage
+        self._grid, self.names, self._liar, self._damage = grid, names, liar, damage
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
         for reply in self._grid.send_and_receive(messages, timeout=timeout):
-            if self._names[reply.metadata.src_node_id] == self._liar and reply.has_content():
+            if self.names[reply.metadata.src_node_id] == self._liar and reply.has_content():
                 self._damage(reply.content)
             yield reply
-
-    def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
-        return self._grid.push_messages(messages)
-
-    def pull_messages(self, message_ids: Iterable[str]) -> Iterable[Message]:
-        return self._grid.pull_messages(message_ids)
 
 
 def run(
     monkeypatch: pytest.MonkeyPatch, rules: Rules, liar: str, damage: Damage, strategy: Strategy = FEDAVG
 ) -> tuple[Weights, FederationState]:
-    def link(grid: Any, account: Account, names: Mapping[int, str]) -> LyingGrid:
-        return LyingGrid(BudgetedGrid(grid, account, names), names, liar, damage)
+    def link(grid: Any, account: Account, names: Mapping[int, str]) -> MeteredGrid:
+        return MeteredGrid(LyingGrid(grid, names, liar, damage), account, names)
 
-    monkeypatch.setattr(links, "BudgetedGrid", link)
+    monkeypatch.setattr(links, "MeteredGrid", link)
     clients, state = {f"cav{i}": Vehicle() for i in range(5)}, FederationState()
     account = Account(Ledger(LinkMegabytes(999.0, 0.0)), "edge", "toy", "wireless")
     return federate(clients, START, SCHEDULE, account, rules=rules, state=state, strategy=strategy).weights, state
@@ -129,7 +123,7 @@ def with_array(change: Callable[[str, np.ndarray], Mapping[str, Any]], where: st
             own = {name: array.numpy() for name, array in content.array_records[ARRAYS].items()}
             name = next(iter(own)) if where is None else where
             array = own.pop(name)
-            content[ARRAYS] = to_arrays({**own, **change(name, array)})
+            content[ARRAYS] = to_array_record({**own, **change(name, array)})
 
     return damage
 
@@ -160,11 +154,11 @@ ANYWHERE: Mapping[str, Damage] = {
     "deep header": with_header("-" * 5000 + "1"),
     "deep brackets": with_header("(" * 3000),
     **{f"header of {text}": with_header(declared(text)) for text in ("'|O'", "[('a', '<f4')]", "'|V0'", "'>f4'")},
-    "unknown record": with_records(extra=to_arrays({"x": np.zeros(1, np.float32)})),
+    "unknown record": with_records(extra=to_array_record({"x": np.zeros(1, np.float32)})),
     "no metrics": without(METRICS),
     "no arrays": without(ARRAYS),
     "other metrics": with_metrics(more=1),
-    "metrics as arrays": with_records(metrics=to_arrays(START)),
+    "metrics as arrays": with_records(metrics=to_array_record(START)),
     "arrays as settings": with_records(arrays=ConfigRecord({"w": 1})),
     "other shape": with_array(lambda name, array: {name: np.zeros((3, 4, 2), array.dtype)}),
     "other type": with_array(lambda name, array: {name: array.astype(np.complex128)}),
@@ -279,9 +273,9 @@ def test_arrays_beside_updates_are_judged_by_the_server_s_weights_and_not_by_the
     monkeypatch: pytest.MonkeyPatch, liar: str
 ):
     for odd in ({"w": np.ones(2)}, {"odd": np.ones((4, 3), np.float32)}, {"w": START["w"]}):
-        check(*run(monkeypatch, Rules(), liar, with_records(extra=to_arrays(odd)), Scaffold()), liar)
+        check(*run(monkeypatch, Rules(), liar, with_records(extra=to_array_record(odd)), Scaffold()), liar)
     check(*run(monkeypatch, Rules(), liar, without("extra"), Scaffold()), liar)
-    check(*run(monkeypatch, Rules(), liar, with_records(extra=to_arrays({"x": np.ones(1)})), Median()), liar)
+    check(*run(monkeypatch, Rules(), liar, with_records(extra=to_array_record({"x": np.ones(1)})), Median()), liar)
 
 
 def test_limits_of_samples_norm_and_loss_are_those_of_the_rules(monkeypatch: pytest.MonkeyPatch):

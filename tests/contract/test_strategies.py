@@ -15,10 +15,10 @@ import pytest
 import torch
 from safetensors.numpy import load, save
 
-from flcav.federation.attendance import ClientFailed
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.exchange import ClientFailed
+from flcav.federation.links.metered import Account, MeteredGrid
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account, MeteredGrid
 from flcav.federation.state import FederationState, RoundRecord
 from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy
 from flcav.federation.strategies.fedbuff import FedBuff

@@ -18,10 +18,10 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.state import FederationState
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.corrections import Scaffold
 from flcav.federation.trainable import Trainable
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.card import CARD_KEY

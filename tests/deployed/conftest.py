@@ -28,7 +28,7 @@ def importable():
 
 @pytest.fixture(scope="session")
 def deployment(importable):
-    from flcav.federation.runtimes.deployed import start_fleet
+    from flcav.federation.links.flower import start_fleet
 
     with start_fleet(VEHICLES) as found:
         yield found

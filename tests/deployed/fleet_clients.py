@@ -43,16 +43,16 @@ class Liar(Walker):
     lie: str = ""
 
     def train(self, weights, *, steps, learning_rate, seed, proximal=0.0, shift=None, centre=None, layers=()):
-        from flcav.federation import client
-        from flcav.federation.messages.records import LOST_BY_NETWORK
-        from flcav.federation.runtimes import vehicle_app
+        from flcav.federation import wire
+        from flcav.federation.links import vehicle_app
+        from flcav.federation.wire import LOST_BY_NETWORK
 
         if self.lie == "raises":
             raise OSError("no power")
-        answer, size = client.reply, vehicle_app.wire_bytes
+        answer, size = wire.reply, vehicle_app.wire_bytes
         if self.lie == "large":
             junk = {"junk": np.zeros(250_000)}
-            client.reply = lambda message, update, extra: answer(message, update, junk)
+            wire.reply = lambda message, update, extra: answer(message, update, junk)
         vehicle_app.wire_bytes = lambda content: 0 if self.lie == "large" else size(content) + 2**63
         if self.lie == "lost by the network":
             vehicle_app.OVER_BUDGET = LOST_BY_NETWORK

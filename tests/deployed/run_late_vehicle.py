@@ -10,7 +10,7 @@ folder, ahead = map(Path, sys.argv[1:])
 date.now = lambda: datetime.now(UTC) + timedelta(seconds=float(ahead.read_text()))  # before others import it
 
 if __name__ == "__main__":
-    from flcav.federation.fleet.up import run_vehicle
-    from flcav.federation.runtimes.vehicle_app import prepare
+    from flcav.federation.links.vehicle_app import preload_assignment
+    from flcav.fleet.up import run_vehicle
 
-    run_vehicle(folder, prepare)
+    run_vehicle(folder, preload_assignment)

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from fleet_clients import Walker
 
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.deployed import Deployment
+from flcav.federation.links.flower import Deployment
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.strategies import strategy_named
 
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from waiting import LONGEST_S, wait_for
 
-from flcav.federation.fleet.authority import open_authority
-from flcav.federation.fleet.bundle import TRUSTED
-from flcav.federation.fleet.install import install_vehicle
-from flcav.federation.fleet.keys import AUTHORITY, request_certificate
-from flcav.federation.fleet.status import read_status
-from flcav.federation.fleet.up import read_ready
+from flcav.fleet.authority import open_authority
+from flcav.fleet.keys import AUTHORITY, request_certificate
+from flcav.fleet.status import read_fleet_status
+from flcav.fleet.superlink import TRUSTED
+from flcav.fleet.up import read_ready
+from flcav.fleet.vehicle import install_vehicle
 
 HERE = Path(__file__).parent
 NAME = "without-clock"  # after all others: no federation of other tests has it
@@ -30,11 +30,13 @@ def test_clock_of_a_node_a_day_off(ahead_s, told, deployment, tmp_path):
     clock.write_text(str(ahead_s))
 
     def is_named():
-        of_clock = [each for each in read_status(fleet).refused if each.startswith(f"{name}: ") and "clock" in each]
+        of_clock = [
+            each for each in read_fleet_status(fleet).refused if each.startswith(f"{name}: ") and "clock" in each
+        ]
         return any(each.endswith(f"s {told}") for each in of_clock)
 
     def is_online():
-        return next(each for each in read_status(fleet).vehicles if each.name == name).online
+        return next(each for each in read_fleet_status(fleet).vehicles if each.name == name).online
 
     process = subprocess.Popen(
         [sys.executable, str(HERE / "run_late_vehicle.py"), str(own), str(clock)], start_new_session=True

@@ -10,11 +10,11 @@ import pytest
 from run_walkers import walk
 from waiting import LONGEST_S
 
-from flcav.federation.fleet.authority import found_authority
-from flcav.federation.fleet.status import LEAST_ROOM, read_status
-from flcav.federation.fleet.supervisor import LOGS
-from flcav.federation.fleet.up import VEHICLES
-from flcav.federation.runtimes.deployed import Deployment, fleet_up
+from flcav.federation.links.flower import Deployment, fleet_up
+from flcav.fleet.authority import found_authority
+from flcav.fleet.status import LEAST_ROOM, read_fleet_status
+from flcav.fleet.supervisor import LOGS
+from flcav.fleet.up import VEHICLES
 
 COUNT, FULL_S = 2, 6.0
 LATE = "vehicle-002"
@@ -81,7 +81,7 @@ class Filler(threading.Thread):
 
 
 def tells_no_room(fleet: Path) -> bool:
-    federation = read_status(fleet).federation
+    federation = read_fleet_status(fleet).federation
     return federation is not None and "no room on the vehicle's disk" in federation.describe()
 
 
@@ -92,7 +92,7 @@ def test_full_disks(disks):
     expected = walk(None, COUNT, 4)
     fillers = {
         2: Filler(disk, lambda: tells_no_room(fleet)),
-        4: Filler(fleet, lambda: read_status(fleet).free < LEAST_ROOM),
+        4: Filler(fleet, lambda: read_fleet_status(fleet).free < LEAST_ROOM),
     }
 
     def begin(number, _):

@@ -10,8 +10,8 @@ import pytest
 import yaml
 from waiting import read_all_traffic
 
-from flcav.federation.fleet.authority import open_registry
-from flcav.federation.fleet.up import VEHICLES
+from flcav.fleet.authority import open_registry
+from flcav.fleet.up import VEHICLES
 
 RECIPE = {
     "seed": 1,

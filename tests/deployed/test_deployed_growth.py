@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from fleet_clients import Walker
 
-from flcav.federation.fleet.supervisor import LOGS, read_processes
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.deployed import start_fleet
+from flcav.federation.links.flower import start_fleet
+from flcav.federation.loop import Schedule, federate
+from flcav.fleet.supervisor import LOGS, read_processes
 
 COUNT, ROUNDS, SETTLED = 4, 10, 4  # from the last on, everything that is kept is there
 

@@ -12,11 +12,11 @@ import pytest
 from run_walkers import walk
 from waiting import LONGEST_S, wait_for
 
-from flcav.federation.fleet.authority import found_authority, open_authority
-from flcav.federation.fleet.bundle import TRUSTED, make_publisher
-from flcav.federation.fleet.install import install_vehicle
-from flcav.federation.fleet.keys import AUTHORITY, request_certificate
-from flcav.federation.fleet.up import READY, VEHICLES, read_ready
+from flcav.fleet.authority import found_authority, open_authority
+from flcav.fleet.keys import AUTHORITY, request_certificate
+from flcav.fleet.superlink import TRUSTED, make_publisher
+from flcav.fleet.up import READY, VEHICLES, read_ready
+from flcav.fleet.vehicle import install_vehicle
 
 HERE = Path(__file__).parent
 OPERATOR, HUB, COUNT, PORT = "flcav-op", "flcav-hub", 4, 9443

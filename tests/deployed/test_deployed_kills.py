@@ -11,11 +11,10 @@ from fleet_clients import Walker
 from flwr.proto.control_pb2 import StartRunRequest
 from flwr.proto.fab_pb2 import Fab
 
-from flcav.federation.fleet.bundle import build_bundle
-from flcav.federation.fleet.superlink import DATABASE
-from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.strategies import strategy_named
+from flcav.fleet.superlink import DATABASE, build_bundle
+from flcav.fleet.supervisor import read_processes
 
 SCHEDULE = Schedule(3, 2, 0.1, 0.05, 7)
 NODE = "vehicle-002-supernode"

@@ -9,18 +9,18 @@ import pytest
 from fleet_clients import Imitator, Liar, Walker
 from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 
-from flcav.federation.messages.acceptance import Expected, read_masked
-from flcav.federation.messages.records import ARRAYS, ASK, CONFIG, LocalWork, to_arrays
-from flcav.federation.noise import draw_secret
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.acceptance import Expected, read_masked
+from flcav.federation.client import ClientAgreement
+from flcav.federation.links.flower_grid import DeployedGrid
+from flcav.federation.links.metered import Account, open_account
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.privacy import draw_secret
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.deployed import Agreement
-from flcav.federation.runtimes.deployed_grid import DeployedGrid
-from flcav.federation.runtimes.metered import Account, open_account
 from flcav.federation.secure.messages import SecureSum
 from flcav.federation.secure.parties import SecureClient
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, strategy_named
+from flcav.federation.wire import ARRAYS, ASK, CONFIG, LocalWork, to_array_record
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 NOISY = {"secure": {}, "privacy": {"where": "local", "clip": 1, "noise": 4}}
@@ -36,7 +36,7 @@ class Server:
     def ask(self, asks: Mapping[str, ConfigRecord], seed: int = 7, kind: str = MessageType.TRAIN) -> dict[str, Any]:
         """Return by client its answer, or why there is none."""
         nodes = {name: node for node, name in self.grid.names.items()}
-        about = {CONFIG: LocalWork(1, 1, 0.1, seed).record(), ARRAYS: to_arrays(self.weights)}
+        about = {CONFIG: LocalWork(1, 1, 0.1, seed).record(), ARRAYS: to_array_record(self.weights)}
         sent = (Message(RecordDict({**about, ASK: ask}), nodes[name], kind) for name, ask in asks.items())
         return {
             self.grid.names[reply.metadata.src_node_id]: reply.content if reply.has_content() else reply.error.reason
@@ -51,7 +51,7 @@ def test_a_server_neither_invents_vehicles_nor_begins_a_round_of_masks_anew_with
     clients, weights, deployment
 ):
     rules = Rules.model_validate(NOISY).settle_threshold([*clients], certified=True)
-    agreed = Agreement(FEDAVG, rules, {name: draw_secret() for name in clients}, 0)
+    agreed = ClientAgreement(FEDAVG, rules, {name: draw_secret() for name in clients}, 0)
     with deployment.open(clients, agreed, {}, open_account()) as grid:
         server = Server(grid, weights)
         one = next(iter(clients))

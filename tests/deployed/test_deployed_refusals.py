@@ -22,10 +22,11 @@ from flwr.proto.node_pb2 import Node
 from waiting import LONGEST_S, wait_for
 
 from flcav.config import InputError
-from flcav.federation.fleet import bundle
-from flcav.federation.fleet.authority import found_authority, open_authority
-from flcav.federation.fleet.forwarder import send_request
-from flcav.federation.fleet.keys import (
+from flcav.fleet import superlink
+from flcav.fleet.authority import found_authority, open_authority
+from flcav.fleet.fl_request import PATH, make_request
+from flcav.fleet.forwarder import send_request
+from flcav.fleet.keys import (
     AUTHORITY,
     CERTIFICATE,
     KEY,
@@ -33,11 +34,10 @@ from flcav.federation.fleet.keys import (
     request_certificate,
     take_certificate,
 )
-from flcav.federation.fleet.status import read_status
-from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.fleet.traffic import read_traffic
-from flcav.federation.fleet.up import VEHICLES, read_ready
-from flcav.federation.messages.fl_request import PATH, make_request
+from flcav.fleet.status import read_fleet_status
+from flcav.fleet.supervisor import read_processes
+from flcav.fleet.traffic import read_traffic
+from flcav.fleet.up import VEHICLES, read_ready
 
 PROTOBUF = {"content-type": "application/protobuf", "accept": "application/protobuf"}
 
@@ -156,7 +156,7 @@ def test_fl_request_sent_twice(deployment):
     server = read_ready(deployment.folder).proxy
     one, another = (deployment.folder / VEHICLES / name for name in ("vehicle-001", "vehicle-002"))
     asked = make_request("weather", 2.5, 12, (10.0, -3.0))
-    earlier = read_status(deployment.folder).requests
+    earlier = read_fleet_status(deployment.folder).requests
     send_request(one, server, asked)
     with pytest.raises(InputError, match="a request with this nonce came before"):
         send_request(one, server, asked)
@@ -173,7 +173,7 @@ def test_fl_request_sent_twice(deployment):
 
     wait_for(is_refused)
     assert read_processes(deployment.folder)["proxy"] != before
-    came = [each for each in read_status(deployment.folder).requests if each not in earlier]
+    came = [each for each in read_fleet_status(deployment.folder).requests if each not in earlier]
     assert [(each.vehicle, each.request) for each in came] == [(one.name, asked)]
 
 
@@ -193,7 +193,7 @@ def test_unregistered(deployment, authority, tmp_path):
     """A certificate that the authority has signed, and that is in no registry: as after a loss of the registry."""
     other = found_authority(tmp_path / "other")
     request = request_certificate(tmp_path / "v", "unknown")
-    from flcav.federation.fleet.authority import Authority
+    from flcav.fleet.authority import Authority
 
     forged = Authority(tmp_path / "other", authority.key, authority.certificate, other.registry)
     take_certificate(tmp_path / "v", forged.register(request), (deployment.folder / AUTHORITY).read_bytes())
@@ -309,12 +309,12 @@ def ask(deployment, app, signature):
 def test_tampered_app(deployment, tmp_path):
     """An app whose signature is of another one, one without a signature, and one that somebody else has signed."""
     mark = tmp_path / "ran"
-    evil = bundle.build_bundle(f"open({str(mark)!r}, 'w').close()\n{bundle.CLIENT}")
-    bundle.make_publisher(tmp_path)
+    evil = superlink.build_bundle(f"open({str(mark)!r}, 'w').close()\n{superlink.CLIENT}")
+    superlink.make_publisher(tmp_path)
     for signature in (
-        bundle.sign_bundle(deployment.folder, bundle.build_bundle()),
+        superlink.sign_bundle(deployment.folder, superlink.build_bundle()),
         {},
-        bundle.sign_bundle(tmp_path, evil),
+        superlink.sign_bundle(tmp_path, evil),
     ):
         answer = ask(deployment, evil, signature)
         assert answer.has_error()
@@ -324,7 +324,7 @@ def test_tampered_app(deployment, tmp_path):
 
 def test_signed_app_runs(deployment, clients, weights):
     """What the tests before have refused does not keep the vehicles from their publisher's app."""
-    from flcav.federation.rounds import Schedule, federate
+    from flcav.federation.loop import Schedule, federate
 
     schedule = Schedule(1, 1, 0.1, 0.1, 3)
     expected, found = (federate(clients, weights, schedule, runtime=each).weights for each in (None, deployment))

@@ -17,27 +17,32 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.federation.fleet.authority import open_authority
-from flcav.federation.fleet.keys import AUTHORITY, request_certificate, take_certificate
-from flcav.federation.fleet.releases.offer import LARGEST_FILE, read_reports
-from flcav.federation.fleet.status import read_status
-from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.fleet.up import VEHICLES, read_ready
-from flcav.federation.fleet.vehicle import VehicleSettings
-from flcav.federation.messages.release_report import LARGEST, RELEASES, REPORT, ReleaseReport, ShadowReport
+from flcav.fleet.authority import open_authority
+from flcav.fleet.keys import AUTHORITY, request_certificate, take_certificate
+from flcav.fleet.releases import (
+    LARGEST_FILE,
+    LARGEST_REPORT,
+    RELEASES,
+    REPORT,
+    ReleaseReport,
+    ShadowReport,
+    read_reports,
+)
+from flcav.fleet.status import read_fleet_status
+from flcav.fleet.supervisor import read_processes
+from flcav.fleet.up import VEHICLES, read_ready
+from flcav.fleet.vehicle import VehicleSettings
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
-from flcav.releases.candidates.candidate import WEIGHTS
-from flcav.releases.candidates.proposal import propose
-from flcav.releases.repositories.creation import create_repository
-from flcav.releases.repositories.directive import MILLION, Directive
-from flcav.releases.repositories.repository import publish, stage_release
+from flcav.releases.candidate import WEIGHTS
+from flcav.releases.installation import Installed, read_installed
+from flcav.releases.proposal import propose
+from flcav.releases.repositories.metadata import MILLION, Directive
+from flcav.releases.repositories.repository import create_repository, publish, stage_release
 from flcav.releases.rollout.deployed import roll_out
-from flcav.releases.rollout.shadow import run_shadow
-from flcav.releases.rollout.stages import read_directive, roll_back
+from flcav.releases.rollout.stages import read_directive, roll_back, run_shadow
 from flcav.releases.rollout.updater import FOLDER, open_client
-from flcav.releases.vehicles.installation import Installed, read_installed
 from flcav.storage.files import sha256
 
 NAMES = [f"vehicle-{number:03d}" for number in (1, 2, 3)]
@@ -200,7 +205,9 @@ def test_shadow_runs_stop_it_and_the_roll_back_has_a_higher_number(parties, caps
     expected = run_shadow("", [data.frame(0)], *networks)
     for name in canaries:
         assert parties.reports()[name].shadow == replace(expected, vehicle=name)
-    told = {own.name: own.release.describe() for own in read_status(parties.fleet).vehicles if own.release is not None}
+    told = {
+        own.name: own.release.describe() for own in read_fleet_status(parties.fleet).vehicles if own.release is not None
+    }
     assert all(told[name].endswith("disagreement 1.000 over 1 frame") for name in canaries)
 
     wait_for(lambda: all(parties.installed(name).weights == sha256(bad) for name in canaries))
@@ -274,7 +281,7 @@ def test_messages_that_are_no_reports(parties, client):
         replace(before, task="../x").as_bytes(),
         replace(before, shadow=replace(shadow, agreed=6)).as_bytes(),  # would outweigh the disagreement of others
         replace(before, shadow=replace(shadow, candidate="1")).as_bytes(),
-        replace(before, refused="x" * LARGEST).as_bytes(),
+        replace(before, refused="x" * LARGEST_REPORT).as_bytes(),
         bytes(10**7),
     ):
         assert client.post(REPORT, content=content).status_code == 400

@@ -13,16 +13,16 @@ from fleet_clients import Walker
 from test_deployed_refusals import activate, reach
 from waiting import wait_for
 
-from flcav.federation.fleet.authority import REGISTRY, open_authority
-from flcav.federation.fleet.keys import KEY, load_key
-from flcav.federation.fleet.status import read_status
-from flcav.federation.fleet.supervisor import read_processes
-from flcav.federation.fleet.up import VEHICLES
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links import flower_grid
+from flcav.federation.links.flower import start_fleet
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import ReplyLimits, Rules
-from flcav.federation.runtimes import deployed_grid
-from flcav.federation.runtimes.deployed import start_fleet
 from flcav.federation.state import FederationState
+from flcav.fleet.authority import REGISTRY, open_authority
+from flcav.fleet.keys import KEY, load_key
+from flcav.fleet.status import read_fleet_status
+from flcav.fleet.supervisor import read_processes
+from flcav.fleet.up import VEHICLES
 
 SCHEDULE = Schedule(3, 2, 0.1, 0.05, 7)
 
@@ -57,7 +57,7 @@ def follow(fleet, weights, clients, log, rules, in_second_round):
 
 def test_a_vehicle_that_hangs(fleet, weights, tmp_path, monkeypatch):
     """All its processes stop, so that it cannot keep the limit itself; the server's own ends the wait for it."""
-    monkeypatch.setattr(deployed_grid, "ALLOWANCE_S", 30.0)
+    monkeypatch.setattr(flower_grid, "ALLOWANCE_S", 30.0)
     log = tmp_path / "log"
     clients = {f"town/cav{n}": Walker(n + 1, log, lasts_s=2.0) for n in range(3)}
     stopped = []
@@ -81,7 +81,7 @@ def test_a_vehicle_that_hangs(fleet, weights, tmp_path, monkeypatch):
     assert records[1].failed == {"town/cav2": "it had not answered after 40 s"}
     assert [len(record.clients) for record in records] == [3, 2, 2]
     assert ends[-1] - ends[1] < 180  # of two rounds
-    federation = read_status(fleet.folder).federation
+    federation = read_fleet_status(fleet.folder).federation
     assert federation is not None
     assert "round 3 without town/cav2: " in federation.describe()
 
@@ -120,7 +120,7 @@ def test_a_vehicle_that_is_revoked(fleet, weights, tmp_path):
     def revoke():
         open_authority(fleet.folder).registry.revoke("vehicle-002", "stolen")
         begun = time.monotonic()
-        wait_for(lambda: (found := read_status(fleet.folder).federation) is not None and found.gone)
+        wait_for(lambda: (found := read_fleet_status(fleet.folder).federation) is not None and found.gone)
         took.append(time.monotonic() - begun)
 
     records, ends = follow(fleet, weights, clients, tmp_path / "log", Rules(), revoke)
@@ -128,6 +128,6 @@ def test_a_vehicle_that_is_revoked(fleet, weights, tmp_path):
     assert [record.failed for record in records[1:]] == [{"town/cav1": told}] * 2
     assert took[0] < 5  # a second, and the time that a status takes on a busy machine
     assert ends[3] - ends[2] < 60
-    federation = read_status(fleet.folder).federation
+    federation = read_fleet_status(fleet.folder).federation
     assert federation is not None
     assert f"without town/cav1: {told}" in federation.describe()

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from fleet_clients import Walker
 
+from flcav.federation.links.flower import RegionalDeployment
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import Privacy
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules, SecureAggregation
-from flcav.federation.runtimes.deployed import RegionalDeployment
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import STRATEGIES, strategy_named
 from flcav.federation.upload import Upload

@@ -7,10 +7,10 @@ from flcav.perception.card import Card, DataEntry
 from flcav.perception.objects.model import pillars_config, second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network, read_card, save_network
-from flcav.releases.repositories.directive import Directive
+from flcav.releases.checking import RepositorySources, open_sources
+from flcav.releases.installation import Installed, update_vehicle
+from flcav.releases.repositories.metadata import Directive
 from flcav.releases.repositories.repository import publish, stage_release
-from flcav.releases.vehicles.checking import Sources, open_sources
-from flcav.releases.vehicles.installation import Installed, update_vehicle
 
 ALL = 1_000_000
 
@@ -46,10 +46,10 @@ class Parties:
         stage_release(self.folder / party, self.candidate(number), self.keys(party, 1, 2), directive)
         publish(self.folder / party)
 
-    def sources(self) -> Sources:
+    def sources(self) -> RepositorySources:
         return open_sources(str(self.image / "repository"), str(self.director / "repository"))
 
-    def update(self, sources: Sources | None = None) -> Installed | None:
+    def update(self, sources: RepositorySources | None = None) -> Installed | None:
         return update_vehicle(self.vehicle, "cav0", sources or self.sources())
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from flcav.federation.fleet.traffic import TRAFFIC, Traffic, read_traffic
+from flcav.fleet.traffic import TRAFFIC, ProxyTraffic, read_traffic
 
 Found = TypeVar("Found")
 LONGEST_S = 900.0  # that anything takes on a busy machine
@@ -31,7 +31,7 @@ def wait_for(
     return found
 
 
-def read_all_traffic(fleet: Path) -> Traffic:
+def read_all_traffic(fleet: Path) -> ProxyTraffic:
     """Return the counts of a fleet's proxy with all that was counted before the call.
 
     They are written with a delay, and vehicles that are up go on calling: what is written second from now on has them.

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from waiting import read_all_traffic
 
-from flcav.federation.fleet.status import read_status
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.deployed import start_fleet
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.flower import start_fleet
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
+from flcav.fleet.status import read_fleet_status
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 CLIENTS = Path(__file__).parents[1] / "deployed"  # `make test-deployed` has the other tests of a fleet
@@ -29,7 +29,7 @@ def test_a_deployed_round_ends_with_the_embedded_weights(monkeypatch):
         found = federate(clients, weights, schedule, account, runtime=deployment)
         sent = {direction: account.ledger.used_bytes("wireless", direction=direction) for direction in ("up", "down")}
         read_all_traffic(deployment.folder)
-        told = read_status(deployment.folder)
+        told = read_fleet_status(deployment.folder)
     np.testing.assert_array_equal(expected.weights["w"], found.weights["w"])
     assert [own.online for own in told.vehicles] == [True, True]
     assert told.federation is not None

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from flcav.federation.links.metered import Account
+from flcav.federation.links.ray import RaySimulation
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import Privacy
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.simulation import RaySimulation
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
-from flcav.federation.strategies.krum import Krum
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.corrections import Scaffold
+from flcav.federation.strategies.robust import Krum
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import Upload
 from flcav.network.ledger import Ledger, LinkMegabytes

@@ -24,11 +24,11 @@ from flcav.experiments.experiment import (
     describe_differences,
     name_differences,
 )
-from flcav.federation.buffered_rounds import Buffers
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.in_process import update_bytes
+from flcav.federation.links.metered import Account, Outage
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.modes.buffered import Buffers
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.trainable import Trainable, Weights

@@ -21,7 +21,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from flcav.config import Json
 from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
-from flcav.federation.divergence import RoundDivergence
+from flcav.federation.state import RoundDivergence
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
 from flcav.network.clock.work import ClientWork, work_of_messages
 from flcav.network.ledger import Ledger, LedgerEntry

@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.experiments.experiment import Experiment, Options, Outcome
-from flcav.federation.attendance import ClientFailed
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.exchange import ClientFailed
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.strategies import FEDAVG, Strategy
-from flcav.federation.strategies.krum import Krum
-from flcav.federation.strategies.median import Median
-from flcav.federation.strategies.trimmed_mean import TrimmedMean
+from flcav.federation.strategies.robust import Krum, Median, TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights, learned_names
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes

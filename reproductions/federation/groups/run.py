@@ -23,9 +23,9 @@ from flcav.experiments.experiment import (
     describe_differences,
     name_differences,
 )
-from flcav.federation.rounds import EVERYBODY, Schedule, federate
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import EVERYBODY, Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import Weights
 from flcav.interface.progress import Report, ignore_progress

@@ -16,20 +16,17 @@ from numpy.typing import NDArray
 
 from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.federation.client import client_app
-from flcav.federation.messages.encoding import decode, unflatten
-from flcav.federation.messages.records import ARRAYS, VECTOR, LocalWork, read_arrays
-from flcav.federation.noise import draw_secret
-from flcav.federation.privacy import SEEDED, Privacy, account_epsilon
-from flcav.federation.rounds import Schedule, Server, federate
+from flcav.federation.links.in_process import EmbeddedGrid, LinkGrid
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.privacy import SEEDED, Privacy, account_epsilon, draw_secret
 from flcav.federation.rules import Rules, SecureAggregation
-from flcav.federation.runtimes.embedded import EmbeddedGrid
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.wrapped import WrappedGrid
-from flcav.federation.secure.masks import to_values
+from flcav.federation.secure.primitives import to_values
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.trainable import Trainable, Weights
+from flcav.federation.wire import ARRAYS, VECTOR, LocalWork, decode_update, read_arrays, unflatten
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.weather.task import WEATHER
@@ -255,18 +252,18 @@ def draw_leakage(levels: Sequence[str], lines: Mapping[str, Sequence[MeanOverSee
     return figure
 
 
-class ReadGrid(WrappedGrid):
+class ReadGrid(LinkGrid):
     """A grid whose server keeps the arrays of each client's last update as they were sent."""
 
     def __init__(self, grid: Grid, names: Mapping[int, str]) -> None:
-        self._grid, self._names = grid, names
+        self._grid, self.names = grid, names
         self.updates: dict[str, Weights] = {}
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterable[Message]:
         """Yield the replies, and keep those that are updates."""
         for reply in self._grid.send_and_receive(messages, timeout=timeout):
             if reply.has_content() and ARRAYS in reply.content:
-                self.updates[self._names[reply.metadata.src_node_id]] = read_arrays(reply.content, ARRAYS)
+                self.updates[self.names[reply.metadata.src_node_id]] = read_arrays(reply.content, ARRAYS)
             yield reply
 
 
@@ -281,11 +278,11 @@ def read_round(
     secrets = {party: draw_secret() for party in rules.secret_parties([*clients]) if party in clients}
     with EmbeddedGrid(client_app(clients, FEDAVG, rules, secrets), [*clients]) as grid:
         reading = ReadGrid(grid, grid.names)
-        after = dict(Server(reading, grid.names, FEDAVG, rules, work, FederationState()).run_round(1, start))
+        after = dict(FederationServer(reading, grid.names, FEDAVG, rules, work, FederationState()).run_round(1, start))
     seen: dict[str, Weights] = {}
     for name, update in reading.updates.items():
         if rules.secure is None:
-            seen[name] = decode(update, start, rules)
+            seen[name] = decode_update(update, start, rules)
         else:
             vector = np.asarray(update[VECTOR], np.uint32)
             seen[name] = unflatten(to_values(vector, rules.secure.largest, len(clients)), start, rules)

@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 
 from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.federation.strategies import FEDAVG, Strategy
-from flcav.federation.strategies.krum import Krum
-from flcav.federation.strategies.median import Median
-from flcav.federation.strategies.trimmed_mean import TrimmedMean
+from flcav.federation.strategies.robust import Krum, Median, TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.interface.progress import Report, ignore_progress
 from flcav.pipeline.provenance import Provenance, provenance

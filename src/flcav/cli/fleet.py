@@ -11,7 +11,7 @@ from flcav.cli.terminal import Answer, answer_json, echo
 from flcav.interface.wording import make_printable, plural
 
 if TYPE_CHECKING:
-    from flcav.federation.fleet.registry import Registry, Vehicle
+    from flcav.fleet.registry import RegisteredVehicle, VehicleRegistry
 
 fleet = typer.Typer(
     help="A deployed fleet: its registered vehicles, its servers, and what they do.", no_args_is_help=True
@@ -40,8 +40,8 @@ def init(
     ),
 ) -> None:
     """Make the authority of a new fleet: its key and certificate, its registry, and the servers' certificate."""
-    from flcav.federation.fleet.authority import found_authority
-    from flcav.federation.fleet.bundle import make_publisher
+    from flcav.fleet.authority import found_authority
+    from flcav.fleet.superlink import make_publisher
 
     found_authority(folder, tuple(host))
     make_publisher(folder)
@@ -54,7 +54,7 @@ def key(
     vehicle: str = typer.Option(..., "--vehicle", help="Unique identifier of the vehicle: a-z 0-9 . _ -"),
 ) -> None:
     """On a vehicle: make its key, which never leaves the folder, and the signing request that goes to the authority."""
-    from flcav.federation.fleet.keys import request_certificate
+    from flcav.fleet.keys import request_certificate
 
     echo(f"{request_certificate(folder, vehicle)}: signing request of {vehicle}")
 
@@ -64,7 +64,7 @@ def register_vehicle(
     folder: Path = FLEET, request: Path = REQUEST, out: Path = CERTIFICATE, days: float = DAYS
 ) -> None:
     """Register a vehicle by its signing request, and certify its key."""
-    from flcav.federation.fleet.authority import open_authority
+    from flcav.fleet.authority import open_authority
     from flcav.storage.files import write_bytes
 
     authority = open_authority(folder)
@@ -76,7 +76,7 @@ def register_vehicle(
 @fleet.command()
 def rotate(folder: Path = FLEET, request: Path = REQUEST, out: Path = CERTIFICATE, days: float = DAYS) -> None:
     """Certify a registered vehicle's new key; its certificate before is refused from now on."""
-    from flcav.federation.fleet.authority import open_authority
+    from flcav.fleet.authority import open_authority
     from flcav.storage.files import write_bytes
 
     authority = open_authority(folder)
@@ -99,7 +99,7 @@ def install(
     ),
 ) -> None:
     """On a vehicle: put its certificate to use, and set where the fleet is reached."""
-    from flcav.federation.fleet.install import install_vehicle
+    from flcav.fleet.vehicle import install_vehicle
 
     install_vehicle(folder, certificate, authority, trusted, server, client)
     echo(f"{folder}: ready; flcav fleet vehicle {folder} runs it")
@@ -112,7 +112,7 @@ def revoke(
     reason: str = typer.Option("", "--reason", help="Kept in the audit trail."),
 ) -> None:
     """Revoke a vehicle's certificate: it is refused from its next call on."""
-    from flcav.federation.fleet.authority import open_registry
+    from flcav.fleet.authority import open_registry
 
     open_registry(folder).revoke(vehicle, reason)
     echo(f"{vehicle}: revoked")
@@ -127,7 +127,7 @@ def list_vehicles(
     """List the registered vehicles with the state and expiry of their certificates."""
     from dataclasses import asdict
 
-    from flcav.federation.fleet.authority import open_registry
+    from flcav.fleet.authority import open_registry
 
     registry = open_registry(folder)
     if audit:
@@ -163,14 +163,14 @@ def status(
     ),
 ) -> Answer:
     """Tell who is in, the rounds of the federation, bytes against budgets, failures and refusals."""
-    from flcav.federation.fleet.status import LEAST_ROOM, read_status
+    from flcav.fleet.status import LEAST_ROOM, read_fleet_status
 
     if page is not None:
-        from flcav.federation.fleet.page import serve_page
+        from flcav.fleet.page import serve_page
 
         serve_page(folder, page, echo)
         return
-    found = read_status(folder)
+    found = read_fleet_status(folder)
     yield found.as_json()
     yield "not up" if found.proxy is None else f"up at {found.proxy}, processes: {len(found.processes)}"
     for own in found.vehicles:
@@ -202,9 +202,9 @@ def request(
     at: tuple[float, float] = typer.Option(..., "--at", help="Position of the vehicle: X Y [m]."),
 ) -> None:
     """On a vehicle: ask the fleet for federated learning; a request is taken once."""
-    from flcav.federation.fleet.forwarder import send_request
-    from flcav.federation.fleet.vehicle import load_settings
-    from flcav.federation.messages.fl_request import make_request
+    from flcav.fleet.fl_request import make_request
+    from flcav.fleet.forwarder import send_request
+    from flcav.fleet.vehicle import load_settings
 
     made = make_request(task, loss, frames, at)
     send_request(folder, load_settings(folder).server, made)
@@ -221,19 +221,19 @@ def up(
     port: int = typer.Option(0, "--port", min=0, max=65535, help="Port of the proxy; 0: a free one."),
 ) -> None:
     """Run the SuperLink and the proxy of a fleet until interrupted, and vehicles on this machine."""
-    from flcav.federation.fleet.up import run_fleet
-    from flcav.federation.runtimes.vehicle_app import prepare
+    from flcav.federation.links.vehicle_app import preload_assignment
+    from flcav.fleet.up import run_fleet
 
-    run_fleet(folder, host, port, vehicles or 0, prepare, echo, _updater())
+    run_fleet(folder, host, port, vehicles or 0, preload_assignment, echo, _updater())
 
 
 @fleet.command("vehicle")
 def run_vehicle(folder: Path = typer.Argument(help="Folder of the vehicle, on the vehicle.")) -> None:
     """On a vehicle: run its forwarder, its node and its app until interrupted."""
-    from flcav.federation.fleet.up import run_vehicle as run
-    from flcav.federation.runtimes.vehicle_app import prepare
+    from flcav.federation.links.vehicle_app import preload_assignment
+    from flcav.fleet.up import run_vehicle as run
 
-    run(folder, prepare, _updater())
+    run(folder, preload_assignment, _updater())
 
 
 def _updater() -> dict[str, Callable[[Path], None]]:
@@ -247,15 +247,15 @@ def _updater() -> dict[str, Callable[[Path], None]]:
     return {"updater": run_updater}
 
 
-def _describe_new(registry: "Registry", certificate: bytes) -> str:
-    from flcav.federation.fleet.keys import fingerprint_of
+def _describe_new(registry: "VehicleRegistry", certificate: bytes) -> str:
+    from flcav.fleet.keys import fingerprint_of
 
     own = registry.find(fingerprint_of(certificate))
     assert own is not None
     return _describe(own)
 
 
-def _describe(own: "Vehicle") -> str:
+def _describe(own: "RegisteredVehicle") -> str:
     return f"{own.name} {own.describe_state()}, until {_date(own.expires)}, SHA-256 {own.fingerprint[:16]}"
 
 

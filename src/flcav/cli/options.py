@@ -50,7 +50,7 @@ class EngineName(StrEnum):
 
 
 class Runtime(StrEnum):
-    """Runtime of a federation, see `flcav.federation.runtimes`."""
+    """Runtime of a federation, see `flcav.federation.links`."""
 
     embedded = "embedded"
     ray = "ray"

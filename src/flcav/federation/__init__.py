@@ -8,10 +8,10 @@ from flcav.interface.lazy import lazy_names
 os.environ.setdefault("FLWR_TELEMETRY_ENABLED", "0")  # read when Flower is imported
 
 if TYPE_CHECKING:
+    from flcav.federation.links.metered import Account
+    from flcav.federation.loop import Schedule, federate
     from flcav.federation.privacy import Privacy
-    from flcav.federation.rounds import Schedule, federate
     from flcav.federation.rules import Rules
-    from flcav.federation.runtimes.metered import Account
     from flcav.federation.selection import Selection
     from flcav.federation.state import FederationState, RoundRecord
     from flcav.federation.strategies import STRATEGIES, FedAvg, Strategy, strategy_named
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from flcav.federation.upload import Upload
 
 PLACES = {
-    "Account": "flcav.federation.runtimes.metered",
+    "Account": "flcav.federation.links.metered",
     "Privacy": "flcav.federation.privacy",
     "Rules": "flcav.federation.rules",
     "Selection": "flcav.federation.selection",
     "Upload": "flcav.federation.upload",
     "FederationState": "flcav.federation.state",
     "RoundRecord": "flcav.federation.state",
-    "Schedule": "flcav.federation.rounds",
-    "federate": "flcav.federation.rounds",
+    "Schedule": "flcav.federation.loop",
+    "federate": "flcav.federation.loop",
     "STRATEGIES": "flcav.federation.strategies",
     "FedAvg": "flcav.federation.strategies",
     "Strategy": "flcav.federation.strategies",

@@ -1,17 +1,15 @@
 """Consistency of a federation's settings: which strategies, rules and clients go together."""
 
-from collections.abc import Mapping, Sequence
-
-import numpy as np
+import inspect
+from collections.abc import Iterable, Mapping, Sequence
 
 from flcav.config import InputError
-from flcav.federation.client import check_arguments
 from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Robust, needs_known_number
-from flcav.federation.trainable import Counts, Trainable, Weights
+from flcav.federation.trainable import Counts, Trainable
 
 
 def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> None:
@@ -38,17 +36,16 @@ def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules
         check_arguments(clients, ["proximal", "centre"], "personal:")
 
 
-def check_weights(weights: Weights, told: str) -> None:
-    """Raise `InputError` where weights are not finite arrays of numbers; `told` begins the sentence."""
-    for name, array in weights.items():
-        if not isinstance(array, np.ndarray | np.generic) or array.dtype.kind not in "fiub":
-            kind = f" of {dtype}" if (dtype := getattr(array, "dtype", None)) else ""
+def check_arguments(trainables: Mapping[str, Trainable], wanted: Iterable[str], why: str) -> None:
+    """Raise `InputError` where a client's `train` does not take the arguments `wanted`; `why` begins the sentence."""
+    for name, trainable in trainables.items():
+        known = inspect.signature(trainable.train).parameters
+        if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in known.values()):
+            continue
+        if lacking := [argument for argument in wanted if argument not in known]:
             raise InputError(
-                f"{told}: '{name}' is {type(array).__name__}{kind}, and arrays of NumPy's numbers are wanted"
-            )
-        if not (finite := np.isfinite(array)).all():
-            raise InputError(
-                f"{told}: {np.size(array) - finite.sum()} of {np.size(array)} values of '{name}' are not finite"
+                f"{why} needs clients whose training takes '{lacking[0]}', and that of {name} "
+                f"({type(trainable).__name__}) does not"
             )
 
 

@@ -1,60 +1,33 @@
 """The Flower client app of both federated stages: vehicles with their edge server, edge servers with the cloud."""
 
-import inspect
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from flwr.app import Context, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from flcav.config import InputError
-from flcav.federation.messages.acceptance import Expected, extra_forms, is_usable
-from flcav.federation.messages.conduct import (
+from flcav.federation import wire
+from flcav.federation.acceptance import Expected, extra_forms, is_usable
+from flcav.federation.conduct import (
     ANSWERED,
+    RequestDigests,
     RequestRefused,
-    Requests,
     asked_for,
     keep_answered,
     recall_answered,
 )
-from flcav.federation.messages.encoding import encode, flatten, is_local
-from flcav.federation.messages.records import (
-    ARRAYS,
-    ASK,
-    CENTRE,
-    CONFIG,
-    COUNT,
-    EXTRA,
-    LOSS,
-    LOST,
-    MASKED,
-    METRICS,
-    NAMES,
-    NORM,
-    SAMPLES,
-    SEND,
-    UNMASK,
-    VECTOR,
-    LocalWork,
-    NoCount,
-    read_arrays,
-    refuse,
-    reply,
-    reply_norm,
-    to_arrays,
-    to_metrics,
-)
-from flcav.federation.noise import Secret, derive_key
-from flcav.federation.privacy import change_norm
-from flcav.federation.rules import RegionalModels, Rules
-from flcav.federation.secure.certified import Identity
-from flcav.federation.secure.masks import to_integers
+from flcav.federation.privacy import Secret, change_norm, derive_key
+from flcav.federation.rules import RegionalModels, Rules, SecureAggregation
 from flcav.federation.secure.messages import answer_secretly, complain, mask_update
+from flcav.federation.secure.parties import Identity
+from flcav.federation.secure.primitives import to_integers
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
 from flcav.federation.trainable import (
     Accounts,
+    Arrays,
     Correction,
     LocalUpdate,
     Trainable,
@@ -64,7 +37,7 @@ from flcav.federation.trainable import (
     count_samples,
     learned_names,
 )
-from flcav.federation.upload import Arrays, subtract
+from flcav.federation.upload import find_change
 from flcav.network.ledger import BudgetExceeded
 from flcav.statistics.streams import derive_seed
 
@@ -76,12 +49,22 @@ KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, un
 HIDDEN = "hidden"  # an update that was masked, until the sum of its round is unmasked
 
 
+@dataclass(frozen=True)
+class ClientAgreement:
+    """What server and clients of a federation agree on before it begins."""
+
+    strategy: Strategy
+    rules: Rules
+    secrets: Mapping[str, Secret]  # by client, that it draws local noise by
+    spent: int  # rounds of earlier federations that count against each client's privacy budget
+
+
 def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
     """Return the records of a node's state that a checkpoint has: those of strategy and compression, the optimiser's
     where it is kept, and under clients' own noise or masks what they have answered.
     """
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"
-    guards = is_local(rules) or rules.secure is not None
+    guards = wire.is_local(rules) or rules.secure is not None
     digests = (OWN_DIGESTS,) if isinstance(strategy, FedMD) else ()
     optimiser = (OPTIMISER,) if rules.keep_optimiser else ()
     return (*((OWN, RESIDUAL) if keeps else ()), *digests, *optimiser, *((ANSWERED,) if guards else ()))
@@ -110,110 +93,153 @@ def client_app(
     use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
     arrives, and so optimisers that are kept.
     """
-    app, clients, requests = ClientApp(), [*trainables], Requests(rules.privacy)
+    own = _ClientSide(
+        trainables, strategy, rules, secrets, spent, identity, simulated, [*trainables], RequestDigests(rules.privacy)
+    )
+    app = ClientApp()
+    app.train()(own.train)
+    app.query(wire.ASK)(own.answer)
+    app.query()(own.query)
+    return app
 
-    def admit(message: Message, context: Context, name: str, work: LocalWork) -> str:
+
+@dataclass(frozen=True)
+class _ClientSide:
+    """The clients' side of a federation: what the client app does with each kind of message."""
+
+    trainables: Mapping[str, Trainable]
+    strategy: Strategy
+    rules: Rules
+    secrets: Mapping[str, Secret]
+    spent: int
+    identity: Identity | None
+    simulated: bool
+    names: Sequence[str]  # of the trainables, by place
+    requests: RequestDigests
+
+    def _admit(self, message: Message, context: Context, name: str, work: wire.LocalWork) -> str:
         """Return what is asked for; raises `RequestRefused` where the client is not to answer."""
         asked, before = asked_for(message.content), recall_answered(context)
-        repeatable = rules.secure is None and not {OWN, RESIDUAL, OPTIMISER} & {*context.state}
-        digest = requests.digest(message.content, LOST if rules.secure is None else ASK)
-        answered = before.admit(work.round, asked, digest, rules, repeatable)
-        if (most := requests.affordable) is not None and answered.rounds > most - spent:
+        repeatable = self.rules.secure is None and not {OWN, RESIDUAL, OPTIMISER} & {*context.state}
+        digest = self.requests.digest(message.content, wire.LOST if self.rules.secure is None else wire.ASK)
+        answered = before.admit(work.round, asked, digest, self.rules, repeatable)
+        if (most := self.requests.affordable) is not None and answered.rounds > most - self.spent:
             raise RequestRefused(f"a round more than the {most} that the privacy budget of {name} affords")
         keep_answered(context, answered)
-        if HIDDEN in context.state and (asked == UNMASK or answered.round > before.round):
-            del context.state[HIDDEN], context.state[f"{HIDDEN}-{SAMPLES}"]
+        if HIDDEN in context.state and (asked == wire.UNMASK or answered.round > before.round):
+            del context.state[HIDDEN], context.state[f"{HIDDEN}-{wire.SAMPLES}"]
         return asked
 
-    @app.train()
-    def train(message: Message, context: Context) -> Message:
+    def train(self, message: Message, context: Context) -> Message:
+        """Return the answer to a request of a round."""
         try:
-            return answer_training(message, context)
-        except NoCount as error:
-            return refuse(message, str(error))
+            return self._answer_training(message, context)
+        except wire.NoCount as error:
+            return wire.refuse_request(message, str(error))
 
-    def answer_training(message: Message, context: Context) -> Message:
-        name = clients[int(context.node_config[PARTITION])]
-        work = LocalWork.from_record(message.content.config_records[CONFIG])
-        asked = admit(message, context, name, work)
-        if rules.secure is not None and asked != MASKED:
-            return answer_secretly(message, context, name, rules.secure, work.round, identity)
-        seed = derive_seed(work.seed, name)
-        key = derive_key(secrets[name], "noise", work.round, work.seed) if name in secrets else None
-        if asked == COUNT:
-            return reply_norm(message, 0.0, count_samples(trainables[name], work.steps))
-        if rules.secure is not None:
-            if (complaint := complain(message, context)) is not None:
-                return complaint
-            if HIDDEN not in context.state:
-                start = read_arrays(message.content, ARRAYS)
-                update, _, _ = _train(trainables[name], message, context, start, work, seed)
-                about = (1, 0.0) if is_local(rules) else (update.samples, update.loss)
-                values = flatten(update, start, rules, seed, key)
-                _keep(context, HIDDEN, LocalUpdate({VECTOR: values}, *about))
-            hidden, peers = _recall(context, HIDDEN), message.content.config_records[ASK][NAMES]
-            values = np.asarray(hidden.weights[VECTOR], np.float64)
-            integers = to_integers(values, rules.secure.largest, len(peers) + 1)  # type: ignore[arg-type]
-            return reply(message, replace(hidden, weights={VECTOR: mask_update(context, integers)}), {})
-        extra, own, sent = {}, {}, _optional(message.content, EXTRA)
-        if asked == SEND:
+    def _answer_training(self, message: Message, context: Context) -> Message:
+        name = self._name(context)
+        work = wire.LocalWork.from_record(message.content.config_records[wire.CONFIG])
+        asked = self._admit(message, context, name, work)
+        if self.rules.secure is not None and asked != wire.MASKED:
+            return answer_secretly(message, context, name, self.rules.secure, work.round, self.identity)
+        seed, key = self._seeds(name, work)
+        if asked == wire.COUNT:
+            return wire.reply_norm(message, 0.0, count_samples(self.trainables[name], work.steps))
+        if self.rules.secure is not None:
+            return self._answer_masked(message, context, name, work, self.rules.secure)
+        extra, own, sent = {}, {}, _optional(message.content, wire.EXTRA)
+        if asked == wire.SEND:
             start, update = _recorded(context, KEPT_START), _recall(context, KEPT)
         else:
-            start = read_arrays(message.content, ARRAYS)
-            update, extra, own = _train(trainables[name], message, context, start, work, seed)
-        if asked == NORM:
-            context.state[KEPT_START] = to_arrays(start)
+            start = wire.read_arrays(message.content, wire.ARRAYS)
+            update, extra, own = self._train(self.trainables[name], message, context, start, work, seed)
+        if asked == wire.NORM:
+            context.state[KEPT_START] = wire.to_array_record(start)
             _keep(context, KEPT, update)
-            names = [each for each in learned_names(start) if each in rules.upload.exchanged(start)]
-            return reply_norm(message, change_norm(subtract(update.weights, start, names)), update.samples)
-        encoded, left = encode(update, start, rules, _recorded(context, RESIDUAL), seed, key)
-        if rules.hides_draws:  # neither the ledger's bytes nor the server's figures are to tell who was drawn
+            names = [each for each in learned_names(start) if each in self.rules.upload.exchanged(start)]
+            return wire.reply_norm(message, change_norm(find_change(update.weights, start, names)), update.samples)
+        encoded, left = wire.encode_update(update, start, self.rules, _recorded(context, RESIDUAL), seed, key)
+        if self.rules.hides_draws:  # neither the ledger's bytes nor the server's figures are to tell who was drawn
             encoded = replace(encoded, samples=min(encoded.samples, 1), loss=0.0)
-        answer = reply(message, encoded, extra)
-        if (left or own) and LOST not in message.content:
-            expected = Expected(rules, start, extra_forms(strategy, rules, start, sent))
+        answer = wire.reply(message, encoded, extra)
+        if (left or own) and wire.LOST not in message.content:
+            expected = Expected(self.rules, start, extra_forms(self.strategy, self.rules, start, sent))
             if is_usable(answer.content, expected):
                 _record(context, RESIDUAL, left)
                 _record(context, OWN, own)
         return answer
 
-    @app.query(ASK)
-    def answer(message: Message, context: Context) -> Message:
-        client, arrays = trainables[clients[int(context.node_config[PARTITION])]], _optional(message.content, ARRAYS)
-        found = answer_question(client, asked_for(message.content), arrays)
-        return Message(RecordDict({ARRAYS: to_arrays(found)}), reply_to=message)
+    def _answer_masked(
+        self, message: Message, context: Context, name: str, work: wire.LocalWork, secure: SecureAggregation
+    ) -> Message:
+        """Return the masked update, or a complaint where others' shares do not open.
 
-    @app.query()
-    def query(message: Message, context: Context) -> Message:
+        The update is trained once, and kept until its sum is unmasked: what new masks hide stays the same.
+        """
+        if (complaint := complain(message, context)) is not None:
+            return complaint
+        if HIDDEN not in context.state:
+            start = wire.read_arrays(message.content, wire.ARRAYS)
+            seed, key = self._seeds(name, work)
+            update, _, _ = self._train(self.trainables[name], message, context, start, work, seed)
+            about = (1, 0.0) if wire.is_local(self.rules) else (update.samples, update.loss)
+            values = wire.flatten_change(update, start, self.rules, seed, key)
+            _keep(context, HIDDEN, LocalUpdate({wire.VECTOR: values}, *about))
+        hidden, peers = _recall(context, HIDDEN), message.content.config_records[wire.ASK][wire.NAMES]
+        values = np.asarray(hidden.weights[wire.VECTOR], np.float64)
+        integers = to_integers(values, secure.largest, len(peers) + 1)  # type: ignore[arg-type]
+        return wire.reply(message, replace(hidden, weights={wire.VECTOR: mask_update(context, integers)}), {})
+
+    def _name(self, context: Context) -> str:
+        """Return the client that a node stands for."""
+        return self.names[int(context.node_config[PARTITION])]
+
+    def _seeds(self, name: str, work: wire.LocalWork) -> tuple[int, bytes | None]:
+        """Return the seed of a client's training, and the key of its noise where that is by a secret."""
+        secret = self.secrets.get(name)
+        key = None if secret is None else derive_key(secret, "noise", work.round, work.seed)
+        return derive_seed(work.seed, name), key
+
+    def answer(self, message: Message, context: Context) -> Message:
+        """Return the client's answer to a question."""
+        arrays = _optional(message.content, wire.ARRAYS)
+        found = answer_question(self.trainables[self._name(context)], asked_for(message.content), arrays)
+        return Message(RecordDict({wire.ARRAYS: wire.to_array_record(found)}), reply_to=message)
+
+    def query(self, message: Message, context: Context) -> Message:
+        """Return a client's place, and what it keeps between rounds."""
         kept = (OWN, RESIDUAL, OPTIMISER, ANSWERED)
-        if message.content and (not simulated or context.state or not {*message.content} <= {*kept}):
+        if message.content and (not self.simulated or context.state or not {*message.content} <= {*kept}):
             raise RequestRefused("a client's state is its own once it has any")
         for key in message.content:
             context.state[key] = message.content[key]
         found = {key: context.state[key] for key in kept if key in context.state}
-        if OWN in found and isinstance(strategy, FedMD) and not simulated:
-            now = np.frombuffer(requests.digest(RecordDict({OWN: found.pop(OWN)})), np.uint8)
+        if OWN in found and isinstance(self.strategy, FedMD) and not self.simulated:
+            now = np.frombuffer(self.requests.digest(RecordDict({OWN: found.pop(OWN)})), np.uint8)
             before = [each for each in _recorded(context, OWN_DIGESTS).values() if not np.array_equal(each, now)]
-            context.state[OWN_DIGESTS] = to_arrays(dict(zip(("last", "before"), (now, *before), strict=False)))
+            context.state[OWN_DIGESTS] = wire.to_array_record(
+                dict(zip(("last", "before"), (now, *before), strict=False))
+            )
             found[OWN_DIGESTS] = context.state[OWN_DIGESTS]
         place = MetricRecord({PARTITION: int(context.node_config[PARTITION])})
-        return Message(RecordDict({**found, METRICS: place}), reply_to=message)
+        return Message(RecordDict({**found, wire.METRICS: place}), reply_to=message)
 
     def _train(
-        trainable: Trainable, message: Message, context: Context, start: Weights, work: LocalWork, seed: int
+        self, trainable: Trainable, message: Message, context: Context, start: Weights, work: wire.LocalWork, seed: int
     ) -> tuple[Update, Weights, Weights]:
-        """Return the result of local training, a strategy's arrays beside it, and those to keep if they arrive."""
-        sent, own = _optional(message.content, EXTRA), _recorded(context, OWN)
-        correction = strategy.correct(sent, own) if isinstance(strategy, Corrects) else Correction()
-        if isinstance(rules.personal, RegionalModels) and CENTRE in message.content:
-            correction = Correction(rules.personal.pull, centre=read_arrays(message.content, CENTRE))
-        layers = {"layers": rules.upload.layers} if rules.upload.layers else {}
+        """Return the result of local training, a self.strategy's arrays beside it, and those to keep if they arrive."""
+        sent, own = _optional(message.content, wire.EXTRA), _recorded(context, OWN)
+        correction = self.strategy.correct(sent, own) if isinstance(self.strategy, Corrects) else Correction()
+        if isinstance(self.rules.personal, RegionalModels) and wire.CENTRE in message.content:
+            correction = Correction(self.rules.personal.pull, centre=wire.read_arrays(message.content, wire.CENTRE))
+        layers = {"layers": self.rules.upload.layers} if self.rules.upload.layers else {}
         how = {**correction.arguments(), **layers}
-        if isinstance(strategy, FedMD):
+        if isinstance(self.strategy, FedMD):
             if not own and OWN_DIGESTS in context.state:
                 raise InputError("its network of the last round is in the folder of a vehicle")
-            how |= {"own": own, "imitation_steps": strategy.steps}
-        if rules.keep_optimiser:
+            how |= {"own": own, "imitation_steps": self.strategy.steps}
+        if self.rules.keep_optimiser:
             how |= {"optimiser": _recorded(context, OPTIMISER)}
         try:
             update = trainable.train(start, steps=work.steps, learning_rate=work.learning_rate, seed=seed, **how)
@@ -221,20 +247,18 @@ def client_app(
             if isinstance(trainable, Accounts):
                 raise
             raise RuntimeError(f"no budget is its own: {error}") from None  # which would end the federation
-        if rules.keep_optimiser:
+        if self.rules.keep_optimiser:
             if not (state := getattr(update, "optimiser", {})):
                 raise TypeError("keep_optimiser: its update has no 'optimiser' to keep")
             _record(context, OPTIMISER, state)
-        if isinstance(strategy, FedMD):
+        if isinstance(self.strategy, FedMD):
             _record(context, OWN, getattr(update, "own", {}))
-        if not isinstance(strategy, Exchanges):
+        if not isinstance(self.strategy, Exchanges):
             return update, {}, {}
-        exchanged, asked = rules.upload.exchanged(start), getattr(update, "gradient", {})  # by the correction
+        exchanged, asked = self.rules.upload.exchanged(start), getattr(update, "gradient", {})  # by the correction
         gradient = {name: array for name, array in asked.items() if name in exchanged}
         found = LocalUpdate(update.weights, update.samples, update.loss, gradient)
-        return update, *strategy.report(found, sent, own)
-
-    return app
+        return update, *self.strategy.report(found, sent, own)
 
 
 def _recorded(context: Context, key: str) -> Arrays:
@@ -242,33 +266,23 @@ def _recorded(context: Context, key: str) -> Arrays:
 
 
 def _optional(content: RecordDict, key: str) -> Arrays:
-    return read_arrays(content, key) if key in content else {}
+    return wire.read_arrays(content, key) if key in content else {}
 
 
 def _record(context: Context, key: str, arrays: Weights) -> None:
     """Keep arrays for the next round; of a training that diverged nothing is kept."""
     if arrays and all(np.isfinite(array).all() for array in arrays.values()):
-        context.state[key] = to_arrays(arrays)
+        context.state[key] = wire.to_array_record(arrays)
 
 
 def _keep(context: Context, key: str, update: Update) -> None:
-    context.state[key], context.state[f"{key}-{SAMPLES}"] = to_arrays(update.weights), to_metrics(update)
+    context.state[key], context.state[f"{key}-{wire.SAMPLES}"] = (
+        wire.to_array_record(update.weights),
+        wire.to_metrics(update),
+    )
 
 
 def _recall(context: Context, key: str) -> LocalUpdate:
-    metrics = context.state.metric_records[f"{key}-{SAMPLES}"]
-    samples, loss = metrics[SAMPLES], metrics[LOSS]
+    metrics = context.state.metric_records[f"{key}-{wire.SAMPLES}"]
+    samples, loss = metrics[wire.SAMPLES], metrics[wire.LOSS]
     return LocalUpdate(_recorded(context, key), int(samples), float(loss))  # type: ignore[arg-type]
-
-
-def check_arguments(trainables: Mapping[str, Trainable], wanted: Iterable[str], why: str) -> None:
-    """Raise `InputError` where a client's `train` does not take the arguments `wanted`; `why` begins the sentence."""
-    for name, trainable in trainables.items():
-        known = inspect.signature(trainable.train).parameters
-        if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in known.values()):
-            continue
-        if lacking := [argument for argument in wanted if argument not in known]:
-            raise InputError(
-                f"{why} needs clients whose training takes '{lacking[0]}', and that of {name} "
-                f"({type(trainable).__name__}) does not"
-            )

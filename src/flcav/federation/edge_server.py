@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flcav.federation.buffered_rounds import Buffers
+from flcav.federation.links.link import Runtime
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import EVERYBODY, Schedule, federate
+from flcav.federation.modes.buffered import Buffers
 from flcav.federation.privacy import count_affordable
-from flcav.federation.rounds import EVERYBODY, Schedule, federate
 from flcav.federation.rules import RegionalModels, Rules
-from flcav.federation.runtimes.link import Runtime
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.trainable import Distiller, LocalUpdate, Trainable, Weights
@@ -47,10 +47,10 @@ class EdgeServer:
 
         The first cloud round starts from the server's own stage II model instead: the cloud has not averaged yet, and
         its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are;
-        of regional models these are all, and vehicles are pulled to the cloud's from the second cloud round on.
-        Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles
-        keep to. Under central noise the region counts by its number of vehicles, whoever took part; otherwise by the
-        samples of its last edge round that is not empty. Where all are, it has no samples itself, but in the first
+        of regional models these are all, and vehicles are pulled to the cloud's from the second cloud round on. Edge
+        rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles keep
+        to. Under central noise the region counts by its number of vehicles, even those that took no part; otherwise by
+        the samples of its last edge round that is not empty. Where all are, it has no samples itself, but in the first
         cloud round one, for its model of stage II.
         """
         start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own

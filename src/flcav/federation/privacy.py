@@ -1,32 +1,34 @@
-"""Differential privacy of clients: clipped updates, Gaussian noise, and an account of epsilon.
+"""Differential privacy of clients: clipped updates, Gaussian noise, its sources, and an account of epsilon.
 
 Central: a trusted server adds noise to the sum of the clipped changes of a round (McMahan et al., "Learning
 Differentially Private Recurrent Language Models", ICLR 2018, algorithm 1 with the fixed-denominator estimator). Local:
-every client adds noise to its own clipped change, and the server is not trusted. Who adds noise draws it by a secret
-of its own, or, where the noise is `seeded`, by the seed of the round, which all know.
+every client adds noise to its clipped change, and the server is not trusted. Noise hides a change only from those who
+cannot repeat it: it is drawn by a party's secret, 32 bytes of the operating system, or, where it is `seeded`, by the
+seed of the round, which all know. By a secret it is drawn with SHAKE256, so that noise that is seen bare, where a
+weight did not change, reveals nothing of the rest.
 """
 
 import bisect
 import functools
+import hashlib
 import itertools
 import logging
 import math
+import secrets
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flcav.config import Config, InputError
-from flcav.federation.noise import Normals, secret_noise
 from flcav.federation.selection import Selection
-from flcav.federation.trainable import LocalUpdate, Weights
-from flcav.federation.upload import add, subtract
+from flcav.federation.trainable import Arrays, LocalUpdate, Weights
+from flcav.federation.upload import apply_change, find_change
 from flcav.statistics.streams import stream
 
-Arrays = dict[str, NDArray[np.number]]  # by name
 ROUNDING = 1e-12  # relative: more than the sum of squares of a clipped change is off in float64
 MOST_NOISE = 1e6
 SMALLEST = 1e-12  # epsilon, and the inverse of the largest, that noise is sought for
@@ -127,10 +129,10 @@ def average_privately(
     """
     total: Arrays = {name: np.zeros(start[name].shape) for name in names}
     for update in updates:
-        for name, array in clip_change(subtract(update.weights, start, names), privacy.clip).items():
+        for name, array in clip_change(find_change(update.weights, start, names), privacy.clip).items():
             total[name] += array
     noisy = add_noise(total, privacy, seed, key)
-    return add(start, {name: array / expected for name, array in noisy.items()})
+    return apply_change(start, {name: array / expected for name, array in noisy.items()})
 
 
 def expected_clients(selection: Selection, names: Sequence[str]) -> float:
@@ -265,3 +267,59 @@ def count_affordable(privacy: Privacy, selection: Selection, names: Sequence[str
     if privacy.epsilon is None or rounds == 0:
         return rounds
     return max(bisect.bisect_left(range(rounds + 1), True, key=exceeds) - 1, 0)
+
+
+Secret = NDArray[np.uint8]  # (32,)
+SECRET_BYTES = 32
+
+
+class Normals(Protocol):
+    """Source of normal numbers, as NumPy's generators are."""
+
+    def normal(self, *, scale: float, size: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return numbers of mean 0 and standard deviation `scale`."""
+        ...
+
+
+class SecretNormals:
+    """Normal numbers by Box and Muller from the output of SHAKE256 for a key; equal keys give equal numbers."""
+
+    def __init__(self, key: bytes) -> None:
+        """Draw by `key`, which is to be used for one change alone."""
+        self._key, self._arrays = key, 0
+
+    def normal(self, *, scale: float, size: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return numbers of mean 0 and standard deviation `scale`."""
+        count, self._arrays = math.prod(size), self._arrays + 1
+        pairs = -(-count // 2)
+        drawn = hashlib.shake_256(_derive(self._key, f"array {self._arrays}")).digest(16 * pairs)
+        uniform = ((np.frombuffer(drawn, "<u8") >> np.uint64(11)) + 1.0) * 2.0**-53  # in (0, 1]
+        radius, angle = np.sqrt(-2.0 * np.log(uniform[:pairs])), 2.0 * np.pi * uniform[pairs:]
+        found = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
+        return scale * found[:count].reshape(size)
+
+
+def draw_secret() -> Secret:
+    """Return a new secret from the operating system's randomness."""
+    return np.frombuffer(secrets.token_bytes(SECRET_BYTES), np.uint8)
+
+
+def derive_key(secret: Secret, purpose: str, round_: int, seed: int) -> bytes:
+    """Return the 32-byte key of a secret for a purpose in one round; `seed` is the round's, which others know."""
+    return _derive(secret.tobytes(), f"{purpose} {round_} {seed}")
+
+
+def secret_noise(key: bytes, change: Weights) -> SecretNormals:
+    """Return the noise of a change in the round of `key`: the same for the same change, and for another one another.
+
+    So a round that is repeated after a stop sends the same again, and the difference of two messages reveals no change.
+    """
+    hashed = hashlib.blake2b(key=key, digest_size=SECRET_BYTES)
+    for name, array in change.items():
+        hashed.update(f"{name} {array.dtype} {array.shape} ".encode())
+        hashed.update(np.ascontiguousarray(array).tobytes())
+    return SecretNormals(hashed.digest())
+
+
+def _derive(key: bytes, purpose: str) -> bytes:
+    return hashlib.blake2b(purpose.encode(), key=key, digest_size=SECRET_BYTES).digest()

@@ -101,7 +101,7 @@ class Rules(Config):
         return self.privacy is not None and self.privacy.hides_draws(self.selection)
 
     def secret_parties(self, clients: Sequence[str]) -> Sequence[str]:
-        """Return who draws noise by a secret: each of these clients, or `SERVER`; nobody where it is seeded."""
+        """Return the parties that draw noise by a secret: these clients, or `SERVER`; none where it is seeded."""
         if self.privacy is None or self.privacy.seeded:
             return ()
         return clients if self.privacy.local else (SERVER,)

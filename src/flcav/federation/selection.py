@@ -123,7 +123,7 @@ class Selection(Config):
         """Return the clients that importance selection draws, with the probability of each.
 
         `norms` are the norms of the clients' updates times their shares of all samples. Each counts as `LONGEST` times
-        their lower median at most, so that fewer than half of the clients, whatever norms they tell, leave the others
+        their lower median at most, so that fewer than half of the clients, whatever norms they report, leave the others
         a part in the draw; the mean stays unbiased, since its weights are by the same probabilities.
         """
         assert self.clients is not None

@@ -1,4 +1,8 @@
-"""State of a federation between rounds, as arrays for a checkpoint, and the record of each round."""
+"""State of a federation between rounds, as arrays for a checkpoint, and the record of each round.
+
+A cloud round's record has the weight divergence of the regions: the relative L2 distance of their weights from their
+mean (after Zhao et al., "Federated Learning with Non-IID Data", 2018, whose reference is centralised training).
+"""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -8,18 +12,53 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.federation.divergence import RoundDivergence
-from flcav.federation.noise import Secret, draw_secret
+from flcav.federation.privacy import Secret, draw_secret
+from flcav.federation.trainable import Arrays, Weights, learned_names, statistics_names
 from flcav.interface.wording import make_printable
 from flcav.storage.records import LEFT_OUT, WHERE_TRUE, Record
 
-Arrays = dict[str, NDArray[np.number]]  # by name
+
+@dataclass(frozen=True)
+class Divergence(Record):
+    """Weight divergence of several models: mean over them of |w_i - m| / |m|, where m is the mean of all w_i."""
+
+    whole: float  # over all floating arrays
+    statistics: float | None  # over batch normalisation's running means and variances; None: the network has none
+    learned: float  # over all others, which gradients change
+
+
+@dataclass(frozen=True)
+class RoundDivergence(Record):
+    """Weight divergence of the regions in a cloud round: of what they begin with, and of what the cloud averages."""
+
+    begun: Divergence
+    trained: Divergence
+
+
+def measure_divergence(models: Sequence[Weights]) -> Divergence:
+    """Return the weight divergence of models with arrays of the same names and shapes; 0 of a single one."""
+    learned, statistics = learned_names(models[0]), statistics_names(models[0])
+    return Divergence(
+        whole=_mean_distance(models, [*learned, *statistics]),
+        statistics=_mean_distance(models, statistics) if statistics else None,
+        learned=_mean_distance(models, learned),
+    )
+
+
+def _mean_distance(models: Sequence[Weights], names: Sequence[str]) -> float:
+    """Return the mean of |w_i - m| / |m| over the arrays `names`; where m is 0, of |w_i|."""
+    rows = np.array([np.concatenate([np.ravel(own[name]).astype(np.float64) for name in names]) for own in models])
+    mean = rows.mean(axis=0)
+    return float(np.mean(np.linalg.norm(rows - mean, axis=1)) / (np.linalg.norm(mean) or 1.0))
+
+
 ClientStates = dict[str, dict[str, Arrays]]  # by client and kind
 ReadStates = Callable[[Iterable[str]], ClientStates]  # of what clients keep, by kind
 
 SERVER, CLIENT, PERSONAL = "server", "client", "personal"
-FAILED = "failed or lost"  # begins what is told of clients without an update
-LONGEST = 500  # characters of a client's words that are told
+UNSENT = "over the budget, not sent"  # why an update is not there that its client kept
+FAILED = "failed or lost"  # begins the list of clients without an update
+LONGEST = 500  # characters of a client's words that are shown
 
 
 @dataclass(frozen=True)
@@ -33,7 +72,7 @@ class RoundRecord(Record):
     clients: tuple[str, ...]  # whose updates were combined, by name
     failed: Mapping[str, str] = field(default_factory=dict)  # by client what was wrong
     epsilon: float | None = None  # of differential privacy, of all rounds so far; None: without noise
-    loss: float | None = None  # mean training loss, weighted by samples; None: of nobody that is known
+    loss: float | None = None  # mean training loss, weighted by samples; None: no client reported one
     samples: int = 0  # of the clients together
     divergence: Annotated[RoundDivergence | None, LEFT_OUT] = None  # of the regions; None: no cloud round of several
     empty: Annotated[bool, WHERE_TRUE] = False  # no update, since clients had no samples: the model is that of before
@@ -94,3 +133,8 @@ class FederationState:
                 client, kind, name = rest.split("|", 2)
                 self.clients.setdefault(client, {}).setdefault(kind, {})[name] = array
         self.records = [*records]
+
+    @property
+    def spent(self) -> bool:
+        """Return whether an update of the last round was not sent, since it would have exceeded a budget."""
+        return bool(self.records) and UNSENT in self.records[-1].failed.values()

@@ -10,6 +10,9 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.config import InputError
+
+Arrays = dict[str, NDArray[np.number]]  # by name
 Weights = Mapping[str, NDArray[np.number]]  # name -> array, parameters and buffers, in a fixed order
 Forms = Mapping[str, tuple[tuple[int, ...], np.dtype]]  # shape and type of arrays by name
 STATISTICS = (  # of batch normalisation, last part of a name: PyTorch's, and those of the package's own layer
@@ -38,6 +41,20 @@ def statistics_names(weights: Weights) -> list[str]:
     """Return the names of the floating arrays that no gradient changes: batch normalisation's means and variances."""
     learned = {*learned_names(weights)}
     return [name for name, array in weights.items() if np.issubdtype(array.dtype, np.floating) and name not in learned]
+
+
+def check_weights(weights: Weights, told: str) -> None:
+    """Raise `InputError` where weights are not finite arrays of numbers; `told` begins the sentence."""
+    for name, array in weights.items():
+        if not isinstance(array, np.ndarray | np.generic) or array.dtype.kind not in "fiub":
+            kind = f" of {dtype}" if (dtype := getattr(array, "dtype", None)) else ""
+            raise InputError(
+                f"{told}: '{name}' is {type(array).__name__}{kind}, and arrays of NumPy's numbers are wanted"
+            )
+        if not (finite := np.isfinite(array)).all():
+            raise InputError(
+                f"{told}: {np.size(array) - finite.sum()} of {np.size(array)} values of '{name}' are not finite"
+            )
 
 
 class Update(Protocol):
@@ -128,7 +145,7 @@ def count_samples(client: Trainable, steps: int) -> int:
 class Accounts(Protocol):
     """A client with a link of its own to clients, whose budget its training may exceed: an edge server."""
 
-    account: Any  # of that link, `flcav.federation.runtimes.metered.Account`
+    account: Any  # of that link, `flcav.federation.links.metered.Account`
 
 
 @runtime_checkable

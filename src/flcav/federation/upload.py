@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flcav.config import Config, InputError
-from flcav.federation.trainable import Forms, Weights, forms_of, learned_names
+from flcav.federation.trainable import Arrays, Forms, Weights, forms_of, learned_names
 
-Arrays = dict[str, NDArray[np.number]]  # by name
 INDICES, VALUES, SCALES = "#indices", "#values", "#scales"  # arrays of a compressed change; no parameter is called so
 LEVELS = 127  # of int8, on either side of 0
 
@@ -149,12 +148,12 @@ def decompress(upload: Upload, sent: Weights, like: Weights) -> Arrays:
             return {name: sent[name].astype(array.dtype) for name, array in like.items()}
 
 
-def subtract(weights: Weights, start: Weights, names: Sequence[str]) -> Arrays:
+def find_change(weights: Weights, start: Weights, names: Sequence[str]) -> Arrays:
     """Return the change of the arrays `names` in a round, in their own types."""
     return {name: (weights[name].astype(np.float64) - start[name]).astype(start[name].dtype) for name in names}
 
 
-def add(start: Weights, change: Mapping[str, NDArray[np.number]]) -> Arrays:
+def apply_change(start: Weights, change: Mapping[str, NDArray[np.number]]) -> Arrays:
     """Return the weights `start` with their `change` added to those arrays that it names."""
     return {
         name: (array.astype(np.float64) + change[name]).astype(array.dtype) if name in change else np.asarray(array)

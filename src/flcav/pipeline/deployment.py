@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from flcav.config import InputError
-from flcav.federation.runtimes.link import check_deployable
+from flcav.federation.links.link import check_deployable
 from flcav.pipeline.engine import Step
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.steps.cloud import cloud_step
@@ -41,7 +41,7 @@ def deploy(graph: Graph, runtime: str, fleet: Path | None, engine: str = "proces
         raise InputError(f"runtime '{runtime}': vehicles are reached from this machine; not with engine '{engine}'")
     check_clients(graph, graph.settings, runtime)
     if fleet is not None:
-        from flcav.federation.runtimes.deployed import RegionalDeployment
+        from flcav.federation.links.flower import RegionalDeployment
 
         RegionalDeployment(fleet, graph.vehicles)  # says now that it is not up
     where = {"runtime": runtime, "fleet": "" if fleet is None else str(fleet.absolute())}

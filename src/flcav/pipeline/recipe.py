@@ -11,8 +11,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from flcav.config import Config, InputError, parse_config, read_yaml
+from flcav.federation.links.ros_names import ROS_NAMESPACE
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.ros_names import ROS_NAMESPACE
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.clock.rounds import NetworkSettings

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from scipy.stats import permutation_test, rankdata
 
-from flcav.federation.divergence import RoundDivergence
+from flcav.federation.state import RoundDivergence
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
 from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.training import FederatedRound, StageResult

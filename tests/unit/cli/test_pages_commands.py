@@ -14,10 +14,10 @@ from flcav import load_run_recipe
 from flcav.cli.main import app
 from flcav.config import InputError
 from flcav.federation import LocalUpdate, Update
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import Privacy
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import Ledger, LinkMegabytes

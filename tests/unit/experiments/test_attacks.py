@@ -8,7 +8,7 @@ import torch
 from scipy.stats import mannwhitneyu
 from torch.nn import functional
 
-from flcav.federation.rounds import Schedule
+from flcav.federation.loop import Schedule
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.reproductions.federation.drives import (
     CLASSES,

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from flcav.federation.divergence import Divergence, RoundDivergence
+from flcav.federation.state import Divergence, RoundDivergence
 from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
 from flcav.pipeline.results.training import FederatedRound, StageResult, StatisticsScore
 from flcav.report.cloud_rounds import cloud_tables, describe_correlation

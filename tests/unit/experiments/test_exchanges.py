@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flcav.experiments.experiment import shrink_recipe
-from flcav.federation.divergence import Divergence, RoundDivergence
+from flcav.federation.state import Divergence, RoundDivergence
 from flcav.federation.upload import name_like
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.network.radio.budget import Radio

@@ -17,16 +17,16 @@ from dp_accounting.pld import PLDAccountant
 from flwr.app import Context, Message
 
 from flcav.federation import client
-from flcav.federation.buffered_rounds import Buffers, take_turns
-from flcav.federation.messages.conduct import ANSWERED
-from flcav.federation.messages.records import VECTOR, read_arrays
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.conduct import ANSWERED
+from flcav.federation.links.metered import Account, Outage
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.modes.buffered import Buffers, fill_in_turns
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.secure.parties import SecureClient
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.trainable import LocalUpdate, Update, Weights
+from flcav.federation.wire import VECTOR, read_arrays
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings
 
@@ -52,7 +52,7 @@ class Walker:
 def sent(monkeypatch: pytest.MonkeyPatch) -> Exposures:
     """Note what leaves each client; of masked updates what the masks hide."""
     found: Exposures = defaultdict(set)
-    reply, mask = client.reply, client.mask_update
+    reply, mask = client.wire.reply, client.mask_update
 
     def noted(message: Message, update: Update, extra: Weights) -> Message:
         if VECTOR not in update.weights:
@@ -63,7 +63,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> Exposures:
         found[context.node_id].add(read_arrays(context.state, client.HIDDEN)[VECTOR].tobytes())
         return mask(context, integers)
 
-    monkeypatch.setattr(client, "reply", noted)
+    monkeypatch.setattr(client.wire, "reply", noted)
     monkeypatch.setattr(client, "mask_update", hidden)
     return found
 
@@ -153,7 +153,7 @@ def test_buffers(sent: Exposures, rules: dict[str, Any]):
     state, local = FederationState(), rules is LOCAL
     run(rules, state, strategy=FedBuff(2))
     check(last(state), gaussian(sent, local))
-    before = Buffers(take_turns([*map("cav{}".format, range(CLIENTS))], 2, 7).rounds, {"cav0": 4, "cav4": 5})
+    before = Buffers(fill_in_turns([*map("cav{}".format, range(CLIENTS))], 2, 7).rounds, {"cav0": 4, "cav4": 5})
     late = FederationState()
     run(rules, late, strategy=FedBuff(2), buffers=before)
     noise = NOISE / 2 if local else NOISE

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from flwr.app import Array, ArrayRecord
 
-from flcav.federation.messages.records import to_arrays, to_weights
-from flcav.federation.runtimes.blocks import SharedBlock
+from flcav.federation.links.processes import SharedBlock
 from flcav.federation.strategies.fedavg import BLOCK, RunningMean
+from flcav.federation.wire import to_array_record, to_weights
 
 RNG = np.random.default_rng(0)
 WEIGHTS = {
@@ -26,7 +26,7 @@ def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
 
 
 def test_arrays_become_flowers_bytes_and_weights_again():
-    record = to_arrays(WEIGHTS)
+    record = to_array_record(WEIGHTS)
     for name, array in record.items():
         flowers = Array(np.asarray(WEIGHTS[name], order="C"))
         assert (array.dtype, array.shape, array.stype, array.data) == (

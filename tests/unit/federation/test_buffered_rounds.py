@@ -8,16 +8,16 @@ import pytest
 from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
-from flcav.federation.buffered_rounds import OVER_BUDGET, BrokenUpdate, BufferedRound, Buffers, take_turns
 from flcav.federation.edge_server import EdgeServer
+from flcav.federation.links.in_process import update_bytes
+from flcav.federation.links.metered import Account
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.modes.buffered import BrokenUpdate, Buffers, FilledBuffer, fill_in_turns
 from flcav.federation.privacy import Privacy, account_epsilon
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.selection import Selection
-from flcav.federation.state import FederationState
+from flcav.federation.state import UNSENT, FederationState
 from flcav.federation.strategies import of_servers, strategy_named
 from flcav.federation.strategies.fedavg import FedAvg
 from flcav.federation.strategies.fedbuff import FedBuff
@@ -71,7 +71,7 @@ def test_a_schedule_by_hand():
         {"w": np.zeros(1), "bn.running_var": np.ones(1)},
         replace(SCHEDULE, rounds=3),
         strategy=FedBuff(),
-        buffers=Buffers(tuple(BufferedRound(each) for each in rounds)),
+        buffers=Buffers(tuple(FilledBuffer(each) for each in rounds)),
         on_round=lambda number, weights, loss: reached.append(float(weights["w"][0])),
     )
     half = 2**-0.5
@@ -106,7 +106,7 @@ def test_clients_train_with_the_seed_and_rate_of_the_version_that_they_were_sent
             asked.append((learning_rate, seed))
             return LocalUpdate(weights, 1, 0.0)
 
-    buffers = Buffers((BufferedRound({"a": 0}), BufferedRound({"a": 1}), BufferedRound({"b": 0})))
+    buffers = Buffers((FilledBuffer({"a": 0}), FilledBuffer({"a": 1}), FilledBuffer({"b": 0})))
     federate({"a": Notes(), "b": Notes()}, START, SCHEDULE, strategy=FedBuff(1), buffers=buffers)
     work = [SCHEDULE.work(version + 1) for version in (0, 1, 0)]
     names = ("a", "a", "b")
@@ -145,7 +145,7 @@ def test_an_update_over_the_budget_is_not_sent_and_ends_the_federation():
     assert rounds == [1, 2]
     assert [len(record.clients) for record in state.records] == [2, 1]
     (late,) = state.records[-1].failed.items()
-    assert late[1] == OVER_BUDGET
+    assert late[1] == UNSENT
     assert late[0] not in {entry.client for entry in ups if entry.round == 2}
     before = book.entries
     assert same(federate(clients, found.weights, SCHEDULE, account(book), **how, done=2).weights, found.weights)
@@ -155,7 +155,7 @@ def test_an_update_over_the_budget_is_not_sent_and_ends_the_federation():
 def test_what_breaks_off_is_in_the_ledger_and_named():
     clients, book, state = vehicles("grid", 3), ledger(), FederationState()
     broken = (BrokenUpdate("grid/cav2", "left the town", 100, 40), BrokenUpdate("grid/cav0", "out of coverage", 7, 0))
-    buffers = Buffers((BufferedRound({"grid/cav0": 0, "grid/cav1": 0}, broken),))
+    buffers = Buffers((FilledBuffer({"grid/cav0": 0, "grid/cav1": 0}, broken),))
     one = replace(SCHEDULE, rounds=1)
     federate(clients, START, one, account(book), strategy=FedBuff(2), state=state, buffers=buffers)
     sizes = {(entry.client, entry.direction): entry.bytes for entry in book.entries[:4]}
@@ -169,8 +169,8 @@ def test_what_breaks_off_is_in_the_ledger_and_named():
 def test_epsilon_is_that_of_the_client_that_took_part_most_often(where: Any):
     """cav0 takes part in three of four rounds, and began a fourth time to send what broke off."""
     rounds = [{"grid/cav0": 0, "grid/cav1": 0}, {"grid/cav0": 1, "grid/cav2": 0}, {"grid/cav0": 2, "grid/cav1": 1}]
-    last = BufferedRound({"grid/cav1": 3, "grid/cav2": 2}, (BrokenUpdate("grid/cav0", "left the town", 9, 9),))
-    buffers = Buffers((*(BufferedRound(each) for each in rounds), last))
+    last = FilledBuffer({"grid/cav1": 3, "grid/cav2": 2}, (BrokenUpdate("grid/cav0", "left the town", 9, 9),))
+    buffers = Buffers((*(FilledBuffer(each) for each in rounds), last))
     privacy, state = Privacy(where=where, clip=0.1, noise=2.0, seeded=True), FederationState()
     how: Any = {"strategy": FedBuff(2), "state": state, "buffers": buffers}
     federate(vehicles("grid", 3), START, SCHEDULE, rules=Rules(privacy=privacy), **how)
@@ -220,7 +220,7 @@ def test_edge_servers_are_asynchronous_below_a_synchronous_cloud():
 
 def test_turns_of_equal_clients():
     """All are ready at once: c waits in the second buffer, where a, which has begun again, joins it."""
-    assert [dict(each.versions) for each in take_turns(["a", "b", "c"], 2, 3).rounds[:3]] == [
+    assert [dict(each.versions) for each in fill_in_turns(["a", "b", "c"], 2, 3).rounds[:3]] == [
         {"a": 0, "b": 0},
         {"c": 0, "a": 1},
         {"b": 1, "c": 2},

@@ -13,24 +13,22 @@ from flwr.app import ConfigRecord, Message, MessageType, RecordDict
 from flwr.common.serde import recorddict_to_proto
 
 from flcav.federation.client import client_app
-from flcav.federation.messages.conduct import ANSWERED
-from flcav.federation.messages.records import ARRAYS, ASK, CONFIG, LOST, VECTOR, read_arrays, to_arrays
-from flcav.federation.noise import draw_secret
-from flcav.federation.privacy import Privacy, account_epsilon
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.conduct import ANSWERED
+from flcav.federation.links.in_process import EmbeddedGrid
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.privacy import Privacy, account_epsilon, draw_secret
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import EmbeddedGrid
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.secure.masks import agree, to_values
 from flcav.federation.secure.messages import SecureSum, TooFewClients
 from flcav.federation.secure.parties import PublicKeys, SecureClient, add_mask
-from flcav.federation.secure.shamir import SHARE_BYTES, join_shares
+from flcav.federation.secure.primitives import SHARE_BYTES, agree, join_shares, to_values
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
+from flcav.federation.strategies.corrections import Scaffold
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.wire import ARRAYS, ASK, CONFIG, LOST, VECTOR, read_arrays, to_array_record
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.distillation import SentOutputs
 from flcav.statistics.streams import derive_seed
@@ -65,7 +63,7 @@ class Server:
         """Return the answer to a request; more: entries of a request of secure aggregation."""
         work = SCHEDULE.work(round_)
         records: dict[str, Any] = {CONFIG: (work if seed is None else replace(work, seed=seed)).record()}
-        records[ARRAYS] = to_arrays(start)
+        records[ARRAYS] = to_array_record(start)
         if asked is not None:
             records[ASK] = ConfigRecord({ASK: asked, **more})
         return self.send(records)
@@ -155,8 +153,8 @@ def test_noise_cannot_be_averaged_away():
 
 def test_a_client_that_keeps_something_answers_a_request_once():
     with serve("plain", Scaffold()) as server:
-        extra = {"extra": to_arrays({"w": START["w"]})}
-        work = {CONFIG: SCHEDULE.work(1).record(), ARRAYS: to_arrays(START)}
+        extra = {"extra": to_array_record({"w": START["w"]})}
+        work = {CONFIG: SCHEDULE.work(1).record(), ARRAYS: to_array_record(START)}
         server.send(work | extra)
         with pytest.raises(ConnectionRefusedError, match="after update of round 1 was answered"):
             server.send(work | extra)
@@ -164,7 +162,7 @@ def test_a_client_that_keeps_something_answers_a_request_once():
 
 def test_a_note_that_nothing_arrives_is_no_other_request():
     with serve("plain") as server:
-        server.send({CONFIG: SCHEDULE.work(1).record(), ARRAYS: to_arrays(START), LOST: ConfigRecord()})
+        server.send({CONFIG: SCHEDULE.work(1).record(), ARRAYS: to_array_record(START), LOST: ConfigRecord()})
         server.ask(None)
 
 
@@ -226,7 +224,7 @@ def test_a_query_plants_nothing_in_a_client():
                 server.send({"secrets": ConfigRecord({"secrets": "planted"})}, MessageType.QUERY)
             server.ask("keys")
         with pytest.raises(ConnectionRefusedError, match="a client's state is its own"):
-            server.send({ANSWERED: to_arrays({ANSWERED: np.zeros(7, np.int64)})}, MessageType.QUERY)
+            server.send({ANSWERED: to_array_record({ANSWERED: np.zeros(7, np.int64)})}, MessageType.QUERY)
         server.send({}, MessageType.QUERY)
 
 
@@ -345,10 +343,15 @@ def test_no_request_gets_the_network_of_a_client_that_sends_outputs():
     strategy, network = FedMD(), np.full(5, 7.0, np.float32)
     with EmbeddedGrid(client_app({"cav0": Imitator()}, strategy, Rules()), ["cav0"]) as grid:
         server, told = Server(grid), list[RecordDict]()
-        told.append(server.send({CONFIG: SCHEDULE.work(1).record(), ARRAYS: to_arrays({"p": np.zeros((4, 3))})}))
+        told.append(server.send({CONFIG: SCHEDULE.work(1).record(), ARRAYS: to_array_record({"p": np.zeros((4, 3))})}))
         assert np.array_equal(grid.read_states(["own"])["cav0"]["own"]["net"], network)
         for kind in (MessageType.TRAIN, MessageType.QUERY, MessageType.EVALUATE, "query.ask", "query.own", "train.own"):
-            for content in ({}, {"own": ConfigRecord()}, {ASK: ConfigRecord({ASK: "own"})}, {"own": to_arrays({})}):
+            for content in (
+                {},
+                {"own": ConfigRecord()},
+                {ASK: ConfigRecord({ASK: "own"})},
+                {"own": to_array_record({})},
+            ):
                 for key in ({}, {CONFIG: SCHEDULE.work(2).record()}):
                     with contextlib.suppress(ConnectionRefusedError, ValueError):
                         told.append(server.send({**content, **key}, kind))
@@ -372,7 +375,7 @@ def test_no_request_gets_an_update_without_its_masks_or_noise(name: str):
         def try_all(round_: int) -> None:
             for kind, asked in itertools.product(kinds, (None, "norm", "send", "count", "unmask", "update", "shares")):
                 ask = {} if asked is None else {ASK: ConfigRecord({ASK: asked})}
-                for more in ({}, {ARRAYS: to_arrays(START), CONFIG: SCHEDULE.work(round_).record()}):
+                for more in ({}, {ARRAYS: to_array_record(START), CONFIG: SCHEDULE.work(round_).record()}):
                     with contextlib.suppress(ConnectionRefusedError, ValueError):
                         told.append(server.send({**ask, **more}, kind))
 
@@ -401,7 +404,7 @@ def test_arrays_that_are_not_sent_stay_with_their_gradients(strategy: Strategy):
         {"head.w": np.zeros(3), "body.w": np.zeros(4)},
     )
     with EmbeddedGrid(client_app({"cav0": Whole()}, strategy, rules), ["cav0"]) as grid:
-        content = {CONFIG: SCHEDULE.work(1).record(), ARRAYS: to_arrays(start), "extra": to_arrays(start)}
+        content = {CONFIG: SCHEDULE.work(1).record(), ARRAYS: to_array_record(start), "extra": to_array_record(start)}
         told = Server(grid).send(content)
         for key in told.array_records:
             assert {*told.array_records[key]} == {"head.w"}

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.in_process import ClientLate, limit_time
+from flcav.federation.links.metered import Account
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import ReplyLimits, Rules
-from flcav.federation.runtimes.deadline import ClientLate, TimedClients
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes
@@ -86,7 +86,7 @@ def test_a_client_is_asked_again_when_it_has_ended_and_raises_what_it_raises():
             return steps
 
     slow = Vehicle(0.4)
-    clients = TimedClients({"slow": slow, "odd": Odd()}, 0.1)
+    clients = limit_time({"slow": slow, "odd": Odd()}, 0.1)
     assert [*clients] == ["slow", "odd"]
     how: Any = {"steps": 1, "learning_rate": 0.1, "seed": 1}
     for _ in range(2):

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from regression import ledger
 
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.metered import Account, Outage
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.corrections import Scaffold
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import Upload
 from flcav.network.ledger import BudgetExceeded

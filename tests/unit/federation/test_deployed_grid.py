@@ -14,25 +14,25 @@ import pytest
 from flwr.app import ConfigRecord, Context, Error, Message, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.attendance import ClientFailed
-from flcav.federation.fleet.authority import found_authority, open_registry
-from flcav.federation.fleet.keys import AUTHORITY, request_certificate, take_certificate
-from flcav.federation.messages.records import ASK, LOST_BY_NETWORK, NAMES, OVER_BUDGET, SHARES, to_arrays
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.client import ClientAgreement
+from flcav.federation.exchange import ClientFailed
+from flcav.federation.links.flower_grid import DeployedGrid
+from flcav.federation.links.in_process import keep_identity, wire_bytes
+from flcav.federation.links.link import open_link
+from flcav.federation.links.metered import Account
+from flcav.federation.links.vehicle_app import Assignment, VehicleApp, load_identity
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.deployed import Agreement
-from flcav.federation.runtimes.deployed_grid import DeployedGrid
-from flcav.federation.runtimes.embedded import keep_identity, wire_bytes
-from flcav.federation.runtimes.link import open_link
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.vehicle_app import Assignment, VehicleApp, load_identity
-from flcav.federation.secure.masks import draw_keys
 from flcav.federation.secure.parties import SEALED_BYTES, PublicKeys
+from flcav.federation.secure.primitives import draw_keys
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.strategy import Strategy
 from flcav.federation.trainable import LocalUpdate, Weights
+from flcav.federation.wire import ASK, LOST_BY_NETWORK, NAMES, OVER_BUDGET, SHARES, to_array_record
+from flcav.fleet.authority import found_authority, open_registry
+from flcav.fleet.keys import AUTHORITY, request_certificate, take_certificate
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 
 START = {"w": np.zeros((4, 3), np.float32), "b": np.zeros(700)}
@@ -97,7 +97,7 @@ class Fleet:
         self.folder, self.link = folder, Apps(folder, lies)
 
     @contextlib.contextmanager
-    def open(self, clients: Any, agreed: Agreement, states: Any, account: Account) -> Iterator[DeployedGrid]:
+    def open(self, clients: Any, agreed: ClientAgreement, states: Any, account: Account) -> Iterator[DeployedGrid]:
         names = dict(enumerate(clients, FIRST))
         for node, name in names.items():
             state = states.get(name, {})
@@ -126,7 +126,7 @@ def with_code(code: int) -> Lie:
 
 
 def enlarge(asked: Message, answer: Message) -> Message:
-    content = RecordDict({**answer.content, "junk": to_arrays({"junk": np.zeros(10**6)})})
+    content = RecordDict({**answer.content, "junk": to_array_record({"junk": np.zeros(10**6)})})
     return Message(content, reply_to=asked)
 
 
@@ -209,7 +209,7 @@ def test_a_vehicle_that_claims_does_not_end_questions(folder: Path):
         Account(Ledger(LinkMegabytes(9, 0)), "edge", "t", "wireless"),
     )
     for lies in ({FIRST: with_code(OVER_BUDGET)}, {FIRST: with_code(LOST_BY_NETWORK)}):
-        with open_link(clients, Fleet(folder, lies), account, FEDAVG, Rules(), {}, {}, 0) as link:  # type: ignore[arg-type]
+        with open_link(clients, Fleet(folder, lies), account, ClientAgreement(FEDAVG, Rules(), {}, 0), {}) as link:  # type: ignore[arg-type]
             for asked in (["cav0", "cav1"], ["cav0"]):
                 told = link.ask("offer", asked)
                 assert told.missing.keys() == {"cav0"}

@@ -11,14 +11,14 @@ import pytest
 from flwr.app import ArrayRecord, ConfigRecord, Error, Message, MessageType, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.fleet.authority import found_authority
-from flcav.federation.fleet.keys import request_certificate
-from flcav.federation.fleet.status import PROGRESS, Followed, FollowedRound
-from flcav.federation.messages.records import LOST_BY_NETWORK
-from flcav.federation.runtimes import deployed_grid
-from flcav.federation.runtimes.deployed_grid import ALLOWANCE_S, RAISED, DeployedGrid
-from flcav.federation.runtimes.embedded import keep_identity
-from flcav.federation.runtimes.metered import open_account
+from flcav.federation.links import flower_grid
+from flcav.federation.links.flower_grid import ALLOWANCE_S, RAISED, DeployedGrid
+from flcav.federation.links.in_process import keep_identity
+from flcav.federation.links.metered import open_account
+from flcav.federation.wire import LOST_BY_NETWORK
+from flcav.fleet.authority import found_authority
+from flcav.fleet.keys import request_certificate
+from flcav.fleet.status import PROGRESS, FederationProgress, RoundProgress
 
 NAMES = {1: "town/cav1", 2: "town/cav2", 3: "town/cav3"}
 SILENT = 2
@@ -74,14 +74,14 @@ def ask(grid):
 
 
 def test_a_vehicle_that_hangs_is_given_up_and_not_waited_for_while_it_is_away(fleet, monkeypatch):
-    monkeypatch.setattr(deployed_grid, "ALLOWANCE_S", 0.6)
+    monkeypatch.setattr(flower_grid, "ALLOWANCE_S", 0.6)
     grid, begun = fleet.open(0.2), time.monotonic()
     replies = ask(grid)
     assert 0.8 <= time.monotonic() - begun < 3
     assert (replies[SILENT].error.code, replies[SILENT].error.reason) == (RAISED, "it had not answered after 1 s")
     assert [node for node, reply in replies.items() if reply.has_content()] == [1, 3]
     fleet.nodes.answers[SILENT] = Error(3, "node is not available")
-    monkeypatch.setattr(deployed_grid, "ALLOWANCE_S", 60.0)
+    monkeypatch.setattr(flower_grid, "ALLOWANCE_S", 60.0)
     assert ask(grid)[SILENT].error.code == LOST_BY_NETWORK
     assert time.monotonic() - begun < 6
     fleet.nodes.answers[SILENT] = None
@@ -89,8 +89,8 @@ def test_a_vehicle_that_hangs_is_given_up_and_not_waited_for_while_it_is_away(fl
 
 
 def test_a_silent_vehicle_is_asked_again_ever_more_seldom(fleet, monkeypatch):
-    monkeypatch.setattr(deployed_grid, "ALLOWANCE_S", 1.8)
-    monkeypatch.setattr(deployed_grid, "AGAIN_S", 0.4)
+    monkeypatch.setattr(flower_grid, "ALLOWANCE_S", 1.8)
+    monkeypatch.setattr(flower_grid, "AGAIN_S", 0.4)
     ask(fleet.open(0.2))
     assert fleet.nodes.pushed == [1, 2, 3, SILENT, SILENT]  # after 0.4 s, and 0.8 s more; given up before 1.6 s more
 
@@ -109,7 +109,7 @@ def test_a_revoked_vehicle_is_not_asked(fleet):
     assert fleet.nodes.pushed == [1, 3]
     assert (
         f"; without town/cav2: {told}"
-        in Followed.from_json(json.loads((fleet.folder / PROGRESS).read_bytes()), "").describe()
+        in FederationProgress.from_json(json.loads((fleet.folder / PROGRESS).read_bytes()), "").describe()
     )
 
 
@@ -139,7 +139,9 @@ def test_words_of_vehicles_are_fit_for_a_terminal(fleet):
     reason = ask(fleet.open())[SILENT].error.reason
     assert reason.isprintable()
     assert len(reason) < 600
-    odd = Followed("edge", "weather", "wireless", 1.0, 2.0, (FollowedRound(1, 0.0, 2, {"cav": "\x1b[31m\n" * 99}),))
+    odd = FederationProgress(
+        "edge", "weather", "wireless", 1.0, 2.0, (RoundProgress(1, 0.0, 2, {"cav": "\x1b[31m\n" * 99}),)
+    )
     told = replace(odd, waits={"cav2": "\x07"}).in_plain_words().describe()
     assert told.isprintable()
     assert "round 1 without cav: \\x1b[31m\\n" in told

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from line_task import LineTask, Slope
 
-from flcav.federation.divergence import measure_divergence
 from flcav.federation.rules import Rules
+from flcav.federation.state import measure_divergence
 from flcav.federation.strategies import FEDAVG
 from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes

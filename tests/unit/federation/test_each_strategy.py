@@ -13,21 +13,16 @@ from scipy.stats import trim_mean
 from flcav.config import InputError
 from flcav.federation.checks import check_federation
 from flcav.federation.edge_server import EdgeServer
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import Privacy
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import RegionalModels, Rules
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, STRATEGIES, of_servers, strategy_named
-from flcav.federation.strategies.fedadam import FedAdam
-from flcav.federation.strategies.fedavgm import FedAvgM
+from flcav.federation.strategies.corrections import FedProx, Scaffold
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.strategies.fedprox import FedProx
-from flcav.federation.strategies.fedyogi import FedYogi
-from flcav.federation.strategies.krum import Krum
-from flcav.federation.strategies.median import Median
-from flcav.federation.strategies.scaffold import Scaffold
-from flcav.federation.strategies.trimmed_mean import TrimmedMean
+from flcav.federation.strategies.fedopt import FedAdam, FedAvgM, FedYogi
+from flcav.federation.strategies.robust import Krum, Median, TrimmedMean
 from flcav.federation.trainable import LocalUpdate
 from flcav.federation.upload import Upload
 from flcav.statistics.streams import derive_seed

@@ -8,10 +8,9 @@ import pytest
 from flwr.app import Array, ArrayRecord, ConfigRecord, Message, RecordDict
 from flwr.supercore.task_identity import TaskIdentity
 
-from flcav.federation.messages.records import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
-from flcav.federation.runtimes.embedded import wire_bytes
-from flcav.federation.runtimes.metered import Account, MeteredGrid, Outage
-from flcav.federation.runtimes.outages import LossyGrid
+from flcav.federation.links.in_process import wire_bytes
+from flcav.federation.links.metered import Account, MeteredGrid, Outage
+from flcav.federation.wire import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 NAMES = {1: "a", 2: "b", 3: "c"}
@@ -58,6 +57,11 @@ def entered(own: Account) -> list[tuple[str, int, str, int]]:
     return [(entry.direction, entry.round, entry.client, entry.bytes) for entry in own.ledger.entries]
 
 
+def down(client: str) -> tuple[str, int, str, int]:
+    node = next(node for node, name in NAMES.items() if name == client)
+    return "down", 4, client, wire_bytes(content(20 + node))
+
+
 @pytest.mark.parametrize("answering", [(1, 2, 3), (2,), (), (3, 1)])
 def test_every_message_that_was_sent_is_entered_once_whether_answered_or_not(answering: tuple[int, ...]) -> None:
     own, grid = account(), Nodes(answering)
@@ -72,8 +76,8 @@ def test_every_message_that_was_sent_is_entered_once_whether_answered_or_not(ans
 @pytest.mark.parametrize(("sent", "bytes_"), [(0, 0), (37, 37), (10**6, wire_bytes(content(40)))])
 def test_an_update_that_breaks_off_is_entered_as_far_as_it_came(sent: int, bytes_: int) -> None:
     own, grid = account({(4, "b"): Outage("out of coverage", sent)}), Nodes((1, 2, 3))
-    replies = list(LossyGrid(grid, own, NAMES).send_and_receive(messages(1, 2, 3)))  # type: ignore[arg-type]
-    assert entered(own) == [("up", 4, "b", bytes_)]
+    replies = list(MeteredGrid(grid, own, NAMES).send_and_receive(messages(1, 2, 3)))  # type: ignore[arg-type]
+    assert sorted(entry for entry in entered(own) if entry[2] == "b") == [down("b"), ("up", 4, "b", bytes_)]
     failed = [reply for reply in replies if reply.has_error()]
     assert [(reply.error.code, reply.error.reason) for reply in failed] == [(LOST_BY_NETWORK, "out of coverage")]
     assert [node for node, message in grid.got.items() if LOST in message.content] == [2]
@@ -81,10 +85,10 @@ def test_an_update_that_breaks_off_is_entered_as_far_as_it_came(sent: int, bytes
 
 def test_a_node_that_is_away_gets_nothing_and_another_round_loses_nobody() -> None:
     own, grid = account({(4, "b"): Outage("parked"), (5, "c"): Outage("out of coverage", 9)}), Nodes((1, 2, 3))
-    replies = list(LossyGrid(grid, own, NAMES).send_and_receive(messages(1, 2, 3)))  # type: ignore[arg-type]
+    replies = list(MeteredGrid(grid, own, NAMES).send_and_receive(messages(1, 2, 3)))  # type: ignore[arg-type]
     assert sorted(grid.got) == [1, 3]
     assert [reply.has_error() for reply in replies] == [False, False, True]
     assert replies[-1].error.reason == "parked"
-    assert entered(own) == []
+    assert [entry for entry in entered(own) if entry[2] == "b"] == [down("b")]
     assert own.find_away(4) == {"b": "parked"}
     assert own.find_away(5) == {}

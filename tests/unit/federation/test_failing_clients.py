@@ -11,20 +11,19 @@ from pydantic import ValidationError
 from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
-from flcav.federation.attendance import ClientFailed
 from flcav.federation.edge_server import EdgeServer
+from flcav.federation.exchange import ClientFailed
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import Privacy
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules, SecureAggregation
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy, strategy_named
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.strategies.fedbuff import FedBuff
-from flcav.federation.strategies.krum import Krum
-from flcav.federation.strategies.median import Median
+from flcav.federation.strategies.robust import Krum, Median
 from flcav.federation.trainable import LocalUpdate, Trainable, Update, Weights
 from flcav.network.ledger import BudgetExceeded
 

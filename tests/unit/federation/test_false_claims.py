@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from flwr.app import Array, ConfigRecord, RecordDict
 
-from flcav.federation.messages.acceptance import ReplyRefused
-from flcav.federation.messages.records import to_numpy
-from flcav.federation.messages.release_report import MOST, ShadowReport
-from flcav.federation.secure.messages import ASK, CIPHERS, MASKS, NAMES, SHARES, read_keys, read_shares
+from flcav.federation.acceptance import ReplyRefused
+from flcav.federation.secure.messages import read_keys, read_shares
 from flcav.federation.secure.parties import SecureClient
+from flcav.federation.wire import ASK, CIPHERS, MASKS, NAMES, SHARES, to_numpy
+from flcav.fleet.releases import MOST, ShadowReport
 
 
 @pytest.mark.parametrize("bad", [CIPHERS, MASKS])

@@ -10,8 +10,8 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import REGISTRY, found_authority, open_authority, open_registry
-from flcav.federation.fleet.keys import (
+from flcav.fleet.authority import REGISTRY, found_authority, open_authority, open_registry
+from flcav.fleet.keys import (
     AUTHORITY,
     CERTIFICATE,
     FLOWER_KEY,
@@ -22,7 +22,7 @@ from flcav.federation.fleet.keys import (
     request_certificate,
     take_certificate,
 )
-from flcav.federation.fleet.registry import Vehicle
+from flcav.fleet.registry import RegisteredVehicle
 
 
 @pytest.fixture
@@ -185,7 +185,7 @@ def test_certificate_for_another_key(authority, vehicle, tmp_path):
 def test_ten_thousand_vehicles(authority):
     """A register, a revoke and a look-up take milliseconds; the bounds are for a busy machine."""
     registry, end = authority.registry, int(time.time()) + 1000
-    make = lambda i: Vehicle(f"v{i:05d}", f"{i:064x}", i.to_bytes(8, "big"), 0, end)  # noqa: E731
+    make = lambda i: RegisteredVehicle(f"v{i:05d}", f"{i:064x}", i.to_bytes(8, "big"), 0, end)  # noqa: E731
     with registry._change() as cursor:
         for i in range(10_000):
             registry._insert(cursor, make(i), "register")

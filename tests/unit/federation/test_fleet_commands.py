@@ -18,15 +18,14 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from flcav.cli.main import run as command
-from flcav.federation.fleet import authority
-from flcav.federation.fleet.authority import open_authority, open_registry
-from flcav.federation.fleet.keys import request_certificate, take_certificate
-from flcav.federation.fleet.page import make_page
-from flcav.federation.fleet.releases.offer import KeptReport
-from flcav.federation.fleet.status import Followed, FollowedRound, read_status
-from flcav.federation.fleet.traffic import Traffic
-from flcav.federation.fleet.vehicle import VehicleSettings
-from flcav.federation.messages.release_report import ReleaseReport
+from flcav.fleet import authority
+from flcav.fleet.authority import open_authority, open_registry
+from flcav.fleet.keys import request_certificate, take_certificate
+from flcav.fleet.page import make_page
+from flcav.fleet.releases import KeptReport, ReleaseReport
+from flcav.fleet.status import FederationProgress, RoundProgress, read_fleet_status
+from flcav.fleet.traffic import ProxyTraffic
+from flcav.fleet.vehicle import VehicleSettings
 
 
 @pytest.fixture
@@ -171,12 +170,12 @@ def test_escapes_of_vehicles_do_not_reach_the_terminal(flcav, fleet, tmp_path):
     odd = "\x1b[2J\x1b]0;owned\x07\u202efine\ncav-2: registered\r" + "x" * 3000
     register(flcav, fleet, tmp_path / "vehicle", "cav-1")
     assert flcav("revoke", fleet, "cav-1", "--reason", odd)[0] == 0
-    traffic = Traffic()
+    traffic = ProxyTraffic()
     traffic.refuse("cav-1", odd)
     traffic.save(fleet)
     KeptReport("cav-1", 0.0, 0, ReleaseReport("objects", 1, 1, odd)).save(fleet)
-    rounds = (FollowedRound(1, 0.0, 2, {"cav": odd}),)
-    Followed("edge", "weather", "wireless", 1.0, 2.0, rounds, {"cav": odd}, {"cav": odd}).save(fleet)
+    rounds = (RoundProgress(1, 0.0, 2, {"cav": odd}),)
+    FederationProgress("edge", "weather", "wireless", 1.0, 2.0, rounds, {"cav": odd}, {"cav": odd}).save(fleet)
     key = ec.generate_private_key(ec.SECP384R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, odd[:60])])
     signed = x509.CertificateSigningRequestBuilder().subject_name(name).sign(key, hashes.SHA384())
@@ -191,14 +190,14 @@ def test_escapes_of_vehicles_do_not_reach_the_terminal(flcav, fleet, tmp_path):
         lines = (out + err).splitlines()
         assert not [line for line in lines if not line.isprintable() or len(line) > 1300 or line.startswith("cav-2")]
     assert all("\\x1b[2J" in out + err for _, out, err in said)
-    page = json.dumps(read_status(fleet).as_json(), ensure_ascii=False)
+    page = json.dumps(read_fleet_status(fleet).as_json(), ensure_ascii=False)
     assert page.isprintable()
     assert "x" * 300 not in page
 
 
 def test_page(flcav, fleet):
     """The page is served for this host alone, and has what the status says."""
-    traffic = Traffic()
+    traffic = ProxyTraffic()
     traffic.count("vehicle-001", "push-object", 5, 7, (50, 70), 200)
     traffic.refuse("<script>", "a certificate is wanted")
     traffic.save(fleet)

@@ -16,12 +16,12 @@ from flwr.proto.fleet_pb2 import ActivateNodeRequest, DeactivateNodeRequest, Pus
 from flwr.proto.message_pb2 import Message, Metadata
 from flwr.proto.node_pb2 import Node
 
-from flcav.federation.fleet import mutual_tls, proxy, relay
-from flcav.federation.fleet.authority import SERVER, SERVER_KEY, found_authority
-from flcav.federation.fleet.keys import AUTHORITY, CERTIFICATE, KEY, request_certificate, take_certificate
-from flcav.federation.fleet.mutual_tls import HANDSHAKES, LARGEST_HEADER, OF_EACH, find_superfluous, serve_https
-from flcav.federation.fleet.relay import CALLS, FLEET, LARGEST_CALL, MOST_HEADERS, name_key
-from flcav.federation.fleet.traffic import read_traffic
+from flcav.fleet import mutual_tls, proxy, relay
+from flcav.fleet.authority import SERVER, SERVER_KEY, found_authority
+from flcav.fleet.keys import AUTHORITY, CERTIFICATE, KEY, request_certificate, take_certificate
+from flcav.fleet.mutual_tls import HANDSHAKES, LARGEST_HEADER, OF_EACH, find_superfluous, serve_https
+from flcav.fleet.relay import CALLS, FLEET, LARGEST_CALL, MOST_HEADERS, name_key
+from flcav.fleet.traffic import read_traffic
 
 NODES = {"cav-1": 11, "cav-2": 22}
 REQUIRED = ["host: x", "content-type: application/protobuf"]

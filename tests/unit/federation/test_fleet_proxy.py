@@ -12,19 +12,12 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 
-from flcav.federation.fleet.authority import found_authority
-from flcav.federation.fleet.forwarder import run_forwarder
-from flcav.federation.fleet.keys import (
-    CERTIFICATE,
-    LOOPBACK,
-    load_key,
-    public_der,
-    request_certificate,
-    take_certificate,
-)
-from flcav.federation.fleet.proxy import describe_clock, find_caller, node_key, run_proxy
-from flcav.federation.fleet.registry import Vehicle
-from flcav.federation.fleet.vehicle import VehicleSettings, run_supernode
+from flcav.fleet.authority import found_authority
+from flcav.fleet.forwarder import run_forwarder
+from flcav.fleet.keys import CERTIFICATE, LOOPBACK, load_key, public_der, request_certificate, take_certificate
+from flcav.fleet.proxy import describe_clock, find_caller, node_key, run_proxy
+from flcav.fleet.registry import RegisteredVehicle
+from flcav.fleet.vehicle import VehicleSettings, run_supernode
 
 
 @pytest.fixture
@@ -41,7 +34,7 @@ def vehicle(tmp_path):
 def test_who_calls(vehicle):
     registry, certificate, _ = vehicle
     found = find_caller(registry, certificate)
-    assert isinstance(found, Vehicle)
+    assert isinstance(found, RegisteredVehicle)
     assert found.name == "cav-1"
     assert find_caller(registry, certificate, found.expires) == "the certificate of cav-1 is expired"
     assert find_caller(registry, certificate + b"\0") == "the certificate is not registered"
@@ -83,7 +76,7 @@ def test_servers_have_the_key_of_their_certificate(which, vehicle, tmp_path, mon
         ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(certificate, key)
         return SimpleNamespace(run=lambda: None)
 
-    monkeypatch.setattr(f"flcav.federation.fleet.{which}.serve_https", start)
+    monkeypatch.setattr(f"flcav.fleet.{which}.serve_https", start)
     VehicleSettings("127.0.0.1:3", 1, 2).save(own)
     if which == "forwarder":
         run_forwarder(own, 1, "127.0.0.1:3")

@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from flcav.federation.fleet.relay import Refused
-from flcav.federation.fleet.releases.offer import Offer, find_offered
-from flcav.federation.fleet.releases.service import RELEASES, answer_release
+from flcav.fleet.proxy import RELEASES, answer_release
+from flcav.fleet.relay import CallRefused
+from flcav.fleet.releases import ReleaseOffer, find_offered
 
 
 def test_a_file_of_either_repository_is_found_and_none_without_an_offer(tmp_path):
@@ -17,7 +17,7 @@ def test_a_file_of_either_repository_is_found_and_none_without_an_offer(tmp_path
     (own["image"] / "metadata" / "way").symlink_to(tmp_path)
     fleet = tmp_path / "fleet"
     assert find_offered(fleet, "image/metadata/timestamp.json") is None
-    Offer(*map(str, own.values())).save(fleet)
+    ReleaseOffer(*map(str, own.values())).save(fleet)
     for party in own:
         found = find_offered(fleet, f"{party}/metadata/timestamp.json")
         assert found is not None
@@ -33,5 +33,5 @@ def test_releases_are_only_read(tmp_path, method: str):
         scope = {"path": f"{RELEASES}image/metadata/root.json", "method": method}
         await answer_release(tmp_path, "a", scope, None, None, lambda: 0)  # pyright: ignore
 
-    with pytest.raises(Refused, match="is no call of a vehicle's"):
+    with pytest.raises(CallRefused, match="is no call of a vehicle's"):
         asyncio.run(call())

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import found_authority, open_registry
-from flcav.federation.fleet.registry import KEPT_S, MOST, WINDOW_S
-from flcav.federation.fleet.status import Asked
-from flcav.federation.messages.fl_request import LARGEST, OLDEST_S, check_age, make_request, parse_request
+from flcav.fleet.authority import found_authority, open_registry
+from flcav.fleet.fl_request import LARGEST, OLDEST_S, check_age, make_request, parse_request
+from flcav.fleet.registry import KEPT_S, MOST, WINDOW_S
+from flcav.fleet.status import Asked
 
 REQUEST = make_request("weather", 2.5, 12, (10.0, -3.0))
 

@@ -10,7 +10,7 @@ import pytest
 SUPERVISOR = """
 import sys, time
 from pathlib import Path
-from flcav.federation.fleet.supervisor import supervise
+from flcav.fleet.supervisor import supervise
 supervise(Path(sys.argv[1]), {"sleep": lambda: time.sleep(60)}, is_up=lambda: print("ready", flush=True) or True)
 """
 COMMAND = """

@@ -3,8 +3,8 @@
 import httpx
 import pytest
 
-from flcav.federation.fleet.proxy import FleetProxy
-from flcav.federation.fleet.traffic import Crossed, Traffic, read_traffic
+from flcav.fleet.proxy import FleetProxy
+from flcav.fleet.traffic import Crossed, ProxyTraffic, read_traffic
 
 
 @pytest.mark.parametrize(
@@ -15,7 +15,7 @@ from flcav.federation.fleet.traffic import Crossed, Traffic, read_traffic
     ],
 )
 def test_bytes_are_counted_once_and_begin_at_none(call, counted, tmp_path):
-    traffic = Traffic()
+    traffic = ProxyTraffic()
     traffic.count("cav-1", call, 1, 2, (10, 20), 200)
     traffic.save(tmp_path)
     assert read_traffic(tmp_path).vehicles["cav-1"] == counted
@@ -35,7 +35,7 @@ def test_bytes_are_counted_once_and_begin_at_none(call, counted, tmp_path):
     ],
 )
 def test_losses(call, status, activations, lost, tmp_path):
-    traffic = Traffic()
+    traffic = ProxyTraffic()
     traffic.count("cav-1", call, 1, 2, (10, 20), status)
     traffic.save(tmp_path)
     own = read_traffic(tmp_path).vehicles["cav-1"]
@@ -43,7 +43,7 @@ def test_losses(call, status, activations, lost, tmp_path):
 
 
 def test_answers_that_reach_nobody_and_a_proxy_that_begins_anew_may_lose_a_message(tmp_path):
-    traffic = Traffic()
+    traffic = ProxyTraffic()
     traffic.count("cav-1", "pull-messages", 1, 2, (10, 20), 200)
     traffic.count("cav-2", "pull-messages", 1, 2, (10, 20), 200, gone=True)
     assert [own.lost for own in traffic.vehicles.values()] == [0, 1]

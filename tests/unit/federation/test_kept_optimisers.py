@@ -11,13 +11,14 @@ from line_task import Line, LineTask, Slope
 from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
-from flcav.federation.attendance import ClientFailed
+from flcav.federation.client import ClientAgreement
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.exchange import ClientFailed
+from flcav.federation.links.link import open_link
+from flcav.federation.links.metered import Account, open_account
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.link import open_link
-from flcav.federation.runtimes.metered import Account, open_account
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
 from flcav.federation.strategies.fedmd import FedMD
@@ -156,7 +157,7 @@ def test_who_cannot_keep_it_says_so(tmp_path: Path):
 
     with (
         pytest.raises(InputError, match="keep_optimiser: the server's checkpoint would need the state of each"),
-        open_link(CLIENTS, Far(), open_account(), FEDAVG, KEEP, {}, {}, 0),  # type: ignore[arg-type]
+        open_link(CLIENTS, Far(), open_account(), ClientAgreement(FEDAVG, KEEP, {}, 0), {}),  # type: ignore[arg-type]
     ):
         pass
 

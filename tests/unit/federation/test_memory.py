@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 import pytest
 
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.strategies import FEDAVG, Strategy
-from flcav.federation.strategies.fedadam import FedAdam
 from flcav.federation.strategies.fedavg import FedAvg
-from flcav.federation.strategies.median import Median
+from flcav.federation.strategies.fedopt import FedAdam
+from flcav.federation.strategies.robust import Median
 from flcav.federation.strategies.strategy import find_weigher
 from flcav.federation.trainable import LocalUpdate, Trainable, Update, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes

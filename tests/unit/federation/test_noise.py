@@ -10,19 +10,27 @@ from flwr.common.serde import recorddict_to_proto
 from regression import ledger
 from scipy.stats import kstest
 
-from flcav.federation import rounds
+from flcav.federation import loop
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.messages.records import ARRAYS, read_arrays
-from flcav.federation.noise import SECRET_BYTES, derive_key, draw_secret, secret_noise
-from flcav.federation.privacy import Privacy, add_noise, average_privately, clip_change
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.in_process import EmbeddedGrid
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.privacy import (
+    SECRET_BYTES,
+    Privacy,
+    add_noise,
+    average_privately,
+    clip_change,
+    derive_key,
+    draw_secret,
+    secret_noise,
+)
 from flcav.federation.rules import Rules, SecureAggregation
-from flcav.federation.runtimes.embedded import EmbeddedGrid
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
 from flcav.federation.state import SERVER, FederationState, RoundRecord
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import Upload
+from flcav.federation.wire import ARRAYS, read_arrays
 from flcav.statistics.streams import derive_seed, stream
 
 START = {"w": np.zeros((60, 50), np.float32), "b": np.ones(30, np.float32)}
@@ -37,7 +45,7 @@ ROUGHLY = 5 / np.sqrt(2 * 3000)  # relative error of a standard deviation of 300
 @pytest.fixture(autouse=True)
 def no_account(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave epsilon out, whose account takes seconds: `test_privacy.py` has it."""
-    monkeypatch.setattr(rounds, "account_epsilon", lambda *_: 1.0)
+    monkeypatch.setattr(loop, "account_epsilon", lambda *_: 1.0)
 
 
 class Mover:

@@ -7,9 +7,9 @@ import pytest
 
 from flcav.config import InputError
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes

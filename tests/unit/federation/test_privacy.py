@@ -21,6 +21,8 @@ from scipy.stats import norm
 from flcav.config import InputError
 from flcav.federation.checks import check_federation
 from flcav.federation.edge_server import EdgeServer
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import (
     Privacy,
     account_epsilon,
@@ -32,15 +34,13 @@ from flcav.federation.privacy import (
     find_noise,
     most_participations,
 )
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
-from flcav.federation.strategies.fedadam import FedAdam
-from flcav.federation.strategies.median import Median
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.corrections import Scaffold
+from flcav.federation.strategies.fedopt import FedAdam
+from flcav.federation.strategies.robust import Median
 from flcav.federation.trainable import LocalUpdate, Weights
 
 START = {

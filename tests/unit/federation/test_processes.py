@@ -11,11 +11,11 @@ from regression import START, Regression, ledger, vehicles
 
 from flcav.config import InputError
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.link import open_client_processes
+from flcav.federation.links.metered import Account
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.link import open_processes
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import LocalUpdate, Weights
@@ -99,7 +99,7 @@ def test_edge_servers_whose_vehicles_train_in_two_processes_federate_to_the_same
 
 def test_clients_that_cannot_be_sent_are_refused_or_train_in_this_process():
     clients = {"cav0": Regression(np.zeros((1, 3)), (lambda: 0))}  # type: ignore[arg-type]
-    with open_processes(clients, 2) as processes:
+    with open_client_processes(clients, 2) as processes:
         assert processes is None
     with pytest.raises(InputError, match="clients cannot be sent to processes"):
         ClientProcesses(clients, 2)

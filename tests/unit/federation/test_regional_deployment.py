@@ -6,13 +6,13 @@ from typing import Any
 import pytest
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import found_authority
-from flcav.federation.fleet.up import READY, Ready
-from flcav.federation.messages.fl_request import make_request
+from flcav.federation.links import flower
+from flcav.federation.links.flower import Deployment, RegionalDeployment
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes import deployed
-from flcav.federation.runtimes.deployed import Deployment, RegionalDeployment
 from flcav.federation.strategies import FEDAVG
+from flcav.fleet.authority import found_authority
+from flcav.fleet.fl_request import make_request
+from flcav.fleet.up import READY, Ready
 from flcav.storage.files import write_json
 
 
@@ -75,9 +75,9 @@ class Fleet:
 @pytest.fixture
 def one(fleets, monkeypatch):
     fleet: Any = Fleet()
-    monkeypatch.setattr(deployed, "open_registry", lambda _: fleet)
-    monkeypatch.setattr(deployed, "STARTING_S", 0.0)
-    monkeypatch.setattr(deployed, "STARTING_VEHICLE_S", 0.0)
+    monkeypatch.setattr(flower, "open_registry", lambda _: fleet)
+    monkeypatch.setattr(flower, "STARTING_S", 0.0)
+    monkeypatch.setattr(flower, "STARTING_VEHICLE_S", 0.0)
     deployment: Any = Deployment(fleets)
     deployment.link = fleet
     return deployment, fleet
@@ -102,8 +102,8 @@ def test_a_client_keeps_its_vehicle(one):
 
 def test_vehicles_that_come_in_late_are_waited_for(one, monkeypatch):
     deployment, fleet = one
-    monkeypatch.setattr(deployed, "STARTING_S", 30.0)
-    monkeypatch.setattr(deployed, "LOOK_S", 0.0)
+    monkeypatch.setattr(flower, "STARTING_S", 30.0)
+    monkeypatch.setattr(flower, "LOOK_S", 0.0)
     coming = iter([set(), {3}, {2, 3}])
     fleet.list_online = lambda: next(coming)
     assert enter(deployment, "r/1", "r/2") == ["b", "c"]
@@ -120,8 +120,8 @@ def test_each_client_is_reached_at_the_node_of_its_vehicle(one, monkeypatch):
         def end(self, failed=False):
             pass
 
-    monkeypatch.setattr(deployed, "DeployedGrid", Grid)
-    agreed: Any = deployed.Agreement(FEDAVG, Rules(), {}, 0)
+    monkeypatch.setattr(flower, "DeployedGrid", Grid)
+    agreed: Any = flower.ClientAgreement(FEDAVG, Rules(), {}, 0)
     with deployment._open({"r/1": None, "r/2": None}, agreed, {}, None):
         assert reached == [({2: "r/1", 3: "r/2"}, {2: "b", 3: "c"})]
 

@@ -9,9 +9,9 @@ import pytest
 from flcav.config import InputError
 from flcav.federation.checks import check_rules
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import strategy_named
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights

@@ -13,27 +13,38 @@ from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.config import InputError
 from flcav.federation.checks import check_federation
-from flcav.federation.fleet.authority import found_authority
-from flcav.federation.fleet.keys import AUTHORITY, request_certificate, take_certificate
-from flcav.federation.messages.records import ASK
+from flcav.federation.links.in_process import keep_identity
+from flcav.federation.links.metered import Account, MeteredGrid
+from flcav.federation.links.vehicle_app import load_identity
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import Privacy, account_epsilon
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules, SecureAggregation
-from flcav.federation.runtimes.embedded import keep_identity
-from flcav.federation.runtimes.metered import Account, MeteredGrid
-from flcav.federation.runtimes.vehicle_app import load_identity
-from flcav.federation.secure.certified import Identity
-from flcav.federation.secure.masks import add_vectors, agree, draw_keys, expand, seal, to_integers, to_values, unseal
 from flcav.federation.secure.messages import TooFewClients, answer_secretly
-from flcav.federation.secure.parties import SecureClient, SumLost, add_mask, settle_complaints, unmask_sum
-from flcav.federation.secure.shamir import SHARE_BYTES, find_wrong_shares, join_shares, split_secret
+from flcav.federation.secure.parties import Identity, SecureClient, SumLost, add_mask, settle_complaints, unmask_sum
+from flcav.federation.secure.primitives import (
+    SHARE_BYTES,
+    add_vectors,
+    agree,
+    draw_keys,
+    expand,
+    find_wrong_shares,
+    join_shares,
+    seal,
+    split_secret,
+    to_integers,
+    to_values,
+    unseal,
+)
 from flcav.federation.selection import Selection
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
-from flcav.federation.strategies.fedadam import FedAdam
-from flcav.federation.strategies.median import Median
+from flcav.federation.strategies.fedopt import FedAdam
+from flcav.federation.strategies.robust import Median
 from flcav.federation.trainable import LocalUpdate
 from flcav.federation.upload import Upload
+from flcav.federation.wire import ASK
+from flcav.fleet.authority import found_authority
+from flcav.fleet.keys import AUTHORITY, request_certificate, take_certificate
 from flcav.network.ledger import Ledger, LinkMegabytes
 
 NAMES = [f"grid/cav{i}" for i in (3, 0, 4, 1, 2)]

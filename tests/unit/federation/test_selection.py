@@ -12,17 +12,17 @@ from regression import START, ledger, vehicles
 
 from flcav.config import InputError
 from flcav.federation.checks import check_federation
+from flcav.federation.links.metered import Account
+from flcav.federation.links.processes import train_remotely
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.privacy import Privacy
-from flcav.federation.rounds import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.processes import RemoteClients
 from flcav.federation.selection import Selection, optimal_probabilities
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG
+from flcav.federation.strategies.corrections import Scaffold
 from flcav.federation.strategies.fedavg import average_inversely
-from flcav.federation.strategies.krum import Krum
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.robust import Krum
 from flcav.federation.trainable import LocalUpdate, count_samples
 from flcav.statistics.streams import derive_seed
 
@@ -180,7 +180,7 @@ def test_numbers_of_samples_are_messages_with_a_price():
     assert [entry.client for entry in counts] == NAMES
     assert [entry.client for entry in updates] == [*state.records[0].clients]
     assert 0 < max(entry.bytes for entry in counts) < min(entry.bytes for entry in updates)
-    remote = RemoteClients(vehicles("grid", 2), cast(Any, None))  # counted here, wherever they train
+    remote = train_remotely(vehicles("grid", 2), cast(Any, None))  # counted here, wherever they train
     assert [count_samples(remote[f"grid/cav{i}"], 5) for i in (0, 1)] == [4, 5]
 
 

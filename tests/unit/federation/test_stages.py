@@ -6,8 +6,8 @@ from flwr.supercore.task_identity import TaskIdentity
 from regression import START, TRUTH, ledger, vehicles
 
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.strategies.fedavg import FedAvg, average
 from flcav.network.ledger import BudgetExceeded
 from flcav.network.plan import MessageSizes, StagePlan, price

@@ -12,9 +12,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from flcav.config import InputError
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
-from flcav.federation.runtimes.topics import HASH, RECORDS, TYPE, RosTopics, Topic, unpack_records
+from flcav.federation.links.metered import Account
+from flcav.federation.links.topics import HASH, RECORDS, TYPE, RosTopics, Topic
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.wire import unpack_records
 from flcav.network.ledger import Ledger
 
 pytest.importorskip("cyclonedds")
@@ -94,7 +95,7 @@ def test_a_network_of_the_articles_size_goes_by_a_topic():
 
 
 def test_a_server_that_fails_is_named_with_its_reason():
-    from flcav.federation.attendance import ClientFailed
+    from flcav.federation.exchange import ClientFailed
 
     clients = vehicles("grid", 2)
     clients["grid/cav1"] = replace(clients["grid/cav1"], fail=True)

@@ -13,17 +13,16 @@ from regression import ledger
 from safetensors.numpy import load, save
 
 from flcav.config import InputError
+from flcav.federation.acceptance import Expected, ReplyRefused, read_update
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.messages.acceptance import Expected, ReplyRefused, read_update
-from flcav.federation.messages.encoding import encode
-from flcav.federation.messages.records import EXTRA, to_arrays, update_content
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.links.in_process import update_bytes
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.runtimes.metered import Account
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.upload import SCALES, VALUES, Upload, compress, decompress
+from flcav.federation.wire import EXTRA, encode_update, to_array_record, update_content
 
 SCHEDULE = Schedule(rounds=5, steps=3, learning_rate=0.5, final_learning_rate=0.5, seed=3)
 SIZE = (64, 50)
@@ -69,7 +68,7 @@ MEAN = {
     ("upload", "beside"), [(Upload(), ["body.weight", "head.weight"]), (Upload(layers=("head.*",)), ["head.weight"])]
 )
 def test_an_array_beside_each_that_is_learned_and_sent_is_priced(upload: Upload, beside: list[str]):
-    more = recorddict_to_proto(RecordDict({EXTRA: to_arrays({name: START[name] for name in beside})})).ByteSize()
+    more = recorddict_to_proto(RecordDict({EXTRA: to_array_record({name: START[name] for name in beside})})).ByteSize()
     assert update_bytes(START, upload, exchanging=True) - update_bytes(START, upload) == more
 
 
@@ -193,7 +192,7 @@ def test_messages_that_are_no_update_are_told():
         ("layers", {"body.weight": START["body.weight"]}),
     ):
         rules = Rules(upload=Upload(**KINDS[kind]))
-        sent, expected = encode(update, START, rules, {}, 1)[0], Expected(rules, START)
+        sent, expected = encode_update(update, START, rules, {}, 1)[0], Expected(rules, START)
         read_update(update_content(sent, {}), expected)
         with pytest.raises(ReplyRefused):
             read_update(update_content(replace(sent, weights={**sent.weights, **wrong}), {}), expected)
@@ -206,7 +205,7 @@ def test_a_change_that_is_not_finite_is_refused_in_every_form(kind: str, value: 
     weights = START | {"body.weight": START["body.weight"].copy()}
     weights["body.weight"][3, 4] = value
     rules = Rules(upload=Upload(**KINDS[kind]))
-    sent, _ = encode(LocalUpdate(weights, 2, 1.0), START, rules, {}, 1)
+    sent, _ = encode_update(LocalUpdate(weights, 2, 1.0), START, rules, {}, 1)
     with pytest.raises(ReplyRefused, match=r"'body.weight' has values that are not finite"):
         read_update(update_content(sent, {}), Expected(rules, START))
 

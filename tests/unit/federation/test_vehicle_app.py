@@ -15,11 +15,17 @@ from flwr.common.serde import recorddict_to_proto
 from flwr.supercore.task_identity import TaskIdentity
 
 from flcav.config import InputError
-from flcav.federation.fleet.authority import SERVER, SERVER_KEY, found_authority
-from flcav.federation.fleet.keys import AUTHORITY, load_key, request_certificate, take_certificate
-from flcav.federation.fleet.vehicle import VehicleSettings
-from flcav.federation.messages.conduct import recall_answered
-from flcav.federation.messages.records import (
+from flcav.federation.conduct import recall_answered
+from flcav.federation.links.in_process import keep_identity, wire_bytes
+from flcav.federation.links.vehicle_app import Assignment, VehicleApp, load_assignment, load_identity
+from flcav.federation.privacy import draw_secret
+from flcav.federation.rules import Rules
+from flcav.federation.secure import parties
+from flcav.federation.secure.parties import Identity, SecureClient
+from flcav.federation.strategies import strategy_named
+from flcav.federation.strategies.fedmd import FedMD
+from flcav.federation.trainable import LocalUpdate
+from flcav.federation.wire import (
     ARRAYS,
     ASK,
     CONFIG,
@@ -28,18 +34,11 @@ from flcav.federation.messages.records import (
     OVER_BUDGET,
     LocalWork,
     read_arrays,
-    to_arrays,
+    to_array_record,
 )
-from flcav.federation.noise import draw_secret
-from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import keep_identity, wire_bytes
-from flcav.federation.runtimes.vehicle_app import Assignment, VehicleApp, load_assignment, load_identity
-from flcav.federation.secure import certified
-from flcav.federation.secure.certified import Identity
-from flcav.federation.secure.parties import SecureClient
-from flcav.federation.strategies import strategy_named
-from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.trainable import LocalUpdate
+from flcav.fleet.authority import SERVER, SERVER_KEY, found_authority
+from flcav.fleet.keys import AUTHORITY, load_key, request_certificate, take_certificate
+from flcav.fleet.vehicle import VehicleSettings
 from flcav.perception.distillation import SentOutputs
 
 TRAINED: list[int] = []
@@ -73,8 +72,8 @@ def folder(tmp_path):
 def ask(folder: Path, round_: int, grant: int | None = None, start: float = 0.0) -> Message:
     """Return the answer of a new process's app, with Flower's node having forgotten all."""
     weights = {"w": np.full(4, start, np.float32)}
-    content = {ARRAYS: to_arrays(weights), CONFIG: LocalWork(round_, 1, 0.1, 7 + round_).record()}
-    content["extra"] = to_arrays({"w": np.zeros(4, np.float32)})
+    content = {ARRAYS: to_array_record(weights), CONFIG: LocalWork(round_, 1, 0.1, 7 + round_).record()}
+    content["extra"] = to_array_record({"w": np.zeros(4, np.float32)})
     if grant is not None:
         content[GRANT] = ConfigRecord({GRANTED: grant})
     message = Message(RecordDict(content), 2, MessageType.TRAIN)
@@ -127,7 +126,7 @@ class Talking(Counting):
 
 
 def question(folder: Path, asked: str, arrays: dict[str, np.ndarray], grant: int | None = None) -> Message:
-    content = {ASK: ConfigRecord({ASK: asked}), ARRAYS: to_arrays(arrays)}
+    content = {ASK: ConfigRecord({ASK: asked}), ARRAYS: to_array_record(arrays)}
     if grant is not None:
         content[GRANT] = ConfigRecord({GRANTED: grant})
     message = Message(RecordDict(content), 2, f"{MessageType.QUERY}.{ASK}")
@@ -196,7 +195,10 @@ def train(folder: Path, federation: str, round_: int, state: dict | None = None,
     """Train in a round, of a federation that begins where a state is given."""
     if state is not None:
         Assignment(federation, "town/cav0", Imitating(), FedMD(), Rules(), state=state).save(folder)
-    content = {ARRAYS: to_arrays({"w": np.full(4, start, np.float32)}), CONFIG: LocalWork(round_, 1, 0.1, 7).record()}
+    content = {
+        ARRAYS: to_array_record({"w": np.full(4, start, np.float32)}),
+        CONFIG: LocalWork(round_, 1, 0.1, 7).record(),
+    }
     message = Message(RecordDict(content), 2, MessageType.TRAIN)
     message.metadata.__dict__["_message_id"] = "1"
     assert VehicleApp(folder)(message, Context(1, 2, {}, RecordDict(), {})).has_content()
@@ -236,7 +238,7 @@ def test_the_network_of_fedmd_stays_with_its_vehicle_and_goes_on_in_the_next_fed
     train(tmp_path, "k", 1, {"own": {"net": np.zeros(3, np.float32)}})  # of a run that began within one process
     assert network(tmp_path, "k") == 4
     with pytest.raises(ValueError, match="a client's state is its own"):
-        query(tmp_path, RecordDict({"own": to_arrays({"net": np.zeros(3)})}))
+        query(tmp_path, RecordDict({"own": to_array_record({"net": np.zeros(3)})}))
 
 
 @pytest.fixture(scope="module")
@@ -272,7 +274,10 @@ def assign(clients: dict[str, Path], rules: dict) -> None:
 
 
 def answer(folder: Path, ask: dict, round_: int = 1, seed: int = 7) -> RecordDict:
-    content = {ARRAYS: to_arrays({"w": np.zeros(4, np.float32)}), CONFIG: LocalWork(round_, 1, 0.1, seed).record()}
+    content = {
+        ARRAYS: to_array_record({"w": np.zeros(4, np.float32)}),
+        CONFIG: LocalWork(round_, 1, 0.1, seed).record(),
+    }
     message = Message(RecordDict({**content, ASK: ConfigRecord(ask)}), 2, MessageType.TRAIN)
     message.metadata.__dict__["_message_id"] = "1"
     return VehicleApp(folder)(message, Context(1, 2, {}, RecordDict(), {})).content
@@ -335,7 +340,7 @@ def test_a_certificate_that_is_not_in_force_is_no_peer_s(masked, monkeypatch: py
     keys = {name: keys_of(own) for name, own in masked.items()}
     for days in (-1, 400):
         later = SimpleNamespace(now=lambda zone, days=days: datetime.now(zone) + timedelta(days=days))
-        monkeypatch.setattr(certified, "datetime", later)
+        monkeypatch.setattr(parties, "datetime", later)
         with pytest.raises(ValueError, match="the certificate is not in force"):
             answer(masked["town/cav1"], roster(keys))
 

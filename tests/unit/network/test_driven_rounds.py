@@ -9,15 +9,14 @@ import pytest
 from moving import made_links
 
 from flcav.config import InputError
-from flcav.federation.attendance import ClientFailed
 from flcav.federation.edge_server import EdgeServer, edge_seeds
-from flcav.federation.rounds import Schedule, federate
+from flcav.federation.exchange import ClientFailed
+from flcav.federation.links.metered import Account, Outage
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Account, Outage
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
-from flcav.federation.strategies.krum import Krum
-from flcav.federation.strategies.trimmed_mean import TrimmedMean
+from flcav.federation.strategies.robust import Krum, TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.clock.rounds import NetworkSettings, RoundRules
 from flcav.network.ledger import Ledger, LinkMegabytes

@@ -3,8 +3,8 @@
 from flcav.dataset.store import Dataset
 from flcav.odd.domain import Domain
 from flcav.odd.measure import measure, select_vehicles
-from flcav.releases.verification.domain import find_cells
 from flcav.releases.verification.testing import VerificationFrame
+from flcav.releases.verification.verify import find_cells
 
 
 def test_frames_are_in_the_buckets_that_their_measurements_say(drive: Dataset, urban: Domain):

@@ -10,7 +10,7 @@ from line_task import Line, LineTask, Slope
 from flcav.config import InputError
 from flcav.federation.checks import check_federation
 from flcav.federation.rules import Rules
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.corrections import Scaffold
 from flcav.perception.client import TaskClient
 from flcav.perception.weights import to_arrays
 

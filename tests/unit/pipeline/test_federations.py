@@ -16,8 +16,7 @@ from flcav.config import InputError
 from flcav.federation.privacy import account_epsilon
 from flcav.federation.rules import Rules
 from flcav.federation.strategies import FEDAVG
-from flcav.federation.strategies.fedadam import FedAdam
-from flcav.federation.strategies.fedavgm import FedAvgM
+from flcav.federation.strategies.fedopt import FedAdam, FedAvgM
 from flcav.federation.trainable import LocalUpdate, Weights, learned_names
 from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes

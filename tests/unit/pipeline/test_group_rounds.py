@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from line_task import LineTask, Slope
 
+from flcav.federation.links.link import open_questions
+from flcav.federation.links.metered import Outage, open_account
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.link import open_questions
-from flcav.federation.runtimes.metered import Outage, open_account
 from flcav.federation.strategies import FEDAVG
 from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 from safetensors.numpy import load
 
 from flcav.config import InputError
-from flcav.federation.runtimes.link import open_questions
-from flcav.federation.runtimes.metered import open_account
+from flcav.federation.links.link import open_questions
+from flcav.federation.links.metered import open_account
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.network.messages import pack

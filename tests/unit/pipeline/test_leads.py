@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flcav.federation.rounds import OnRound, Schedule, federate
-from flcav.federation.runtimes.metered import Account, Outage
-from flcav.federation.runtimes.processes import ClientProcesses
+from flcav.federation.links.metered import Account, Outage
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import OnRound, Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import strategy_named
 from flcav.federation.trainable import LocalUpdate, Weights

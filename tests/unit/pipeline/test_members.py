@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from line_task import LineTask, Slope
 
-from flcav.federation.messages.fl_request import make_request
-from flcav.federation.runtimes.link import Replies
+from flcav.federation.links.link import Replies
 from flcav.federation.trainable import Weights
+from flcav.fleet.fl_request import make_request
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.network.messages import pack
 from flcav.perception.task import Task

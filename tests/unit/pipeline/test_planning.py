@@ -14,8 +14,8 @@ from flwr.app import Array, ArrayRecord, MetricRecord, RecordDict
 from flwr.common.serde import recorddict_to_proto
 
 from flcav.config import InputError
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.network.plan import MessageSizes, price

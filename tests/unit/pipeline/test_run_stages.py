@@ -13,12 +13,12 @@ from safetensors.numpy import load_file, save
 
 from flcav.config import InputError
 from flcav.federation.edge_server import EdgeServer
-from flcav.federation.rounds import Schedule, federate
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.metered import Account
+from flcav.federation.loop import Schedule, federate
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import FEDAVG, Strategy, of_servers
-from flcav.federation.strategies.fedadam import FedAdam
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.corrections import Scaffold
+from flcav.federation.strategies.fedopt import FedAdam
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.clock.records import save_rounds

@@ -5,10 +5,10 @@ import pytest
 from release_drives import make_frame
 from release_parties import Parties, write_weights
 
-from flcav.releases.candidates.proposal import propose
-from flcav.releases.repositories.creation import create_repository
+from flcav.releases.checking import trust_roots
+from flcav.releases.proposal import propose
 from flcav.releases.repositories.metadata import read_root
-from flcav.releases.vehicles.checking import trust_roots
+from flcav.releases.repositories.repository import create_repository
 from flcav.sensors.frame import Frame
 
 

@@ -14,11 +14,11 @@ from flcav.dataset.recording.recorder import record
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import RadioLinks
-from flcav.releases.candidates.candidate import WEIGHTS, read_candidate
-from flcav.releases.candidates.proposal import propose
-from flcav.releases.rollout import fleet
+from flcav.releases.candidate import WEIGHTS, read_candidate
+from flcav.releases.proposal import propose
+from flcav.releases.rollout import simulated_fleet
 from flcav.releases.rollout.rehearsal import rehearse
-from flcav.releases.rollout.turns import Rollout
+from flcav.releases.rollout.stages import Rollout
 from flcav.sensors.frame import Frame
 
 VEHICLES, SCENES = 20, 4
@@ -44,7 +44,7 @@ def radio(monkeypatch: pytest.MonkeyPatch) -> None:
             links=RadioLinks(radio, time_s, ("cav0",), ("pole0",), np.full(shape, 50.0), states, loss)
         )
 
-    monkeypatch.setattr(fleet, "link_scene", link)
+    monkeypatch.setattr(simulated_fleet, "link_scene", link)
 
 
 @pytest.fixture

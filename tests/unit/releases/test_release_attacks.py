@@ -16,16 +16,26 @@ from securesystemslib.signer import SSlibKey
 from tuf.api.metadata import Metadata, TargetFile
 
 from flcav.config import InputError
-from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS, Candidate, read_candidate
+from flcav.releases.candidate import CANDIDATE, WEIGHTS, Candidate, read_candidate
+from flcav.releases.checking import ReleaseRefused, RepositoryFetcher, check_release, trust_roots
+from flcav.releases.installation import read_installed, update_vehicle, weights_path
 from flcav.releases.keys import generate_key, read_private_key
 from flcav.releases.repositories import repository
-from flcav.releases.repositories.creation import create_repository, replace_online_key
-from flcav.releases.repositories.directive import Directive
-from flcav.releases.repositories.metadata import load_root, load_targets, read_root, sign_online, target_names
-from flcav.releases.repositories.repository import publish, stage_directive, stage_release
-from flcav.releases.vehicles.checking import Refused, check_release, trust_roots
-from flcav.releases.vehicles.fetching import RepositoryFetcher
-from flcav.releases.vehicles.installation import read_installed, update_vehicle, weights_path
+from flcav.releases.repositories.metadata import (
+    Directive,
+    load_root,
+    load_targets,
+    read_root,
+    sign_online,
+    target_names,
+)
+from flcav.releases.repositories.repository import (
+    create_repository,
+    publish,
+    replace_online_key,
+    stage_directive,
+    stage_release,
+)
 
 EVERYBODY = Directive(release=2, share_ppm=ALL)
 
@@ -37,7 +47,7 @@ def drives(parties: Parties) -> int:
 
 
 def refuses(parties: Parties, reason: str, sources=None, **changes) -> None:
-    with pytest.raises(Refused, match=reason):
+    with pytest.raises(ReleaseRefused, match=reason):
         update_vehicle(parties.vehicle, "cav0", sources or parties.sources(), **changes)
     assert drives(parties) == 1
 
@@ -133,7 +143,7 @@ def test_weights_that_were_changed_in_the_vehicle_are_not_loaded(parties: Partie
     assert installed is not None
     with weights_path(parties.vehicle, installed).open("ab") as file:
         file.write(b"x")
-    with pytest.raises(Refused, match="is not the network that was installed"):
+    with pytest.raises(ReleaseRefused, match="is not the network that was installed"):
         read_installed(parties.vehicle)
 
 
@@ -160,7 +170,7 @@ def test_rollback_to_an_older_release_by_both_parties(parties: Parties):
     names = target_names("objects", 1)
     files = dict(zip(names, (parties.candidate(1) / WEIGHTS, parties.candidate(1) / CANDIDATE), strict=True))
     sign_targets(parties, "director", files, Directive(release=1, share_ppm=ALL))
-    with pytest.raises(Refused, match="does not rise above 2"):
+    with pytest.raises(ReleaseRefused, match="does not rise above 2"):
         parties.update()
     assert drives(parties) == 2
 
@@ -330,7 +340,7 @@ def test_what_each_stolen_key_can_do(parties: Parties, stolen: str):
     chosen = Directive(release=2, share_ppm=ALL)
     stage_release(parties.director, parties.candidate(2), parties.keys("director", *customer), chosen)
     force(parties, "director", "director" in online)
-    with contextlib.suppress(Refused):
+    with contextlib.suppress(ReleaseRefused):
         parties.update()
     assert (drives(parties) == 2) == other_choice
     evil = parties.folder / "evil"
@@ -341,7 +351,7 @@ def test_what_each_stolen_key_can_do(parties: Parties, stolen: str):
         directive = Directive(release=3, share_ppm=ALL) if party == "director" else None
         stage_release(parties.folder / party, evil, parties.keys(party, *keys), directive)
         force(parties, party, before[party][1])
-    with contextlib.suppress(Refused):
+    with contextlib.suppress(ReleaseRefused):
         parties.update()
     assert (drives(parties) == 3) == other_weights
 

@@ -12,7 +12,7 @@ import pytest
 from release_parties import Parties
 
 from flcav.cli.main import run
-from flcav.releases.candidates.candidate import (
+from flcav.releases.candidate import (
     ACKNOWLEDGEMENTS,
     CANDIDATE,
     REPORT,
@@ -20,7 +20,7 @@ from flcav.releases.candidates.candidate import (
     WEIGHTS,
     read_candidate,
 )
-from flcav.releases.verification.records import Comparison, Verification
+from flcav.releases.verification.records import CandidateVerification, Comparison
 from flcav.releases.verification.verify import write_verification
 
 Call = Callable[..., tuple[int, str]]
@@ -41,7 +41,7 @@ def call(capsys: pytest.CaptureFixture[str]) -> Call:
 
 def accept(folder: Path, accepted: bool = True) -> None:
     candidate = read_candidate(folder)
-    found = Verification(
+    found = CandidateVerification(
         candidate=candidate.weights,
         driving=candidate.driving,
         accepted=accepted,

@@ -13,7 +13,7 @@ from flcav.geometry import Boxes, concatenate
 from flcav.perception.metrics import match
 from flcav.perception.metrics.operating_point import DISTANCES_M
 from flcav.perception.objects.truth import FrameTruth
-from flcav.releases.verification.comparison import Measured, compare, draw_scenes, measure_results
+from flcav.releases.verification.comparison import MeasuredNetwork, compare_pair, draw_scenes, measure_results
 from flcav.releases.verification.guards import SECTORS_DEG, pair_classes, tabulate
 from flcav.releases.verification.testing import ConditionResults, VerificationFrame
 from flcav.releases.verification.verify import _find_broken
@@ -61,16 +61,16 @@ def run(seed: int, change: Change | None = None) -> ConditionResults:
 
 
 @pytest.fixture(scope="module")
-def driving() -> Measured:
+def driving() -> MeasuredNetwork:
     return measure_results(run(1))
 
 
-def find_lost(driving: Measured, candidate: ConditionResults) -> list[str]:
+def find_lost(driving: MeasuredNetwork, candidate: ConditionResults) -> list[str]:
     """Return the guards that a candidate has lost, as "by name"."""
     fog = np.array([truth.weather == "fog" for truth in candidate.truths])
     pairs = [*pair_classes(driving, measure_results(candidate), groups=[("fog", fog)])]
     times = draw_scenes(pairs[0].scene, 200)
-    found = (compare(pair, times, len(pairs))[0] for pair in pairs)
+    found = (compare_pair(pair, times, len(pairs))[0] for pair in pairs)
     return [f"{each.by} {each.name}" for each in found if each.judgement == "lost"]
 
 
@@ -175,11 +175,11 @@ def renamed(boxes: Boxes) -> Boxes:
         (without(lambda boxes: of("Cyclist", boxes) & (distance(boxes) > FAR_M)), "found Cyclist 40-80 m"),
     ],
 )
-def test_what_is_spoilt_is_lost_by_name(driving: Measured, change: Change, lost: str):
+def test_what_is_spoilt_is_lost_by_name(driving: MeasuredNetwork, change: Change, lost: str):
     assert lost in find_lost(driving, run(1, change))
 
 
-def test_a_class_that_is_lost_in_one_weather_is_lost(driving: Measured):
+def test_a_class_that_is_lost_in_one_weather_is_lost(driving: MeasuredNetwork):
     spoilt = run(1)
     boxes = [
         boxes[boxes.label != "Car"] if truth.weather == "fog" else boxes
@@ -195,11 +195,11 @@ def test_sectors_and_distances_leave_no_gap_and_overlap_nowhere():
 
 
 @pytest.mark.parametrize("seed", range(1, 6))
-def test_detectors_that_differ_by_chance_lose_nothing(driving: Measured, seed: int):
+def test_detectors_that_differ_by_chance_lose_nothing(driving: MeasuredNetwork, seed: int):
     assert find_lost(driving, run(seed)) == []
 
 
-def test_the_table_counts_as_the_evaluation_matches(driving: Measured):
+def test_the_table_counts_as_the_evaluation_matches(driving: MeasuredNetwork):
     tested = driving.tested
     for label in SIZE:
         table = tabulate(driving, label)

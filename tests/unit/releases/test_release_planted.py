@@ -18,10 +18,9 @@ from flcav.machine.threads import use_threads
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import find_shipped, load_network
-from flcav.releases.verification.comparison import Measured, compare, draw_scenes, measure_results
-from flcav.releases.verification.conditions import PLAIN
+from flcav.releases.verification.comparison import MeasuredNetwork, compare_pair, draw_scenes, measure_results
 from flcav.releases.verification.guards import pair_classes
-from flcav.releases.verification.testing import ConditionResults, choose_test_frames, run_condition
+from flcav.releases.verification.testing import PLAIN, ConditionResults, choose_test_frames, run_condition
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 
@@ -48,7 +47,7 @@ class Driving:
     """The packaged network's answers: the maps that its head reads, and its results."""
 
     maps: list[Tensor]
-    measured: Measured
+    measured: MeasuredNetwork
 
 
 def head_rows(network: Second, output: int, width: int, label: int, part: int) -> list[int]:
@@ -122,7 +121,7 @@ def run_head(driving: Driving, network: Second, label: int) -> ConditionResults:
 def find_lost(driving: Driving, candidate: ConditionResults) -> list[str]:
     pairs = [*pair_classes(driving.measured, measure_results(candidate))]
     times = draw_scenes(pairs[0].scene, 200)
-    found = (compare(pair, times, len(pairs))[0] for pair in pairs)
+    found = (compare_pair(pair, times, len(pairs))[0] for pair in pairs)
     return [f"{each.by} {each.name}" for each in found if each.judgement == "lost"]
 
 

@@ -21,15 +21,25 @@ from flcav.perception.objects.evaluate import split_parts
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.weights import load_network
-from flcav.releases.candidates.candidate import CARD, LEDGER, WEIGHTS, DataHash, LedgerSum, read_candidate
+from flcav.releases.candidate import CARD, LEDGER, WEIGHTS, DataHash, LedgerSum, read_candidate
 from flcav.releases.verification import verify
-from flcav.releases.verification.comparison import Limit, Pair, compare, draw_scenes, measure_results, pair_slices
-from flcav.releases.verification.conditions import CONDITIONS, LIFTED_M, PLAIN
-from flcav.releases.verification.domain import describe_domain
+from flcav.releases.verification.comparison import (
+    GuardPair,
+    Limit,
+    compare_pair,
+    draw_scenes,
+    measure_results,
+    pair_slices,
+)
 from flcav.releases.verification.files import find_faults, find_overlap
-from flcav.releases.verification.records import OddCoverage, Verification, VerificationData, VerifiedDomain
-from flcav.releases.verification.testing import ConditionResults, VerificationFrame
-from flcav.releases.verification.verify import decide, read_verification, write_verification
+from flcav.releases.verification.records import CandidateVerification, OddCoverage, VerificationData, VerifiedDomain
+from flcav.releases.verification.testing import CONDITIONS, LIFTED_M, PLAIN, ConditionResults, VerificationFrame
+from flcav.releases.verification.verify import (
+    decide_on_candidate,
+    describe_domain,
+    read_verification,
+    write_verification,
+)
 from flcav.report.pages.release_page import release_page
 from flcav.sensors.frame import Annotations, Frame
 from flcav.statistics.power import plan_scenes
@@ -87,14 +97,14 @@ def run(
     return results
 
 
-def judge(new: Results, scenes: int = SCENES, margin: float = 0.03) -> Verification:
+def judge(new: Results, scenes: int = SCENES, margin: float = 0.03) -> CandidateVerification:
     candidate = read_candidate_like()
     data = [VerificationData("d", "a" * 64, "grid", 1, scenes * FRAMES, scenes)]
-    return decide(candidate, run(1, scenes=scenes), new, data, None, margin)
+    return decide_on_candidate(candidate, run(1, scenes=scenes), new, data, None, margin)
 
 
 def read_candidate_like():
-    from flcav.releases.candidates.candidate import Candidate
+    from flcav.releases.candidate import Candidate
 
     fields = dict.fromkeys(("weights", "driving", "card"), "b" * 64)
     return Candidate(task="objects", release=2, changes="", audience="", network="pillars", data=(), **fields)
@@ -208,8 +218,8 @@ def test_a_class_that_is_never_found_any_more_refuses_however_weak_it_was():
 
     data = [VerificationData("d", "a" * 64, "grid", 1, SCENES * FRAMES, SCENES)]
     driving = run(1, rare)
-    assert decide(read_candidate_like(), driving, driving, data, None).accepted
-    silent = decide(read_candidate_like(), driving, run(1, without("Pedestrian")), data, None)
+    assert decide_on_candidate(read_candidate_like(), driving, driving, data, None).accepted
+    silent = decide_on_candidate(read_candidate_like(), driving, run(1, without("Pedestrian")), data, None)
     assert [each.partition(":")[0] for each in silent.reasons] == ["class Pedestrian is never found"]
 
 
@@ -229,13 +239,13 @@ def test_the_page_says_what_was_not_tested_and_not_judged():
     assert all(f"<b>{party}</b>: not yet" in text for party in ("provider", "customer"))
 
 
-def pair_of(driving: list[float], candidate: list[float], limit: Limit) -> Pair:
+def pair_of(driving: list[float], candidate: list[float], limit: Limit) -> GuardPair:
     """A pair whose measures are means of numbers of scenes."""
 
     def mean(values: list[float]):
         return lambda times: times @ np.array(values) / times.sum(axis=1)
 
-    return Pair("class", "x", mean(driving), mean(candidate), np.array([*"abcdef"]), 6, 50, limit)
+    return GuardPair("class", "x", mean(driving), mean(candidate), np.array([*"abcdef"]), 6, 50, limit)
 
 
 @pytest.mark.parametrize(
@@ -256,7 +266,7 @@ def test_a_guard_is_lost_where_its_bound_is_beyond_the_limit(
     driving: list[float], candidate: list[float], limit: Limit, judgement: str
 ):
     pair = pair_of(driving, candidate, limit)
-    found, _ = compare(pair, draw_scenes(pair.scene, 200), 100)
+    found, _ = compare_pair(pair, draw_scenes(pair.scene, 200), 100)
     assert found.judgement == judgement
     assert (found.spare is not None and found.spare < 0) == (judgement == "lost")
 
@@ -271,10 +281,10 @@ def test_a_guard_is_lost_by_chance_in_as_few_families_as_its_level_says():
             pairs.append((old, new))
         times = rng.multinomial(20, np.full(20, 0.05), size=100)
         every = [
-            Pair("x", "x", lambda t, v=a: t @ v / 20, lambda t, v=b: t @ v / 20, np.arange(20).astype(str), 20, 50)
+            GuardPair("x", "x", lambda t, v=a: t @ v / 20, lambda t, v=b: t @ v / 20, np.arange(20).astype(str), 20, 50)
             for a, b in pairs
         ]
-        lost += any(compare(pair, times, len(every))[0].judgement == "lost" for pair in every)
+        lost += any(compare_pair(pair, times, len(every))[0].judgement == "lost" for pair in every)
     assert lost / 200 < 0.1
 
 
@@ -300,7 +310,7 @@ def test_a_single_scene_accepts_nothing():
 def test_a_driving_network_that_finds_nothing_is_no_measure():
     data = [VerificationData("d", "a" * 64, "grid", 1, SCENES * FRAMES, SCENES)]
     nothing = run(1, found=0.0)
-    found = decide(read_candidate_like(), nothing, run(2), data, None)
+    found = decide_on_candidate(read_candidate_like(), nothing, run(2), data, None)
     assert found.reasons == ("AP50 0.000 of the network that drives: nothing that could be kept",)
 
 
@@ -323,7 +333,7 @@ def test_an_own_class_without_objects_is_undecided():
     data = [VerificationData("d", "a" * 64, "grid", 1, 24, 24)]
     frames = run(1)[PLAIN]
     domain = replace(describe(frames), objects={"Car": 200, "Pedestrian": 100, "Cyclist": 2})
-    found = decide(read_candidate_like(), run(1), run(1), data, domain)
+    found = decide_on_candidate(read_candidate_like(), run(1), run(1), data, domain)
     assert found.undecided
     assert found.reasons == ("2 objects of the class Cyclist, and 10 are wanted",)
     assert found.frames_to_decide == 120

@@ -9,19 +9,26 @@ import pytest
 from release_parties import ALL, Parties
 
 from flcav.config import InputError
-from flcav.federation.messages.release_report import ShadowReport
+from flcav.fleet.releases import ShadowReport
 from flcav.geometry import Boxes
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.network.radio.budget import Radio, lone_rate_bps
 from flcav.network.radio.links import RadioLinks
-from flcav.releases.candidates.candidate import CANDIDATE, WEIGHTS, read_candidate
-from flcav.releases.repositories.directive import Directive, is_assigned
+from flcav.releases.candidate import CANDIDATE, WEIGHTS, read_candidate
+from flcav.releases.repositories.metadata import Directive, is_assigned
 from flcav.releases.repositories.repository import publish
-from flcav.releases.rollout.delivery import deliver
 from flcav.releases.rollout.deployed import share_of
-from flcav.releases.rollout.shadow import count_agreed, judge_shadows
-from flcav.releases.rollout.stages import STAGES, change_share, next_share, read_directive, roll_back
+from flcav.releases.rollout.simulated_fleet import deliver
+from flcav.releases.rollout.stages import (
+    STAGES,
+    change_share,
+    count_agreed,
+    judge_shadows,
+    next_share,
+    read_directive,
+    roll_back,
+)
 from flcav.storage.files import sha256
 
 

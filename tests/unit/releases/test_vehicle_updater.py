@@ -9,8 +9,10 @@ from release_parties import Parties
 
 from flcav.config import InputError, read_json
 from flcav.dataset.recording.recorder import record
-from flcav.federation.fleet.vehicle import VehicleSettings
-from flcav.releases.candidates.candidate import read_candidate
+from flcav.fleet.vehicle import VehicleSettings
+from flcav.releases.candidate import read_candidate
+from flcav.releases.checking import FIRST_ROOT, trusts_roots
+from flcav.releases.installation import fetch_release
 from flcav.releases.repositories.metadata import read_released, read_root
 from flcav.releases.rollout.updater import (
     DRIVE,
@@ -21,8 +23,6 @@ from flcav.releases.rollout.updater import (
     _run_shadow,
     equip_vehicle,
 )
-from flcav.releases.vehicles.checking import FIRST_ROOT, trusts_roots
-from flcav.releases.vehicles.installation import fetch_release
 from flcav.sensors.frame import Frame
 from flcav.storage.files import write_json
 

@@ -10,8 +10,8 @@ from flcav.cli.terminal import Answer, answer_json, echo, only_writer_of, when_i
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
-    from flcav.releases.candidates.candidate import Candidate
-    from flcav.releases.repositories.repository import Staged
+    from flcav.releases.candidate import Candidate
+    from flcav.releases.repositories.repository import StagedTargets
 
 CANDIDATE = typer.Argument(metavar="CANDIDATE", help="Folder of the candidate.")
 DRIVING = typer.Option(..., "--driving", help="Weights of the network that drives (safetensors).")
@@ -24,14 +24,14 @@ AS_JSON = typer.Option(False, "--json", help="Print one JSON object.")
 
 def describe_candidate(folder: Path) -> "Candidate":
     """Return the description of a candidate whose files are as it says."""
-    from flcav.releases.candidates.candidate import check_files, read_candidate
+    from flcav.releases.candidate import check_files, read_candidate
 
     described = read_candidate(folder)
     check_files(folder, described)
     return described
 
 
-def tell_signatures(repository: Path, state: "Staged") -> None:
+def tell_signatures(repository: Path, state: "StagedTargets") -> None:
     """Print how many signatures a party's next metadata have."""
     more = "publish it" if state.complete else "another owner's is missing"
     echo(
@@ -41,7 +41,7 @@ def tell_signatures(repository: Path, state: "Staged") -> None:
 
 def draw_page(folder: Path, repositories: list[Path]) -> None:
     """Draw the candidate's page with the signatures of the repositories' parties."""
-    from flcav.releases.candidates.candidate import REPORT, read_candidate, write_report
+    from flcav.releases.candidate import REPORT, read_candidate, write_candidate_page
     from flcav.releases.repositories.status import read_acknowledgements
     from flcav.releases.verification.verify import read_verification
     from flcav.report.pages.release_page import release_page
@@ -50,7 +50,7 @@ def draw_page(folder: Path, repositories: list[Path]) -> None:
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and path.name != REPORT]
     hashes = {path.name: sha256(path) for path in files}
     signed = read_acknowledgements(folder, repositories)
-    write_report(folder, release_page(read_candidate(folder), read_verification(folder), hashes, signed))
+    write_candidate_page(folder, release_page(read_candidate(folder), read_verification(folder), hashes, signed))
 
 
 def propose(
@@ -68,7 +68,7 @@ def propose(
     task: str = TASK,
 ) -> None:
     """Make a candidate of trained weights: hashes of data, recipe and ledger, the card, and what it replaces."""
-    from flcav.releases.candidates.proposal import propose as make_candidate
+    from flcav.releases.proposal import propose as make_candidate
 
     made = make_candidate(
         out, weights, driving, number, changes, audience, task=task, data=data, recipe=recipe, ledger=ledger

@@ -37,7 +37,7 @@ def init(
     threshold: int = typer.Option(2, "--threshold", min=1, max=16, help="Signatures that a release needs."),
 ) -> None:
     """Create a party's keys and its empty repository of The Update Framework."""
-    from flcav.releases.repositories.creation import create_repository
+    from flcav.releases.repositories.repository import create_repository
 
     made = create_repository(out, party.value, keys, threshold)
     echo(f"{out}: repository of the {party.value}, {threshold} of {plural(len(made), 'key')} sign a release")
@@ -62,9 +62,8 @@ def sign(
     revoke: list[str] = REVOKE,
 ) -> None:
     """Acknowledge a verified candidate, and sign its place in the party's repository; `publish` makes it current."""
-    from flcav.releases.candidates.acknowledgement import acknowledge
-    from flcav.releases.repositories.directive import MILLION, Directive
-    from flcav.releases.repositories.metadata import read_party
+    from flcav.releases.candidate import acknowledge
+    from flcav.releases.repositories.metadata import MILLION, Directive, read_party
     from flcav.releases.repositories.repository import stage_release
     from flcav.releases.verification.verify import read_verification
 
@@ -109,8 +108,8 @@ def install(
 ) -> None:
     """Install in a vehicle what both repositories name with the same hash; refuse anything else."""
     from flcav.config import check_is_file
-    from flcav.releases.vehicles.checking import open_sources, trust_roots
-    from flcav.releases.vehicles.installation import update_vehicle
+    from flcav.releases.checking import open_sources, trust_roots
+    from flcav.releases.installation import update_vehicle
 
     if not name.isprintable() or not name:
         raise InputError("--name: a vehicle's name has letters, digits and signs")
@@ -139,7 +138,7 @@ def equip(
     """On a vehicle of a fleet: trust both parties, and follow the releases that the fleet offers."""
     from flcav.config import check_is_file
     from flcav.dataset.store import Dataset
-    from flcav.releases.rollout.fleet import list_drives
+    from flcav.releases.rollout.simulated_fleet import list_drives
     from flcav.releases.rollout.updater import RecordedDrive, equip_vehicle
 
     if (image_root is None) != (director_root is None):
@@ -170,9 +169,9 @@ def status(
     task: str = TASK,
 ) -> Answer:
     """Show what repositories name: releases, the customer's directive, signatures on their way, times of expiry."""
-    from flcav.releases.repositories.status import read_status
+    from flcav.releases.repositories.status import read_repository_status
 
-    found = [read_status(folder, task) for folder in repository]
+    found = [read_repository_status(folder, task) for folder in repository]
     if candidate is not None:
         draw_page(candidate, repository)
     yield {"repositories": [each.as_json() for each in found]}

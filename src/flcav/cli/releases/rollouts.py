@@ -39,8 +39,8 @@ def shadow(
     from flcav.perception.agents import kind_of
     from flcav.perception.objects.task import OBJECTS
     from flcav.perception.weights import load_network
-    from flcav.releases.candidates.candidate import WEIGHTS
-    from flcav.releases.rollout.shadow import run_shadow
+    from flcav.releases.candidate import WEIGHTS
+    from flcav.releases.rollout.stages import run_shadow
     from flcav.storage.files import sha256, write_json
 
     use_threads(1)
@@ -124,8 +124,7 @@ def _widen(
     repository: Path, key: list[Path], shadows: Path | None, share: float | None, revoke: list[str], task: str
 ) -> None:
     from flcav.releases.repositories.metadata import read_weights
-    from flcav.releases.rollout.shadow import judge_shadows, read_shadow
-    from flcav.releases.rollout.stages import change_share, next_share, read_directive
+    from flcav.releases.rollout.stages import change_share, judge_shadows, next_share, read_directive, read_shadow
 
     if (shadows is None) == (share is None):
         raise InputError("either --shadows or --share: who decides on the next share of the fleet?")
@@ -165,8 +164,8 @@ def deliver(
     from flcav.network.clock.rounds import NetworkSettings
     from flcav.network.ledger import Ledger, LinkMegabytes
     from flcav.network.radio.recorded import link_scene
-    from flcav.releases.candidates.candidate import WEIGHTS
-    from flcav.releases.rollout.delivery import deliver as deliver_release
+    from flcav.releases.candidate import WEIGHTS
+    from flcav.releases.rollout.simulated_fleet import deliver as deliver_release
 
     described = describe_candidate(candidate)
     settings = NetworkSettings() if network is None else read_config(NetworkSettings, network)

@@ -9,24 +9,21 @@ from cryptography import x509
 from flwr.app import ConfigRecord, Context, Message, RecordDict
 
 from flcav.config import shorten
-from flcav.federation.messages.acceptance import ReplyRefused, read_entry
-from flcav.federation.messages.records import (
-    ASK,
-    CERTIFICATES,
-    CIPHERS,
-    KEYS,
-    MASKED,
-    MASKS,
-    NAMES,
-    SHARES,
-    SIGNATURES,
-    UNMASK,
-)
+from flcav.federation import wire
+from flcav.federation.acceptance import ReplyRefused, read_entry
 from flcav.federation.rules import SecureAggregation
-from flcav.federation.secure.certified import Identity, SignedKeys, check_certified, find_vehicle
-from flcav.federation.secure.masks import Vector, add_vectors, is_public_key
-from flcav.federation.secure.parties import SEALED_BYTES, PublicKeys, SecureClient, find_liars, unmask_sum
-from flcav.federation.secure.shamir import SHARE_BYTES
+from flcav.federation.secure.parties import (
+    SEALED_BYTES,
+    Identity,
+    PublicKeys,
+    SecureClient,
+    SignedKeys,
+    check_certified,
+    find_liars,
+    find_vehicle,
+    unmask_sum,
+)
+from flcav.federation.secure.primitives import SHARE_BYTES, Vector, add_vectors, is_public_key
 from flcav.federation.trainable import Weights
 
 SURVIVORS, DROPPED, THRESHOLD = "survivors", "dropped", "threshold"  # entries of the server's messages
@@ -35,7 +32,7 @@ SECRETS = "secrets"  # record of a node's state: the client's own part of a roun
 AnswerT = TypeVar("AnswerT")
 
 
-class Exchange(Protocol):
+class ExchangeStep(Protocol):
     """Messages of one step: what each client is asked, and what is read of each usable answer."""
 
     def __call__(
@@ -59,13 +56,13 @@ def answer_secretly(
     identity: by which a client signs its keys of the round, and accepts those of certified peers alone; None: it has no
     authority. Raises ValueError for a request that would reveal more than `how` and the protocol do.
     """
-    asked = message.content.config_records[ASK]
-    if asked[ASK] == KEYS:
+    asked = message.content.config_records[wire.ASK]
+    if asked[wire.ASK] == wire.KEYS:
         client = SecureClient.draw(name)
-        record = ConfigRecord({CIPHERS: client.keys.cipher, MASKS: client.keys.mask})
+        record = ConfigRecord({wire.CIPHERS: client.keys.cipher, wire.MASKS: client.keys.mask})
         if identity is not None:
-            record[CERTIFICATES], record[SIGNATURES] = identity.sign(name, round_, client.keys)
-    elif asked[ASK] == SHARES:
+            record[wire.CERTIFICATES], record[wire.SIGNATURES] = identity.sign(name, round_, client.keys)
+    elif asked[wire.ASK] == wire.SHARES:
         client = _recall(context)
         peers, threshold = _peers(asked), _number(asked[THRESHOLD])
         if identity is not None:
@@ -73,13 +70,13 @@ def answer_secretly(
         if threshold < (needed := how.needed(len(peers), certified=identity is not None)):
             raise ValueError(f"a threshold of {threshold} of {len(peers)} clients: {needed} are agreed on")
         sealed = client.share(peers, threshold)
-        record = ConfigRecord({NAMES: [*sealed], SHARES: [*sealed.values()]})
+        record = ConfigRecord({wire.NAMES: [*sealed], wire.SHARES: [*sealed.values()]})
     else:
         client = _recall(context)
         shares = client.reveal(_strings(asked[SURVIVORS]), _strings(asked[DROPPED]))
-        record = ConfigRecord({NAMES: [*shares], SHARES: [*shares.values()]})
+        record = ConfigRecord({wire.NAMES: [*shares], wire.SHARES: [*shares.values()]})
     _keep(context, client)
-    return Message(RecordDict({ASK: record}), reply_to=message)
+    return Message(RecordDict({wire.ASK: record}), reply_to=message)
 
 
 def complain(message: Message, context: Context) -> Message | None:
@@ -88,9 +85,9 @@ def complain(message: Message, context: Context) -> Message | None:
     The shares are those that the server passed on with the request.
     """
     client = _recall(context)
-    odd = client.take(_named(message.content.config_records[ASK]))
+    odd = client.take(_named(message.content.config_records[wire.ASK]))
     _keep(context, client)
-    return Message(RecordDict({ASK: ConfigRecord({NAMES: odd})}), reply_to=message) if odd else None
+    return Message(RecordDict({wire.ASK: ConfigRecord({wire.NAMES: odd})}), reply_to=message) if odd else None
 
 
 def mask_update(context: Context, update: Vector) -> Vector:
@@ -102,7 +99,7 @@ class SecureSum:
     """The server's side of one round: what it has to ask for, and the sum in the end."""
 
     def __init__(
-        self, exchange: Exchange, threshold: int, round_: int, authority: x509.Certificate | None = None
+        self, exchange: ExchangeStep, threshold: int, round_: int, authority: x509.Certificate | None = None
     ) -> None:
         """Ask clients by `exchange`; `threshold` of them have to be left at every step.
 
@@ -131,19 +128,19 @@ class SecureSum:
                 signed[name] = found
             return found[0]
 
-        self._keys = self._exchange({name: ConfigRecord({ASK: KEYS}) for name in chosen}, read)
+        self._keys = self._exchange({name: ConfigRecord({wire.ASK: wire.KEYS}) for name in chosen}, read)
         self._check(len(self._keys), "sent keys")
         ask = {
-            ASK: SHARES,
-            NAMES: [*self._keys],
-            CIPHERS: [keys.cipher for keys in self._keys.values()],
-            MASKS: [keys.mask for keys in self._keys.values()],
+            wire.ASK: wire.SHARES,
+            wire.NAMES: [*self._keys],
+            wire.CIPHERS: [keys.cipher for keys in self._keys.values()],
+            wire.MASKS: [keys.mask for keys in self._keys.values()],
             THRESHOLD: self._threshold,
         }
         if signed:
             ask |= {
-                CERTIFICATES: [each[1] for each in signed.values()],
-                SIGNATURES: [each[2] for each in signed.values()],
+                wire.CERTIFICATES: [each[1] for each in signed.values()],
+                wire.SIGNATURES: [each[2] for each in signed.values()],
             }
         sealed = self._exchange(
             dict.fromkeys(self._keys, ConfigRecord(ask)),
@@ -155,7 +152,7 @@ class SecureSum:
         for name in sealed:
             others = [other for other in sealed if other != name]
             shares = [sealed[other][name] for other in others]
-            asks[name] = ConfigRecord({ASK: MASKED, NAMES: others, SHARES: shares})
+            asks[name] = ConfigRecord({wire.ASK: wire.MASKED, wire.NAMES: others, wire.SHARES: shares})
         return asks
 
     @property
@@ -171,7 +168,7 @@ class SecureSum:
         survivors = [*masked]
         dropped = [name for name in self._peers if name not in masked]
         self._check(len(survivors), "sent an update")
-        ask = ConfigRecord({ASK: UNMASK, SURVIVORS: survivors, DROPPED: dropped})
+        ask = ConfigRecord({wire.ASK: wire.UNMASK, SURVIVORS: survivors, DROPPED: dropped})
         shares = self._exchange(
             dict.fromkeys(survivors, ask),
             lambda _, content: read_shares(content, [*survivors, *dropped], SHARE_BYTES),
@@ -211,19 +208,19 @@ def _recall(context: Context) -> SecureClient:
 
 
 def _named(record: ConfigRecord) -> dict[str, bytes]:
-    shares: Any = record[SHARES]
-    return dict(zip(_strings(record[NAMES]), shares, strict=True))
+    shares: Any = record[wire.SHARES]
+    return dict(zip(_strings(record[wire.NAMES]), shares, strict=True))
 
 
 def _peers(record: ConfigRecord) -> dict[str, PublicKeys]:
-    ciphers: Any = record[CIPHERS]
-    masks: Any = record[MASKS]
-    each = zip(_strings(record[NAMES]), ciphers, masks, strict=True)
+    ciphers: Any = record[wire.CIPHERS]
+    masks: Any = record[wire.MASKS]
+    each = zip(_strings(record[wire.NAMES]), ciphers, masks, strict=True)
     return {name: PublicKeys(cipher, mask) for name, cipher, mask in each}
 
 
 def _signed(record: ConfigRecord, peers: Mapping[str, PublicKeys]) -> dict[str, SignedKeys]:
-    given: Any = (record.get(kind, [b""] * len(peers)) for kind in (CERTIFICATES, SIGNATURES))
+    given: Any = (record.get(kind, [b""] * len(peers)) for kind in (wire.CERTIFICATES, wire.SIGNATURES))
     return {name: (keys, *proof) for (name, keys), *proof in zip(peers.items(), *given, strict=True)}
 
 
@@ -235,19 +232,15 @@ def _number(value: Any) -> int:
     return int(value)
 
 
-def _bytes(value: Any) -> bytes:
-    return bytes(value)
-
-
 def read_keys(content: RecordDict) -> SignedKeys:
     """Return a client's public keys of a round, with a certificate and a signature that are not checked here.
 
     Where the client has no authority these are empty. Raises `ReplyRefused`.
     """
-    found = PublicKeys(*(read_entry(content, kind) for kind in (CIPHERS, MASKS)))
+    found = PublicKeys(*(read_entry(content, kind) for kind in (wire.CIPHERS, wire.MASKS)))
     if not (is_public_key(found.cipher) and is_public_key(found.mask)):
         raise ReplyRefused("keys that nobody can agree on a secret with")
-    certificate, signature = (read_entry(content, kind) or b"" for kind in (CERTIFICATES, SIGNATURES))
+    certificate, signature = (read_entry(content, kind) or b"" for kind in (wire.CERTIFICATES, wire.SIGNATURES))
     if not isinstance(certificate, bytes) or not isinstance(signature, bytes):
         raise ReplyRefused("a certificate or a signature that is not in bytes")
     return found, certificate, signature
@@ -255,7 +248,7 @@ def read_keys(content: RecordDict) -> SignedKeys:
 
 def read_shares(content: RecordDict, owners: Sequence[str], size: int) -> dict[str, bytes]:
     """Return the shares of `size` bytes that a client sends, one for each name of `owners`; raises `ReplyRefused`."""
-    names, shares = read_entry(content, NAMES), read_entry(content, SHARES)
+    names, shares = read_entry(content, wire.NAMES), read_entry(content, wire.SHARES)
     if not isinstance(names, list) or not isinstance(shares, list) or len(names) != len(shares):
         raise ReplyRefused(f"no shares by name, but {shorten(names)}")
     found = dict(zip(names, shares, strict=True))

@@ -6,18 +6,13 @@ from dataclasses import fields, is_dataclass
 from pydantic import TypeAdapter, ValidationError
 
 from flcav.config import InputError, Json, shorten
-from flcav.federation.strategies.fedadam import FedAdam
+from flcav.federation.strategies.corrections import FedProx, Scaffold
 from flcav.federation.strategies.fedavg import FedAvg
-from flcav.federation.strategies.fedavgm import FedAvgM
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
-from flcav.federation.strategies.fedprox import FedProx
-from flcav.federation.strategies.fedyogi import FedYogi
-from flcav.federation.strategies.krum import Krum
-from flcav.federation.strategies.median import Median
-from flcav.federation.strategies.scaffold import Scaffold
+from flcav.federation.strategies.fedopt import FedAdam, FedAvgM, FedYogi
+from flcav.federation.strategies.robust import Krum, Median, TrimmedMean
 from flcav.federation.strategies.strategy import Corrects, Exchanges, Strategy
-from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.plugins import load_named
 
 STRATEGIES: dict[str, type[Strategy]] = {

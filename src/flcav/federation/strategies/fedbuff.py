@@ -13,7 +13,7 @@ from pydantic import Field
 
 from flcav.config import InputError
 from flcav.federation.strategies.fedavg import FedAvg
-from flcav.federation.strategies.fedavgm import move_mean
+from flcav.federation.strategies.fedopt import move_mean
 from flcav.federation.trainable import LocalUpdate, Update, Weights, learned_names
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.links.in_process import update_bytes
 from flcav.fusion.distillation import Distillation, pack_sighting
 from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.sightings import Sighting

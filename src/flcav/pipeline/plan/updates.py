@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Sequence
 
 from flcav.config import Config
+from flcav.federation.links.in_process import update_bytes
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.selection import Selection
 from flcav.federation.strategies import exchanges_more, strategy_named
 from flcav.federation.strategies.fedmd import FedMD

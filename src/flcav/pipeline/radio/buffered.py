@@ -8,7 +8,7 @@ full and the models have gone up and down by wireline. Meanwhile vehicles go on,
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from flcav.federation.buffered_rounds import BrokenUpdate, BufferedRound, Buffers
+from flcav.federation.modes.buffered import BrokenUpdate, Buffers, FilledBuffer
 from flcav.federation.rules import Rules
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.network.clock.buffers import BufferClock, BufferTiming
@@ -45,7 +45,7 @@ class BufferedFleet:
                 for own in map(named, each.broken)
             )
             versions = {f"{self.fleet.region}/{vehicle}": version for vehicle, version in each.versions.items()}
-            rounds.append(BufferedRound(versions, broken))
+            rounds.append(FilledBuffer(versions, broken))
         records = tuple(each.as_round() for each in timings)
         return DrivenRounds(rules, {}, records, Buffers(tuple(rounds), self.before))
 

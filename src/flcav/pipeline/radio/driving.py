@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flcav.config import InputError
-from flcav.federation.buffered_rounds import Buffers
+from flcav.federation.links.metered import Outage
+from flcav.federation.modes.buffered import Buffers
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.metered import Outage
 from flcav.federation.selection import Selection
 from flcav.network.clock.records import ClientTiming, RoundTiming
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import numpy as np
 
-from flcav.federation.divergence import RoundDivergence
 from flcav.federation.privacy import SEEDED
+from flcav.federation.state import RoundDivergence
 from flcav.pipeline.results.groups import Group
 from flcav.pipeline.results.saved import Saved
 from flcav.storage.records import LEFT_OUT, WHERE_TRUE, Record

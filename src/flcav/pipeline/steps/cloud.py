@@ -7,16 +7,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flcav.federation.buffered_rounds import Buffers, afford_buffers
-from flcav.federation.divergence import RoundDivergence, measure_divergence
 from flcav.federation.edge_server import EdgeServer, afford_cloud_rounds, edge_seeds
-from flcav.federation.rounds import federate
+from flcav.federation.links.in_process import update_bytes
+from flcav.federation.links.link import Runtime, open_runtime
+from flcav.federation.links.metered import Account, Outage
+from flcav.federation.links.ros_names import join_names
+from flcav.federation.loop import federate
+from flcav.federation.modes.buffered import Buffers, afford_buffers
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.runtimes.link import Runtime, open_runtime
-from flcav.federation.runtimes.metered import Account, Outage
-from flcav.federation.runtimes.ros_names import join_names
-from flcav.federation.state import FederationState
+from flcav.federation.state import FederationState, RoundDivergence, measure_divergence
 from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedavg import average
 from flcav.federation.strategies.fedbuff import FedBuff
@@ -64,7 +63,7 @@ from flcav.pipeline.training.records import read_rounds
 from flcav.pipeline.training.statistics import keep_statistics, score_statistics
 
 if TYPE_CHECKING:
-    from flcav.federation.runtimes.topics import RosTopics
+    from flcav.federation.links.topics import RosTopics
 
 BAG = "bag-from-round"  # begins the names of the folders of ROS 2 bags
 REPLAY = "cloud-replay"  # the cloud's own training among the edge servers; no region has a hyphen in its name
@@ -136,7 +135,7 @@ class CloudFederation:
         """Return the topics of the rounds after `done`, and their bag; None where messages stay in memory."""
         if self.topics is None:
             return None
-        from flcav.federation.runtimes.topics import RosTopics
+        from flcav.federation.links.topics import RosTopics
 
         bag = self.folder / f"{BAG}{done + 1}"
         shutil.rmtree(bag, ignore_errors=True)  # of rounds that a kill undid

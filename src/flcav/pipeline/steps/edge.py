@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flcav.federation.runtimes.link import open_fleet, open_questions
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.link import open_deployment, open_questions
+from flcav.federation.links.metered import Account
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.network.ledger import Ledger
@@ -92,7 +92,7 @@ def edge_step(
     if runtime != "flower":
         _federate_region(work, settings, plan, book, before, labelled, where)
     else:
-        with open_fleet(clients, Path(fleet) if fleet else None, settings.vehicles) as deployed:
+        with open_deployment(clients, Path(fleet) if fleet else None, settings.vehicles) as deployed:
             _federate_region(work, settings, plan, book, before, labelled, {**where, "deployed": deployed})
 
 

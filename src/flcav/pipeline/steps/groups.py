@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.federation.runtimes.embedded import update_bytes
-from flcav.federation.runtimes.link import NOTHING, UNREADABLE, Ask, open_questions
-from flcav.federation.runtimes.metered import Account
+from flcav.federation.links.in_process import update_bytes
+from flcav.federation.links.link import NOTHING, UNREADABLE, Ask, open_questions
+from flcav.federation.links.metered import Account
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send
@@ -61,7 +61,7 @@ from flcav.pipeline.training.members import (
 from flcav.statistics.streams import derive_seed
 
 if TYPE_CHECKING:
-    from flcav.federation.runtimes.deployed import RegionalDeployment
+    from flcav.federation.links.flower import RegionalDeployment
 
 EVERY_SCENE = 10**6  # more than there are
 AnswerT = TypeVar("AnswerT")

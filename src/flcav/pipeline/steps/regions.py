@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from flcav.federation.buffered_rounds import count_participations
+from flcav.federation.links.in_process import update_bytes
+from flcav.federation.modes.buffered import count_participations
 from flcav.federation.rules import RegionalModels, Rules
-from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.strategies import exchanges_more
 from flcav.network.clock.records import save_rounds
 from flcav.network.clock.rounds import NetworkSettings

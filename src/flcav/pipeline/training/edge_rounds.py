@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from safetensors.numpy import load_file
 
-from flcav.federation.buffered_rounds import Buffers, afford_buffers
+from flcav.federation.links.link import Runtime, open_questions, open_runtime
+from flcav.federation.links.metered import Account, Outage
+from flcav.federation.links.processes import ClientProcesses
+from flcav.federation.loop import BeforeRound, OnRound, Schedule, federate
+from flcav.federation.modes.buffered import Buffers, afford_buffers
 from flcav.federation.privacy import count_affordable
-from flcav.federation.rounds import BeforeRound, OnRound, Schedule, federate
 from flcav.federation.rules import Rules
-from flcav.federation.runtimes.link import Runtime, open_questions, open_runtime
-from flcav.federation.runtimes.metered import Account, Outage
-from flcav.federation.runtimes.processes import ClientProcesses
 from flcav.federation.state import FederationState
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
@@ -35,7 +35,7 @@ from flcav.pipeline.training.learning import Learning, describe_federation, give
 from flcav.pipeline.training.timing import time_clients
 
 if TYPE_CHECKING:
-    from flcav.federation.runtimes.deployed import RegionalDeployment
+    from flcav.federation.links.flower import RegionalDeployment
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flcav.federation.messages.fl_request import FLRequest, parse_request
+from flcav.fleet.fl_request import FLRequest, parse_request
 from flcav.pipeline.results.saved import Saved
 
 if TYPE_CHECKING:
-    from flcav.federation.runtimes.deployed import RegionalDeployment
+    from flcav.federation.links.flower import RegionalDeployment
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.federation.runtimes.link import Ask
+from flcav.federation.links.link import Ask
 from flcav.federation.trainable import Trainable, Weights
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send

@@ -9,8 +9,8 @@ a strategy keeps at the server between rounds, such as moments, is lost with the
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from flcav.federation.rounds import OnRound
-from flcav.federation.runtimes.metered import Account, Outage
+from flcav.federation.links.metered import Account, Outage
+from flcav.federation.loop import OnRound
 from flcav.federation.state import FederationState
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.clock.records import RoundTiming

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flcav.federation.rounds import Schedule
+from flcav.federation.loop import Schedule
 from flcav.federation.rules import Rules
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Weights

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
-from flcav.federation.buffered_rounds import count_participations
+from flcav.federation.modes.buffered import count_participations
 from flcav.federation.privacy import affordable_rounds, compose_epsilon, find_noise
 from flcav.federation.rules import Rules
 from flcav.federation.strategies import fills_buffers

@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
 from flcav.config import InputError
-from flcav.federation.noise import Secret
+from flcav.federation.privacy import Secret
 from flcav.storage.files import flush_all, sha256, write_bytes, write_in_pieces
 
 SECRETS, SECRETS_HASH, PART = "secrets.safetensors", "secrets.sha256", ".secrets."

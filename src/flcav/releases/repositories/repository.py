@@ -1,7 +1,12 @@
-"""A party's repository of The Update Framework, with a stage for signatures that are given one after another.
+"""A party's repository of The Update Framework: its creation, and a stage for signatures that come one after another.
 
 The provider's is Uptane's image repository: it names every release. The customer's is Uptane's director repository: it
 names the release that its vehicles are to run, with a `Directive`. Both have roots of their own.
+
+OUT/keys/{1..m,online}.pem    private keys, to be given to their owners
+OUT/repository/metadata/      what vehicles fetch
+OUT/repository/targets/       weights and descriptions of releases
+OUT/staged/targets.json       the next targets metadata, while it lacks signatures
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,15 +16,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flcav.config import InputError
-from flcav.releases.candidates.candidate import Candidate, check_bundle, check_files, read_candidate
-from flcav.releases.keys import check_distinct, read_private_key
-from flcav.releases.repositories.creation import ONLINE
-from flcav.releases.repositories.directive import Directive
+from flcav.releases.candidate import Candidate, check_bundle, check_files, read_candidate
+from flcav.releases.keys import PublicKey, check_distinct, generate_key, read_private_key
 from flcav.releases.repositories.metadata import (
     DIRECTIVE,
     LIFETIME,
+    PARTY,
+    Directive,
     Party,
     expiry_of,
+    latest_version,
     list_releases,
     load_metadata,
     load_root,
@@ -33,11 +39,11 @@ from flcav.releases.repositories.metadata import (
 from flcav.storage.files import write_bytes
 
 if TYPE_CHECKING:
-    from tuf.api.metadata import Metadata, Snapshot, TargetFile, Targets, Timestamp
+    from tuf.api.metadata import Metadata, Root, Snapshot, TargetFile, Targets, Timestamp
 
 
 @dataclass(frozen=True)
-class Staged:
+class StagedTargets:
     """Targets metadata on its way: how many of the wanted signatures it has."""
 
     version: int
@@ -52,7 +58,7 @@ class Staged:
 
 def stage_release(
     out: Path, folder: Path, keys: Sequence[Path], directive: Directive | None = None, now: datetime | None = None
-) -> Staged:
+) -> StagedTargets:
     """Add a candidate to the party's next targets metadata and sign it; the provider keeps its files, too.
 
     Args:
@@ -89,7 +95,7 @@ def stage_release(
 
 def stage_directive(
     out: Path, task: str, directive: Directive, keys: Sequence[Path], now: datetime | None = None
-) -> Staged:
+) -> StagedTargets:
     """Change the customer's directive on the release that its repository names already, and sign the change.
 
     Raises `InputError` as `stage_release`, and where the repository names no such release.
@@ -133,7 +139,7 @@ def publish(out: Path, now: datetime | None = None) -> int:
     return version
 
 
-def read_staged(out: Path) -> Staged | None:
+def read_staged(out: Path) -> StagedTargets | None:
     """Return the state of the staged targets metadata; None without one."""
     return _count(out, load_metadata(_staged_path(out))) if _staged_path(out).is_file() else None
 
@@ -145,7 +151,7 @@ def _stage(
     alone: bool,
     keys: Sequence[Path],
     at: datetime,
-) -> Staged:
+) -> StagedTargets:
     """Sign the next targets metadata with `files`; of the customer's, the task's other releases leave (`alone`)."""
     _check_clock(out, at)
     owned = [read_private_key(path) for path in keys]
@@ -210,11 +216,97 @@ def _check_clock(out: Path, at: datetime) -> None:
         )
 
 
-def _count(out: Path, targets: "Metadata[Targets]") -> Staged:
+def _count(out: Path, targets: "Metadata[Targets]") -> StagedTargets:
     root = load_root(out).signed
     result = root.get_verification_result("targets", targets.signed_bytes, targets.signatures)
-    return Staged(targets.signed.version, len(result.signed), root.roles["targets"].threshold)
+    return StagedTargets(targets.signed.version, len(result.signed), root.roles["targets"].threshold)
 
 
 def _staged_path(out: Path) -> Path:
     return out / "staged" / "targets.json"
+
+
+ONLINE = "online"
+MOST_KEYS = 16
+
+
+def create_repository(
+    out: Path, party: Party, keys: int = 3, threshold: int = 2, own: Sequence[Path] = (), now: datetime | None = None
+) -> tuple[PublicKey, ...]:
+    """Create a party's keys and its empty repository at `out`; return its public keys.
+
+    Args:
+        out: the folder, which may not exist yet.
+        party: whose it is.
+        keys: number of keys m that are generated, unless `own` are given.
+        threshold: number of signatures n that root and targets want.
+        own: private keys of the party (PEM files).
+        now: time of the signatures; None: by this machine's clock.
+
+    Raises:
+        InputError: for a folder that exists, a threshold above the number of keys, or a key given twice.
+    """
+    from tuf.api.metadata import Metadata, Root, Snapshot, Targets, Timestamp
+
+    if out.exists():
+        raise InputError(f"{out}: exists already; a repository is a new folder")
+    owned = [read_private_key(path) for path in own]
+    check_distinct([key.public for key in owned], f"the keys of the {party}")
+    count = len(owned) or keys
+    if not 1 <= threshold <= count <= MOST_KEYS:
+        raise InputError(f"{threshold} of {count} signatures: at least 1 of at most {MOST_KEYS} keys is wanted")
+    owned = owned or [generate_key(out / "keys" / f"{number}.pem") for number in range(1, count + 1)]
+    online = generate_key(out / "keys" / f"{ONLINE}.pem")
+    at = now or datetime.now(UTC)
+    root = Root(expires=expiry_of("root", at), consistent_snapshot=True, unrecognized_fields={PARTY: party})
+    for role in ("root", "targets"):
+        for key in owned:
+            root.add_key(key.signer().public_key, role)
+        root.roles[role].threshold = threshold
+    for role in ("snapshot", "timestamp"):
+        root.add_key(online.signer().public_key, role)
+    signed = Metadata(root)
+    targets = Metadata(Targets(expires=expiry_of("targets", at)))
+    for key in owned[:threshold]:
+        signed.sign(key.signer(), append=True)
+        targets.sign(key.signer(), append=True)
+    metadata = out / "repository" / "metadata"
+    write_metadata(signed, metadata / "1.root.json")
+    write_metadata(targets, metadata / "1.targets.json")
+    (out / "repository" / "targets").mkdir()
+    snapshot, timestamp = Metadata(Snapshot(expires=expiry_of("snapshot", at))), Metadata(Timestamp())
+    sign_online(metadata, snapshot, timestamp, online, at, targets_version=1, first=True)
+    return tuple(key.public for key in owned)
+
+
+def replace_online_key(out: Path, keys: Sequence[Path], now: datetime | None = None) -> None:
+    """Replace the online key by a new root, signed by the party's keys, and sign snapshot and timestamp anew.
+
+    What a thief of the old key signed is worth nothing from then on, high version numbers included. Raises `InputError`
+    for fewer keys than the root's threshold, keys of nobody, and one given twice.
+    """
+    at, metadata = now or datetime.now(UTC), out / "repository" / "metadata"
+    owned, party = [read_private_key(path) for path in keys], read_party(out)
+    check_distinct([key.public for key in owned], f"the keys of the {party}")
+    signed = load_root(out)
+    root: Root = signed.signed
+    lost = root.roles["timestamp"].keyids[0]
+    (out / "keys" / f"{ONLINE}.pem").unlink(missing_ok=True)
+    online = generate_key(out / "keys" / f"{ONLINE}.pem")
+    for role in ("snapshot", "timestamp"):
+        root.revoke_key(lost, role)
+        root.add_key(online.signer().public_key, role)
+    root.version, root.expires = root.version + 1, expiry_of("root", at)
+    signed.signatures.clear()
+    for key in owned:
+        signed.sign(key.signer(), append=True)
+    if (
+        len(root.get_verification_result("root", signed.signed_bytes, signed.signatures).signed)
+        < root.roles["root"].threshold
+    ):
+        raise InputError(f"{out}: fewer signatures of the {party} than its root wants")
+    version = latest_version(metadata, "targets")
+    write_metadata(signed, metadata / f"{root.version}.root.json")
+    timestamp: Metadata[Timestamp] = load_metadata(metadata / "timestamp.json")
+    snapshot: Metadata[Snapshot] = load_metadata(metadata / f"{timestamp.signed.snapshot_meta.version}.snapshot.json")
+    sign_online(metadata, snapshot, timestamp, online, at, version)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from flcav.interface.wording import plural
-from flcav.releases.candidates.acknowledgement import Acknowledgement, find_acknowledgements
+from flcav.releases.candidate import Acknowledgement, find_acknowledgements
 from flcav.releases.repositories.metadata import (
     list_releases,
     load_root,
@@ -17,7 +17,7 @@ from flcav.releases.repositories.metadata import (
     read_party,
     root_keys,
 )
-from flcav.releases.repositories.repository import Staged, read_staged
+from flcav.releases.repositories.repository import StagedTargets, read_staged
 from flcav.storage.records import LEFT_OUT, Record
 
 
@@ -32,7 +32,7 @@ class RepositoryStatus(Record):
     threshold: int
     keys: tuple[str, ...]
     fresh_until: datetime  # when the first of its metadata expires; vehicles refuse it afterwards
-    staged: Annotated[Staged | None, LEFT_OUT] = None
+    staged: Annotated[StagedTargets | None, LEFT_OUT] = None
     share: Annotated[float | None, LEFT_OUT] = None  # of the fleet; None of the provider
     revoked: tuple[str, ...] = ()
 
@@ -53,7 +53,7 @@ class RepositoryStatus(Record):
         return lines
 
 
-def read_status(out: Path, task: str) -> RepositoryStatus:
+def read_repository_status(out: Path, task: str) -> RepositoryStatus:
     """Return the state of a party's repository; raises `InputError` where `out` holds none."""
     party, targets, root = read_party(out), load_targets(out).signed, load_root(out).signed
     directive = read_directives(targets.targets).get(task)

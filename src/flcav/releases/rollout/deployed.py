@@ -13,24 +13,36 @@ from pathlib import Path
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.federation.fleet.authority import open_registry
-from flcav.federation.fleet.releases.offer import KeptReport, Offer, read_reports
-from flcav.federation.fleet.traffic import read_traffic
-from flcav.federation.fleet.up import VEHICLES, read_ready
+from flcav.fleet.authority import open_registry
+from flcav.fleet.releases import KeptReport, ReleaseOffer, read_reports
+from flcav.fleet.traffic import read_traffic
+from flcav.fleet.up import VEHICLES, read_ready
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
-from flcav.releases.candidates.candidate import Candidate
-from flcav.releases.repositories.directive import MILLION, Directive, is_assigned, place_in_queue
-from flcav.releases.repositories.metadata import read_party, read_released, read_root
+from flcav.releases.candidate import Candidate
+from flcav.releases.checking import trusts_roots
+from flcav.releases.repositories.metadata import (
+    MILLION,
+    Directive,
+    is_assigned,
+    place_in_queue,
+    read_party,
+    read_released,
+    read_root,
+)
 from flcav.releases.repositories.repository import publish
-from flcav.releases.repositories.status import read_status
-from flcav.releases.rollout.delivery import STAGE, Delivered
-from flcav.releases.rollout.fleet import list_drives
-from flcav.releases.rollout.shadow import ShadowDecision, judge_shadows
-from flcav.releases.rollout.stages import STAGES, change_share, read_directive
-from flcav.releases.rollout.turns import Rollout, Turn
+from flcav.releases.repositories.status import read_repository_status
+from flcav.releases.rollout.simulated_fleet import STAGE, Delivered, list_drives
+from flcav.releases.rollout.stages import (
+    STAGES,
+    Rollout,
+    ShadowDecision,
+    Turn,
+    change_share,
+    judge_shadows,
+    read_directive,
+)
 from flcav.releases.rollout.updater import FOLDER, TASK, RecordedDrive, equip_vehicle
-from flcav.releases.vehicles.checking import trusts_roots
 
 LEAST = 2  # canaries: shadow runs of one vehicle do not tell
 POLL_S = 0.5  # between looks at the vehicles' reports
@@ -56,7 +68,7 @@ def roll_out(
         fleet: folder of the fleet's authority.
         provider: folder of the provider, whose published repository is offered.
         customer: that of the customer.
-        keys: private keys of the customer, as many as its targets want, so that a stop waits for nobody.
+        keys: private keys of the customer, as many as its targets want, so that a stop can be signed at once.
         ledger: where every downlink is entered; None: nowhere.
         share: of the fleet, to begin with; None: as the customer has signed it, or more for two canaries.
         data: dataset whose drives stand for what the vehicles of this machine meet; None: as before.
@@ -69,12 +81,12 @@ def roll_out(
     read_ready(fleet)
     names, directive = list_registered(fleet), read_directive(customer, TASK)
     candidate = read_released(provider, TASK, directive.release)
-    if len(keys) < (threshold := read_status(customer, TASK).threshold):
+    if len(keys) < (threshold := read_repository_status(customer, TASK).threshold):
         raise InputError(f"{len(keys)} of {threshold} keys of the customer: a roll-out that stops by itself needs all")
     if share is None and not directive.share and not directive.vehicles:
         raise InputError(f"release {directive.release} was stopped, or is for nobody; --share begins it")
     equip_fleet(fleet, provider, customer, data)
-    Offer(*(str((party / "repository").resolve()) for party in (provider, customer))).save(fleet)
+    ReleaseOffer(*(str((party / "repository").resolve()) for party in (provider, customer))).save(fleet)
     rollout = _Rollout(fleet, customer, tuple(keys), candidate, names, ledger or Ledger(LinkMegabytes(0, 0)))
     wanted = directive.share if share is None else share
     if len(rollout.assigned(_with_share(directive, wanted))) < min(LEAST, len(names)):

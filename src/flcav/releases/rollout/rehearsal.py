@@ -12,30 +12,36 @@ from pathlib import Path
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.federation.messages.release_report import ShadowReport
+from flcav.fleet.releases import ShadowReport
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network
-from flcav.releases.candidates.candidate import WEIGHTS, Candidate, check_files, read_candidate
-from flcav.releases.repositories.creation import create_repository
-from flcav.releases.repositories.directive import MILLION, Directive, is_assigned
-from flcav.releases.repositories.metadata import read_root
-from flcav.releases.repositories.repository import publish, stage_release
-from flcav.releases.rollout.delivery import Delivered
-from flcav.releases.rollout.fleet import (
-    Drive,
+from flcav.releases.candidate import WEIGHTS, Candidate, check_files, read_candidate
+from flcav.releases.checking import RepositorySources, open_sources
+from flcav.releases.repositories.metadata import MILLION, Directive, is_assigned, read_root
+from flcav.releases.repositories.repository import create_repository, publish, stage_release
+from flcav.releases.rollout.simulated_fleet import (
+    Delivered,
+    FleetDrive,
     SimulatedFleet,
     SimulatedRadio,
     build_fleet,
     list_drives,
     update_over_radio,
 )
-from flcav.releases.rollout.shadow import ShadowDecision, judge_shadows, run_shadow
-from flcav.releases.rollout.stages import STAGES, change_share, next_share, roll_back
-from flcav.releases.rollout.turns import Rollout, Turn
-from flcav.releases.vehicles.checking import Sources, open_sources
+from flcav.releases.rollout.stages import (
+    STAGES,
+    Rollout,
+    ShadowDecision,
+    Turn,
+    change_share,
+    judge_shadows,
+    next_share,
+    roll_back,
+    run_shadow,
+)
 
 MOST_TURNS = 12  # of the whole rehearsal; a vehicle drives once a turn
 KEYS = (1, 2)  # of each party, that sign
@@ -63,7 +69,7 @@ class _Parties:
         change_share(self.folder / "customer", self.task, share, self.keys("customer"))
         publish(self.folder / "customer")
 
-    def sources(self) -> Sources:
+    def sources(self) -> RepositorySources:
         return open_sources(*(str(self.folder / party / "repository") for party in ("provider", "customer")))
 
 
@@ -113,14 +119,15 @@ def rehearse(
         roots = (read_root(out / "provider"), read_root(out / "customer"))
         fleet = build_fleet(out / "fleet", vehicles, drives, roots, parties.sources(), new.task)
         shadows = _Shadows(opened, earlier / WEIGHTS, candidate / WEIGHTS, old.weights, new.weights)
-        turns = _roll_out(candidate, parties, fleet, radio, spent, shadows, progress)
+        rehearsal = _Rehearsal(parties, fleet, radio, spent)
+        turns = rehearsal.roll_out(candidate, shadows, progress)
         stopped = turns[-1].decision is not None and turns[-1].decision.judgement == "stop"
         if stopped:
             parties.widen(0.0)
             back = out / "rollback"
             roll_back(earlier, new.release + 1, "Shadow runs disagree.", back, new.weights)
             parties.release(back, 1.0)
-            turns += _spread(new.release + 1, parties, fleet, radio, spent, len(turns))
+            turns += rehearsal.spread(new.release + 1, len(turns))
         drive = Counter(fleet.installed(name).release for name in fleet.names)
         wanted = new.release + 1 if stopped else new.release
         return Rollout(stopped, drive[wanted] == vehicles, tuple(turns), dict(sorted(drive.items())))
@@ -134,9 +141,9 @@ class _Shadows:
     def __init__(self, data: Dataset, driving: Path, candidate: Path, old: str, new: str) -> None:
         self.data = data
         self.networks = ((load_network(OBJECTS, driving), old), (load_network(OBJECTS, candidate), new))
-        self.reports: dict[Drive, ShadowReport] = {}
+        self.reports: dict[FleetDrive, ShadowReport] = {}
 
-    def run(self, drives: Sequence[Drive]) -> ShadowDecision | None:
+    def run(self, drives: Sequence[FleetDrive]) -> ShadowDecision | None:
         """Return what follows from all drives so far and these; None without any."""
         for drive in drives:
             if drive not in self.reports:
@@ -145,73 +152,66 @@ class _Shadows:
         return judge_shadows([*self.reports.values()]) if self.reports else None
 
 
-def _roll_out(
-    candidate: Path,
-    parties: _Parties,
-    fleet: SimulatedFleet,
-    radio: SimulatedRadio,
-    ledger: Ledger,
-    shadows: _Shadows,
-    progress: Report,
-) -> list[Turn]:
-    """Return the turns until the whole fleet has the release, it is stopped, or there were `MOST_TURNS`."""
-    release, share = read_candidate(candidate).release, STAGES[0]
-    parties.release(candidate, share)
-    turns: list[Turn] = []
-    fetched: set[str] = set()
-    while len(turns) < MOST_TURNS:
-        number = len(turns)
-        moved = _turn(release, share, parties, fleet, radio, ledger, number, fetched)
-        having = [name for name in fleet.names if fleet.installed(name).release == release]
-        decision = shadows.run([fleet.drive_of(name, number) for name in having])
-        turns.append(Turn(*moved, decision))
-        progress(len(turns), MOST_TURNS, turns[-1].describe())
-        if (decision is not None and decision.judgement == "stop") or len(having) == len(fleet.names):
-            break
-        wider = next_share(share, decision) if decision is not None else share
-        if not any(is_assigned(name, fleet.task, _directive(release, share)) for name in fleet.names):
-            wider = next(stage for stage in STAGES if stage > share)  # a small fleet has no vehicle in the first share
-        if wider != share:
-            share = wider
-            parties.widen(share)
-    return turns
+@dataclass(frozen=True)
+class _Rehearsal:
+    """A rehearsal under way: who signs, who drives, how they download, and where that is entered."""
 
+    parties: _Parties
+    fleet: SimulatedFleet
+    radio: SimulatedRadio
+    ledger: Ledger
 
-def _spread(
-    release: int, parties: _Parties, fleet: SimulatedFleet, radio: SimulatedRadio, ledger: Ledger, first: int
-) -> list[Turn]:
-    """Return the turns until every vehicle has a release that is for all, or there were `MOST_TURNS`."""
-    turns: list[Turn] = []
-    fetched: set[str] = set()
-    while len(turns) < MOST_TURNS and not (turns and turns[-1].reached == turns[-1].assigned):
-        number = first + len(turns)
-        turns.append(Turn(*_turn(release, 1.0, parties, fleet, radio, ledger, number, fetched), None))
-    return turns
+    def roll_out(self, candidate: Path, shadows: _Shadows, progress: Report) -> list[Turn]:
+        """Return the turns until the whole fleet has the release, it is stopped, or there were `MOST_TURNS`."""
+        release, share, fleet = read_candidate(candidate).release, STAGES[0], self.fleet
+        self.parties.release(candidate, share)
+        turns: list[Turn] = []
+        fetched: set[str] = set()
+        while len(turns) < MOST_TURNS:
+            number = len(turns)
+            moved = self._deliver(release, share, number, fetched)
+            having = [name for name in fleet.names if fleet.installed(name).release == release]
+            decision = shadows.run([fleet.drive_of(name, number) for name in having])
+            turns.append(Turn(*moved, decision))
+            progress(len(turns), MOST_TURNS, turns[-1].describe())
+            if (decision is not None and decision.judgement == "stop") or len(having) == len(fleet.names):
+                break
+            wider = next_share(share, decision) if decision is not None else share
+            if not self._assigned(release, share):
+                wider = next(stage for stage in STAGES if stage > share)  # a small fleet has no vehicle in the first
+            if wider != share:
+                share = wider
+                self.parties.widen(share)
+        return turns
 
+    def spread(self, release: int, first: int) -> list[Turn]:
+        """Return the turns until every vehicle has a release that is for all, or there were `MOST_TURNS`."""
+        turns: list[Turn] = []
+        fetched: set[str] = set()
+        while len(turns) < MOST_TURNS and not (turns and turns[-1].reached == turns[-1].assigned):
+            turns.append(Turn(*self._deliver(release, 1.0, first + len(turns), fetched), None))
+        return turns
 
-def _turn(
-    release: int,
-    share: float,
-    parties: _Parties,
-    fleet: SimulatedFleet,
-    radio: SimulatedRadio,
-    ledger: Ledger,
-    number: int,
-    fetched: set[str],
-) -> tuple[int, float, int, int, tuple[Delivered, ...], float, float]:
-    """Deliver to the vehicles of a share that lack a release; return the fields of a `Turn` but the decision."""
-    assigned = [name for name in fleet.names if is_assigned(name, fleet.task, _directive(release, share))]
-    lacking = [name for name in assigned if fleet.installed(name).release != release]
-    before = [ledger.used_mb(link, direction="down") for link in ("wireless", "wireline")]
-    arrivals = update_over_radio(fleet, lacking, number, radio, parties.sources(), ledger, fetched)
-    after = [ledger.used_mb(link, direction="down") for link in ("wireless", "wireline")]
-    reached = sum(fleet.installed(name).release == release for name in assigned)
-    moved = (after[0] - before[0], after[1] - before[1])
-    return release, share, len(assigned), reached, tuple(arrivals), *moved
+    def _assigned(self, release: int, share: float) -> list[str]:
+        directive = Directive(release=release, share_ppm=round(share * MILLION))
+        return [name for name in self.fleet.names if is_assigned(name, self.fleet.task, directive)]
 
+    def _deliver(
+        self, release: int, share: float, number: int, fetched: set[str]
+    ) -> tuple[int, float, int, int, tuple[Delivered, ...], float, float]:
+        """Deliver to the vehicles of a share that lack a release; return the fields of a `Turn` but the decision."""
+        assigned = self._assigned(release, share)
+        lacking = [name for name in assigned if self.fleet.installed(name).release != release]
+        before = self._megabytes()
+        sources = self.parties.sources()
+        arrivals = update_over_radio(self.fleet, lacking, number, self.radio, sources, self.ledger, fetched)
+        reached = sum(self.fleet.installed(name).release == release for name in assigned)
+        after = self._megabytes()
+        return release, share, len(assigned), reached, tuple(arrivals), after[0] - before[0], after[1] - before[1]
 
-def _directive(release: int, share: float) -> Directive:
-    return Directive(release=release, share_ppm=round(share * MILLION))
+    def _megabytes(self) -> tuple[float, float]:
+        """Return what went down so far, over wireless and over wireline [MB]."""
+        return self.ledger.used_mb("wireless", direction="down"), self.ledger.used_mb("wireline", direction="down")
 
 
 def _check_sequence(candidate: Path, earlier: Path) -> tuple[Candidate, Candidate]:

@@ -1,15 +1,29 @@
-"""Stages of a roll-out: canaries first, then larger shares, while shadow runs agree; and roll-backs.
+"""Stages of a roll-out: canaries first, then larger shares while shadow runs agree, else a stop and a roll-back.
 
-A roll-back is a release of its own: earlier weights under a number that rises, so that no vehicle ever takes an older
-number, whoever signs it.
+In a shadow run a vehicle runs the candidate on the frames that it drives with, and its detections are compared with
+those of the network that drives. A roll-back is a release with a number of its own: earlier weights under a number that
+rises, so that no vehicle ever takes an older number, even a signed one.
 """
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-from flcav.config import InputError, parse_config
-from flcav.releases.candidates.candidate import (
+import numpy as np
+from scipy.special import stdtrit
+
+from flcav.config import InputError, parse_config, read_json
+from flcav.fleet.releases import ShadowReport
+from flcav.geometry import Boxes
+from flcav.interface.wording import plural
+from flcav.perception.errors import THRESHOLD
+from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import detect_in
+from flcav.perception.objects.truth import select_class
+from flcav.releases.candidate import (
     ACKNOWLEDGEMENTS,
     CANDIDATE,
     REPORT,
@@ -17,11 +31,88 @@ from flcav.releases.candidates.candidate import (
     check_files,
     read_candidate,
 )
-from flcav.releases.repositories.directive import MILLION, Directive
-from flcav.releases.repositories.metadata import load_targets, read_directives
-from flcav.releases.repositories.repository import Staged, stage_directive
-from flcav.releases.rollout.shadow import ShadowDecision
+from flcav.releases.repositories.metadata import MILLION, Directive, load_targets, read_directives
+from flcav.releases.repositories.repository import StagedTargets, stage_directive
+from flcav.releases.rollout.simulated_fleet import Delivered
+from flcav.sensors.frame import Frame
 from flcav.storage.files import write_json
+from flcav.storage.records import Record
+
+OVERLAP = 0.5
+LIMIT = 0.4  # of the mean disagreement over vehicles
+LEVEL = 0.05  # one-sided
+Judgement = Literal["go on", "wait", "stop"]
+
+
+@dataclass(frozen=True)
+class ShadowDecision:
+    """What follows from the shadow runs of several vehicles."""
+
+    judgement: Judgement
+    vehicles: int
+    mean: float  # disagreement
+    low: float  # one-sided bounds at .05, over vehicles
+    high: float
+
+    def describe(self) -> str:
+        """Return the decision in words."""
+        over = f"over {plural(self.vehicles, 'vehicle')}"
+        found = f"{self.mean:.3f} ({self.low:.3f} to {self.high:.3f})"
+        return f"{self.judgement}: disagreement {found} {over}, limit {LIMIT:g}"
+
+
+def run_shadow(
+    vehicle: str, frames: Iterable[Frame], driving: tuple[Second, str], candidate: tuple[Second, str]
+) -> ShadowReport:
+    """Return the shadow run of a vehicle on its frames; both networks come with the SHA-256 of their weights."""
+    counts = np.zeros(4, np.int64)
+    for frame in frames:
+        (old,), (new,) = (detect_in(each, [frame], score_threshold=THRESHOLD) for each, _ in (driving, candidate))
+        counts += (1, len(old), len(new), count_agreed(old, new))
+    number, before, after, agreed = counts.tolist()
+    return ShadowReport(vehicle, "objects", driving[1], candidate[1], number, before, after, agreed)
+
+
+def read_shadow(path: Path) -> ShadowReport:
+    """Return the shadow run in a JSON file; raises `InputError` where there is none, or its numbers cannot be."""
+    found = ShadowReport.from_json(read_json(path), str(path))
+    try:
+        found.check()
+    except ValueError as error:
+        raise InputError(f"{path}: no shadow run: {error}") from None
+    return found
+
+
+def count_agreed(first: Boxes, second: Boxes) -> int:
+    """Return how many detections of two networks agree, each matched once."""
+    labels = set(first.label.tolist()) & set(second.label.tolist())
+    pairs = ((select_class(first, label), select_class(second, label)) for label in sorted(labels))
+    return sum(int((assign_targets(one, other, OVERLAP, "bev") >= 0).sum()) for one, other in pairs)
+
+
+def judge_shadows(reports: Sequence[ShadowReport], limit: float = LIMIT) -> ShadowDecision:
+    """Return whether a roll-out goes on: its canaries' mean disagreement lies below the limit, at .05.
+
+    It stops where the mean lies above the limit, and waits for more vehicles where neither is told. Bounds are
+    Student's t over vehicles. Raises `InputError` for no reports, of different networks, and for a vehicle that
+    reports twice.
+    """
+    reports = [each for each in reports if each.frames]  # who met nothing tells nothing
+    if not reports:
+        raise InputError("no shadow run of any frame: at least two vehicles' are wanted")
+    if len({(each.driving, each.candidate) for each in reports}) > 1:
+        raise InputError("the shadow runs are of different networks")
+    if len({each.vehicle for each in reports}) < len(reports):
+        raise InputError("a vehicle reports its shadow run twice")
+    values = np.array([each.disagreement for each in reports])
+    mean, number = float(values.mean()), len(values)
+    if number < 2:
+        return ShadowDecision("stop" if mean > limit else "wait", number, mean, 0.0, 1.0)
+    half = float(stdtrit(number - 1, 1 - LEVEL)) * float(values.std(ddof=1)) / float(np.sqrt(number))
+    low, high = max(mean - half, 0.0), min(mean + half, 1.0)
+    judgement: Judgement = "stop" if low > limit else "go on" if high < limit else "wait"
+    return ShadowDecision(judgement, number, mean, low, high)
+
 
 STAGES = (0.01, 0.05, 0.2, 1.0)  # shares of the fleet
 
@@ -48,7 +139,7 @@ def next_share(share: float, decision: ShadowDecision) -> float:
 
 def change_share(
     out: Path, task: str, share: float, keys: Sequence[Path], revoke: Sequence[str] = ()
-) -> tuple[Directive, Staged]:
+) -> tuple[Directive, StagedTargets]:
     """Stage a directive with another share of the fleet, and more revoked vehicles; return it and its signatures.
 
     A share of 0 stops the roll-out for vehicles that were named, too.
@@ -87,3 +178,51 @@ def roll_back(earlier: Path, release: int, reason: str, out: Path, driving: str)
     shutil.copytree(earlier, out, ignore=shutil.ignore_patterns(ACKNOWLEDGEMENTS, REPORT))
     write_json(out / CANDIDATE, changed.model_dump(mode="json"), sort=False)
     return changed
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One turn: a share of the fleet, the deliveries to it, and the results of the shadow runs."""
+
+    release: int
+    share: float
+    assigned: int  # vehicles of the share
+    reached: int  # of these, have the release by the end of the turn
+    arrivals: tuple[Delivered, ...]  # seconds from the beginning of the vehicle's drive, or of the turn
+    wireless_mb: float
+    wireline_mb: float | None  # None: not counted
+    decision: ShadowDecision | None  # None without shadow runs
+
+    def describe(self) -> str:
+        """Return the turn in words."""
+        times = sorted(each.at_s for each in self.arrivals if each.at_s is not None)
+        after = (
+            f", {len(times)} now, half of these by {np.median(times):.2f} s, all by {times[-1]:.2f} s" if times else ""
+        )
+        wireline = "" if self.wireline_mb is None else f", {self.wireline_mb:.2f} MB wireline"
+        said = f"; {self.decision.describe()}" if self.decision is not None else ""
+        return (
+            f"release {self.release}, {self.share:.0%} of the fleet: reaches {self.reached} of "
+            f"{plural(self.assigned, 'vehicle')}{after}; {self.wireless_mb:.2f} MB wireless{wireline}{said}"
+        )
+
+
+@dataclass(frozen=True)
+class Rollout(Record):
+    """What became of a roll-out: stopped or not, its turns, and how many vehicles drive which release in the end."""
+
+    stopped: bool
+    complete: bool  # every vehicle drives the new release, or after a stop the earlier weights
+    turns: tuple[Turn, ...]
+    drive: Mapping[int, int]  # release -> vehicles
+
+    def lines(self) -> list[str]:
+        """Return the roll-out in words."""
+        held = ", ".join(
+            f"{f'release {release}' if release else 'no release'}: {plural(count, 'vehicle')}"
+            for release, count in self.drive.items()
+        )
+        end = "complete" if self.complete else "not complete"
+        if self.stopped:
+            end = "stopped and rolled back" if self.turns[-1].release > self.turns[0].release else "stopped"
+        return [*(turn.describe() for turn in self.turns), f"{end}; in the end {held}"]

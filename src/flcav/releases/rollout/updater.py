@@ -19,18 +19,17 @@ from pathlib import Path
 import httpx
 
 from flcav.config import InputError, read_json
-from flcav.federation.fleet.forwarder import vehicle_tls
-from flcav.federation.fleet.keys import REQUEST, read_request, requested_name
-from flcav.federation.fleet.supervisor import end_with_parent
-from flcav.federation.fleet.vehicle import load_settings
-from flcav.federation.messages.release_report import RELEASES, REPORT, ReleaseReport, ShadowReport
-from flcav.releases.vehicles.checking import Sources, trust_roots, trusts_roots
-from flcav.releases.vehicles.fetching import CertifiedFetcher
-from flcav.releases.vehicles.installation import (
+from flcav.fleet.forwarder import vehicle_tls
+from flcav.fleet.keys import REQUEST, read_request, requested_name
+from flcav.fleet.releases import RELEASES, REPORT, ReleaseReport, ShadowReport
+from flcav.fleet.supervisor import end_with_parent
+from flcav.fleet.vehicle import load_settings
+from flcav.releases.checking import CertifiedFetcher, RepositorySources, trust_roots, trusts_roots
+from flcav.releases.installation import (
     Fetched,
     Installed,
     fetch_release,
-    install,
+    install_release,
     read_installed,
     weights_path,
 )
@@ -104,7 +103,7 @@ def update_in_fleet(folder: Path) -> None:
         left.unlink()
     with open_client(folder) as client:
         base = str(client.base_url)
-        sources = Sources(f"{base}image", f"{base}director", CertifiedFetcher(client))
+        sources = RepositorySources(f"{base}image", f"{base}director", CertifiedFetcher(client))
         told = ReleaseReport(TASK, 0, 0)
         try:
             driving = read_installed(own)
@@ -117,7 +116,7 @@ def update_in_fleet(folder: Path) -> None:
                     write_json(own / SHADOW, shadow.as_json())
                     told = replace(told, shadow=shadow)
                     _report(client, told)
-                told = _describe(own, install(own, found.newer))
+                told = _describe(own, install_release(own, found.newer))
         except InputError as error:
             _report(client, replace(told, refused=str(error)[:500]))
             raise
@@ -144,7 +143,7 @@ def _run_shadow(own: Path, vehicle: str, found: Fetched) -> ShadowReport | None:
     from flcav.machine.threads import use_threads
     from flcav.perception.objects.task import OBJECTS
     from flcav.perception.weights import load_network
-    from flcav.releases.rollout.shadow import run_shadow
+    from flcav.releases.rollout.stages import run_shadow
 
     use_threads(1)
     drive = RecordedDrive.from_json(read_json(own / DRIVE), str(own / DRIVE))

@@ -14,20 +14,106 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from flcav.geometry import Boxes
+from flcav.geometry import Boxes, wrap_angle
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.metrics import Matches, weighted_precision
+from flcav.perception.metrics.matching import lies_on, on_neutral
 from flcav.perception.metrics.operating_point import DISTANCES_M
 from flcav.perception.objects.evaluate import BORDER_M, OCCLUSIONS
-from flcav.releases.verification.matching import Mask, Overlaps, match_overlaps, measure_overlaps
+from flcav.perception.objects.truth import FrameTruth, select_class
+from flcav.perception.ops.rotated import iou
 from flcav.releases.verification.records import LEAST_MEASURE, Comparison, Judgement
 from flcav.releases.verification.testing import ConditionResults
 from flcav.statistics.bootstrap import REDRAWS
 from flcav.statistics.estimates import TAILS
 from flcav.statistics.streams import stream
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """How the D detections of one class in a frame lie on its T targets and on neutral objects."""
+
+    score: NDArray[np.float64]  # (D,) falling
+    iou: NDArray[np.float64]  # (D, T) of volumes
+    turned: NDArray[np.float64]  # (D, T) difference of headings [rad], in [0, pi]
+    covered: Mask  # (D, T) whether at least half of the detection's footprint lies on the target
+    neutral: Mask  # (D,) the same on a neutral object
+    detections: NDArray[np.int64]  # (D,) their places among the frame's detections of all classes
+    targets: NDArray[np.int64]  # (T,) places of the targets among the frame's of all classes
+
+
+def measure_overlaps(detections: Boxes, truth: FrameTruth, label: str) -> Overlaps:
+    """Return the overlaps of the detections of one class in a frame."""
+    own, among = np.flatnonzero(detections.label == label), np.flatnonzero(truth.targets.label == label)
+    if detections.score is not None:
+        own = own[np.argsort(-detections.score[own], kind="stable")]
+    found, targets = detections[own], truth.targets[among]
+    known = iou(torch.from_numpy(found.array()), torch.from_numpy(targets.array())).numpy()
+    return Overlaps(
+        score=np.zeros(0) if found.score is None else found.score,
+        iou=known,
+        turned=np.abs(wrap_angle(found.yaw[:, None] - targets.yaw)),
+        covered=lies_on(found, targets),
+        neutral=on_neutral(found, select_class(truth.neutral, label)),
+        detections=own,
+        targets=among,
+    )
+
+
+def match_overlaps(
+    overlaps: Sequence[Overlaps], least: float, wanted: Sequence[Mask] | None = None, kept: Sequence[Mask] | None = None
+) -> Matches:
+    """Return the matches from an IoU of `least` on, of all targets or of a slice.
+
+    wanted: of each frame, whether a target is in the slice. kept: of each frame, whether a detection counts in it.
+    """
+    parts = [
+        _match_frame(each, least, None if wanted is None else wanted[number], None if kept is None else kept[number])
+        for number, each in enumerate(overlaps)
+    ]
+    frame = np.repeat(np.arange(len(parts)), [len(scores) for scores, _, _ in parts])
+    score = np.concatenate([scores for scores, _, _ in parts]) if parts else np.zeros(0)
+    turned = np.concatenate([turned for _, turned, _ in parts]) if parts else np.zeros(0)
+    order = np.argsort(-score, kind="stable")
+    targets = np.array([count for _, _, count in parts], dtype=np.int64)
+    return Matches(score[order], ~np.isnan(turned[order]), turned[order], frame[order], targets)
+
+
+def match_detections(each: Overlaps, least: float, inside: Mask, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+    """Return (R,) the target of each of the detections `rows`, -1 for none, greedily by score.
+
+    least: IoU from which a detection finds a target. inside (T,): targets that can be found. rows (R,), rising.
+    """
+    found = np.full(len(rows), -1)
+    free = np.where(inside, each.iou, -1.0)
+    for place, row in enumerate(rows if inside.any() else ()):
+        best = int(free[row].argmax())
+        if free[row, best] >= least:
+            found[place] = best
+            free[:, best] = -1.0
+    return found
+
+
+def _match_frame(
+    each: Overlaps, least: float, wanted: Mask | None, kept: Mask | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    """Return the scores of one frame's detections that count, their heading errors (NaN: false), and its targets."""
+    inside = np.ones(len(each.targets), bool) if wanted is None else wanted[each.targets]
+    rows = np.arange(len(each.score)) if kept is None else np.flatnonzero(kept[each.detections])
+    found = match_detections(each, least, inside, rows)
+    hit = found >= 0
+    turned = np.full(len(rows), np.nan)
+    turned[hit] = each.turned[rows[hit], found[hit]]
+    ignored = each.neutral | each.covered[:, ~inside].any(axis=1)
+    counts = hit | ~ignored[rows]
+    return each.score[rows][counts], turned[counts], int(inside.sum())
+
 
 LEVEL = 0.05  # one-sided
 KEPT = 0.8  # share of the driving network's measure that every slice keeps
@@ -61,7 +147,7 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Pair:
+class GuardPair:
     """A measure of both networks on the same frames: (n, F) multiplicities of frames in, (n,) values out."""
 
     by: str
@@ -81,7 +167,7 @@ def draw_scenes(scene: NDArray[np.str_], redraws: int = REDRAWS) -> Times:
     return rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=redraws)[:, index]
 
 
-def compare(pair: Pair, times: Times, guards: int = 1) -> tuple[Comparison, float]:
+def compare_pair(pair: GuardPair, times: Times, guards: int = 1) -> tuple[Comparison, float]:
     """Return the comparison of a pair and the standard error of the difference over scenes.
 
     times (n, F): bootstrap samples, see `draw_scenes`. guards: number of guards that are judged together, by which the
@@ -121,26 +207,28 @@ def compare(pair: Pair, times: Times, guards: int = 1) -> tuple[Comparison, floa
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredNetwork:
     """Results of a network, with the overlaps frame by frame of each class with targets."""
 
     tested: ConditionResults
     overlaps: dict[str, list[Overlaps]]
 
 
-def measure_results(tested: ConditionResults) -> Measured:
+def measure_results(tested: ConditionResults) -> MeasuredNetwork:
     """Return results with the overlaps of all detections, which every slice is matched from."""
     labels = sorted({str(label) for truth in tested.truths for label in truth.targets.label})
     pairs = [*zip(tested.detections, tested.truths, strict=True)]
-    return Measured(tested, {label: [measure_overlaps(*pair, label) for pair in pairs] for label in labels})
+    return MeasuredNetwork(tested, {label: [measure_overlaps(*pair, label) for pair in pairs] for label in labels})
 
 
-def pair_whole(driving: Measured, candidate: Measured, by: str = "whole", name: str = "AP50") -> Pair:
+def pair_whole(
+    driving: MeasuredNetwork, candidate: MeasuredNetwork, by: str = "whole", name: str = "AP50"
+) -> GuardPair:
     """Return the pair of the mean AP50 over classes on all frames."""
     return _pair(by, name, _match(driving), _match(candidate), driving)
 
 
-def pair_slices(driving: Measured, candidate: Measured) -> Iterator[Pair]:
+def pair_slices(driving: MeasuredNetwork, candidate: MeasuredNetwork) -> Iterator[GuardPair]:
     """Yield the pairs by class, distance, occlusion, weather, scenario, town and cell of the domain, and by measure."""
     both = (driving, candidate)
     old, new = (_match(each) for each in both)
@@ -151,7 +239,7 @@ def pair_slices(driving: Measured, candidate: Measured) -> Iterator[Pair]:
         sides = [_match(each, 0.5, wanted, within) for each in both]
         yield _pair(by, name, sides[0], sides[1], driving)
         yield _pair("found", name, sides[0], sides[1], driving, measure=_recall)
-    for by, name, frames in group_frames(candidate.tested):
+    for by, name, frames in list_frame_slices(candidate.tested):
         yield _pair(by, name, old, new, driving, frames)
         if by != "cell":
             yield _pair("found", name, old, new, driving, frames, _recall)
@@ -171,7 +259,7 @@ def _ranges(tested: ConditionResults) -> Iterator[tuple[str, str, list[Mask], tu
         yield "occlusion", f"{low:.0%}-{min(high, 1):.0%}", [_between(share, low, high) for share in hidden], None
 
 
-def group_frames(tested: ConditionResults) -> Iterator[tuple[str, str, NDArray[np.bool_]]]:
+def list_frame_slices(tested: ConditionResults) -> Iterator[tuple[str, str, NDArray[np.bool_]]]:
     """Yield the slices of frames, where there are several of a kind: by, name, which frames (F,)."""
     names = {
         "weather": [truth.weather or "" for truth in tested.truths],
@@ -194,7 +282,7 @@ def _between(value: Values, low: float, high: float) -> Mask:
 
 
 def _match(
-    measured: Measured,
+    measured: MeasuredNetwork,
     least: float = 0.5,
     wanted: Sequence[Mask] | None = None,
     within: tuple[float, float] | None = None,
@@ -209,10 +297,10 @@ def _pair(
     name: str,
     old: dict[str, Matches],
     new: dict[str, Matches],
-    driving: Measured,
+    driving: MeasuredNetwork,
     inside: Mask | None = None,
     measure: Callable[[Matches, Times], Values] = weighted_precision,
-) -> Pair:
+) -> GuardPair:
     """Return a pair over the classes with targets in the slice; inside: (F,) frames that are in it."""
     scene = np.array([truth.scene for truth in driving.tested.truths])
     counted = np.ones(len(scene), np.int64) if inside is None else inside.astype(np.int64)
@@ -221,7 +309,7 @@ def _pair(
         return lambda times: _mean(matches, times * counted, measure)
 
     targets = sum(int((each.targets * counted).sum()) for each in old.values())
-    return Pair(by, name, mean(old), mean(new), scene, len(np.unique(scene[counted > 0])), targets)
+    return GuardPair(by, name, mean(old), mean(new), scene, len(np.unique(scene[counted > 0])), targets)
 
 
 def _mean(matches: dict[str, Matches], times: Times, measure: Callable[[Matches, Times], Values]) -> Values:

@@ -11,8 +11,8 @@ from flcav.network.ledger import Ledger
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network, read_card
-from flcav.releases.candidates.candidate import LEDGER, WEIGHTS, Candidate, check_bundle, check_files
-from flcav.releases.candidates.proposal import sum_ledger, trace_data
+from flcav.releases.candidate import LEDGER, WEIGHTS, Candidate, check_bundle, check_files
+from flcav.releases.proposal import sum_ledger, trace_data
 from flcav.releases.verification.records import VerificationData
 from flcav.storage.files import sha256
 

@@ -14,8 +14,16 @@ from numpy.typing import NDArray
 from flcav.geometry import Boxes, concatenate, wrap_angle
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.metrics.operating_point import DISTANCES_M
-from flcav.releases.verification.comparison import LEAST_TARGETS, Limit, Measured, Pair, Times, Values
-from flcav.releases.verification.matching import Mask, assign_detections
+from flcav.releases.verification.comparison import (
+    LEAST_TARGETS,
+    GuardPair,
+    Limit,
+    Mask,
+    MeasuredNetwork,
+    Times,
+    Values,
+    match_detections,
+)
 
 OVERLAP = 0.5  # IoU in 3D from which a detection finds a target
 SECTORS_DEG = ((-90, -30), (-30, 0), (0, 30), (30, 90))  # of azimuth, counter-clockwise from straight ahead
@@ -58,7 +66,7 @@ class ClassTable:
 
 
 @dataclass(frozen=True)
-class Terms:
+class MeasureTerms:
     """What N rows add to the numerator and to the denominator of a measure."""
 
     rows: Rows
@@ -73,7 +81,7 @@ class ClassMeasure:
     by: str
     name: str  # "" where `by` says it
     limit: Limit
-    terms: Callable[[ClassTable], Terms]
+    terms: Callable[[ClassTable], MeasureTerms]
     everywhere: bool = False  # on every slice and in every condition, else on distances alone
 
 
@@ -86,13 +94,13 @@ class Slice:
     frames: Mask
 
 
-def tabulate(measured: Measured, label: str) -> ClassTable:
+def tabulate(measured: MeasuredNetwork, label: str) -> ClassTable:
     """Return the table of one class that has targets."""
     tested = measured.tested
     boxes, targets, errors, rights, seen = [], [], [], [], []
     for each, detections, truth in zip(measured.overlaps[label], tested.detections, tested.truths, strict=True):
         own, wanted = detections[each.detections], truth.targets[each.targets]
-        found = assign_detections(each, OVERLAP, np.ones(len(wanted), bool), np.arange(len(own)))
+        found = match_detections(each, OVERLAP, np.ones(len(wanted), bool), np.arange(len(own)))
         hit = found >= 0
         error, score = np.zeros((len(own), 7)), np.zeros(len(wanted))
         error[hit] = own.array()[hit] - wanted.array()[found[hit]]
@@ -117,8 +125,8 @@ def tabulate(measured: Measured, label: str) -> ClassTable:
 
 
 def pair_classes(
-    driving: Measured, candidate: Measured, condition: str = "", groups: Sequence[tuple[str, Mask]] = ()
-) -> Iterator[Pair]:
+    driving: MeasuredNetwork, candidate: MeasuredNetwork, condition: str = "", groups: Sequence[tuple[str, Mask]] = ()
+) -> Iterator[GuardPair]:
     """Yield the pairs of every measure of each class, on all rows and slice by slice.
 
     condition: of the sensor; what is found and invented is measured there, in all. groups: slices of the frames, by
@@ -150,7 +158,7 @@ def pair_classes(
 
 def _pair(
     measure: ClassMeasure, label: str, tables: tuple[ClassTable, ClassTable], scene: NDArray[np.str_], part: Slice
-) -> Iterator[Pair]:
+) -> Iterator[GuardPair]:
     """Yield the pair of a measure on a slice; none where one of the networks has too few rows for it."""
     sums = []
     for table in tables:
@@ -164,7 +172,7 @@ def _pair(
         driving, candidate = (_ratio(*each) for each in sums)
         scenes = min(len(np.unique(scene[below > 0])) for _, below in sums)
         name = " ".join(filter(None, (label, measure.name, part.name)))
-        yield Pair(measure.by, name, driving, candidate, scene, scenes, least, measure.limit)
+        yield GuardPair(measure.by, name, driving, candidate, scene, scenes, least, measure.limit)
 
 
 def _sum(frame: NDArray[np.int64], values: Values, frames: int) -> Values:
@@ -190,39 +198,39 @@ def _locate(parts: Sequence[Boxes]) -> Rows:
     return Rows(frame, np.hypot(x, y), np.degrees(np.arctan2(y, x)), boxes.size[:, 0])
 
 
-def _found(table: ClassTable) -> Terms:
-    return Terms(table.targets, (table.seen >= THRESHOLD).astype(float), np.ones(len(table.seen)))
+def _found(table: ClassTable) -> MeasureTerms:
+    return MeasureTerms(table.targets, (table.seen >= THRESHOLD).astype(float), np.ones(len(table.seen)))
 
 
-def _false(table: ClassTable) -> Terms:
-    return Terms(table.detections, (table.used & ~table.right).astype(float), None)
+def _false(table: ClassTable) -> MeasureTerms:
+    return MeasureTerms(table.detections, (table.used & ~table.right).astype(float), None)
 
 
-def _precision(table: ClassTable) -> Terms:
-    return Terms(table.detections, (table.used & table.right).astype(float), table.used.astype(float))
+def _precision(table: ClassTable) -> MeasureTerms:
+    return MeasureTerms(table.detections, (table.used & table.right).astype(float), table.used.astype(float))
 
 
-def _confidence(table: ClassTable) -> Terms:
+def _confidence(table: ClassTable) -> MeasureTerms:
     """Return the score minus whether it is right, of detections in use: 0 where scores are calibrated."""
-    return Terms(table.detections, table.used * (table.score - table.right), table.used.astype(float))
+    return MeasureTerms(table.detections, table.used * (table.score - table.right), table.used.astype(float))
 
 
-def _heading(table: ClassTable) -> Terms:
+def _heading(table: ClassTable) -> MeasureTerms:
     return _of_right(table, (1 + np.cos(table.error[:, 6])) / 2)
 
 
-def _error(part: int) -> Callable[[ClassTable], Terms]:
+def _error(part: int) -> Callable[[ClassTable], MeasureTerms]:
     return lambda table: _of_right(table, np.abs(table.axis_error[:, part]))
 
 
-def _bias(part: int) -> Callable[[ClassTable], Terms]:
+def _bias(part: int) -> Callable[[ClassTable], MeasureTerms]:
     return lambda table: _of_right(table, table.axis_error[:, part])
 
 
-def _normalised(part: int) -> Callable[[ClassTable], Terms]:
+def _normalised(part: int) -> Callable[[ClassTable], MeasureTerms]:
     """Return the logarithm of errors in predicted standard deviations, from `LEAST_SIGMAS` on: it has no heavy tail."""
 
-    def normalised(table: ClassTable) -> Terms:
+    def normalised(table: ClassTable) -> MeasureTerms:
         assert table.variance is not None
         sigmas = np.abs(table.axis_error[:, part]) / np.sqrt(table.variance[:, part])
         return _of_right(table, np.log(np.maximum(sigmas, LEAST_SIGMAS)))
@@ -230,8 +238,8 @@ def _normalised(part: int) -> Callable[[ClassTable], Terms]:
     return normalised
 
 
-def _of_right(table: ClassTable, values: Values) -> Terms:
-    return Terms(table.detections, np.where(table.right, values, 0.0), table.right.astype(float))
+def _of_right(table: ClassTable, values: Values) -> MeasureTerms:
+    return MeasureTerms(table.detections, np.where(table.right, values, 0.0), table.right.astype(float))
 
 
 MEASURES = (

@@ -77,7 +77,7 @@ class VerificationData:
 
 
 @dataclass(frozen=True)
-class Verification(Record):
+class CandidateVerification(Record):
     """The verification of a candidate beside the driving network: accepted, or refused for reasons."""
 
     candidate: str  # SHA-256 of the weights

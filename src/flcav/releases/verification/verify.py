@@ -12,38 +12,114 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
-from flcav.odd.domain import read_domain
+from flcav.odd.cells import cells_of, full_name
+from flcav.odd.coverage import Document, collect_runs, list_covered, merge_runs
+from flcav.odd.domain import Domain, read_domain
+from flcav.odd.judge import INSIDE, OUTSIDE, UNKNOWN, judge
+from flcav.odd.measure import measure
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.weights import load_network
-from flcav.releases.candidates.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
+from flcav.releases.candidate import VERIFICATION, WEIGHTS, Candidate, read_candidate
 from flcav.releases.verification.comparison import (
     KEPT,
     LEAST_SCENES,
     LEAST_TARGETS,
     LEVEL,
-    Measured,
-    compare,
+    MeasuredNetwork,
+    compare_pair,
     draw_scenes,
-    group_frames,
+    list_frame_slices,
     measure_results,
     pair_slices,
     pair_whole,
 )
-from flcav.releases.verification.conditions import CONDITIONS, PLAIN
-from flcav.releases.verification.domain import BY, ODD, describe_domain, find_cells
 from flcav.releases.verification.files import describe_data, find_faults
 from flcav.releases.verification.guards import pair_classes
 from flcav.releases.verification.records import (
     LEAST_MEASURE,
+    CandidateVerification,
     Comparison,
-    Verification,
+    OddCoverage,
     VerificationData,
     VerifiedDomain,
 )
-from flcav.releases.verification.testing import ConditionResults, VerificationFrame, choose_test_frames, run_tests
+from flcav.releases.verification.testing import (
+    CONDITIONS,
+    PLAIN,
+    ConditionResults,
+    VerificationFrame,
+    choose_test_frames,
+    run_tests,
+)
 from flcav.statistics.power import plan_scenes
 from flcav.storage.files import sha256, write_json
+
+ODD, BY = "urban", ("junction", "visibility")
+
+
+def describe_domain(
+    frames: Sequence[VerificationFrame], truths: Sequence[FrameTruth], classes: Sequence[str], odd: OddCoverage
+) -> VerifiedDomain:
+    """Return the domain that frames cover, for a network of `classes`."""
+    opened = {folder: Dataset.open(folder, checked=False) for folder in {each.data for each in frames}}
+    read = [opened[each.data].frame(each.number) for each in frames]
+    weather = [frame.weather for frame in read if frame.weather is not None]
+    speeds = [np.linalg.norm(np.nan_to_num(frame.annotations.velocity), axis=1) for frame in read]
+    far = [np.hypot(truth.targets.center[:, 0], truth.targets.center[:, 1]) for truth in truths]
+    return VerifiedDomain(
+        towns=tuple(sorted({each.town for each in frames})),
+        scenarios=tuple(sorted({each.scenario for each in frames})),
+        weathers=tuple(sorted({truth.weather for truth in truths if truth.weather is not None})),
+        visibility_m=_span([each.visibility_m for each in weather]),
+        rain_mm_h=_span([each.rain_mm_h for each in weather]),
+        sun_elevation_deg=_span([each.sun_elevation_deg for each in weather]),
+        speed_m_s=_span(np.concatenate(speeds).tolist()) or (0.0, 0.0),
+        distance_m=_span(np.concatenate(far).tolist()) or (0.0, 0.0),
+        objects={label: int(sum((truth.targets.label == label).sum() for truth in truths)) for label in classes},
+        lidars=tuple(sorted({str(name) for frame in read for name in frame.lidar})),
+        odd=odd,
+    )
+
+
+def find_cells(
+    frames: Sequence[VerificationFrame], domain: Domain, by: Sequence[str]
+) -> tuple[tuple[str, ...], OddCoverage]:
+    """Return the cell of each frame by two attributes of a domain, and how much of the domain the frames cover.
+
+    Raises `InputError` for an attribute without buckets, and where nothing measures what the domain tests.
+    """
+    axes = [full_name(domain, name) for name in by]
+    folders = dict.fromkeys(each.data for each in frames)
+    cells: dict[tuple[Path, int], str] = {}
+    counts: dict[str, int] = {INSIDE: 0, OUTSIDE: 0, UNKNOWN: 0}
+    documents: dict[str, Document] = {}
+    for number, folder in enumerate(folders):
+        data = Dataset.open(folder, checked=False)
+        measured = measure(data, [each.number for each in frames if each.data == folder])
+        names = (" x ".join(cell) for cell in cells_of(domain, measured, axes))
+        cells |= {(folder, frame): name for frame, name in zip(measured.frames, names, strict=True)}
+        verdicts = judge(domain, measured)
+        for verdict in counts:
+            counts[verdict] += verdicts.count(verdict)
+        documents |= {f"{number}_{name}": run for name, run in collect_runs(domain, data, measured).items()}
+    wanted = {*domain.tested, *axes}
+    rows = [row for row in list_covered(merge_runs([*documents.values()])) if row.attribute in wanted]
+    coverage = OddCoverage(
+        domain=domain.name,
+        revision=domain.definition.revision,
+        by=tuple(by),
+        frames=counts,
+        grade=float(np.mean([row.grade for row in rows])) if rows else 0.0,
+        holes={row.attribute.rpartition(".")[2]: row.holes for row in rows if row.holes},
+    )
+    return tuple(cells[each.data, each.number] for each in frames), coverage
+
+
+def _span(values: Sequence[float]) -> tuple[float, float] | None:
+    return (round(min(values), 3), round(max(values), 3)) if len(values) else None
+
 
 MARGIN, MOST_MARGIN = 0.05, 0.5  # AP50
 LEAST_SEEN = 3  # detections of the driving network in a frame where the candidate finds something, too
@@ -63,7 +139,7 @@ def verify(
     jobs: int = 1,
     known: Results | None = None,
     progress: Report = ignore_progress,
-) -> Verification:
+) -> CandidateVerification:
     """Return the verification of a candidate beside the network that drives.
 
     Args:
@@ -93,17 +169,17 @@ def verify(
     tested = [_describe(path, frames) for path in data]
     faults = list(find_faults(folder, candidate, driving, tested))
     if faults:
-        return decide(candidate, None, None, tested, None, margin, faults)
+        return decide_on_candidate(candidate, None, None, tested, None, margin, faults)
     own = [] if known is not None else [driving]
     results = run_tests([*own, folder / WEIGHTS], frames, jobs=jobs, progress=progress)
     old, new = known if known is not None else results[0], results[-1]
     if not any(len(truth.targets) for truth in new[PLAIN].truths):
         raise InputError(f"no object to be found in {', '.join(map(str, data))}")
     domain = describe_domain(frames, new[PLAIN].truths, network.config.classes, coverage)
-    return decide(candidate, old, new, tested, domain, margin)
+    return decide_on_candidate(candidate, old, new, tested, domain, margin)
 
 
-def decide(
+def decide_on_candidate(
     candidate: Candidate,
     driving: Results | None,
     new: Results | None,
@@ -111,7 +187,7 @@ def decide(
     domain: VerifiedDomain | None,
     margin: float = MARGIN,
     faults: Sequence[str] = (),
-) -> Verification:
+) -> CandidateVerification:
     """Return the decision on a candidate by the results of both networks, or by the faults of its files alone."""
     frames, scenes = sum(each.frames for each in data), sum(each.scenes for each in data)
     reasons, open_reasons, wanted = list(faults), [], 0
@@ -120,7 +196,7 @@ def decide(
     if driving is not None and new is not None:
         plain = measure_results(driving[PLAIN]), measure_results(new[PLAIN])
         pair = pair_whole(*plain)
-        whole, error = compare(pair, draw_scenes(pair.scene))
+        whole, error = compare_pair(pair, draw_scenes(pair.scene))
         for guard in _guard(*plain, driving, new):
             guards.append(guard)
             if guard.judgement == "lost":
@@ -144,7 +220,7 @@ def decide(
             enough = _frames(change + margin, error, frames, scenes)
             wanted = max(wanted, enough)
             open_reasons.append(said if enough else f"{said}: no number of frames would accept this")
-    return Verification(
+    return CandidateVerification(
         candidate=candidate.weights,
         driving=candidate.driving,
         accepted=not (reasons or open_reasons),
@@ -162,12 +238,12 @@ def decide(
     )
 
 
-def write_verification(folder: Path, verification: Verification) -> None:
+def write_verification(folder: Path, verification: CandidateVerification) -> None:
     """Write the verification into the candidate's folder."""
     write_json(folder / VERIFICATION, verification.as_json(), sort=False)
 
 
-def read_verification(folder: Path) -> Verification:
+def read_verification(folder: Path) -> CandidateVerification:
     """Return the verification in a candidate's folder.
 
     Raises `InputError` for none, one of other weights, and one whose acceptance its own numbers contradict.
@@ -175,7 +251,7 @@ def read_verification(folder: Path) -> Verification:
     path = folder / VERIFICATION
     if not path.is_file():
         raise InputError(f"{folder}: was not verified")
-    found = Verification.from_json(read_json(path), str(path))
+    found = CandidateVerification.from_json(read_json(path), str(path))
     described = read_candidate(folder)
     if found.candidate != described.weights or sha256(folder / WEIGHTS) != found.candidate:
         raise InputError(f"{path}: is the verification of other weights")
@@ -186,7 +262,7 @@ def read_verification(folder: Path) -> Verification:
     return found
 
 
-def _supports_acceptance(found: Verification) -> bool:
+def _supports_acceptance(found: CandidateVerification) -> bool:
     """Return whether the numbers of a verification allow that the candidate is accepted."""
     whole = found.whole
     if whole is None or found.reasons or found.undecided or found.kept_share != KEPT:
@@ -207,9 +283,9 @@ def _is_kept(guard: Comparison) -> bool:
     return guard.judgement in ("kept", "open") and not (guard.spare is not None and guard.spare < 0)
 
 
-def _guard(old: Measured, new: Measured, driving: Results, candidate: Results) -> list[Comparison]:
+def _guard(old: MeasuredNetwork, new: MeasuredNetwork, driving: Results, candidate: Results) -> list[Comparison]:
     """Return the comparisons of all guards, judged together."""
-    groups = [(name, frames) for by, name, frames in group_frames(new.tested) if by != "cell"]
+    groups = [(name, frames) for by, name, frames in list_frame_slices(new.tested) if by != "cell"]
     pairs = [*pair_slices(old, new), *pair_classes(old, new, groups=groups)]
     for name in CONDITIONS:
         if name in candidate:
@@ -218,7 +294,7 @@ def _guard(old: Measured, new: Measured, driving: Results, candidate: Results) -
     pairs = [pair for pair in pairs if pair.targets >= LEAST_TARGETS]
     drawn = {len(pair.scene): pair.scene for pair in pairs}  # conditions share their frames, which are fewer
     times = {frames: draw_scenes(scene, GUARD_REDRAWS) for frames, scene in drawn.items()}
-    found = [compare(pair, times[len(pair.scene)], len(pairs))[0] for pair in pairs]
+    found = [compare_pair(pair, times[len(pair.scene)], len(pairs))[0] for pair in pairs]
     return [each for each in found if np.isfinite([each.driving, each.candidate]).all()]
 
 
@@ -255,7 +331,7 @@ def _is_finite(boxes: Boxes) -> bool:
 
 
 def _frames(effect: float, error: float, frames: int, scenes: int) -> int:
-    """Return the number of frames that tell an effect; 0 where no number does."""
+    """Return the number of frames by which an effect is significant at `LEVEL`; 0 where no number is enough."""
     enough = plan_scenes(effect, error, scenes, LEVEL)
     return 0 if enough is None else int(np.ceil(enough * frames / scenes))
 

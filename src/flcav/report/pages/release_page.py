@@ -4,10 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from flcav.releases.candidates.acknowledgement import Acknowledgement
-from flcav.releases.candidates.candidate import Candidate
-from flcav.releases.verification.conditions import WORDS
-from flcav.releases.verification.records import Comparison, OddCoverage, Verification
+from flcav.releases.candidate import Acknowledgement, Candidate
+from flcav.releases.verification.records import CandidateVerification, Comparison, OddCoverage
+from flcav.releases.verification.testing import WORDS
 from flcav.report.pages import html
 
 GROUPS = {
@@ -37,7 +36,7 @@ STATES = {"kept": "held", "lost": "did-not-hold", "open": "undecided"}  # classe
 
 def release_page(
     candidate: Candidate,
-    verification: Verification,
+    verification: CandidateVerification,
     hashes: Mapping[str, str],
     acknowledgements: Sequence[Acknowledgement] = (),
 ) -> str:
@@ -84,7 +83,7 @@ def _row(each: Comparison) -> dict[str, Any]:
     }
 
 
-def _scale(verification: Verification) -> dict[str, float] | None:
+def _scale(verification: CandidateVerification) -> dict[str, float] | None:
     """Return the places of the interval, the mean, 0 and the margin on a bar, in percent of its width."""
     whole = verification.whole
     if whole is None:
@@ -100,7 +99,7 @@ def _scale(verification: Verification) -> dict[str, float] | None:
     return {name: round(50 + 50 * value / reach, 2) for name, value in place.items()}
 
 
-def _domain(verification: Verification) -> list[tuple[str, str]]:
+def _domain(verification: CandidateVerification) -> list[tuple[str, str]]:
     domain = verification.domain
     assert domain is not None
     spans = {

@@ -1,0 +1,146 @@
+"""The metered link: a Flower grid around another one, with the ledger, the budget and the outages of the network."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+from flwr.app import ConfigRecord, Error, Message, RecordDict
+from flwr.serverapp import Grid
+
+from flcav.federation.links.in_process import LinkGrid, wire_bytes
+from flcav.federation.wire import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
+from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link, LinkMegabytes
+
+UNDISCLOSED = "undisclosed"  # in the place of a client's name
+UNLIMITED_MB = 1e12  # budget of a federation whose bytes nobody limits
+
+
+@dataclass(frozen=True)
+class Outage:
+    """A client that the network loses in a round."""
+
+    reason: str  # e.g. "out of coverage"
+    sent_bytes: int | None = None  # of its update, until it broke off; None: it was not there when the round began
+
+
+@dataclass(frozen=True)
+class Account:
+    """The ledger, stage, task and link that messages are entered under, and what the link loses."""
+
+    ledger: Ledger
+    stage: str  # of training, as in the ledger's entries
+    task: str  # its name
+    link: Link  # wireless or wireline
+    outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by round and client
+    within: frozenset[str] = frozenset()  # clients in the server itself, whose messages cross no link
+    concealed: bool = False  # whether it stays secret who was drawn: entries have a client's region alone
+
+    def find_away(self, round_: int) -> dict[str, str]:
+        """Return the clients that are away when a round begins and take no part in it, each with the reason."""
+        lost = self.outages.items()
+        return {name: each.reason for (number, name), each in lost if number == round_ and each.sent_bytes is None}
+
+    def describe(self, direction: Direction, round_: int, client: str, size: int) -> LedgerEntry:
+        """Return the entry of a message of `size` bytes."""
+        if self.concealed:
+            region, slash, _ = client.rpartition("/")
+            client = f"{region}{slash}{UNDISCLOSED}"
+        return LedgerEntry(self.stage, self.task, self.link, direction, round_, client, size)
+
+
+def open_account() -> Account:
+    """Return the account of a federation without a budget."""
+    return Account(Ledger(LinkMegabytes(UNLIMITED_MB, UNLIMITED_MB)), "edge", "federation", "wireless")
+
+
+class MeteredGrid(LinkGrid):
+    """Grid that meters another one, holds its nodes to the budget, and loses those that the network loses.
+
+    Every message to a node is a downlink entry of the ledger, every reply an uplink entry. A reply over the budget
+    stays with its node: `BudgetExceeded` is raised in its stead. The nodes which `account.outages` has lost in a round
+    are answered for, with the reason as an error. Nothing reaches a node that is not there; the bytes of an update that
+    broke off are entered as far as they came; what comes before training, such as keys, arrives. A node whose update
+    will break off gets a note of it with the message, in the place of the acknowledgement that it would miss later.
+    """
+
+    def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:
+        """Meter `grid` on `account`; `names` are the clients' names by node id."""
+        self._grid, self._account, self.names = grid, account, names
+
+    def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
+        """Yield the replies as they arrive, then the errors of nodes that are not there.
+
+        A message is entered when it is sent or, while another one has no reply yet, with its own reply: so the entries
+        do not depend on how many are under way. Nothing is sent before the first reply is asked for. The first reply
+        over a budget ends the exchange: raises `BudgetExceeded`.
+        """
+        asked: dict[int, Message] = {}
+        waiting: dict[int, tuple[int, int]] = {}  # round and bytes of messages that are not entered, by node
+        open_: set[int] = set()  # nodes that have not answered
+        away: list[Message] = []
+
+        def sent() -> Iterator[Message]:
+            content, size = None, 0
+            for message in messages:
+                if message.content is not content:  # many messages share one
+                    content, size = message.content, wire_bytes(message.content)
+                node = message.metadata.dst_node_id
+                waiting[node] = _round(message), size
+                if not open_:
+                    self._enter("down", node, *waiting.pop(node))
+                open_.add(node)
+                outage = self._find_outage(message)
+                if outage is not None and outage.sent_bytes is None:
+                    away.append(message)
+                    continue
+                if outage is not None:
+                    message.content = RecordDict({**message.content, LOST: ConfigRecord()})  # others share the content
+                asked[node] = message
+                yield message
+
+        def arrived() -> Iterator[Message]:
+            for reply in self._grid.send_and_receive(sent(), timeout=timeout):
+                yield self._cut(reply, asked[reply.metadata.src_node_id])
+            yield from map(self._fail, away)
+
+        for reply in arrived():
+            node, number, size = reply.metadata.src_node_id, 0, 0
+            counts = reply.has_content() and self.names[node] not in self._account.within
+            if counts:
+                number, size = _round(asked[node]), wire_bytes(reply.content)
+                self._account.ledger.check(self._account.describe("up", number, self.names[node], size))
+            open_.remove(node)
+            if node in waiting:
+                self._enter("down", node, *waiting.pop(node))
+            if counts:
+                self._enter("up", node, number, size)
+            yield reply
+        for node, about in waiting.items():
+            self._enter("down", node, *about)
+
+    def _enter(self, direction: Direction, node: int, round_: int, size: int) -> None:
+        if (name := self.names[node]) not in self._account.within:
+            self._account.ledger.enter(self._account.describe(direction, round_, name, size))
+
+    def _find_outage(self, message: Message) -> Outage | None:
+        """Return the outage of the node that a message is to in the message's round."""
+        return self._account.outages.get((_round(message), self.names[message.metadata.dst_node_id]))
+
+    def _fail(self, message: Message) -> Message:
+        """Return an error in the place of the answer to a message, with the reason of the outage."""
+        outage = self._find_outage(message)
+        assert outage is not None
+        return Message(Error(code=LOST_BY_NETWORK, reason=outage.reason), reply_to=message)
+
+    def _cut(self, reply: Message, message: Message) -> Message:
+        """Return a reply as it arrives: an error where it is an update and breaks off."""
+        outage = self._find_outage(message)
+        if outage is None or not reply.has_content() or ARRAYS not in reply.content.array_records:
+            return reply
+        account, size = self._account, min(outage.sent_bytes or 0, wire_bytes(reply.content))
+        name = self.names[message.metadata.dst_node_id]
+        account.ledger.enter(account.describe("up", _round(message), name, size))
+        return self._fail(message)
+
+
+def _round(message: Message) -> int:
+    return int(message.content.config_records[CONFIG]["round"])  # type: ignore[arg-type]

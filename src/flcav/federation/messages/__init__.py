@@ -1,1 +1,0 @@
-"""Messages of a federation: their records, their encoding, what is asked, what is accepted, and what arrives."""

@@ -1,0 +1,47 @@
+"""Rounds of drawn clients, whose updates are weighted by the inverse of their probability: the mean is unbiased."""
+
+from functools import partial
+
+from flwr.app import ConfigRecord, RecordDict
+
+from flcav.federation.acceptance import read_norm, read_update
+from flcav.federation.exchange import Exchange, Intake, OpenRound
+from flcav.federation.strategies.fedavg import average_inversely
+from flcav.federation.wire import ASK, CONFIG, COUNT, NORM, SEND
+
+
+def collect(exchange: Exchange, round_: OpenRound) -> Intake:
+    """Return the updates that count of those who are drawn, and their Horvitz-Thompson mean.
+
+    Under importance selection all clients train and report the norm of their update, and those that are drawn by it are
+    asked to send that update. Under other unbiased selections all first report their number of samples, and those who
+    are chosen then train. Where fewer take part than the rules want nobody is asked for an update.
+    """
+    here, rules, work = round_.here, round_.rules, round_.work
+    unbiased, local = rules.selection.unbiased, RecordDict({CONFIG: work.record()})
+    first = RecordDict({**local}) if unbiased else round_.training()
+    first[ASK] = ConfigRecord({ASK: COUNT if unbiased else NORM})
+    asked = dict.fromkeys(here.asked if unbiased else here.chosen, first)
+    reports = dict(exchange.ask(here, asked, lambda _, content: read_norm(content, rules)))  # norm, number of samples
+    total = max(sum(samples for _, samples in reports.values()), 1)
+    shares = {name: samples / total for name, (_, samples) in reports.items()}
+    norms: dict[str, float] = {}  # which the updates that are sent later may not exceed
+    if unbiased:
+        probability = rules.selection.inclusion_probability(len(here.asked))
+        drawn = {name: probability for name in here.chosen if name in shares}
+        request = round_.training()
+    else:
+        norms = {name: norm for name, (norm, _) in reports.items()}
+        drawn = rules.selection.draw({name: norm * shares[name] for name, norm in norms.items()}, work.seed)
+        here.chosen = [*drawn]
+        request = RecordDict({ASK: ConfigRecord({ASK: SEND}), **local})
+    if not here.count(rules):
+        return Intake()
+    updates = Intake()
+    read = lambda name, content: read_update(content, round_.expected, norms.get(name))  # noqa: E731
+    for name, update in exchange.ask(here, dict.fromkeys(drawn, request), read):
+        updates.add(name, update)
+    if updates.updates:
+        weights = {name: shares[name] / drawn[name] for name in updates.updates}
+        updates.average = partial(average_inversely, round_.start, updates.updates, weights)
+    return updates

@@ -1,0 +1,159 @@
+"""Primitives of secure aggregation: masks, and Shamir's secret sharing.
+
+Masks: key agreement (X25519), expansion of seeds (SHAKE256), sealed shares, fixed point. Updates are vectors of
+integers modulo 2^32, so that masks cancel exactly and leave no trace in the sum. Shares are of 32-byte secrets over a
+prime field (Shamir, Communications of the ACM 22(11), 1979).
+"""
+
+import hashlib
+import itertools
+import math
+import secrets
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+from numpy.typing import NDArray
+
+from flcav.statistics.streams import stream
+
+LARGEST_SUM = 2**31 - 1
+NONCE = bytes(12)  # every key seals one message
+Vector = NDArray[np.uint32]
+
+
+def draw_keys() -> tuple[bytes, bytes]:
+    """Return a new X25519 key pair, private and public, of 32 bytes each, from the operating system's randomness."""
+    private = X25519PrivateKey.generate()
+    return private.private_bytes_raw(), private.public_key().public_bytes_raw()
+
+
+def public_key(private: bytes) -> bytes:
+    """Return the public key of an X25519 private key."""
+    return X25519PrivateKey.from_private_bytes(private).public_key().public_bytes_raw()
+
+
+def agree(private: bytes, public: bytes, purpose: str) -> bytes:
+    """Return the 32-byte key that two clients have in common for a purpose (X25519, HKDF with SHA-256)."""
+    common = X25519PrivateKey.from_private_bytes(private).exchange(X25519PublicKey.from_public_bytes(public))
+    return HKDF(SHA256(), 32, salt=None, info=purpose.encode()).derive(common)
+
+
+def is_public_key(data: object) -> bool:
+    """Return whether it is an X25519 public key that secrets can be agreed on with: of 32 bytes, and of no small order.
+
+    With a point of small order every secret would be 0 (RFC 7748, section 6.1).
+    """
+    try:
+        agree(bytes(range(32)), data, "trial")  # type: ignore[arg-type]: whatever a client sent
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def seal(key: bytes, data: bytes) -> bytes:
+    """Return data encrypted and authenticated (ChaCha20-Poly1305) by a key that is used once."""
+    return ChaCha20Poly1305(key).encrypt(NONCE, data, None)
+
+
+def unseal(key: bytes, sealed: bytes) -> bytes:
+    """Return what was sealed; raises cryptography's `InvalidTag` where it was changed, or by another key."""
+    return ChaCha20Poly1305(key).decrypt(NONCE, sealed, None)
+
+
+def expand(seed: bytes, size: int) -> Vector:
+    """Return the mask of a 32-byte seed, (size,): the output of SHAKE256, as little-endian integers."""
+    return np.frombuffer(hashlib.shake_256(b"flcav mask" + seed).digest(4 * size), "<u4").astype(np.uint32)
+
+
+def add_vectors(vectors: Iterable[Vector]) -> Vector:
+    """Return the sum of vectors, modulo 2^32."""
+    return np.asarray(np.sum([*vectors], axis=0, dtype=np.uint32))
+
+
+def to_integers(values: NDArray[np.float64], largest: float, clients: int) -> Vector:
+    """Return values in fixed point, modulo 2^32; beyond +-largest they are cut off.
+
+    The step is fine enough, and no finer, that the sum of `clients` vectors does not overflow. Raises ValueError for
+    values that are not finite.
+    """
+    if not np.isfinite(values).all():
+        raise ValueError("an update with values that are not finite cannot be masked")
+    limit = LARGEST_SUM // clients
+    return np.rint(np.clip(values / largest, -1.0, 1.0) * limit).astype(np.int64).astype(np.uint32)
+
+
+def to_values(total: Vector, largest: float, clients: int) -> NDArray[np.float64]:
+    """Return the sum of the values of which `total` is the sum in fixed point: the inverse of `to_integers`."""
+    return total.astype(np.int32).astype(np.float64) * (largest / (LARGEST_SUM // clients))
+
+
+PRIME = 2**521 - 1  # a Mersenne prime above any secret
+SECRET_BYTES, SHARE_BYTES = 32, 66
+MOST_TRIED = 256  # sets of shares
+
+
+def split_secret(secret: bytes, threshold: int, shares: int) -> list[bytes]:
+    """Return `shares` shares of a secret, of which any `threshold` determine it and fewer reveal nothing.
+
+    The share of place i (from 0) is the value at i + 1 of a random polynomial of degree threshold - 1 whose value at 0
+    is the secret.
+    """
+    polynomial = [int.from_bytes(secret), *(secrets.randbelow(PRIME) for _ in range(threshold - 1))]
+
+    def value(x: int) -> int:
+        total = 0
+        for coefficient in reversed(polynomial):
+            total = (total * x + coefficient) % PRIME
+        return total
+
+    return [value(place + 1).to_bytes(SHARE_BYTES) for place in range(shares)]
+
+
+def join_shares(shares: Mapping[int, bytes]) -> bytes:
+    """Return the secret of `threshold` or more shares by place, by Lagrange interpolation at 0.
+
+    Raises OverflowError where the shares are not of one secret: a wrong one makes a random element of the field, which
+    is of 32 bytes with a probability of 2^-265.
+    """
+    return _interpolate(shares, 0).to_bytes(SECRET_BYTES)
+
+
+def find_wrong_shares(shares: Mapping[int, bytes], threshold: int) -> set[int]:
+    """Return the places of the shares that do not fit the others, of which `threshold` or more determine the secret.
+
+    Sets of `threshold` shares are tried, all of them where they are few, until one makes a secret. Of a majority as
+    threshold and e wrong shares about one set of 2^e does. Raises ValueError where none of those tried makes a secret.
+    """
+    every = math.comb(len(shares), threshold)
+    rng = stream(0, "shares")
+    tried = (
+        itertools.combinations(shares, threshold)
+        if every <= MOST_TRIED
+        else (rng.permutation([*shares])[:threshold].tolist() for _ in range(MOST_TRIED))
+    )
+    for places in tried:
+        trusted = {place: shares[place] for place in places}
+        if _interpolate(trusted, 0) < 256**SECRET_BYTES:
+            return {place for place, share in shares.items() if _interpolate(trusted, place + 1) != _number(share)}
+    raise ValueError(f"no {threshold} of {len(shares)} shares make a secret")
+
+
+def _interpolate(shares: Mapping[int, bytes], x: int) -> int:
+    """Return the value at x of the polynomial through the shares."""
+    total = 0
+    for place, share in shares.items():
+        above, below = 1, 1
+        for other in shares:
+            if other != place:
+                above = above * (other + 1 - x) % PRIME
+                below = below * (other - place) % PRIME
+        total = (total + _number(share) * above * pow(below, -1, PRIME)) % PRIME
+    return total
+
+
+def _number(share: bytes) -> int:
+    return int.from_bytes(share)

@@ -1,0 +1,1 @@
+"""A deployed fleet: its authority and registry, the proxy before Flower's SuperLink, vehicles, releases, its status."""

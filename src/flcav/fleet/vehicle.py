@@ -1,0 +1,175 @@
+"""A vehicle's processes: its forwarder, Flower's SuperNode, and an executor of its app, one fork a message.
+
+Flower starts a process for every message, which imports everything anew. Here the executor imports once, and forks.
+A vehicle is installed with its certificate, the keys that it trusts, and the address of the fleet.
+"""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import yaml
+
+from flcav.config import InputError
+from flcav.fleet.keys import FLOWER_KEY, LOOPBACK, LOOPBACK_KEY, make_loopback, take_certificate, write_private
+from flcav.fleet.superlink import ACQUIRE, SECRET, TRUSTED
+from flcav.fleet.supervisor import end_with_parent
+from flcav.plugins import PLACE
+from flcav.storage.files import write_bytes, write_json
+
+SETTINGS, FOLDER = "vehicle.json", "FLCAV_VEHICLE"  # the second: environment variable of the app
+POLL_S = 0.1  # between looks for a message
+
+
+@dataclass(frozen=True)
+class VehicleSettings:
+    """Addresses of a vehicle, and its own client."""
+
+    server: str  # host:port of the fleet's proxy
+    forwarder_port: int  # on the vehicle's loopback
+    node_port: int
+    client: str = ""  # module:NAME of its own part in a federation; "": the one in its folder
+
+    def save(self, folder: Path) -> None:
+        """Write them to a vehicle's folder, with the secrets that its processes know each other by."""
+        write_json(folder / SETTINGS, asdict(self))
+        if not (folder / SECRET).exists():
+            write_private(folder / SECRET, os.urandom(32).hex().encode())
+        if not (folder / LOOPBACK_KEY).exists():
+            make_loopback(folder)
+
+
+def load_settings(folder: Path) -> VehicleSettings:
+    """Return the settings in a vehicle's folder; raises `InputError` where there are none."""
+    try:
+        return VehicleSettings(**json.loads((folder / SETTINGS).read_bytes()))
+    except FileNotFoundError:
+        raise InputError(f"{folder}: is no vehicle's folder, without {SETTINGS}") from None
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{folder / SETTINGS}: {error}") from None
+
+
+Prepare = Callable[[Path], None]  # called with the vehicle's folder before each message, to have imported what it needs
+
+
+def vehicle_processes(
+    folder: Path, prepare: Prepare, others: Mapping[str, Callable[[Path], None]] = {}
+) -> dict[str, Callable[[], None]]:
+    """Return what the processes of the vehicle in `folder` run, by name; `others` are called with the folder."""
+    own = load_settings(folder)
+
+    def forward() -> None:
+        from flcav.fleet.forwarder import run_forwarder
+
+        run_forwarder(folder, own.forwarder_port, own.server)
+
+    return {
+        "forwarder": forward,
+        "supernode": lambda: run_supernode(folder, own),
+        "executor": lambda: run_executor(folder, f"127.0.0.1:{own.node_port}", prepare),
+        **{name: partial(do, folder) for name, do in others.items()},
+    }
+
+
+def run_supernode(folder: Path, own: VehicleSettings) -> None:
+    """Run `flower-supernode` in this process until it ends."""
+    from flwr.supernode.cli.flower_supernode import flower_supernode
+
+    sys.argv = [
+        "flower-supernode",
+        *("--superlink", f"127.0.0.1:{own.forwarder_port}"),
+        *("--root-certificates", str(folder / LOOPBACK)),
+        *("--auth-supernode-private-key", str(folder / FLOWER_KEY)),
+        *("--trusted-entities", str(folder / TRUSTED)),
+        *("--isolation", "process", "--superexec-auth-secret-file", str(folder / SECRET)),
+        *("--host", "127.0.0.1", "--port", str(own.node_port)),
+    ]
+    flower_supernode()
+
+
+def run_executor(folder: Path, node: str, prepare: Prepare) -> None:
+    """Run the app for each message that the SuperNode at `node` has, in a fork of this process, one at a time."""
+    import httpx
+    from flwr.proto.runtime_pb2 import AcquireTaskRequest
+    from flwr.supercore.constant import TaskType
+    from flwr.supercore.interceptors import RuntimeVersionHttpInterceptor, SuperExecAuthHttpInterceptor
+    from flwr.supercore.runtime import RuntimeHttpClient
+
+    os.environ[FOLDER] = str(folder)
+    parent = os.getppid()
+    secret = SuperExecAuthHttpInterceptor(master_secret=(folder / SECRET).read_bytes(), protected_methods=ACQUIRE)
+    version = RuntimeVersionHttpInterceptor(component_name="SuperExec")
+    with RuntimeHttpClient.from_server_address(node, True, None, [version, secret]) as client:
+        while os.getppid() == parent:
+            try:
+                task = client.AcquireTask(AcquireTaskRequest(supported_task_types=[TaskType.CLIENT_APP]))
+            except httpx.HTTPError:  # the SuperNode is starting
+                time.sleep(POLL_S)
+                continue
+            if task.token:
+                prepare(folder)
+                os.waitpid(_fork(node, task.token), 0)
+            else:
+                time.sleep(POLL_S)
+
+
+def _fork(node: str, token: str) -> int:
+    """Return the id of a process that runs the app for one message."""
+    parent, child = os.getpid(), os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        end_with_parent(parent, signal.SIGKILL)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        from flwr.supernode.runtime.run_clientapp import run_clientapp
+
+        run_clientapp(node, token, True)
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    finally:
+        os._exit(code)
+
+
+def check_port(host: str, port: int) -> int:
+    """Return a port that can be listened on, `port` or, for 0, a free one; raises `InputError` where it is in use."""
+    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as door:
+        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            door.bind((host, port))
+        except (OSError, OverflowError) as error:
+            raise InputError(f"{host}:{port}: cannot be listened on ({getattr(error, 'strerror', error)})") from None
+        return door.getsockname()[1]
+
+
+def install_vehicle(
+    folder: Path, certificate: Path, authority: Path, trusted: Path, server: str, client: str = ""
+) -> None:
+    """Install the authority's files in a vehicle's folder; raises `InputError` for a file of another kind.
+
+    server: host:port of the proxy. client: module:NAME of the vehicle's own part in a federation, an `Assignment`
+    of federation's `links.vehicle_app`; "": the one that is put into its folder.
+    """
+    if client and not PLACE.fullmatch(client):
+        raise InputError(f"--client {client[:80]}: a module, a colon and a name in it are wanted")
+    if not re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[A-Za-z0-9.-]+):[0-9]{1,5}", server):
+        raise InputError(f"--server {server[:80]}: HOST:PORT is wanted")
+    keys = trusted.read_bytes()
+    try:
+        named = yaml.safe_load(keys)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        named = None
+    if not isinstance(named, dict) or not named:
+        raise InputError(f"{trusted}: names no key that apps are signed by")
+    take_certificate(folder, certificate.read_bytes(), authority.read_bytes())
+    write_bytes(folder / TRUSTED, keys)
+    VehicleSettings(server, check_port("127.0.0.1", 0), check_port("127.0.0.1", 0), client).save(folder)

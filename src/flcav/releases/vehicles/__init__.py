@@ -1,1 +1,0 @@
-"""A vehicle's side of releases: fetching, verification and atomic installation."""
