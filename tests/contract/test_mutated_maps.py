@@ -18,12 +18,11 @@ from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.importing import import_town
 from flcav.world.opendrive.mending.maps import mend_map
 from flcav.world.opendrive.mending.roads import mend_roads
-from flcav.world.opendrive.mirror import mirror_map
-from flcav.world.opendrive.objects.crosswalks import find_crosswalks
-from flcav.world.opendrive.objects.parking_spaces import find_parking
+from flcav.world.opendrive.netconvert import mirror_map
+from flcav.world.opendrive.objects.crossings import find_crosswalks
 from flcav.world.opendrive.objects.signal_heads import find_heads
 from flcav.world.opendrive.objects.signs import find_posts, find_signs
-from flcav.world.opendrive.objects.standing import find_objects
+from flcav.world.opendrive.objects.standing import find_objects, find_parking
 from flcav.world.opendrive.objects.stop_lines import find_stop_lines
 
 DATA = Path(__file__).parents[1] / "data"

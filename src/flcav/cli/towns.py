@@ -51,8 +51,8 @@ def show(
     poles' id, x, y, z [m, world], yaw_deg and kind, which `flcav place` reads; recipes take the same ids.
     """
     from flcav.report.pictures.town_map import town_map
-    from flcav.storage.exchange import write_table
     from flcav.storage.files import write_bytes
+    from flcav.storage.records import write_table
     from flcav.world.map.census import summarise_town
     from flcav.world.map.town import load_town
 

@@ -15,8 +15,8 @@ from flcav.driving.corridor import Occupied, find_meeting, find_occupied
 from flcav.driving.seen import TIMES_S, Seen
 from flcav.geometry import heading_vectors, rotate
 from flcav.world.commands import Controls
-from flcav.world.dynamics.blueprints import Blueprint
-from flcav.world.map.routes import Route
+from flcav.world.dynamics.vehicle import Blueprint
+from flcav.world.map.roads import Route
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flcav.driving.seen import EGO
 from flcav.fusion.detector import THRESHOLD, load_road_network
 from flcav.geometry import Boxes, concatenate
-from flcav.network.messages import from_names, pack
+from flcav.network.ledger import from_names, pack
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import link_vehicles, unit_positions
 from flcav.perception.objects.predict import detect

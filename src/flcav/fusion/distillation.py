@@ -29,7 +29,7 @@ from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Navigation, Sighting, add_pose_variance, tell
 from flcav.geometry import Boxes, inverse, points_in_boxes, spread_over_footprints, transform_points
-from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.network.ledger import from_names, pack, to_names, unpack
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
 from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar

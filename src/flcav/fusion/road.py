@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from flcav.geometry import Boxes, transform_points
-from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.network.ledger import from_names, pack, to_names, unpack
 from flcav.sensors.frame import Frame
 from flcav.world.map.relief import Relief
 

@@ -10,7 +10,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from flcav.arrays import Array
+
 Coordinate = TypeVar("Coordinate", float, Array)
 
 

@@ -1,15 +1,19 @@
 """Communication ledger: the bytes of every message on every link, under uplink budgets that it enforces."""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
+from safetensors.numpy import load, save
 
+from flcav.arrays import Bytes, Words
 from flcav.config import InputError
-from flcav.storage.parquet import read_parquet, write_parquet
+from flcav.storage.files import read_parquet, write_parquet
 
 Link = Literal["wireless", "wireline"]
 Direction = Literal["up", "down"]
@@ -170,3 +174,50 @@ class Ledger:
 
 def _mb(count: int) -> str:
     return f"{count / BYTES_PER_MB:.6g}"
+
+
+Arrays = Mapping[str, NDArray]  # by name
+
+
+def pack(arrays: Arrays) -> bytes:
+    """Return arrays of numbers or truth values as a message."""
+    return save({name: np.asarray(array, order="C") for name, array in arrays.items()})
+
+
+def unpack(message: bytes) -> dict[str, NDArray]:
+    """Return the arrays of a message: the inverse of `pack`, but for their order."""
+    return load(message)
+
+
+def from_names(names: Iterable[str]) -> Bytes:
+    """Return names without line breaks as an array for a message: UTF-8, each ends with a line break."""
+    return np.frombuffer(bytearray("".join(f"{name}\n" for name in names), "utf-8"), dtype=np.uint8)
+
+
+def to_names(array: Bytes) -> Words:
+    """Return the names (N,) in an array of a message: the inverse of `from_names`."""
+    return np.array(array.tobytes().decode("utf-8").split("\n")[:-1], dtype=np.str_)
+
+
+def carry(message: bytes) -> bytes:
+    """Return a message as the other end of its link has it; in a simulation, the same bytes."""
+    return message
+
+
+def send(
+    book: Ledger,
+    message: bytes,
+    *,
+    stage: str,
+    task: str,
+    link: Link,
+    direction: Direction,
+    client: str,
+    round_: int = 0,
+) -> bytes:
+    """Send a message of a client, up, or to it, down; return its bytes as they are received.
+
+    It is entered in the ledger first, see `LedgerEntry`. Raises `BudgetExceeded`, and then nothing is sent.
+    """
+    book.enter(LedgerEntry(stage, task, link, direction, round_, client, len(message)))
+    return carry(message)

@@ -18,8 +18,7 @@ from flcav.interface.wording import plural
 from flcav.odd.domain import Domain, Value
 from flcav.odd.measure import Measurements
 from flcav.statistics.estimates import Estimate, score_interval
-from flcav.storage.exchange import write_table
-from flcav.storage.records import Record
+from flcav.storage.records import Record, write_table
 
 INSIDE, OUTSIDE, UNKNOWN = "inside", "outside", "unknown"
 

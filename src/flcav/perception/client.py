@@ -13,7 +13,7 @@ from torch import nn
 from flcav.config import InputError, Json
 from flcav.dataset.store import Dataset
 from flcav.machine.threads import use_threads
-from flcav.network.messages import from_names, pack
+from flcav.network.ledger import from_names, pack
 from flcav.perception.images import pack_pictures
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task, find_configuration
 from flcav.perception.training import train_steps

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.messages import from_names, pack, to_names, unpack
-from flcav.storage.exchange import write_table
+from flcav.network.ledger import from_names, pack, to_names, unpack
+from flcav.storage.records import write_table
 
 if TYPE_CHECKING:
     from torch import nn

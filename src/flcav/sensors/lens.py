@@ -10,12 +10,11 @@ is at (0, 0), as in OpenCV. With a = x / z, b = y / z and r^2 = a^2 + b^2 (Brown
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
+from flcav.arrays import Array, Array32
 from flcav.config import Config
-
-Array = NDArray[np.float64]
 
 BODY_FROM_OPTICAL: Array = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # rotation of axes
 NEWTON_STEPS = 12  # by which the distortion is inverted
@@ -80,16 +79,14 @@ def unproject(lens: Lens, pixels: ArrayLike) -> Array:
     return unproject_pixels(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
 
 
-def compute_pixel_rays(lens: Lens) -> NDArray[np.float32]:
+def compute_pixel_rays(lens: Lens) -> Array32:
     """Return the viewing rays of the pixels' centres: (height * width, 3) unit vectors, optical frame; read-only."""
     intrinsics, distortion = lens.intrinsics().ravel().tolist(), lens.distortion().tolist()
     return _directions(lens.width, lens.height, tuple(intrinsics), tuple(distortion))
 
 
 @lru_cache(maxsize=16)
-def _directions(
-    width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
-) -> NDArray[np.float32]:
+def _directions(width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]) -> Array32:
     v, u = np.mgrid[:height, :width]
     pixels = np.stack((u.ravel(), v.ravel()), axis=1).astype(np.float64)
     plane = unproject_pixels(np.reshape(intrinsics, (3, 3)), np.array(distortion), pixels)

@@ -9,8 +9,8 @@ Biases are those of the sensors' samples in frames, white noise is drawn for the
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Mask
 from flcav.geometry import rotations
 from flcav.sensors.navigation import GRAVITY, Gnss, Imu, draw_fix_errors, draw_imu_errors
 from flcav.sensors.rig import Rig
@@ -18,8 +18,6 @@ from flcav.statistics.streams import stream
 from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.map.parameters import GeoReference
 from flcav.world.trace import Trace
-
-Array = NDArray[np.float64]
 
 GNSS_HZ = 10.0  # rate of fixes
 SLACK_S = 1e-6  # of times that are compared
@@ -49,7 +47,7 @@ class NavigationLog:
         """Return until when the IMU measures [s]."""
         return float(self.imu_time_s[-1])
 
-    def covers(self, times_s: Array) -> NDArray[np.bool_]:
+    def covers(self, times_s: Array) -> Mask:
         """Return (T,) whether the times [s] are within the log, to a microsecond."""
         return (times_s >= self.begin_s - SLACK_S) & (times_s <= self.end_s + SLACK_S)
 

@@ -4,20 +4,19 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Ints32, Mask
 from flcav.config import InputError
 from flcav.geometry import pose
-from flcav.sensors.calibration import CalibrationError, build_calibration, perturb_calibration
-from flcav.sensors.camera.camera import photograph
-from flcav.sensors.camera.infrared import render_thermal
-from flcav.sensors.frame import Array, Calibration, CameraImage, Frame
-from flcav.sensors.labels.annotate import InstanceImage, Sweep, annotate
+from flcav.sensors.camera import photograph
+from flcav.sensors.frame import Calibration, CameraImage, Frame
+from flcav.sensors.ground_truth import InstanceImage, Sweep, annotate
+from flcav.sensors.infrared import render_thermal
 from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.lidar.lidar import Lidar, point_times_s, scan
 from flcav.sensors.navigation import measure_inertia, measure_position
-from flcav.sensors.radar.radar import sweep_radar
-from flcav.sensors.rig import CAMERA_RANGE_M, Rig
+from flcav.sensors.radar import sweep_radar
+from flcav.sensors.rig import CAMERA_RANGE_M, CalibrationError, Rig, build_calibration, perturb_calibration
 from flcav.statistics.streams import stream
 from flcav.world.scene import Scene
 from flcav.world.weather import WEATHERS, Weather
@@ -183,7 +182,7 @@ def _actor_of(scene: Scene, agent: str, index: int) -> int | None:
 
 def _sweep(
     carrier: _Carrier, name: str, lidar: Lidar, weather: Weather, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], Sweep]:
+) -> tuple[Array32, Sweep]:
     """Return the points (N, 4) of a LiDAR, and its rays and counts for the ground truth."""
     scene, world_from_sensor = carrier.scene, carrier.go_to(name)
     points, actor, passes, hits = scan(scene, world_from_sensor, lidar, rng, carrier.own, weather)
@@ -193,13 +192,13 @@ def _sweep(
     return points, Sweep(lidar, world_from_sensor, passes, hits.distance, hits.instance, returns, visible)
 
 
-def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> NDArray[np.int32]:
+def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> Ints32:
     """Return an instance image (H, W) by one ray for each pixel: a + 1 at the trace's actor a, else 0."""
     hits = carrier.scene.cast(world_from_camera, compute_pixel_rays(lens), hidden=carrier.own)
     return np.maximum(hits.instance, 0).reshape(lens.height, lens.width)
 
 
-def _within_range(carrier: _Carrier, rig: Rig) -> NDArray[np.bool_]:
+def _within_range(carrier: _Carrier, rig: Rig) -> Mask:
     """Return (A,) whether each actor is present and the centre of its box within the range of any LiDAR.
 
     Where the rig has no LiDAR: within CAMERA_RANGE_M of any camera.

@@ -11,25 +11,20 @@ from types import MappingProxyType, TracebackType
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.config import InputError, shorten
 from flcav.world import commands
-from flcav.world.actors import NOBODY, Actors, join_actors, pick_actors
 from flcav.world.commands import Command, Controls
-from flcav.world.dynamics.blueprints import VEHICLES, blueprint
 from flcav.world.dynamics.bodies import Bodies, Body
 from flcav.world.dynamics.contacts import Contacts, Footprints, find_overlaps, resolve
-from flcav.world.dynamics.obstacles import corners, join_footprints, list_obstacles, outline
-from flcav.world.dynamics.standing import Ground
+from flcav.world.dynamics.obstacles import Ground, corners, join_footprints, list_obstacles, outline
+from flcav.world.dynamics.vehicle import VEHICLES, blueprint
 from flcav.world.map.town import Town
 from flcav.world.scenarios.stage import STEP_S
-from flcav.world.snapshot import Collision, Snapshot
+from flcav.world.snapshot import NOBODY, Actors, Collision, Snapshot, join_actors, pick_actors
 from flcav.world.trace import Trace
-from flcav.world.traffic.lights import Lights, read_light_programs
-from flcav.world.traffic.live import WARM_UP_S, SumoTraffic, stand_parked
-
-Array = NDArray[np.float64]
+from flcav.world.traffic.live import WARM_UP_S, Lights, SumoTraffic, read_light_programs, stand_parked
 
 SUBSTEP_S, SUBSTEP_M = 0.05, 2.0  # longest step and way of the vehicle model: nobody passes through a box in it
 LONGEST_S = 10.0  # of a step

@@ -8,14 +8,14 @@ from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Bytes, Ints, Mask
 from flcav.geometry import pose, rotations, rotations_about_z
 from flcav.world.map.town import Town
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
 from flcav.world.meshes import Mesh, actor_mesh
 from flcav.world.rays.embree import Embree, Solid
-from flcav.world.rays.hits import Hits
+from flcav.world.rays.packets import Hits
 from flcav.world.static import SignsAndSignals, build_town_mesh, list_signs_and_signals
 from flcav.world.trace import Trace
 
@@ -29,11 +29,11 @@ class Surfaces(NamedTuple):
     There are I instances and M materials; instances of the same shape share their rows.
     """
 
-    normal: NDArray[np.float32]  # (S, 3) unit normals, of either sign, body frame
-    material: NDArray[np.uint8]  # (S,) a Material
-    first: NDArray[np.int64]  # (I,) first row of each instance's mesh
-    reflectivity: NDArray[np.float32]  # (I, M) at 905 nm, by material: actors differ in their paint
-    retro: NDArray[np.bool_] = RETRO  # (M,) retroreflectors
+    normal: Array32  # (S, 3) unit normals, of either sign, body frame
+    material: Bytes  # (S,) a Material
+    first: Ints  # (I,) first row of each instance's mesh
+    reflectivity: Array32  # (I, M) at 905 nm, by material: actors differ in their paint
+    retro: Mask = RETRO  # (M,) retroreflectors
 
 
 class Scene:
@@ -100,7 +100,7 @@ class Scene:
             self.index, self.offset_s = index, offset_s
             self._place()
 
-    def poses(self) -> NDArray[np.float64]:
+    def poses(self) -> Array:
         """Return x, y, z [m] and yaw [rad] of every actor at the scene's time (A, 4), world frame; NaN where absent."""
         trace, i, dt = self.trace, self.index, self.offset_s
         position, yaw = trace.position[i], trace.yaw[i]
@@ -109,15 +109,15 @@ class Scene:
             yaw = yaw + dt * trace.yaw_rate[i]
         return np.concatenate((position, yaw[:, None]), axis=1)
 
-    def world_from_actor(self, actor: int) -> NDArray[np.float64]:
+    def world_from_actor(self, actor: int) -> Array:
         """Return the pose (4, 4) of an actor that is present; the origin of its body frame is its ground centre."""
         return pose(*self.poses()[actor], *self.trace.tilts(self.index)[actor])
 
-    def world_from_instance(self) -> NDArray[np.float64]:
+    def world_from_instance(self) -> Array:
         """Return the rotations of the instances (I, 3, 3); the identity for the town and for absent actors."""
         return np.concatenate((np.eye(3)[None], self.rotations()))
 
-    def rotations(self) -> NDArray[np.float64]:
+    def rotations(self) -> Array:
         """Return the rotations of the actors' body frames (A, 3, 3); the identity for absent ones."""
         yaw = np.nan_to_num(self.poses()[:, 3])
         if self.trace.tilt is None:
@@ -126,10 +126,10 @@ class Scene:
 
     def cast(
         self,
-        world_from_rays: NDArray[np.float64],
-        directions: NDArray[np.float32],
+        world_from_rays: Array,
+        directions: Array32,
         *,
-        near_m: NDArray[np.float32] | None = None,
+        near_m: Array32 | None = None,
         far_m: float = np.inf,
         hidden: int | None = None,
         threads: int = 1,
@@ -140,13 +140,13 @@ class Scene:
 
     def find_occluded(
         self,
-        origins: NDArray[np.float32],
-        directions: NDArray[np.float32],
-        far_m: NDArray[np.float32],
+        origins: Array32,
+        directions: Array32,
+        far_m: Array32,
         *,
         hidden: int | None = None,
         threads: int = 1,
-    ) -> NDArray[np.bool_]:
+    ) -> Mask:
         """Return (N,) whether anything but the actor `hidden` occludes each ray before its end `far_m` (N,) [m].
 
         `origins` (N, 3) [m] and unit `directions` (N, 3), or (1, 3) for all, are in the world frame. A ray whose
@@ -157,12 +157,12 @@ class Scene:
 
     def cast_each(
         self,
-        actors: NDArray[np.int64],
-        body_from_rays: NDArray[np.float64],
-        ends: NDArray[np.int64],
-        directions: NDArray[np.float32],
+        actors: Ints,
+        body_from_rays: Array,
+        ends: Ints,
+        directions: Array32,
         *,
-        near_m: NDArray[np.float32] | None = None,
+        near_m: Array32 | None = None,
         far_m: float = np.inf,
     ) -> Hits:
         """Return the first hits of K groups of rays, group k with the mesh of `actors[k]` alone.
@@ -200,7 +200,7 @@ class _Model(NamedTuple):
     """A mesh with its normals and its acceleration structure."""
 
     mesh: Mesh
-    normal: NDArray[np.float32]
+    normal: Array32
     solid: Solid
 
 

@@ -25,15 +25,14 @@ from flcav.driving.studies.error_measurement import Tally, summarise
 from flcav.driving.studies.hidden import Hidden, find_hidden, summarise_hidden
 from flcav.driving.studies.pole_gain import FusionTally, PoleGain, Precision, measure_precision
 from flcav.geometry import Boxes, left_vectors
-from flcav.network.messages import unpack
+from flcav.network.ledger import unpack
 from flcav.optimization.problem import Problem
 from flcav.perception.networks import resolve_network
 from flcav.perception.tracking.tracker import Tracker
 from flcav.perception.trajectory.config import FUTURE
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.statistics.estimates import Estimate
-from flcav.world.map.roads import read_net
-from flcav.world.map.routes import draw_route
+from flcav.world.map.roads import draw_route, read_net
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace, empty_trace

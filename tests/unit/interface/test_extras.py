@@ -12,7 +12,7 @@ from packaging.requirements import Requirement
 
 from flcav.config import InputError
 from flcav.dataset.recording.workers import start_actors
-from flcav.interface.extras import format_install_command
+from flcav.interface.wording import format_install_command
 from flcav.world.opendrive import importing
 
 PROJECT = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]

@@ -6,8 +6,8 @@ from moving import made_links
 
 from flcav.config import InputError
 from flcav.network.clock.buffers import BufferClock, BufferTiming, chain_links
+from flcav.network.clock.records import ClientWork
 from flcav.network.clock.rounds import RoundRules, time_clients
-from flcav.network.clock.work import ClientWork
 
 GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing
 NAN = np.nan

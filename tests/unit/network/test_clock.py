@@ -9,11 +9,17 @@ import pytest
 from moving import made_links
 
 from flcav.config import InputError
-from flcav.network.clock.records import ClientTiming, load_rounds, rounds_table, save_rounds
+from flcav.network.clock.records import (
+    ClientTiming,
+    ClientWork,
+    load_rounds,
+    rounds_table,
+    save_rounds,
+    work_of_messages,
+)
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, simulate_rounds, time_clients
-from flcav.network.clock.work import ClientWork, work_of_messages
 from flcav.network.ledger import Direction, LedgerEntry, Link
-from flcav.network.radio.wireline import Wireline
+from flcav.network.radio.links import Wireline
 
 GOOD = 30.0  # dB: 2 bit/s/Hz, 20 Mbit/s of 10 MHz
 MB = 1_000_000

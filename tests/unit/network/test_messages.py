@@ -6,9 +6,18 @@ import threading
 import numpy as np
 import pytest
 
-from flcav.network import messages
-from flcav.network.ledger import BudgetExceeded, Ledger, LedgerEntry, LinkMegabytes
-from flcav.network.messages import from_names, pack, send, to_names, unpack
+from flcav.network import ledger
+from flcav.network.ledger import (
+    BudgetExceeded,
+    Ledger,
+    LedgerEntry,
+    LinkMegabytes,
+    from_names,
+    pack,
+    send,
+    to_names,
+    unpack,
+)
 
 
 def test_arrays_and_names_come_back_as_they_were() -> None:
@@ -43,7 +52,7 @@ def test_a_message_is_booked_before_it_is_sent_in_the_bytes_that_a_socket_carrie
         arrived.append(len(received))
         return received
 
-    monkeypatch.setattr(messages, "carry", through_a_socket)
+    monkeypatch.setattr(ledger, "carry", through_a_socket)
     book = Ledger(LinkMegabytes(wireless_mb=0.5, wireline_mb=0.0))
     sample = {"points": np.random.default_rng(0).normal(size=(10_000, 4)).astype(np.float32)}
     with near, far:

@@ -14,8 +14,7 @@ from flcav.config import InputError
 from flcav.federation.runtimes.link import open_questions
 from flcav.federation.runtimes.metered import open_account
 from flcav.federation.trainable import LocalUpdate
-from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
-from flcav.network.messages import pack
+from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes, pack
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.arms import check_federations, resolve_settings

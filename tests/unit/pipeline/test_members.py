@@ -11,8 +11,7 @@ from line_task import LineTask, Slope
 from flcav.federation.messages.fl_request import make_request
 from flcav.federation.runtimes.link import Replies
 from flcav.federation.trainable import Weights
-from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
-from flcav.network.messages import pack
+from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes, pack
 from flcav.perception.task import Task
 from flcav.pipeline.steps.groups import UNREADABLE, Uplink
 from flcav.pipeline.training.fl_requests import answer_requests, take_requests

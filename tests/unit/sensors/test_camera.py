@@ -6,9 +6,9 @@ import pytest
 from scipy.spatial import Delaunay
 
 from flcav.geometry import inverse, pose, transform_points
-from flcav.sensors.camera.camera import Camera, Exposure, label, photograph
-from flcav.sensors.camera.infrared import Infrared, render_thermal
+from flcav.sensors.camera import Camera, Exposure, label, photograph
 from flcav.sensors.frame import SEMANTICS
+from flcav.sensors.infrared import Infrared, render_thermal
 from flcav.sensors.lens import BODY_FROM_OPTICAL, compute_pixel_rays, project
 from flcav.sensors.rendering.render import render
 from flcav.world.map.signals import Signals

@@ -9,13 +9,12 @@ from hypothesis import strategies as st
 from flcav.config import InputError
 from flcav.dataset.checks.images import check_images
 from flcav.geometry import inverse, points_in_boxes, pose
-from flcav.sensors.calibration import CalibrationError
-from flcav.sensors.camera.camera import Camera
+from flcav.sensors.camera import Camera
+from flcav.sensors.ground_truth import find_occluded_rays
 from flcav.sensors.lens import project
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern, cast, draw_passes
-from flcav.sensors.lidar.visibility import find_occluded_rays
 from flcav.sensors.observe import observe
-from flcav.sensors.rig import RIGS, MountedLidar, Rig
+from flcav.sensors.rig import RIGS, CalibrationError, MountedLidar, Rig
 from flcav.world.map.town import Signs, Town
 from flcav.world.scene import Scene
 from flcav.world.shapes import SHAPES

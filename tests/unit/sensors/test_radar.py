@@ -5,18 +5,21 @@ import numpy as np
 import pytest
 
 from flcav.geometry import pose
-from flcav.sensors.radar.detector import (
+from flcav.sensors.radar import (
     ACTOR_RCS,
     Cells,
+    Radar,
     compute_actor_rcs,
+    cross_sections,
     detect,
+    draw_rays,
     false_alarms,
     silhouette,
     snr_per_m2,
+    sweep_radar,
 )
-from flcav.sensors.radar.radar import Radar, cross_sections, draw_rays, sweep_radar
 from flcav.world.map.town import Town
-from flcav.world.rays.hits import Hits
+from flcav.world.rays.packets import Hits
 from flcav.world.scene import Scene
 from flcav.world.trace import CATEGORIES, Trace
 from flcav.world.weather import WEATHERS

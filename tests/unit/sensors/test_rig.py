@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError, parse_config
-from flcav.sensors.calibration import CalibrationError, build_calibration, perturb_calibration
 from flcav.sensors.lens import Lens, project
-from flcav.sensors.rig import RIGS, Rig
+from flcav.sensors.rig import RIGS, CalibrationError, Rig, build_calibration, perturb_calibration
 
 
 def rig(**kinds: object) -> Rig:

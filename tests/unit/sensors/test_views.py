@@ -9,9 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.geometry import inverse, pose, transform_points
-from flcav.sensors.labels.outlines import clip_boxes, compute_amodal_boxes, hull
-from flcav.sensors.labels.views import find_actor_regions, find_thing_regions, view_actors
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays, project
+from flcav.sensors.views import (
+    clip_boxes,
+    compute_amodal_boxes,
+    find_actor_regions,
+    find_thing_regions,
+    hull,
+    view_actors,
+)
 from flcav.world.map.town import Town
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene

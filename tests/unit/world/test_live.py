@@ -35,7 +35,7 @@ from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import Town, load_town
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot, join_snapshots
-from flcav.world.traffic.lights import read_light_programs
+from flcav.world.traffic.live import read_light_programs
 from flcav.world.traffic.traffic import simulate
 
 EMPTY = Settings()

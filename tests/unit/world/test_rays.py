@@ -10,10 +10,8 @@ from hypothesis import strategies as st
 
 from flcav.geometry import inverse, pose, transform_points
 from flcav.machine.compiled import compiled
-from flcav.world.rays.embree import Assembly, Embree, Solid
-from flcav.world.rays.hits import MISS
-from flcav.world.rays.loader import embree_library
-from flcav.world.rays.packets import trace_packets
+from flcav.world.rays.embree import Assembly, Embree, Solid, embree_library
+from flcav.world.rays.packets import MISS, trace_packets
 
 FORWARD = np.array([[1.0, 0.0, 0.0]], np.float32)
 

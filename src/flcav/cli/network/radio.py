@@ -45,9 +45,8 @@ def radio(
     from flcav.config import read_config
     from flcav.dataset.store import Dataset
     from flcav.network.clock.rounds import NetworkSettings
-    from flcav.network.radio.coverage import cover_town
-    from flcav.network.radio.propagation import PathState
-    from flcav.network.radio.recorded import link_scene, summarise_links
+    from flcav.network.radio.budget import PathState
+    from flcav.network.radio.recorded import cover_town, link_scene, summarise_links
     from flcav.storage.files import check_writable, write_bytes
 
     if map_ is not None:

@@ -65,9 +65,8 @@ def rounds(
 
     from flcav.config import read_config
     from flcav.dataset.store import Dataset
-    from flcav.network.clock.records import save_rounds
+    from flcav.network.clock.records import ClientWork, save_rounds
     from flcav.network.clock.rounds import NetworkSettings, simulate_rounds
-    from flcav.network.clock.work import ClientWork
     from flcav.network.radio.recorded import link_scene
     from flcav.storage.files import check_writable, write_bytes
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from flcav.network.clock.records import ClientWork, work_of_messages
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
-from flcav.network.clock.work import ClientWork, work_of_messages
 from flcav.network.ledger import LedgerEntry
 from flcav.network.radio.links import RadioLinks
 from flcav.pipeline.arms import name_steps

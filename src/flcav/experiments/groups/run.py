@@ -30,8 +30,7 @@ from flcav.federation.runtimes.metered import Account
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import Weights
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes
-from flcav.network.messages import pack, send
+from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes, pack, send
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, Requests

@@ -30,8 +30,8 @@ from flcav.perception.objects.truth import CARS
 from flcav.perception.ops.rectangles import iou
 from flcav.perception.signs.background import picture_reader
 from flcav.perception.signs.predict import detect
-from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
+from flcav.sensors.rig import CalibrationError
 
 CALIBRATED, CORRECTED, EXACT = "as calibrated", "corrected", "true extrinsics"
 OVERLAP = 0.5  # bird's-eye IoU of a car that the LiDAR found, and IoU of one that the picture shows

@@ -31,8 +31,7 @@ from flcav.perception.objects.truth import CARS
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.suites import Shown, draw_suites
-from flcav.sensors.calibration import CalibrationError
-from flcav.sensors.rig import RIGS
+from flcav.sensors.rig import RIGS, CalibrationError
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.storage.records import Record

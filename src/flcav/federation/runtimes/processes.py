@@ -17,9 +17,8 @@ from flcav.config import InputError
 from flcav.federation.runtimes.blocks import Parcel, SharedBlock
 from flcav.federation.runtimes.deadline import ClientLate
 from flcav.federation.trainable import Trainable, Update, Weights, count_samples
-from flcav.machine.memory import keep_freed_memory
 from flcav.machine.processes import exit_with_parent, start_server
-from flcav.machine.threads import use_threads
+from flcav.machine.threads import keep_freed_memory, use_threads
 
 _clients: Mapping[str, Trainable] = {}  # in a client process
 _block = SharedBlock(0)  # in a client process: shared with the one that started it

@@ -23,7 +23,7 @@ from flcav.federation.runtimes.embedded import keep_identity
 from flcav.federation.runtimes.wrapped import WrappedGrid
 from flcav.federation.state import Arrays, ClientStates
 from flcav.federation.trainable import Trainable
-from flcav.machine.actors import ray_session
+from flcav.machine.ray_engine import ray_session
 
 STARTING_S = 120.0  # for the nodes to be there
 

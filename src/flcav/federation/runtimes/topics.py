@@ -28,7 +28,7 @@ from flcav.federation.runtimes.embedded import EmbeddedGrid
 from flcav.federation.runtimes.ros_names import ROS_NAMESPACE, join_names
 from flcav.federation.state import ClientStates
 from flcav.federation.trainable import Trainable
-from flcav.interface.extras import format_install_command
+from flcav.interface.wording import format_install_command
 
 TYPE, HASH = "std_msgs/msg/UInt8MultiArray", "RIHS01_5687e861b8d307a5e48b7515467ae7a5fc2daf805bd0ce6d8e9e604bade9f385"
 RECORDS, FAILED = "flwr.RecordDict", "error"  # labels of the dimension: what the data are

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flcav.config import InputError
-from flcav.network.clock.records import ClientTiming, RoundTiming
+from flcav.network.clock.records import ClientTiming, ClientWork, RoundTiming
 from flcav.network.clock.rounds import TIE, ClientPhases, Phase, RoundRules
-from flcav.network.clock.work import ClientWork
 from flcav.network.radio.links import RadioLinks
 
 PATIENCE = 10  # passes through all scenes, with the longest training each, in which one update has to arrive

@@ -8,17 +8,13 @@ from collections.abc import Mapping, Sequence
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from flcav.arrays import Mask
 from flcav.config import Config, InputError
-from flcav.network.clock.records import ClientTiming, RoundTiming
-from flcav.network.clock.work import ClientWork
+from flcav.network.clock.records import ClientTiming, ClientWork, RoundTiming
 from flcav.network.radio.budget import Radio, shared_rates_bps
-from flcav.network.radio.links import RadioLinks
-from flcav.network.radio.wireline import Wireline
-
-Array = NDArray[np.float64]
+from flcav.network.radio.links import RadioLinks, Wireline
 
 LEFT_TOWN = "left the town"
 NO_COVERAGE = "out of coverage"
@@ -97,7 +93,7 @@ class ClientPhases:
                 return tuple(map(self._timing, range(len(self.work))))
             self._advance(active)
 
-    def _advance(self, active: NDArray[np.bool_]) -> None:
+    def _advance(self, active: Mask) -> None:
         """Let the active clients, one or more, go on until the next event, and end the phases that are done."""
         transfers = active & (self.phase != Phase.COMPUTE)
         rates = shared_rates_bps(self.received[self.instant], self.server, transfers, self.links.radio)

@@ -1,7 +1,7 @@
 """Labelled sweeps as messages: whole and uncompressed, 16 bytes a point, with the boxes to learn from."""
 
 from flcav.geometry import Boxes
-from flcav.network.messages import Arrays, from_names, pack, to_names, unpack
+from flcav.network.ledger import Arrays, from_names, pack, to_names, unpack
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, label_sweep
 from flcav.sensors.frame import Frame

@@ -1,7 +1,7 @@
 """Labelled images of signs as messages: the files as recorded, and the boxes in them."""
 
 from flcav.dataset.store import Dataset
-from flcav.network.messages import pack, unpack
+from flcav.network.ledger import pack, unpack
 from flcav.perception.images import check_picture, pack_pictures, unpack_pictures
 from flcav.perception.signs.config import SignsConfig
 from flcav.perception.signs.samples import Sample, sample_from_frame

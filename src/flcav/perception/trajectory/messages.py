@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
-from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.network.ledger import from_names, pack, to_names, unpack
 from flcav.perception.trajectory.config import TrajectoryConfig
 from flcav.perception.trajectory.samples import Columns, Sample, Surround, pictures_at, samples_of
 

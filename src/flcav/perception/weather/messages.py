@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from flcav.dataset.store import Dataset
-from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.network.ledger import from_names, pack, to_names, unpack
 from flcav.perception.images import pack_pictures, unpack_pictures
 from flcav.perception.weather.samples import Sample, reduce_picture
 from flcav.world.weather import Weather, classify_weather

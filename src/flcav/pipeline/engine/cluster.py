@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import Queue
 from typing import IO, Any
 
-from flcav.machine.actors import Actor, actor_pool
+from flcav.machine.ray_engine import Actor, actor_pool
 from flcav.machine.threads import use_threads
 from flcav.pipeline.engine.source_hash import package_hash
 from flcav.pipeline.engine.step import Step, StepRecord, digest, read_value, remove, reserve_sibling

@@ -13,8 +13,7 @@ from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.fusion.road import RoadView, build_road_view, label_ideally
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report
-from flcav.network.ledger import Ledger
-from flcav.network.messages import send
+from flcav.network.ledger import Ledger, send
 from flcav.perception.metrics import match
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in

@@ -29,8 +29,7 @@ from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Sighting
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.ledger import Direction, Ledger
-from flcav.network.messages import send
+from flcav.network.ledger import Direction, Ledger, send
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import second
 from flcav.perception.objects.samples import Sample

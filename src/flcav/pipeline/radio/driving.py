@@ -15,9 +15,8 @@ from flcav.federation.buffered_rounds import Buffers
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.metered import Outage
 from flcav.federation.selection import Selection
-from flcav.network.clock.records import ClientTiming, RoundTiming
+from flcav.network.clock.records import ClientTiming, ClientWork, RoundTiming
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
-from flcav.network.clock.work import ClientWork
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.recorded import link_scene
 from flcav.pipeline.frames import Frames

@@ -13,8 +13,7 @@ from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.runtimes.link import NOTHING, UNREADABLE, Ask, open_questions
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.trainable import Weights
-from flcav.network.ledger import Ledger
-from flcav.network.messages import send
+from flcav.network.ledger import Ledger, send
 from flcav.perception.objects.samples import Sample
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task

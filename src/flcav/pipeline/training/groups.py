@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from flcav.federation.runtimes.link import Ask
 from flcav.federation.trainable import Trainable, Weights
-from flcav.network.ledger import Ledger
-from flcav.network.messages import send
+from flcav.network.ledger import Ledger, send
 from flcav.optimization.quality import data_quality, gradient_novelty, label_distribution_distance, visible_objects
 from flcav.pipeline.recipe import EDGE, Requests
 from flcav.pipeline.training.members import MESSAGE, SCORE, Member, Offer, Unreadable, read_loss

@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 
 from flcav.federation.trainable import Trainable, Update, Weights, count_samples
 from flcav.machine.threads import use_threads
-from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.network.ledger import from_names, pack, to_names, unpack
 from flcav.perception.client import TaskClient
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays

@@ -9,8 +9,7 @@ import numpy as np
 from flcav.config import InputError
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Weights
-from flcav.network.ledger import Ledger
-from flcav.network.messages import pack, send, unpack
+from flcav.network.ledger import Ledger, pack, send, unpack
 from flcav.perception.client import as_shared
 from flcav.perception.distillation import SharedSamples
 from flcav.perception.errors import Registry, pack_errors, unpack_errors

@@ -14,7 +14,7 @@ from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import FederatedRound, StageResult
 from flcav.pipeline.training.checkpoints import LAST, Checkpoint
-from flcav.storage.exchange import write_table
+from flcav.storage.records import write_table
 
 ROUNDS, EVENTS = "rounds.parquet", "events"  # of a run, beside its results
 SCHEMA = pa.schema(

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flcav.network.clock.records import ClientWork
 from flcav.network.clock.rounds import NetworkSettings, time_clients
-from flcav.network.clock.work import ClientWork
 from flcav.network.ledger import Ledger, LedgerEntry
 from flcav.network.radio.links import RadioLinks
 

@@ -7,14 +7,13 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array32, Bytes, Ints32
 from flcav.geometry import left_vectors
 from flcav.sensors.frame import SEMANTICS
-from flcav.sensors.rendering.facade import Facades, facades_of
+from flcav.sensors.rendering.facade import SIGN_KINDS, Facades, draw_signs, facades_of
 from flcav.sensors.rendering.ground import Markings, build_markings
 from flcav.sensors.rendering.noise import make_noise
-from flcav.sensors.rendering.signs import SIGN_KINDS, draw_signs
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.layers import MapLayers
 from flcav.world.map.town import Town
@@ -55,29 +54,29 @@ _RIDER = (Material.SKIN, Material.CLOTH, Material.TROUSERS)
 class Plates(NamedTuple):
     """The plates of a town's traffic signs: places, kinds and textures."""
 
-    place: NDArray[np.float32]  # (S, 5) centre x, y, z, cosine and sin of the direction to the reader's right
-    kind: NDArray[np.uint8]  # (S,) row of SIGN_KINDS
-    drawn: NDArray[np.float32]  # see `signs.pictures`
+    place: Array32  # (S, 5) centre x, y, z, cosine and sin of the direction to the reader's right
+    kind: Bytes  # (S,) row of SIGN_KINDS
+    drawn: Array32  # see `signs.pictures`
 
 
 class Appearance(NamedTuple):
     """Appearance tables of one scene with S surface rows, I instances and M materials."""
 
-    material: NDArray[np.uint8]  # (S,) by surface row
-    semantic: NDArray[np.uint8]  # (S,) one of SEMANTICS
-    thing: NDArray[np.int32]  # (S,) -(t + 1) for thing t of the town, else 0
-    part: NDArray[np.uint8]  # (S,) a Part; undefined for actors
-    part_row: NDArray[np.int32]  # (S,) see `StaticWorld.row`
+    material: Bytes  # (S,) by surface row
+    semantic: Bytes  # (S,) one of SEMANTICS
+    thing: Ints32  # (S,) -(t + 1) for thing t of the town, else 0
+    part: Bytes  # (S,) a Part; undefined for actors
+    part_row: Ints32  # (S,) see `StaticWorld.row`
     first_actor: int  # first surface row of the actors' faces; the town's come before
-    corner: NDArray[np.float32]  # (S - first_actor, 3, 3) corners of actors' faces, body frame
-    corner_normal: NDArray[np.float32]  # (S - first_actor, 3, 3) see `Mesh.corner_normals`
-    colour: NDArray[np.float32]  # (I, M, 3) by instance and material: actors differ in paint and clothes
-    mirror: NDArray[np.float32]  # (M,) specular reflectance at normal incidence
-    gloss: NDArray[np.float32]  # (M,) exponent of the sun's highlight
+    corner: Array32  # (S - first_actor, 3, 3) corners of actors' faces, body frame
+    corner_normal: Array32  # (S - first_actor, 3, 3) see `Mesh.corner_normals`
+    colour: Array32  # (I, M, 3) by instance and material: actors differ in paint and clothes
+    mirror: Array32  # (M,) specular reflectance at normal incidence
+    gloss: Array32  # (M,) exponent of the sun's highlight
     markings: Markings
     facades: Facades
     plates: Plates
-    noise: NDArray[np.float32]  # see `noise.clouds`
+    noise: Array32  # see `noise.clouds`
 
 
 _AS = {"van": "car", "prop": "static"}  # categories without a class of their own
@@ -88,10 +87,10 @@ _TOWNS: WeakKeyDictionary[Solid, "_OfTown"] = WeakKeyDictionary()
 class _OfTown(NamedTuple):
     """The tables of a town's F faces, and what else does not depend on the actors: see `Appearance`."""
 
-    semantic: NDArray[np.uint8]  # (F,)
-    thing: NDArray[np.int32]  # (F,)
-    part: NDArray[np.uint8]  # (F,)
-    part_row: NDArray[np.int32]  # (F,)
+    semantic: Bytes  # (F,)
+    thing: Ints32  # (F,)
+    part: Bytes  # (F,)
+    part_row: Ints32  # (F,)
     markings: Markings
     facades: Facades
     plates: Plates
@@ -167,12 +166,12 @@ def _markings(town: Town) -> Markings:
 
 
 @lru_cache(maxsize=256)
-def _corners(category: str, shape: int, size: tuple[float, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _corners(category: str, shape: int, size: tuple[float, ...]) -> tuple[Array32, Array32]:
     mesh = actor_mesh(category, shape, size)
     return mesh.vertices[mesh.faces], mesh.corner_normals()
 
 
-def _colours(names: list[str], paints_of: Mapping[str, tuple[float, float, float]]) -> NDArray[np.float32]:
+def _colours(names: list[str], paints_of: Mapping[str, tuple[float, float, float]]) -> Array32:
     """Return the colours (I, M, 3) by instance and material, chosen by a hash of each actor's name, or its paint."""
     out = np.tile(COLOUR, (len(names) + 1, 1, 1))
     for instance, name in enumerate(names, start=1):

@@ -3,17 +3,23 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError, shorten
 from flcav.geometry import heading_vectors, left_vectors, wrap_angle
-from flcav.world.actors import Actors
 from flcav.world.commands import Controls
-from flcav.world.dynamics.blueprints import VEHICLES, Blueprint
-from flcav.world.dynamics.standing import Ground
-from flcav.world.dynamics.vehicle import GRAVITY_MPS2, Motion, Pedals, Vehicles, drive, stack_blueprints
-
-Array = NDArray[np.float64]
+from flcav.world.dynamics.obstacles import Ground
+from flcav.world.dynamics.vehicle import (
+    GRAVITY_MPS2,
+    VEHICLES,
+    Blueprint,
+    Motion,
+    Pedals,
+    Vehicles,
+    drive,
+    stack_blueprints,
+)
+from flcav.world.snapshot import Actors
 
 AT_REST = Controls()
 ON_SPRINGS = ("car", "van", "truck", "bus")
@@ -121,7 +127,7 @@ class Bodies:
             if not self.aloft[row]:
                 self.velocity[row, 2] = climb
 
-    def _climb(self, rows: NDArray[np.int64]) -> Array:
+    def _climb(self, rows: Ints) -> Array:
         """Return the vertical velocities [m/s] by which bodies stay on the slopes that they move on."""
         ahead = (self.velocity[rows, :2] * heading_vectors(self.yaw[rows])).sum(axis=1)
         return -ahead * np.tan(self.tilt[rows, 0])
@@ -167,11 +173,11 @@ class Bodies:
         inertia = np.array([body.blueprint.inertia_kgm2 for body in self.members])
         return mass, np.where(held | upright, np.inf, inertia)
 
-    def find_grounded(self) -> NDArray[np.bool_]:
+    def find_grounded(self) -> Mask:
         """Return who is near the ground (N,): others are in nobody's way there."""
         return np.abs(self._clearance(np.arange(len(self.members)))) <= ALOFT_M
 
-    def _clearance(self, rows: NDArray[np.int64]) -> Array:
+    def _clearance(self, rows: Ints) -> Array:
         """Return the height of bodies above the ground, or a bridge, [m]."""
         x, y, z = self.position[rows].T
         return z - self._ground.heights(x, y, z)
@@ -205,14 +211,14 @@ class Bodies:
         leans = np.column_stack((-PITCH_S2PM * ahead, ROLL_S2PM * aside))
         return np.asarray(lie + np.where((cars & ~self.aloft)[:, None], leans, 0.0), np.float64)
 
-    def _lie(self) -> NDArray[np.bool_]:
+    def _lie(self) -> Mask:
         return np.array([body.fallen for body in self.members], np.bool_)
 
     def _recast(self) -> None:
         self._vehicles = stack_blueprints([body.blueprint for body in self.members])
         self.size = np.array([body.blueprint.size for body in self.members], np.float64).reshape(-1, 3)
 
-    def _drive(self, rows: NDArray[np.int64], dt_s: float) -> None:
+    def _drive(self, rows: Ints, dt_s: float) -> None:
         told = [self.members[row].controls for row in rows]
         pedals = Pedals(
             np.array([each.throttle for each in told]),
@@ -231,7 +237,7 @@ class Bodies:
         self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2] = after.position, after.yaw, after.velocity
         self.yaw_rate[rows], self.steer[rows] = after.yaw_rate, after.steer
 
-    def _walk(self, rows: NDArray[np.int64], dt_s: float) -> None:
+    def _walk(self, rows: Ints, dt_s: float) -> None:
         fallen = np.array([self.members[row].fallen for row in rows], np.bool_)
         wanted = np.where(fallen[:, None], 0.0, np.array([self.members[row].walk for row in rows]))
         able = np.where(fallen, SLIDE_MPS2, WALK_MPS2)[:, None]
@@ -243,7 +249,7 @@ class Bodies:
         self.position[rows, :2] += velocity * dt_s
         self.velocity[rows, :2], self.yaw[rows] = velocity, yaw
 
-    def _stand(self, rows: NDArray[np.int64]) -> None:
+    def _stand(self, rows: Ints) -> None:
         upright = np.array([self.members[row].category == "pedestrian" for row in rows], np.bool_)
         self.position[rows, 2], self.tilt[rows] = self._ground.stand(
             self.position[rows], self.yaw[rows], self.size[rows], upright

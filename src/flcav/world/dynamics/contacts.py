@@ -8,11 +8,9 @@ section 8).
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints
 from flcav.machine.compiled import compiled
-
-Array = NDArray[np.float64]
 
 RESTITUTION = 0.1  # speed after a collision over that before, along its normal
 PASSES = 12  # over all pairs of neighbours
@@ -32,8 +30,8 @@ class Footprints(NamedTuple):
 class Contacts(NamedTuple):
     """C contacts, each of two boxes."""
 
-    first: NDArray[np.int64]  # (C,) row of a box
-    second: NDArray[np.int64]  # (C,) row of the other; greater
+    first: Ints  # (C,) row of a box
+    second: Ints  # (C,) row of the other; greater
     normal: Array  # (C, 2) unit vector from the second towards the first
     point: Array  # (C, 2) place of the contact [m]
     impulse: Array  # (C,) along the normal, on the first [N s]
@@ -59,7 +57,7 @@ def resolve(
     return place, velocity, yaw_rate, Contacts(first, second, normal[touched], point[touched], impulse[touched])
 
 
-def find_overlaps(boxes: Footprints, others: Footprints) -> NDArray[np.int64]:
+def find_overlaps(boxes: Footprints, others: Footprints) -> Ints:
     """Return the rows (K, 2) of each of `boxes` and of `others` that overlap."""
     both = Footprints(*(np.concatenate(pair) for pair in zip(boxes, others)))
     inverse = np.repeat((1.0, 0.0), (len(boxes.place), len(others.place)))

@@ -5,15 +5,15 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
+from shapely.geometry import Polygon
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.geometry import heading_vectors
-from flcav.world.actors import NOBODY, Actors
 from flcav.world.dynamics.contacts import Footprints
-from flcav.world.map.town import Town
+from flcav.world.map.relief import find_tilts
+from flcav.world.map.town import KERB_M, Town
 from flcav.world.meshes.furniture import MAST_BEHIND_M
-
-Array = NDArray[np.float64]
+from flcav.world.snapshot import NOBODY, Actors
 
 LAMP_M, POST_M, MAST_M = 0.08, 0.05, 0.09  # radius of the posts of lamps, of signs and signals, and of sensors
 CLEARANCE_M = 0.15  # what is lower, such as debris, is in nobody's way
@@ -27,7 +27,7 @@ class Obstacles(NamedTuple):
     name: tuple[str, ...]  # (S,) "kind:row", e.g. "building:3"
     tree: shapely.STRtree
 
-    def near(self, low: Array, high: Array) -> NDArray[np.int64]:
+    def near(self, low: Array, high: Array) -> Ints:
         """Return the rows (K,), ascending, of obstacles about boxes with these corners, (N, 2) [m] each."""
         return np.unique(self.tree.query(shapely.box(*low.T, *high.T))[1])
 
@@ -88,3 +88,45 @@ def _posts(foot: Array, radius: Array | float, height: Array | float) -> Array:
     """Return posts at `foot` (K, 2) of this radius and height [m] as rows x, y, yaw, length, width, height."""
     level = np.zeros(len(foot))
     return np.column_stack((foot, level, 2 * radius + level, 2 * radius + level, height + level))
+
+
+EDGE_M = 0.05  # a point so far beside a deck still is on it
+
+
+class Ground:
+    """The ground of a town with its bridges and kerbs."""
+
+    def __init__(self, town: Town) -> None:
+        """Prepare the sidewalks and decks for queries."""
+        self._town = town
+        self._pavement = shapely.union_all([Polygon(outline) for outline in town.sidewalks])
+        shapely.prepare(self._pavement)
+        decks = () if town.relief is None else town.relief.decks
+        self._decks = [(deck, deck.outline.buffer(EDGE_M)) for deck in decks]
+        for _, area in self._decks:
+            shapely.prepare(area)
+
+    def heights(self, x: Array, y: Array, z: Array) -> Array:
+        """Return the height (N,) [m] of the ground, or of a deck there that is nearer to `z` (N,); NaN: the ground."""
+        ground = self._town.grounds(x, y)
+        for deck, area in self._decks:
+            inside = np.flatnonzero(shapely.contains_xy(area, x, y))
+            top = deck.surface.heights(x[inside], y[inside])
+            ground[inside] = np.where(np.abs(top - z[inside]) < np.abs(ground[inside] - z[inside]), top, ground[inside])
+        return ground
+
+    def stand(self, position: Array, yaw: Array, size: Array, upright: Mask) -> tuple[Array, Array]:
+        """Return height (N,) [m], pitch and roll (N, 2) [rad] of bodies of this `size` (N, 3) at `position` (N, 3) [m].
+
+        On a bridge or below it is told by their height, NaN: below. Those who are `upright` (N,) do not tilt, and step
+        onto kerbs.
+        """
+        x, y, z = position.T
+        height, tilt = np.zeros(len(x)), np.zeros((len(x), 2))
+        if self._town.relief is not None:
+            height, pitch, roll = find_tilts(lambda a, b: self.heights(a, b, z), x, y, yaw, size)
+            tilt = np.where(upright[:, None], 0.0, np.column_stack((pitch, roll)))
+            height = np.where(upright, self.heights(x, y, z), height)
+        feet = np.flatnonzero(upright)
+        height[feet] += KERB_M * shapely.contains_xy(self._pavement, x[feet], y[feet])
+        return height, tilt

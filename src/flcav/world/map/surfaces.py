@@ -5,16 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.errors import GEOSException
 from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import linemerge, split
 
+from flcav.arrays import Array
 from flcav.geometry import heading_vectors
 from flcav.world.map.roads import CARRIAGEWAY, RoadNet
-
-Array = NDArray[np.float64]
 
 GRID_M = 1e-3
 SLIVER_M = 0.25  # narrower pieces are dropped, narrower gaps closed, shorter lanes left out: artefacts of the net

@@ -9,19 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError, read_config, read_file, shorten
 from flcav.interface.wording import suggest
 from flcav.statistics.streams import stream
-from flcav.world.map import boundaries, imported, street_furniture
+from flcav.world.map import street_furniture
 from flcav.world.map.parameters import GeoReference, TownParameters
 from flcav.world.map.relief import Relief
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.signals import Signals, place_signals
 from flcav.world.map.surfaces import add, build_ground_surfaces, find_kerbs, split_into_polygons, unite
-
-Array = NDArray[np.float64]
 
 TOWNS: tuple[str, ...] = ("suburb", "grid", "ring", "arterial")
 HILLY: dict[str, str] = {f"hilly_{name}": name for name in TOWNS}  # the same towns with slopes and camber
@@ -38,7 +36,7 @@ MARGIN_M = 5.0  # from the outermost surface or building to the bounds
 class Poles:
     """The P candidate sites of a roadside sensor."""
 
-    id: NDArray[np.int64]  # (P,) site numbers, from 1
+    id: Ints  # (P,) site numbers, from 1
     position: Array  # (P, 3) mount of the sensor, world [m]
     yaw: Array  # (P,) direction the mount faces: the road or the junction, world [rad]
     kind: tuple[str, ...]  # (P,) straight | cross | tee | roundabout
@@ -209,10 +207,10 @@ def _clear_bridges(town: Town, relief: Relief) -> Town:
     taken = shapely.union_all([deck.outline for deck in relief.decks]).buffer(BESIDE_BRIDGE_M)
     shapely.prepare(taken)
 
-    def is_free(feet: Array) -> NDArray[np.bool_]:
+    def is_free(feet: Array) -> Mask:
         return ~shapely.contains_xy(taken, *feet[:, :2].T)
 
-    def is_clear(rows: Array) -> NDArray[np.bool_]:
+    def is_clear(rows: Array) -> Mask:
         return ~shapely.intersects(taken, [street_furniture.make_footprint(*row[:5]) for row in rows])
 
     signals = town.signals
@@ -250,13 +248,15 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
     Ground first, then buildings, clutter, hedges and fences, trees, poles, signs, lamps and signals.
     """
     frontage = {kind: street.frontage_m for kind, street in parameters.streets.items()}
-    ground = build_ground_surfaces(net, frontage, [imported.outline_space(space) for space in parameters.parking])
+    ground = build_ground_surfaces(
+        net, frontage, [street_furniture.outline_space(space) for space in parameters.parking]
+    )
     rows = list(street_furniture.list_verges(net, parameters))
     paved = add(ground.roads, ground.sidewalks)
     land = street_furniture.Plot(paved)
-    for shape in (given := imported.outline_objects(parameters.objects)):
+    for shape in (given := street_furniture.outline_objects(parameters.objects)):
         land.build(shape, 0.0)
-    buildings = imported.list_buildings(parameters.objects)
+    buildings = street_furniture.list_buildings(parameters.objects)
     if not len(buildings):
         buildings = street_furniture.place_buildings(rows, land, stream(parameters.seed, "buildings"))
     walked = unite([verge.line.buffer(verge.half_width, cap_style="flat") for verge in rows])
@@ -268,9 +268,9 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
     for shape in given:
         open_land.build(shape, 0.0)
     clutter = street_furniture.place_clutter(rows, open_land, stream(parameters.seed, "clutter"))
-    enclosing = boundaries.place_boundaries(rows, open_land, stream(parameters.seed, "boundaries"))
-    kerbside = boundaries.place_kerbside(rows, stream(parameters.seed, "kerbside"))
-    trees = imported.list_trees(parameters.objects)
+    enclosing = street_furniture.place_boundaries(rows, open_land, stream(parameters.seed, "boundaries"))
+    kerbside = street_furniture.place_kerbside(rows, stream(parameters.seed, "kerbside"))
+    trees = street_furniture.list_trees(parameters.objects)
     if not len(trees):
         trees = street_furniture.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
     poles = street_furniture.place_poles(net, parameters.poles)
@@ -289,7 +289,9 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
         kerbs=find_kerbs(ground),
         buildings=buildings,
         trees=trees,
-        clutter=boundaries.join_clutter(imported.list_clutter(parameters.objects), clutter, enclosing, kerbside),
+        clutter=street_furniture.join_clutter(
+            street_furniture.list_clutter(parameters.objects), clutter, enclosing, kerbside
+        ),
         poles=Poles(
             id=np.array([row[0] for row in poles], dtype=np.int64),
             position=mounts,

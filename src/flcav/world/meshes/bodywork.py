@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.world.materials import Material
 from flcav.world.meshes.mesh import Mesh, add_mirror_image, box, ellipsoid, join_meshes, sheet, transform_mesh
 
-Array = NDArray[np.float64]
 Outline = tuple[tuple[float, float], ...]
 
 MIRROR_M = 0.05  # width of a mirror beside the body

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from flcav.arrays import Array, Ints, Mask
 
 BRIDGE_M = 2.5  # a road at least this far above another one passes over it
 CLEAR_M = 4.0  # from the end of a deck to the road below, seen from above
@@ -66,9 +65,7 @@ def _join_corners(roads: Sequence[Borders]) -> Array:
     return np.concatenate(pieces) if pieces else np.zeros((0, 4, 3))
 
 
-def _batches(
-    tree: shapely.STRtree, areas: NDArray, rows: NDArray[np.int64], within_m: float
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _batches(tree: shapely.STRtree, areas: NDArray, rows: Ints, within_m: float) -> Iterator[tuple[Ints, Ints]]:
     """Yield pairs of rows of `areas`: some of `rows`, and those of the tree within `within_m` of them."""
     for first in range(0, len(rows), BATCH):
         some = rows[first : first + BATCH]

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError, shorten
 from flcav.world.map.relief import Relief
 from flcav.world.opendrive.bridges import CLEAR_M, Borders, Spans, find_bridges
@@ -17,8 +17,6 @@ from flcav.world.opendrive.document import OPEN_ROADS, describe_map
 from flcav.world.opendrive.road_surface import Road
 from flcav.world.opendrive.standard import FARTHEST_M
 from flcav.world.opendrive.streets import SIDEWALK_M, WALKED
-
-Array = NDArray[np.float64]
 
 HIGHEST_M = 10_000.0
 STEP_M = 1.0  # between two cross-sections, of which those are kept that are needed
@@ -115,7 +113,7 @@ def _list_decks(strips: list[Strip], spans: Spans, *, widened: bool) -> list[tup
     return [tuple(sections[deck]) for deck in spans.decks if (width[deck] > NARROW_M).any()]
 
 
-def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> NDArray[np.bool_]:
+def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> Mask:
     """Return which of a road's K cross-sections a terrain leaves by more than `STRAY_M`.
 
     Those on decks, and those that the ground keeps already, are left out.
@@ -126,7 +124,7 @@ def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> NDArray[n
     return (np.concatenate(errors) > STRAY_M) & ~_find_raised(spans) & ~spans.near
 
 
-def _find_raised(spans: Spans) -> NDArray[np.bool_]:
+def _find_raised(spans: Spans) -> Mask:
     """Return which of a road's K cross-sections are on decks alone.
 
     Where a deck ends within the road, its last cross-section is the ground's, too.
@@ -180,7 +178,7 @@ def _fill_across(points: Array) -> Array:
     return np.concatenate(out)
 
 
-def _find_needed(points: Array, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _find_needed(points: Array, fixed: Mask) -> Ints:
     """Return the columns of points (T, K, 3) between which the others are linear, to `TOLERANCE_M` (Douglas-Peucker).
 
     Rows are in the order of t. Height errors count in full; errors in plan as far as the cross-section is tilted, and

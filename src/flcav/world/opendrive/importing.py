@@ -25,16 +25,13 @@ from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet
 from flcav.world.map.town import HEIGHTS, Town, check_town_name, load_town
 from flcav.world.opendrive.document import describe_map, read_map
-from flcav.world.opendrive.furnishing import furnish
+from flcav.world.opendrive.furnishing import furnish, take_objects, tell
 from flcav.world.opendrive.georeference import locate_origin
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.mending.maps import mend_map, name_safely
 from flcav.world.opendrive.mending.roads import mend_roads
-from flcav.world.opendrive.mirror import mirror_map, mirror_parts
-from flcav.world.opendrive.netconvert import run_netconvert
-from flcav.world.opendrive.objects.crossings import take_crosswalks
-from flcav.world.opendrive.objects.crosswalks import Crosswalk, find_crosswalks
-from flcav.world.opendrive.objects.taken import take_objects, tell
+from flcav.world.opendrive.netconvert import mirror_map, mirror_parts, run_netconvert
+from flcav.world.opendrive.objects.crossings import Crosswalk, find_crosswalks, take_crosswalks
 from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 
 WIDEST_M = 5e5  # farthest that a street is from the middle of the town

@@ -4,11 +4,14 @@ Embree's function is called by its address, an integer argument, so that Numba c
 kernel that closes over a ctypes function cannot be cached.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
+from flcav.arrays import Array32, Ints32
 from flcav.machine.compiled import compiled
 
 # Rows of an RTCRayHit16, seen as a (32, 16) array of float32 or int32.
@@ -145,3 +148,14 @@ def occlude_packets(occluded, scene, arguments, origins, directions, far, blocke
             for lane in range(lanes):
                 blocked[rays[lane]] = packet[FAR, lane] < 0
             lanes = 0
+
+
+MISS = -1  # instance and face of a ray that hits nothing
+
+
+class Hits(NamedTuple):
+    """The first hit of each of N rays."""
+
+    distance: Array32  # (N,) range along the unit direction [m]; inf where nothing is hit
+    instance: Ints32  # (N,) number of the instance; 0 for a solid alone; MISS where nothing is hit
+    face: Ints32  # (N,) row of that solid's faces; MISS where nothing is hit

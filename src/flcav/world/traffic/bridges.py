@@ -10,16 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import LineString
 from shapely.geometry.base import BaseGeometry
 
+from flcav.arrays import Array, Mask
 from flcav.geometry import heading_vectors
 from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet, read_net
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 REACH_M = 15.0  # half a long vehicle, and the way of .3 s: so far beside a deck actors are told to be on it
 ALONG = np.cos(np.pi / 4)  # lanes that lead over a deck keep to its direction

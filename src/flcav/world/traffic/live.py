@@ -2,28 +2,26 @@
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, read_xml, shorten
 from flcav.geometry import heading_vectors, left_vectors, wrap_angle
 from flcav.statistics.streams import derive_seed, stream
-from flcav.world.actors import NOBODY, Actors
-from flcav.world.dynamics.blueprints import VEHICLES
-from flcav.world.dynamics.standing import Ground
+from flcav.world.dynamics.obstacles import Ground
+from flcav.world.dynamics.vehicle import VEHICLES
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import Town
 from flcav.world.scenarios.stage import STEP_S
 from flcav.world.shapes import SHAPES
+from flcav.world.snapshot import NOBODY, Actors
 from flcav.world.traffic.bridges import find_footing
 from flcav.world.traffic.client import Sumo, write_job
 from flcav.world.traffic.demand import list_vehicle_types, park, write_demand
 from flcav.world.traffic.simulation import Body, Job, Request
 from flcav.world.traffic.traffic import number_of
-
-Array = NDArray[np.float64]
 
 FILL_S = 20.0  # all actors have departed by then
 WARM_UP_S = 30.0  # time of SUMO at the start of a live world
@@ -208,3 +206,79 @@ def stand_parked(town: Town, ground: Ground, seed: int) -> Actors:
         *(tuple(f"parked{i}" for i in range(count)), tuple(car.category for car in cars)),
         *(np.array([car.shape for car in cars], np.int64), size, position, yaw, still, still, np.zeros(count), tilt),
     )
+
+
+LETTERS = frozenset("GgyruosO")  # SUMO's states of a link
+
+
+@dataclass(frozen=True)
+class LightProgram:
+    """The program of one junction's lights."""
+
+    junction: str
+    durations_s: tuple[float, ...]  # of each phase
+    states: tuple[str, ...]  # of each phase, one of `LETTERS` for each link
+    offset_s: float  # the first phase begins at this time
+
+    def at(self, time_s: float) -> str:
+        """Return the letters of the links at a time."""
+        left = (time_s - self.offset_s) % sum(self.durations_s)
+        for duration, state in zip(self.durations_s, self.states):
+            if left < duration - 1e-6:
+                return state
+            left -= duration
+        return self.states[0]
+
+
+class Lights:
+    """The lights of a town, which follow their programs unless they are set or frozen."""
+
+    def __init__(self, programs: tuple[LightProgram, ...], time_s: float) -> None:
+        """Start at a time of the programs [s]."""
+        self.frozen = False
+        self._programs = {each.junction: each for each in programs}
+        self._time_s = time_s
+        self._set: dict[str, str] = {}
+
+    def advance(self, dt_s: float) -> None:
+        """Let the programs go on by `dt_s` [s], unless they are frozen."""
+        if not self.frozen:
+            self._time_s += dt_s
+
+    def states(self) -> dict[str, str]:
+        """Return the letters of the links of each junction."""
+        return {name: self._set.get(name) or each.at(self._time_s) for name, each in self._programs.items()}
+
+    def set(self, junction: str, state: str | None) -> None:
+        """Let a junction show these letters, or its program again (None); raises `InputError` for others."""
+        if junction not in self._programs:
+            raise InputError(f"light {shorten(junction)}: the town has no such junction with lights")
+        if state is None:
+            self._set.pop(junction, None)
+            return
+        links = len(self._programs[junction].states[0])
+        if len(state) != links or not set(state) <= LETTERS:
+            letters = "".join(sorted(LETTERS))
+            raise InputError(f"light {shorten(junction)}: {shorten(state)} must be {links} of the letters {letters}")
+        self._set[junction] = state
+
+
+def read_light_programs(net: Path) -> tuple[LightProgram, ...]:
+    """Return the first program of each junction with lights; none where there is no net file.
+
+    Phases of programs that react to traffic keep their nominal durations. Raises `InputError` for a damaged net.
+    """
+    if not net.exists():
+        return ()
+    found: dict[str, LightProgram] = {}
+    try:
+        for row in read_xml(net, "a SUMO net").iterfind("tlLogic"):
+            name, phases = row.attrib["id"], row.findall("phase")
+            durations = tuple(float(phase.attrib["duration"]) for phase in phases)
+            states = tuple(phase.attrib["state"] for phase in phases)
+            if not 0 < sum(durations) < 1e6 or len({len(state) for state in states}) != 1:
+                raise ValueError(f"the phases of light {name}")
+            found.setdefault(name, LightProgram(name, durations, states, float(row.get("offset", "0"))))
+    except (LookupError, ValueError) as error:
+        raise InputError(f"{net}: not a SUMO net ({type(error).__name__}: {error})") from None
+    return tuple(found[name] for name in sorted(found))

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from flcav.geometry import heading_vectors
-from flcav.world.dynamics.blueprints import blueprint
 from flcav.world.dynamics.vehicle import (
     AIR_KGPM3,
     GRAVITY_MPS2,
@@ -13,6 +12,7 @@ from flcav.world.dynamics.vehicle import (
     Motion,
     Pedals,
     Vehicles,
+    blueprint,
     drive,
     stack_blueprints,
 )

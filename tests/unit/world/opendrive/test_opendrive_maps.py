@@ -19,11 +19,11 @@ from flcav.world.map.town import Town
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.importing import ImportedTown, import_town
 from flcav.world.opendrive.mending.maps import mend_map
-from flcav.world.opendrive.mirror import mirror_map
+from flcav.world.opendrive.netconvert import mirror_map
 from flcav.world.opendrive.objects.signs import find_signs
 from flcav.world.static import TownPart, build_static_world
 from flcav.world.traffic.demand import draw_tour, find_middles
-from flcav.world.traffic.reach import find_driven, find_walked
+from flcav.world.traffic.passages import find_driven, find_walked
 from flcav.world.traffic.traffic import simulate
 
 CROSS = Path(__file__).parents[3] / "data" / "cross.xodr"

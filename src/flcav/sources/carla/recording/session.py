@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from flcav.config import InputError, shorten
-from flcav.interface.extras import format_install_command
-from flcav.interface.wording import suggest
+from flcav.interface.wording import format_install_command, suggest
 from flcav.machine.locks import take_turns
 from flcav.sources.recipe import STEP_S, CarlaRecipe
 

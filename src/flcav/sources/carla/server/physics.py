@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from flcav.sources.carla.server.actors import Actor
-from flcav.world.dynamics.blueprints import blueprint
+from flcav.world.dynamics.vehicle import blueprint
 from flcav.world.live import LiveWorld
 
 WHEEL_M = 0.35  # radius

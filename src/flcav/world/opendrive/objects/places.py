@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
+from flcav.arrays import Array
 from flcav.world.opendrive.road_surface import Road
 
 LARGEST_M = 200.0  # farthest corner of an object from its place, or from the middle of its road
@@ -30,7 +30,7 @@ def repeat_object(thing: ElementTree.Element) -> Iterator[ElementTree.Element]:
             yield one
 
 
-def outline_object(road: Road, thing: ElementTree.Element) -> NDArray[np.float64] | None:
+def outline_object(road: Road, thing: ElementTree.Element) -> Array | None:
     """Return the outline (K, 2) of an object in the map [m]: its corners, or its length and width; None without.
 
     Corners are in the object's own frame (u, v), which its heading turns against the road, or on the road (s, t).
@@ -58,12 +58,12 @@ def outline_object(road: Road, thing: ElementTree.Element) -> NDArray[np.float64
 class Rectangle:
     """A rectangle in the plane, by its centre (2,), two edges (2, 2), one a row, and their lengths (2,) [m]."""
 
-    centre: NDArray[np.float64]
-    edges: NDArray[np.float64]
-    sides: NDArray[np.float64]
+    centre: Array
+    edges: Array
+    sides: Array
 
 
-def enclose_outline(outline: NDArray[np.float64]) -> Rectangle | None:
+def enclose_outline(outline: Array) -> Rectangle | None:
     """Return the smallest rectangle around an outline (K, 2); None where it has no area."""
     rectangle = shapely.oriented_envelope(shapely.MultiPoint(outline))
     if not isinstance(rectangle, Polygon):

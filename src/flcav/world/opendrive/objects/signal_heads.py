@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import LineString
 
+from flcav.arrays import Array
 from flcav.config import shorten
 from flcav.geometry import heading_vectors, left_vectors
 from flcav.world.map.parameters import SignalParameters
@@ -20,7 +20,6 @@ from flcav.world.map.signals import ARM_HEAD_M, KERB_HEAD_M
 from flcav.world.opendrive.objects.places import locate, read_number
 from flcav.world.opendrive.road_surface import Road
 
-Array = NDArray[np.float64]
 Placed = tuple[ElementTree.Element, ElementTree.Element]  # a road, and a signal or a reference to one on it
 
 LIGHT, WALKERS = "1000001", "1000002"  # types of traffic lights: for vehicles, for pedestrians

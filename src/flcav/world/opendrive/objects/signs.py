@@ -9,8 +9,9 @@ from typing import Literal
 from flcav.config import shorten
 from flcav.world.map.parameters import PostParameters, SignParameters
 from flcav.world.map.street_furniture import SIGN_HEIGHT_M, SPEED_SIGNS
-from flcav.world.opendrive.objects import crosswalks, stop_lines
+from flcav.world.opendrive.objects.crossings import PAINTED_CROSSWALK
 from flcav.world.opendrive.objects.places import locate, read_number, repeat_object
+from flcav.world.opendrive.objects.stop_lines import PAINTED_STOP_LINE
 from flcav.world.opendrive.road_surface import Road
 
 SIGNS: dict[str, Literal["stop", "yield"]] = {"206": "stop", "205": "yield"}  # numbers of the German catalogue
@@ -19,7 +20,7 @@ KMH = {"km/h": 1.0, "mph": 1.609344, "m/s": 3.6}
 LIMITS_KMH = (5.0, 200.0)  # least and largest limit that is believed
 PLATE_M = (1.2, 4.5)  # heights at which a plate is believed to hang
 POST_M = (0.3, 15.0)  # heights of poles that are taken over
-PAINTED = (crosswalks.MARKING, stop_lines.MARKING)  # types of signals that are paint
+PAINTED = (PAINTED_CROSSWALK, PAINTED_STOP_LINE)  # types of signals that are paint
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import LineString, Point
 
+from flcav.arrays import Array
 from flcav.world.map.parameters import StopLineParameters
 from flcav.world.map.roads import Lane, RoadNet
 from flcav.world.opendrive.objects.places import locate, outline_object
 from flcav.world.opendrive.road_surface import Road
 
-Array = NDArray[np.float64]
-
-MARKING = "294"  # type of a signal that is a painted stop line: its number in the German catalogue
+PAINTED_STOP_LINE = "294"  # type of a signal that is a painted stop line: its number in the German catalogue
 SUBTYPE = "signalLines"  # of an object `roadMark` that is one
 WIDE_M = (1.5, 30.0)  # lengths of a line that are believed
 STOPPED = ("driving", "bicycle")  # lanes with stop lines
@@ -85,7 +83,7 @@ def find_stop_lines(root: ElementTree.Element, offset_m: tuple[float, float], ne
 def _list_lines(row: ElementTree.Element, offset_m: Array) -> Iterator[_Line | None]:
     """Yield the stop lines along one road of the map; None for one that does not say enough."""
     things = [thing for thing in row.iterfind("objects/object") if _is_stop_line(thing)]
-    signals = [signal for signal in row.iterfind("signals/signal") if signal.get("type") == MARKING]
+    signals = [signal for signal in row.iterfind("signals/signal") if signal.get("type") == PAINTED_STOP_LINE]
     if not things and not signals:
         return
     road = Road(row)

@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, TypeVarTuple
 
 from flcav.config import InputError
-from flcav.interface.extras import format_install_command
+from flcav.interface.wording import format_install_command
 from flcav.machine.processes import KILLED
 from flcav.machine.threads import VARIABLES
 
