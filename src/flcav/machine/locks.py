@@ -61,7 +61,7 @@ def only_writer(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def take_turns(what: str) -> Iterator[None]:
+def wait_for_turn(what: str) -> Iterator[None]:
     """Hold what is called `what` (letters, digits, dashes) within the context; others on this machine wait for it."""
     with (Path(tempfile.gettempdir()) / f"flcav-{what}{LOCK}").open("a") as file:
         if fcntl is not None:

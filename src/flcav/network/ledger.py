@@ -20,17 +20,6 @@ Direction = Literal["up", "down"]
 
 LINKS: tuple[Link, ...] = get_args(Link)
 BYTES_PER_MB = 1_000_000
-_SCHEMA = pa.schema(
-    [
-        ("stage", pa.string()),
-        ("task", pa.string()),
-        ("link", pa.string()),
-        ("direction", pa.string()),
-        ("round", pa.int64()),
-        ("client", pa.string()),
-        ("bytes", pa.int64()),
-    ]
-)
 
 
 class BudgetExceeded(InputError):
@@ -71,6 +60,9 @@ class LedgerEntry:
             raise ValueError(f"LedgerEntry.direction = {self.direction!r}, expected one of {get_args(Direction)}")
         if self.bytes < 0:
             raise ValueError(f"LedgerEntry.bytes = {self.bytes}, expected at least 0")
+
+
+_SCHEMA = pa.schema([(each.name, pa.int64() if each.type is int else pa.string()) for each in fields(LedgerEntry)])
 
 
 class Ledger:
@@ -179,13 +171,13 @@ def _mb(count: int) -> str:
 Arrays = Mapping[str, NDArray]  # by name
 
 
-def pack(arrays: Arrays) -> bytes:
+def pack_arrays(arrays: Arrays) -> bytes:
     """Return arrays of numbers or truth values as a message."""
     return save({name: np.asarray(array, order="C") for name, array in arrays.items()})
 
 
-def unpack(message: bytes) -> dict[str, NDArray]:
-    """Return the arrays of a message: the inverse of `pack`, but for their order."""
+def unpack_arrays(message: bytes) -> dict[str, NDArray]:
+    """Return the arrays of a message: the inverse of `pack_arrays`, but for their order."""
     return load(message)
 
 
@@ -204,7 +196,7 @@ def carry(message: bytes) -> bytes:
     return message
 
 
-def send(
+def send_message(
     book: Ledger,
     message: bytes,
     *,

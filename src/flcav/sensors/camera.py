@@ -15,7 +15,7 @@ from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.rendering.appearance import Appearance
 from flcav.sensors.rendering.gbuffer import GBuffer
 from flcav.sensors.rendering.rain import add_drops
-from flcav.sensors.rendering.render import render, survey
+from flcav.sensors.rendering.render import render_radiance, survey
 from flcav.statistics.streams import stream
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
@@ -55,7 +55,7 @@ def photograph(
     `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments, and the same state of `rng`, give the same bytes, with
     any number of `threads`.
     """
-    picture = render(scene, world_from_camera, camera, weather, rng, hidden=hidden, threads=threads)
+    picture = render_radiance(scene, world_from_camera, camera, weather, rng, hidden=hidden, threads=threads)
     shape = (camera.height, camera.width)
     if camera.drops and weather.rain_mm_h > 0:
         add_drops(picture.radiance.reshape(*shape, 3), weather.rain_mm_h, rng)

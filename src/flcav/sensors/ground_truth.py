@@ -17,7 +17,7 @@ from flcav.world.rays.packets import Hits
 from flcav.world.scene import Scene
 
 
-class Sweep(NamedTuple):
+class LidarSweep(NamedTuple):
     """The rays of one LiDAR sweep, and its returns by actor."""
 
     lidar: Lidar
@@ -38,12 +38,12 @@ class InstanceImage(NamedTuple):
     instance: Ints32  # (H, W) 0 none, a + 1 = the scene's actor a, -(t + 1) = thing t of the town
 
 
-def annotate(
+def annotate_frame(
     scene: Scene,
     own: int | None,
     *,
     within: Mask,
-    sweeps: Mapping[str, Sweep],
+    sweeps: Mapping[str, LidarSweep],
     sights: Mapping[str, InstanceImage],
     echoes: Mapping[str, Ints],
 ) -> tuple[Annotations, Ints]:
@@ -88,7 +88,7 @@ def annotate(
     return annotations, actors
 
 
-def _occlusion(scene: Scene, sweeps: list[Sweep], actors: Ints) -> Array:
+def _occlusion(scene: Scene, sweeps: list[LidarSweep], actors: Ints) -> Array:
     """Return (K,) the occluded share of each actor's rays, all LiDARs together; 1 where none is visible."""
     visible, occluded = np.zeros((2, len(actors)), np.int64)
     for sweep in sweeps:

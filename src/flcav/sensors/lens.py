@@ -58,13 +58,13 @@ class Lens(Config):
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
 
-def project(lens: Lens, points: ArrayLike) -> Array:
+def project_optical(lens: Lens, points: ArrayLike) -> Array:
     """Return the pixels (N, 2) u, v of points (N, 3) in the optical frame; NaN for those with z <= 0."""
     return project_points(lens.intrinsics(), lens.distortion(), points)
 
 
 def project_points(intrinsics: Array, distortion: Array, points: ArrayLike) -> Array:
-    """Return pixels as `project` does, given the camera matrix (3, 3) and the distortion coefficients (5,)."""
+    """Return pixels as `project_optical` does, given the camera matrix (3, 3) and the distortion coefficients (5,)."""
     x, y, z = np.asarray(points, np.float64).reshape(-1, 3).T
     z = np.where(z > 1e-9, z, np.nan)
     fx, fy, cx, cy = _focus(intrinsics)

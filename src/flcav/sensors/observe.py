@@ -10,7 +10,7 @@ from flcav.config import InputError
 from flcav.geometry import pose
 from flcav.sensors.camera import photograph
 from flcav.sensors.frame import Calibration, CameraImage, Frame
-from flcav.sensors.ground_truth import InstanceImage, Sweep, annotate
+from flcav.sensors.ground_truth import InstanceImage, LidarSweep, annotate_frame
 from flcav.sensors.infrared import render_thermal
 from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.lidar.lidar import Lidar, point_times_s, scan
@@ -79,7 +79,7 @@ def observe(
         )
 
     scene.move_to(index)
-    annotations, actors = annotate(
+    annotations, actors = annotate_frame(
         scene, carrier.own, within=_within_range(carrier, rig), sweeps=sweeps, sights=sights, echoes=echoes
     )
     row = np.zeros(len(scene.trace.actor) + 1, np.uint16)
@@ -182,14 +182,14 @@ def _actor_of(scene: Scene, agent: str, index: int) -> int | None:
 
 def _sweep(
     carrier: _Carrier, name: str, lidar: Lidar, weather: Weather, rng: np.random.Generator
-) -> tuple[Array32, Sweep]:
+) -> tuple[Array32, LidarSweep]:
     """Return the points (N, 4) of a LiDAR, and its rays and counts for the ground truth."""
     scene, world_from_sensor = carrier.scene, carrier.go_to(name)
     points, actor, passes, hits = scan(scene, world_from_sensor, lidar, rng, carrier.own, weather)
     count = len(scene.trace.actor)
     returns = np.bincount(actor + 1, minlength=count + 1)[1:]
     visible = np.bincount(hits.instance + 1, minlength=count + 2)[2:]  # without misses (-1) and the town (0)
-    return points, Sweep(lidar, world_from_sensor, passes, hits.distance, hits.instance, returns, visible)
+    return points, LidarSweep(lidar, world_from_sensor, passes, hits.distance, hits.instance, returns, visible)
 
 
 def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> Ints32:

@@ -121,7 +121,7 @@ class Cells(NamedTuple):
     actor: Ints  # (C,) that of the largest cross-section; -1 for the town
 
 
-def resolve(values: Array, sigma: Array, actor: Ints32, radar: Radar) -> Cells:
+def resolve_cells(values: Array, sigma: Array, actor: Ints32, radar: Radar) -> Cells:
     """Return the resolution cells that hold N echoes, which are summed up by cell.
 
     `values` (N, 4) are range [m], azimuth [rad], elevation [rad] and Doppler [m/s] of the echoes, `sigma` (N,) their
@@ -154,7 +154,7 @@ def snr_per_m2(radar: Radar, values: Array, rain_mm_h: float) -> Array:
     return at_reference / REFERENCE_M2 * (radar.detects_car_m / distance) ** 4 * 10 ** ((gain_db - loss_db) / 10)
 
 
-def detect(cells: Cells, radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> tuple[Array, Ints]:
+def detect_cells(cells: Cells, radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> tuple[Array, Ints]:
     """Return the detections (M, 5) among `cells` and their actors (M,).
 
     A detection is range [m], azimuth [rad], elevation [rad], Doppler [m/s], all with errors, and cross-section [dBsm].
@@ -173,7 +173,7 @@ def detect(cells: Cells, radar: Radar, rain_mm_h: float, rng: np.random.Generato
 
 
 def false_alarms(radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> Array:
-    """Return M false alarms (M, 5), columns as in `detect`: cells whose noise alone exceeds the threshold (Poisson)."""
+    """Return M false alarms (M, 5), columns as in `detect_cells`: a Poisson number of cells of loud noise."""
     low, high = radar.extent().T
     cells = np.prod(np.ceil((high - low) / radar.resolution()))
     count = rng.poisson(cells * radar.false_alarm_rate)
@@ -211,9 +211,9 @@ def sweep_radar(
     speed = _range_rates(scene, world_from_radar, ahead, hits, velocity, rng)
     away = hits.distance.astype(np.float64)
     values = np.column_stack((away, np.arctan2(ahead[:, 1], ahead[:, 0]), np.arcsin(ahead[:, 2]), speed))
-    cells = resolve(values, sigma, hits.instance - 1, radar)
+    cells = resolve_cells(values, sigma, hits.instance - 1, radar)
     rain = weather.rain_mm_h if weather else 0.0
-    measured, actor = detect(cells, radar, rain, rng)
+    measured, actor = detect_cells(cells, radar, rain, rng)
     alarms = false_alarms(radar, rain, rng)
     everything = np.concatenate((measured, alarms)).astype(np.float32)
     owner = np.concatenate((actor, np.full(len(alarms), -1))).astype(np.int32)

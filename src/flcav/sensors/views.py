@@ -10,7 +10,7 @@ from flcav.arrays import Array, Ints, Ints32, Mask
 from flcav.geometry import inverse, transform_points
 from flcav.machine.compiled import compiled
 from flcav.sensors.frame import Views
-from flcav.sensors.lens import Lens, compute_pixel_rays, project, unproject
+from flcav.sensors.lens import Lens, compute_pixel_rays, project_optical, unproject
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
 
@@ -58,12 +58,7 @@ def _collect(instance, sign, pixels, box):
 
 
 def view_actors(
-    scene: Scene,
-    world_from_camera: Array,
-    lens: Lens,
-    instance: Ints32,
-    regions: Regions,
-    actors: Ints,
+    scene: Scene, world_from_camera: Array, lens: Lens, instance: Ints32, regions: Regions, actors: Ints
 ) -> Views:
     """Return the image annotations of `actors` (M,): 2-D boxes, pixels, truncation and occlusion.
 
@@ -97,13 +92,7 @@ def _sampled(box: Array) -> tuple[Ints, Ints]:
     return np.arange(first_row, int(np.floor(y2)) + 1, step), np.arange(first_column, int(np.floor(x2)) + 1, step)
 
 
-def _unoccluded(
-    scene: Scene,
-    world_from_camera: Array,
-    lens: Lens,
-    actor: int,
-    sampled: tuple[Ints, Ints],
-) -> int:
+def _unoccluded(scene: Scene, world_from_camera: Array, lens: Lens, actor: int, sampled: tuple[Ints, Ints]) -> int:
     """Return the number of sampled pixels that show the actor in an empty world."""
     rows, columns = sampled
     rays = compute_pixel_rays(lens).reshape(lens.height, lens.width, 3)[np.ix_(rows, columns)].reshape(-1, 3)
@@ -215,7 +204,7 @@ def _project(lens: Lens, points: Array) -> Array:
         radius = np.linalg.norm(plane, axis=1, keepdims=True)
         plane = plane * np.minimum(1, BEYOND_IMAGE * _image_radius(lens) / np.maximum(radius, 1e-9))
         points = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
-    return project(lens, points)
+    return project_optical(lens, points)
 
 
 def _image_radius(lens: Lens) -> float:
@@ -233,10 +222,10 @@ def outline_boxes(corners: Array, lens: Lens, world_from_camera: Array) -> tuple
     corners = transform_points(inverse(world_from_camera), corners.reshape(-1, 3)).reshape(-1, 8, 3)
     ahead = (corners[:, :, 2] >= NEAR_M).sum(axis=1)
     whole = ahead == 8
-    pixels = project(lens, corners[whole].reshape(-1, 3)).reshape(-1, 8, 2)
+    pixels = project_optical(lens, corners[whole].reshape(-1, 3)).reshape(-1, 8, 2)
     amodal[whole] = np.concatenate((pixels.min(axis=1), pixels.max(axis=1)), axis=1)
     for row in np.flatnonzero((ahead > 0) & ~whole):  # the others are behind the camera
-        pixels = project(lens, clip_in_front(corners[row], BOX_EDGES, NEAR_M))
+        pixels = project_optical(lens, clip_in_front(corners[row], BOX_EDGES, NEAR_M))
         amodal[row] = *pixels.min(axis=0), *pixels.max(axis=0)
     truncation = compute_truncation(amodal, lens)
     amodal[truncation == 1] = np.nan

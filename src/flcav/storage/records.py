@@ -63,14 +63,14 @@ def to_rows(records: Iterable["DataclassInstance"]) -> list[dict[str, Json]]:
     >>> to_rows([Estimate(0.5, 0.4, 0.6)])
     [{'mean': 0.5, 'low': 0.4, 'high': 0.6}]
     """
-    return [dict(flatten(to_json(record, type(record)))) for record in records]
+    return [dict(flatten_record(to_json(record, type(record)))) for record in records]
 
 
-def flatten(values: Mapping[str, Json], above: str = "") -> Iterator[tuple[str, Json]]:
+def flatten_record(values: Mapping[str, Json], above: str = "") -> Iterator[tuple[str, Json]]:
     """Yield the values within nested JSON objects by dotted names, as in "estimate.mean"; empty objects are values."""
     for name, value in values.items():
         if isinstance(value, Mapping) and value:
-            yield from flatten(value, f"{above}{name}.")
+            yield from flatten_record(value, f"{above}{name}.")
         else:
             yield above + name, value
 
@@ -110,7 +110,7 @@ def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str
     return table
 
 
-def write_table(table: pa.Table, path: Path) -> None:
+def write_any_table(table: pa.Table, path: Path) -> None:
     """Write `table` atomically to `path`, as CSV or Parquet by its suffix; raises `InputError` for any other suffix."""
     check_ending(path)
     if path.suffix == ".parquet":

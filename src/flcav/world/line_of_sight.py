@@ -29,12 +29,8 @@ class Viewshed:
     seen: Mask  # (N, N): rows by y, columns by x
 
 
-def find_visible(
-    town: Town,
-    traces: Sequence[Trace],
-    sites: Array,
-    places: Array,
-    pairs: tuple[Ints, Ints],
+def find_visible_pairs(
+    town: Town, traces: Sequence[Trace], sites: Array, places: Array, pairs: tuple[Ints, Ints]
 ) -> Mask:
     """Return (M,) whether each pair's site (P, 3) sees its place (E, 3), at half of the instants or more.
 
@@ -52,14 +48,14 @@ def find_visible(
 def find_viewshed(town: Town, traces: Sequence[Trace], site: Array, range_m: float) -> Viewshed:
     """Return the viewshed of a site (3,): points EYE_M above the ground that it sees within `range_m`.
 
-    Seen is what `find_visible` calls so.
+    Seen is what `find_visible_pairs` calls so.
     """
     x, y = site[:2, None] + np.linspace(-range_m, range_m, 2 * FINE + 1)
     across, along = (each.ravel() for each in np.meshgrid(x, y))
     places = np.c_[across, along, town.grounds(across, along) + EYE_M]
     near = np.flatnonzero(np.linalg.norm(places - site, axis=1) <= range_m)
     seen = np.zeros(len(places), np.bool_)
-    seen[near] = find_visible(town, traces, site[None], places, (np.zeros_like(near), near))
+    seen[near] = find_visible_pairs(town, traces, site[None], places, (np.zeros_like(near), near))
     return Viewshed(x, y, seen.reshape(len(y), len(x)))
 
 

@@ -1,10 +1,8 @@
 """Scenes: the static mesh of a town and the meshes of its actors at one instant of a trace, for ray casting."""
 
-import pickle
 import zlib
 from collections.abc import Mapping
 from functools import cached_property, lru_cache
-from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +14,10 @@ from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Mater
 from flcav.world.meshes import Mesh, actor_mesh
 from flcav.world.rays.embree import Embree, Solid
 from flcav.world.rays.packets import Hits
-from flcav.world.static import SignsAndSignals, build_town_mesh, list_signs_and_signals
+from flcav.world.static import SignsAndSignals, TownCache, build_town_mesh, list_signs_and_signals
 from flcav.world.trace import Trace
 
 OFFSET_S = 0.1  # largest extrapolation from an instant of the trace: one step of the traffic
-TOWNS_KEPT = 4
 
 
 class Surfaces(NamedTuple):
@@ -47,7 +44,7 @@ class Scene:
         self.town = town
         self.paints: Mapping[str, tuple[float, float, float]] = {}  # linear RGB by actor; others are painted by name
         self._engine = Embree()
-        self._town_model = _town_model(town)
+        self._town_model = _TOWNS.get(town, lambda: _model(build_town_mesh(town)))
         self._cast(trace)
 
     def follow(self, trace: Trace) -> None:
@@ -139,13 +136,7 @@ class Scene:
         return self._assembly.trace(world_from_rays, directions, near_m=near_m, far_m=far_m, threads=threads)
 
     def find_occluded(
-        self,
-        origins: Array32,
-        directions: Array32,
-        far_m: Array32,
-        *,
-        hidden: int | None = None,
-        threads: int = 1,
+        self, origins: Array32, directions: Array32, far_m: Array32, *, hidden: int | None = None, threads: int = 1
     ) -> Mask:
         """Return (N,) whether anything but the actor `hidden` occludes each ray before its end `far_m` (N,) [m].
 
@@ -229,13 +220,4 @@ def _actor_model(category: str, shape: int, size: tuple[float, ...]) -> _Model:
     return _model(actor_mesh(category, shape, size))
 
 
-_TOWNS: dict[str, _Model] = {}  # by hash of the town: the last TOWNS_KEPT
-
-
-def _town_model(town: Town) -> _Model:
-    key = sha256(pickle.dumps(town)).hexdigest()
-    if key not in _TOWNS:
-        while len(_TOWNS) >= TOWNS_KEPT:
-            del _TOWNS[next(iter(_TOWNS))]
-        _TOWNS[key] = _model(build_town_mesh(town))
-    return _TOWNS[key]
+_TOWNS = TownCache[_Model]()

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -112,19 +113,8 @@ NOBODY = Actors((), (), np.zeros(0, np.int64), _THREES, _THREES, _ONES, _THREES,
 
 def pick_actors(actors: Actors, mask: Mask) -> Actors:
     """Return the actors for which `mask` (N,) is true."""
-    rows = np.flatnonzero(mask).tolist()
-    return Actors(
-        tuple(actors.name[row] for row in rows),
-        tuple(actors.category[row] for row in rows),
-        actors.shape[mask],
-        actors.size[mask],
-        actors.position[mask],
-        actors.yaw[mask],
-        actors.velocity[mask],
-        actors.acceleration[mask],
-        actors.yaw_rate[mask],
-        actors.tilt[mask],
-    )
+    names, categories = (tuple(compress(words, mask)) for words in actors[:2])
+    return Actors(names, categories, *(column[mask] for column in actors[2:]))
 
 
 def join_actors(*parts: Actors) -> Actors:

@@ -7,7 +7,7 @@ from enum import IntEnum
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -43,6 +43,9 @@ LAND_M = 150.0  # width of open ground beyond the town's bounds
 TOWNS_KEPT = 4  # size of the cache of meshes
 _FIELDS = ("vertices", "faces", "material", "part", "row")  # of a static world in a file, and their forms
 _FORMS = [("float32", (3,)), ("int32", (3,)), ("uint8", ()), ("uint8", ()), ("int32", ())]
+
+
+Made = TypeVar("Made")
 
 
 class TownPart(IntEnum):
@@ -114,22 +117,28 @@ def _head_kinds(signals: Signals) -> list[str]:
     return ["signal"] * (len(signals.link) - signals.walkers) + ["walker_signal"] * signals.walkers
 
 
-_WORLDS: dict[str, StaticWorld] = {}  # by hash of the town: the last TOWNS_KEPT
+class TownCache(Generic[Made]):
+    """What was made of the last `TOWNS_KEPT` towns, by a hash of their content."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, Made] = {}
+
+    def get(self, town: Town, make: Callable[[], Made]) -> Made:
+        """Return what was made of an equal town, or else what `make` makes now."""
+        key = sha256(pickle.dumps(town)).hexdigest()
+        if key not in self._kept:
+            while len(self._kept) >= TOWNS_KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[key] = make()
+        return self._kept[key]
+
+
+_WORLDS = TownCache[StaticWorld]()
 
 
 def build_static_world(town: Town) -> StaticWorld:
     """Return the static mesh of a town with the object of each face; the last `TOWNS_KEPT` are cached."""
-    return _keep(town, lambda: _build_world(town))
-
-
-def _keep(town: Town, make: Callable[[], StaticWorld]) -> StaticWorld:
-    """Return the world of a town that is kept, or else keep what `make` makes."""
-    key = sha256(pickle.dumps(town)).hexdigest()
-    if key not in _WORLDS:
-        while len(_WORLDS) >= TOWNS_KEPT:
-            del _WORLDS[next(iter(_WORLDS))]
-        _WORLDS[key] = make()
-    return _WORLDS[key]
+    return _WORLDS.get(town, lambda: _build_world(town))
 
 
 def _build_world(town: Town) -> StaticWorld:
@@ -170,7 +179,7 @@ def recall_static_world(town: Town, path: Path) -> None:
         or part.max() >= len(TownPart)
     ):
         raise ValueError(f"{path}: a face names a corner, a material or a part that is not there")
-    _keep(town, lambda: StaticWorld(Mesh(vertices, faces, material), part, row))
+    _WORLDS.get(town, lambda: StaticWorld(Mesh(vertices, faces, material), part, row))
 
 
 Owned = tuple[TownPart, int, Mesh]  # kind of object, its row, its mesh in the world frame

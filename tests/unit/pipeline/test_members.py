@@ -11,7 +11,7 @@ from line_task import LineTask, Slope
 from flcav.federation.messages.fl_request import make_request
 from flcav.federation.runtimes.link import Replies
 from flcav.federation.trainable import Weights
-from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes, pack
+from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes, pack_arrays
 from flcav.perception.task import Task
 from flcav.pipeline.steps.groups import UNREADABLE, Uplink
 from flcav.pipeline.training.fl_requests import answer_requests, take_requests
@@ -73,9 +73,9 @@ def test_messages_of_a_member() -> None:
     [
         b"",
         b"\xff" * 90,
-        pack({"samples": np.array([2])}),
+        pack_arrays({"samples": np.array([2])}),
         *(
-            pack(
+            pack_arrays(
                 {
                     "samples": np.array([2]),
                     "labels": np.array([97, 10], np.uint8),

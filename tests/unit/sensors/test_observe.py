@@ -11,7 +11,7 @@ from flcav.dataset.checks.images import check_images
 from flcav.geometry import inverse, points_in_boxes, pose
 from flcav.sensors.camera import Camera
 from flcav.sensors.ground_truth import find_occluded_rays
-from flcav.sensors.lens import project
+from flcav.sensors.lens import project_optical
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern, cast, draw_passes
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import RIGS, CalibrationError, MountedLidar, Rig
@@ -269,7 +269,7 @@ def test_signs_are_named_where_their_readable_side_shows(
     assert seen.pixels[0] > 5
     camera = frame.world_from_sensor("front")
     assert seen.distance_m[0] == pytest.approx(np.linalg.norm(position[0] - camera[:3, 3]))
-    u, v = project(Camera(width=96, height=64), (position[:1] - camera[:3, 3]) @ camera[:3, :3])[0]
+    u, v = project_optical(Camera(width=96, height=64), (position[:1] - camera[:3, 3]) @ camera[:3, :3])[0]
     x1, y1, x2, y2 = seen.box[0]
     assert x1 < u < x2
     assert y1 < v < y2

@@ -15,7 +15,7 @@ from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays
 from flcav.sensors.rendering import render
 from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sensors.rendering.gbuffer import fill_gbuffer
-from flcav.sensors.rendering.ground import build_markings, find_paint
+from flcav.sensors.rendering.ground import build_markings, sample_paint
 from flcav.sensors.rendering.light import DARKEST, compute_ambient_occlusion, compute_light
 from flcav.sensors.rendering.rain import add_drops, add_sun_glare
 from flcav.world.map.layers import Arrow, Crossing, MapLayers, Marking, outline_paint
@@ -70,7 +70,7 @@ def test_what_is_painted_is_what_the_map_says():
     rng, narrow, found = np.random.default_rng(0), np.float32(1e-4), 0
     for x, y in rng.uniform((-1, -9), (21, 6), (2500, 2)):
         if shapes.boundary.distance(Point(x, y)) > 0.07:  # arrows are strips
-            share, _ = find_paint(x, y, np.float32(1), np.float32(0), narrow, narrow, markings)
+            share, _ = sample_paint(x, y, np.float32(1), np.float32(0), narrow, narrow, markings)
             assert share == shapes.contains(Point(x, y))
             found += share
     assert found > 40

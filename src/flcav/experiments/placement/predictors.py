@@ -22,7 +22,7 @@ from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.pseudo_labels import road_views
-from flcav.world.line_of_sight import find_visible
+from flcav.world.line_of_sight import find_visible_pairs
 from flcav.world.map.town import Town
 from flcav.world.trace import Trace
 
@@ -45,7 +45,7 @@ def expect_labels(town: Town, traces: Sequence[Trace], errors: Sequence[Percepti
     apart = np.linalg.norm(sites[:, None, :2] - places[None, :, :2], axis=2)
     recall = np.append(RECALL, 0.0)[np.minimum(apart / BIN_M, len(RECALL)).astype(np.int64)]
     pole, error = (rows.astype(np.int64) for rows in np.nonzero(recall))
-    seen = find_visible(town, traces, sites, places, (pole, error))
+    seen = find_visible_pairs(town, traces, sites, places, (pole, error))
     return np.bincount(pole, recall[pole, error] * seen, minlength=len(sites)).astype(np.float64)
 
 

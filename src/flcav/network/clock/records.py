@@ -63,7 +63,7 @@ SCHEMA = pa.schema(
 )
 
 
-def rounds_table(records: Sequence[RoundTiming]) -> pa.Table:
+def tabulate_rounds(records: Sequence[RoundTiming]) -> pa.Table:
     """Return a table with a row per client and round; what is said of the round is in the columns `round_...`."""
     rows = [
         {**asdict(client), **{f"round_{field.name}": getattr(record, field.name) for field in _ROUND}}
@@ -74,8 +74,8 @@ def rounds_table(records: Sequence[RoundTiming]) -> pa.Table:
 
 
 def save_rounds(records: Sequence[RoundTiming], path: Path) -> None:
-    """Write `rounds_table` atomically to a Parquet file."""
-    write_parquet(rounds_table(records), path)
+    """Write `tabulate_rounds` atomically to a Parquet file."""
+    write_parquet(tabulate_rounds(records), path)
 
 
 def load_rounds(path: Path) -> tuple[RoundTiming, ...]:

@@ -155,7 +155,7 @@ class ClientPhases:
         )
 
 
-def time_clients(
+def time_round(
     links: RadioLinks, work: Sequence[ClientWork], number: int, start_s: float, rules: RoundRules
 ) -> tuple[ClientTiming, ...]:
     """Return the times of the clients of round `number`, which all begin at `start_s` [s] on the trace's clock.
@@ -192,7 +192,7 @@ def simulate_rounds(
 
     Every vehicle of a round's work that is in the town when the round begins takes part. Before each group of edge
     rounds of a cloud round the cloud's model reaches the edge servers, and after it theirs the cloud, over
-    `settings.wireline`. Raises `InputError` as `time_clients`, and where there is no round, or no multiple of k.
+    `settings.wireline`. Raises `InputError` as `time_round`, and where there is no round, or no multiple of k.
 
     Args:
         links: radio links of the vehicles.
@@ -214,7 +214,7 @@ def simulate_rounds(
         begins = now + down
         instant = int(np.searchsorted(links.time_s, begins, side="right")) - 1
         here = [name for name, there in zip(links.vehicle, links.present[instant].tolist()) if there and name in work]
-        clients = time_clients(links, [work[name] for name in here], number, begins, settings.rounds)
+        clients = time_round(links, [work[name] for name in here], number, begins, settings.rounds)
         ends = max(client.end_s for client in clients) + up
         records.append(RoundTiming(number, now, ends, down, up, clients))
         now = ends

@@ -142,11 +142,7 @@ def _losses(
     tops = trace.position[..., 2] + trace.size[:, 2]  # (T, A)
     top_m = np.take_along_axis(tops, paths.blocker.reshape(len(tops), -1) % tops.shape[1], axis=1)
     blocked = laws.blockage_db(
-        distance,
-        np.minimum(antenna_m, unit_m),
-        np.maximum(antenna_m, unit_m),
-        top_m.reshape(distance.shape),
-        blockage,
+        distance, np.minimum(antenna_m, unit_m), np.maximum(antenna_m, unit_m), top_m.reshape(distance.shape), blockage
     )
     moved = np.linalg.norm(np.diff(paths.antenna, axis=0, prepend=np.nan), axis=-1)
     moved = np.nan_to_num(moved, nan=np.inf)[:, :, None]  # a path begins anew after an absence
@@ -162,7 +158,7 @@ BLOCKING = ("car", "van", "truck", "bus")  # the vehicle types of TR 37.885, cla
 
 
 @dataclass(frozen=True)
-class Sight:
+class PathStates:
     """States of the direct paths from N antennas to U sites."""
 
     state: NDArray[np.int8]  # (N, U) a State
@@ -189,7 +185,7 @@ def vehicle_boxes(trace: Trace, instant: int) -> tuple[Boxes, Ints]:
 
 def find_sight(
     antennas: Array, sites: Array, walls: Assembly | None, vehicles: Boxes, carrier: Ints | None = None
-) -> Sight:
+) -> PathStates:
     """Return the states of the paths from antennas (N, 3) to sites (U, 3) [m], all in the frame of the boxes.
 
     `walls` are the buildings, None where there are none.
@@ -208,7 +204,7 @@ def find_sight(
     blocker = np.where(hidden, tops.argmax(axis=1) if len(vehicles) else 0, -1)
     state = np.where(walled, PathState.NLOS, np.where(hidden, PathState.NLOSV, PathState.LOS)).astype(np.int8)
     shape = (len(antennas), len(sites))
-    return Sight(state.reshape(shape), blocker.reshape(shape))
+    return PathStates(state.reshape(shape), blocker.reshape(shape))
 
 
 def _occlude(walls: Assembly, starts: Array, ends: Array) -> Mask:

@@ -15,7 +15,14 @@ from flcav.arrays import Array, Array32, Ints, Ints32, Mask
 from flcav.config import Config
 from flcav.geometry import unit_vectors
 from flcav.sensors.lidar.air import add_air_returns, compute_air
-from flcav.sensors.lidar.returns import LEVELS, QUANTILES, Returns, cast_through_glass, compute_brightness, detect
+from flcav.sensors.lidar.returns import (
+    LEVELS,
+    QUANTILES,
+    Returns,
+    cast_through_glass,
+    compute_brightness,
+    detect_returns,
+)
 from flcav.sensors.lidar.rolling import step_sectors, time_in_spin_s
 from flcav.world.rays.packets import Hits
 from flcav.world.scene import OFFSET_S, Scene
@@ -66,11 +73,7 @@ class CarlaReturns(Config):
 
 
 def carla_returns(
-    settings: CarlaReturns,
-    directions: Array32,
-    distance: Array32,
-    noise_m: Array32,
-    rng: np.random.Generator,
+    settings: CarlaReturns, directions: Array32, distance: Array32, noise_m: Array32, rng: np.random.Generator
 ) -> tuple[Array32, Ints]:
     """Return the point cloud of CARLA's LiDAR and the ray (M,) of each point.
 
@@ -183,13 +186,7 @@ def draw_passes(lidar: Lidar, rng: np.random.Generator) -> Mask:
     return rng.random(lidar.channels * lidar.azimuth_steps, np.float32) < lidar.glass_pass
 
 
-def cast(
-    scene: Scene,
-    world_from_sensor: Array,
-    lidar: Lidar,
-    passes: Mask,
-    hidden: int | None = None,
-) -> Returns:
+def cast(scene: Scene, world_from_sensor: Array, lidar: Lidar, passes: Mask, hidden: int | None = None) -> Returns:
     """Return the surface within range from which each ray of one spin returns, in a world without the actor `hidden`.
 
     `passes` (N,) marks the rays that go through glass. A rolling LiDAR rides on `hidden`; it stands still where that is
@@ -207,7 +204,8 @@ def cast(
 
     if not lidar.rolling:
         return part(world_from_sensor, slice(None))
-    steps, whole = lidar.azimuth_steps, _room_for(len(pattern))
+    kinds = (np.float32, np.int32, np.int32, np.uint8, np.uint8)
+    steps, whole = lidar.azimuth_steps, Returns(*(np.empty(len(pattern), kind) for kind in kinds))
     for columns, pose in step_sectors(scene, world_from_sensor, steps, 1 / lidar.rate_hz, hidden):
         rays = (np.arange(lidar.channels)[:, None] * steps + columns).ravel()
         for values, found in zip(whole, part(pose, rays)):
@@ -215,17 +213,7 @@ def cast(
     return whole
 
 
-def _room_for(rays: int) -> Returns:
-    return Returns(
-        np.empty(rays, np.float32),
-        np.empty(rays, np.int32),
-        np.empty(rays, np.int32),
-        np.empty(rays, np.uint8),
-        np.empty(rays, np.uint8),
-    )
-
-
-def measure(
+def measure_points(
     scene: Scene,
     world_from_sensor: Array,
     lidar: Lidar,
@@ -258,7 +246,7 @@ def measure(
         source = np.where(aerial, -1, source)
     points = np.empty((rays, 4), np.float32)
     actor = np.empty(rays, np.int32)
-    kept = detect(
+    kept = detect_returns(
         build_ray_pattern(lidar),
         distance,
         bright,
@@ -298,7 +286,7 @@ def scan(
     """
     passes = draw_passes(lidar, rng)
     returns = cast(scene, world_from_sensor, lidar, passes, hidden)
-    return Scan(*measure(scene, world_from_sensor, lidar, returns, rng, weather), passes, returns)
+    return Scan(*measure_points(scene, world_from_sensor, lidar, returns, rng, weather), passes, returns)
 
 
 def point_times_s(lidar: Lidar, points: Array32) -> Array32:

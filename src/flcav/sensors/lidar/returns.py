@@ -49,12 +49,7 @@ class Returns(NamedTuple):
     panes: Bytes  # (N,) panes of glass on the way
 
 
-def cast_through_glass(
-    trace: CastRays,
-    passes: Mask,
-    first: Ints,
-    material: Bytes,
-) -> Returns:
+def cast_through_glass(trace: CastRays, passes: Mask, first: Ints, material: Bytes) -> Returns:
     """Return the surface from which each of N rays returns; rays marked in `passes` (N,) go through up to PANES panes.
 
     Face f of instance i is of `material[first[i] + f]`.
@@ -157,7 +152,7 @@ def compute_wet_brightness(cosine, reflectivity):
 
 
 @compiled
-def detect(
+def detect_returns(
     directions,
     distance,
     brightness,

@@ -35,12 +35,7 @@ class GBuffer(NamedTuple):
 
 
 def fill_gbuffer(
-    scene: Scene,
-    appearance: Appearance,
-    world_from_camera: Array,
-    directions: Array32,
-    hits: Hits,
-    threads: int = 1,
+    scene: Scene, appearance: Appearance, world_from_camera: Array, directions: Array32, hits: Hits, threads: int = 1
 ) -> GBuffer:
     """Return the G-buffer of N rays `directions` (N, 3), unit, optical frame, from their `hits`."""
     count, poses = len(directions), scene.poses()

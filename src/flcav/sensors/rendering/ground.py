@@ -53,7 +53,7 @@ def build_markings(layers: MapLayers) -> Markings:
 
 
 @inlined
-def find_paint(x, y, look_x, look_y, across, along, markings):
+def sample_paint(x, y, look_x, look_y, across, along, markings):
     """Return the painted share of a pixel's footprint around x, y, and the row of the rectangle that covers most of it.
 
     The footprint is `along` [m] long in the horizontal unit direction look_x, look_y, and `across` [m] wide.

@@ -5,7 +5,7 @@ import numpy as np
 from flcav.arrays import Array, Array32
 from flcav.geometry import heading_vectors, inverse, transform_points
 from flcav.machine.compiled import compiled
-from flcav.sensors.lens import Lens, project
+from flcav.sensors.lens import Lens, project_optical
 from flcav.sensors.rendering.light import DARK, Illumination
 from flcav.sensors.rendering.noise import sample_noise
 from flcav.sensors.rendering.state import AMBER, GREEN, RED, LampState, lamp_places
@@ -188,7 +188,7 @@ def add_glare(
     away = places - eye
     distance = np.linalg.norm(away, axis=1)
     local = transform_points(inverse(world_from_camera), places)
-    pixels = project(lens, local)
+    pixels = project_optical(lens, local)
     inside = (local[:, 2] > 0.5) & (distance < FARTHEST_M)
     inside &= (np.abs(pixels - (lens.width / 2, lens.height / 2)) < (lens.width, lens.height)).all(axis=1)
     far = np.where(inside, distance - 0.5, -1.0)
@@ -207,17 +207,12 @@ def add_glare(
 
 
 def add_sun_glare(
-    image: Array32,
-    scene: Scene,
-    light: Illumination,
-    world_from_camera: Array,
-    lens: Lens,
-    hidden: int | None,
+    image: Array32, scene: Scene, light: Illumination, world_from_camera: Array, lens: Lens, hidden: int | None
 ) -> None:
     """Add the veiling glare of the sun to an image (H, W, 3), by the share of its disc that is visible."""
     to_sun, eye = np.array(light.to_sun, np.float64), world_from_camera[:3, 3]
     towards = world_from_camera[:3, :3].T @ to_sun
-    pixel = project(lens, towards)[0]
+    pixel = project_optical(lens, towards)[0]
     size = np.array((lens.width, lens.height))
     if max(light.sun) < DARK or not (np.abs(pixel - size / 2) < (0.5 + BESIDE) * size).all():
         return

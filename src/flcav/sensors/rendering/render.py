@@ -11,7 +11,7 @@ from flcav.arrays import Array, Array32, Bytes, Ints32, Mask
 from flcav.geometry import inverse, transform_points
 from flcav.machine.compiled import compiled
 from flcav.machine.threads import keep_freed_memory, share_among_threads
-from flcav.sensors.lens import Lens, compute_pixel_rays, project
+from flcav.sensors.lens import Lens, compute_pixel_rays, project_optical
 from flcav.sensors.rendering import rain
 from flcav.sensors.rendering.appearance import Appearance, build_appearance
 from flcav.sensors.rendering.gbuffer import GBuffer, fill_gbuffer
@@ -59,7 +59,7 @@ class _World(NamedTuple):
     threads: int
 
 
-def render(
+def render_radiance(
     scene: Scene,
     world_from_camera: Array,
     lens: Lens,
@@ -90,7 +90,7 @@ def render(
     further, pixel = further_rays(rays, kind, lens)
     if len(pixel):
         more = _further(world, world_from_camera, further, pixel, lens.width, seen, open_sky, radiance)
-        average(radiance, more, pixel, np.float32(BRIGHTEST / light.exposure))
+        average_samples(radiance, more, pixel, np.float32(BRIGHTEST / light.exposure))
     image = radiance.reshape(lens.height, lens.width, 3)
     if weather.rain_mm_h > 0:
         rain.add_streaks(image, weather.rain_mm_h, 0.75 * np.array(light.horizon) + 0.05 * np.array(light.sun), rng)
@@ -103,7 +103,7 @@ def render(
 def survey(
     scene: Scene, world_from_camera: Array, lens: Lens, *, hidden: int | None, threads: int = 1
 ) -> tuple[GBuffer, Mask, Appearance]:
-    """Return what the rays through the pixels' centres meet, and where that is paint (N,), as `render` does."""
+    """Return what the rays through the pixels' centres meet, and where that is paint (N,): see `render_radiance`."""
     rays, appearance = compute_pixel_rays(lens), build_appearance(scene)
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden, threads=threads)
     seen = fill_gbuffer(scene, appearance, world_from_camera, rays, hits, threads)
@@ -118,12 +118,7 @@ def survey(
     return seen, painted, appearance
 
 
-def _meet(
-    world: _World,
-    world_from_camera: Array,
-    rays: Array32,
-    near_m: Array32 | None = None,
-) -> GBuffer:
+def _meet(world: _World, world_from_camera: Array, rays: Array32, near_m: Array32 | None = None) -> GBuffer:
     reach, hidden, threads = FAR_M, world.hidden, world.threads
     hits = world.scene.cast(world_from_camera, rays, near_m=near_m, far_m=reach, hidden=hidden, threads=threads)
     return fill_gbuffer(world.scene, world.appearance, world_from_camera, rays, hits, threads)
@@ -170,12 +165,7 @@ def _further(
 
 
 def _mirror(
-    world: _World,
-    world_from_camera: Array,
-    lens: Lens,
-    rays: Array32,
-    seen: GBuffer,
-    radiance: Array32,
+    world: _World, world_from_camera: Array, lens: Lens, rays: Array32, seen: GBuffer, radiance: Array32
 ) -> None:
     """Add planar reflections to wet roads: rays cast from the camera mirrored at the plane of the road, z = 0."""
     wet = rain.wet_pixels(seen, world.appearance, lens.width, lens.height)
@@ -214,12 +204,7 @@ BRIGHTEST = 3.0  # exposed light at which samples are clamped: else edges of lam
 
 
 def find_edges(
-    seen: GBuffer,
-    radiance: Array32,
-    exposure: np.float32,
-    appearance: Appearance,
-    lens: Lens,
-    threads: int = 1,
+    seen: GBuffer, radiance: Array32, exposure: np.float32, appearance: Appearance, lens: Lens, threads: int = 1
 ) -> Bytes:
     """Return (N,) EDGE for pixels at visible edges, else 0, by their G-buffer and `radiance` (N, 3)."""
     out = np.zeros(len(seen), np.uint8)
@@ -239,7 +224,7 @@ def mark_thin(kind: Bytes, town: Town, world_from_camera: Array, lens: Lens, see
     ends = [transform_points(camera_from_world, bars[:, part]) for part in (slice(0, 3), slice(3, 6))]
     near = np.minimum(ends[0][:, 2], ends[1][:, 2])
     kept = (near > 2.0) & (near < FARTHEST_M)
-    pixels = [project(lens, end[kept]) for end in ends]
+    pixels = [project_optical(lens, end[kept]) for end in ends]
     focal = lens.intrinsics()[0, 0]
     half_px = bars[kept, 6] * focal / near[kept]
     small = (half_px * 2 < THIN_PX) | (bars[kept, 6] > POST_M) & (half_px * 2 < 6 * THIN_PX)
@@ -347,7 +332,7 @@ def donors(hits, pixel, seen, first, material, width, out):
 
 
 @compiled
-def average(radiance, further, pixel, ceiling):
+def average_samples(radiance, further, pixel, ceiling):
     """Replace the `radiance` of pixels by the mean with their `further` samples (S, 3), each clamped to `ceiling`."""
     start = 0
     while start < len(pixel):

@@ -8,7 +8,7 @@ import numpy as np
 
 from flcav.machine.compiled import inlined, kernel
 from flcav.sensors.rendering.facade import sample_sign, shade_facade
-from flcav.sensors.rendering.ground import asphalt, find_paint, grass, paving
+from flcav.sensors.rendering.ground import asphalt, grass, paving, sample_paint
 from flcav.sensors.rendering.noise import fade, hash_pair, sample_noise
 from flcav.sensors.rendering.state import AMBER, GREEN, RED
 from flcav.world.materials import Material
@@ -41,7 +41,7 @@ def mark_paint(survey, appearance, pixel_angle, painted):
         across = np.float32(survey.distance[ray] * pixel_angle)
         level = max(np.sqrt(dx * dx + dy * dy), np.float32(1e-6))
         x, y, slant = survey.position[ray, 0], survey.position[ray, 1], across / facing
-        share, _ = find_paint(x, y, dx / level, dy / level, across, slant, appearance.markings)
+        share, _ = sample_paint(x, y, dx / level, dy / level, across, slant, appearance.markings)
         painted[ray] = share > ROAD_LINE
 
 
@@ -78,7 +78,7 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             tone = asphalt(x, y, slant, table)
             red, green, blue = red * tone, green * tone, blue * tone
             level = max(np.sqrt(dx * dx + dy * dy), np.float32(1e-6))
-            share, piece = find_paint(x, y, dx / level, dy / level, across, slant, appearance.markings)
+            share, piece = sample_paint(x, y, dx / level, dy / level, across, slant, appearance.markings)
             if share > 0:
                 painted[ray] = share > ROAD_LINE
                 worn = np.float32(0.72) + np.float32(0.28) * sample_noise(table, x * 1.7, y * 1.7)
@@ -135,11 +135,7 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             near = fade(np.float32(0.25), slant)
             if near > 0 and nz > np.float32(0.2) and nz < np.float32(0.97):
                 tone *= 1 - near * np.float32(0.28) * np.float32(abs((z * 4.5) % 1.0 - 0.5) * 2)
-            red, green, blue = (
-                colour[building, 0] * tone,
-                colour[building, 1] * tone,
-                colour[building, 2] * tone,
-            )
+            red, green, blue = (colour[building, 0] * tone, colour[building, 1] * tone, colour[building, 2] * tone)
         elif material == LEAF:
             near = fade(np.float32(0.10), across)
             tone = np.float32(0.62) + np.float32(0.75) * hash_pair(row, 5)

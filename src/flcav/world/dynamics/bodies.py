@@ -8,15 +8,15 @@ from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError, shorten
 from flcav.geometry import heading_vectors, left_vectors, wrap_angle
 from flcav.world.commands import Controls
-from flcav.world.dynamics.obstacles import Ground
+from flcav.world.dynamics.obstacles import TownGround
 from flcav.world.dynamics.vehicle import (
     GRAVITY_MPS2,
     VEHICLES,
-    Blueprint,
-    Motion,
+    BodyBlueprint,
     Pedals,
+    PlanarMotion,
     Vehicles,
-    drive,
+    drive_vehicles,
     stack_blueprints,
 )
 from flcav.world.snapshot import Actors
@@ -36,11 +36,11 @@ STATE = ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "ti
 
 
 @dataclass
-class Body:
+class ControlledBody:
     """A body under control, but for its motion."""
 
     name: str
-    blueprint: Blueprint
+    blueprint: BodyBlueprint
     controls: Controls = AT_REST
     walk: tuple[float, float] = (0.0, 0.0)  # wanted velocity [m/s]
     physics: bool = True
@@ -57,10 +57,10 @@ class Body:
 class Bodies:
     """N bodies and their motion."""
 
-    def __init__(self, ground: Ground, *, leans: bool = False) -> None:
+    def __init__(self, ground: TownGround, *, leans: bool = False) -> None:
         """Start without any, on this ground; `leans`: cars are seen to lean on their springs."""
         self._leans = leans
-        self.members: list[Body] = []
+        self.members: list[ControlledBody] = []
         self.position, self.velocity, self.acceleration = (np.zeros((0, 3)) for _ in range(3))
         self.yaw, self.yaw_rate, self.steer = (np.zeros(0) for _ in range(3))
         self.tilt = np.zeros((0, 2))
@@ -76,11 +76,11 @@ class Bodies:
                 return row
         raise InputError(f"actor {shorten(name)}: there is none of this name under control")
 
-    def find(self, name: str) -> Body:
+    def find(self, name: str) -> ControlledBody:
         """Return a body; raises `InputError` where there is none of this name."""
         return self.members[self.row(name)]
 
-    def add(self, body: Body, x: float, y: float, yaw: float, z: float | None) -> None:
+    def add(self, body: ControlledBody, x: float, y: float, yaw: float, z: float | None) -> None:
         """Add a body at rest."""
         self.members.append(body)
         for name in STATE:
@@ -227,13 +227,13 @@ class Bodies:
             np.array([each.hand_brake for each in told]),
             np.array([each.reverse for each in told]),
         )
-        motion = Motion(
+        motion = PlanarMotion(
             self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2], self.yaw_rate[rows], self.steer[rows]
         )
         vehicles = Vehicles(*(values[rows] for values in self._vehicles))
         grip = np.array([self.members[row].grip for row in rows])
         vehicles = vehicles._replace(grip_mps2=grip * vehicles.grip_mps2, spin_mps2=grip * vehicles.spin_mps2)
-        after = drive(motion, vehicles, pedals, self.tilt[rows, 0], dt_s)
+        after = drive_vehicles(motion, vehicles, pedals, self.tilt[rows, 0], dt_s)
         self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2] = after.position, after.yaw, after.velocity
         self.yaw_rate[rows], self.steer[rows] = after.yaw_rate, after.steer
 

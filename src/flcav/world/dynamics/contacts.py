@@ -37,7 +37,7 @@ class Contacts(NamedTuple):
     impulse: Array  # (C,) along the normal, on the first [N s]
 
 
-def resolve(
+def resolve_contacts(
     boxes: Footprints, before: Array, velocity: Array, yaw_rate: Array, mass: Array, inertia: Array
 ) -> tuple[Array, Array, Array, Contacts]:
     """Return places (N, 3), velocities (N, 2), yaw rates (N,) after all contacts of N boxes, and these.

@@ -45,12 +45,12 @@ def list_obstacles(town: Town, parked: Actors = NOBODY) -> Obstacles:
         np.column_stack((length, width)) / 2,
         np.column_stack((ground - BELOW_M, ground + height)),
     )
-    boxes = join_footprints(standing, outline(parked))
+    boxes = join_footprints(standing, outline_actors(parked))
     low, high = corners(boxes)
     return Obstacles(boxes, (*name, *parked.name), shapely.STRtree(shapely.box(*low.T, *high.T)))
 
 
-def outline(actors: Actors) -> Footprints:
+def outline_actors(actors: Actors) -> Footprints:
     """Return the boxes of actors, upright; those who move begin above what they drive or step over."""
     z = actors.position[:, 2]
     clear = np.where(np.array(actors.category, np.str_) == "prop", 0.0, CLEARANCE_M)
@@ -93,7 +93,7 @@ def _posts(foot: Array, radius: Array | float, height: Array | float) -> Array:
 EDGE_M = 0.05  # a point so far beside a deck still is on it
 
 
-class Ground:
+class TownGround:
     """The ground of a town with its bridges and kerbs."""
 
     def __init__(self, town: Town) -> None:

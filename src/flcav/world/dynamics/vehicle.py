@@ -46,7 +46,7 @@ VEHICLES = ("car", "van", "truck", "bus", "motorcycle", "bicycle")
 
 
 @dataclass(frozen=True)
-class Blueprint:
+class BodyBlueprint:
     """Category, shape and mechanical parameters of a vehicle, a walker or a prop."""
 
     category: str  # one of `trace.CATEGORIES`, or "prop"
@@ -67,7 +67,7 @@ class Blueprint:
         return self.mass_kg * (length**2 + width**2) / 12
 
 
-def blueprint(category: str, shape: int = 0, size: tuple[float, float, float] | None = None) -> Blueprint:
+def make_blueprint(category: str, shape: int = 0, size: tuple[float, float, float] | None = None) -> BodyBlueprint:
     """Return the blueprint of a shape, with its own or another `size` (length, width, height [m]).
 
     Raises `InputError` for an unknown category or shape, and for a size that is not positive.
@@ -82,7 +82,7 @@ def blueprint(category: str, shape: int = 0, size: tuple[float, float, float] | 
         raise InputError(f"size {length}, {width}, {height}: must be between 0.05 and 100 m")
     make = _MAKES[category]
     mass = make.density * length * width * height
-    return Blueprint(
+    return BodyBlueprint(
         category=category,
         shape=shape,
         size=(float(length), float(width), float(height)),
@@ -105,7 +105,7 @@ STEER_RADPS = 2.5  # how fast the front wheels turn
 REVERSE_MPS = 8.0  # the engine drives backwards no faster
 
 
-class Motion(NamedTuple):
+class PlanarMotion(NamedTuple):
     """The motion of N bodies in plan, world frame."""
 
     position: Array  # (N, 2) middle of the box [m]
@@ -116,7 +116,7 @@ class Motion(NamedTuple):
 
 
 class Vehicles(NamedTuple):
-    """The parameters of N vehicles: see `Blueprint`."""
+    """The parameters of N vehicles: see `BodyBlueprint`."""
 
     mass_kg: Array
     engine_n: Array
@@ -139,7 +139,7 @@ class Pedals(NamedTuple):
     reverse: Mask  # (N,)
 
 
-def stack_blueprints(blueprints: list[Blueprint]) -> Vehicles:
+def stack_blueprints(blueprints: list[BodyBlueprint]) -> Vehicles:
     """Return the parameters of vehicles as arrays."""
     rows = [
         (
@@ -153,7 +153,7 @@ def stack_blueprints(blueprints: list[Blueprint]) -> Vehicles:
     return Vehicles(*np.array(rows, np.float64).reshape(-1, len(Vehicles._fields)).T)
 
 
-def drive(motion: Motion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s: float) -> Motion:
+def drive_vehicles(motion: PlanarMotion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s: float) -> PlanarMotion:
     """Return the motion of N vehicles `dt_s` later, on slopes of this `pitch` (N,) [rad], positive downhill."""
     ahead = heading_vectors(motion.yaw)
     speed = (motion.velocity * ahead).sum(axis=1)
@@ -172,7 +172,7 @@ def drive(motion: Motion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s
         1.0, vehicles.grip_mps2[:, None] * dt_s / np.maximum(needed, 1e-12)
     )
     position = motion.position + (motion.velocity + velocity) / 2 * dt_s
-    return Motion(position, wrap_angle(yaw), velocity, yaw_rate, steer)
+    return PlanarMotion(position, wrap_angle(yaw), velocity, yaw_rate, steer)
 
 
 def _accelerate(speed: Array, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s: float) -> Array:

@@ -60,7 +60,7 @@ class Junction:
 
 
 @dataclass(frozen=True)
-class Connection:
+class LaneConnection:
     """A link from the end of one lane to the start of another."""
 
     start: str  # id of the lane it leaves
@@ -80,7 +80,7 @@ class RoadNet:
     # edge -> right of way of all links of its driving lanes in SUMO's letters, e.g. "MMm": M has priority, m gives way,
     # s stops, o is at a traffic light, ...
     right_of_way: dict[str, str]
-    connections: tuple[Connection, ...]
+    connections: tuple[LaneConnection, ...]
     side: int = 1  # on which side of the road traffic keeps: 1 right, -1 left
 
     @property
@@ -136,8 +136,8 @@ def _refuse_unknown(what: str, named: Iterable[str], known: Container[str]) -> N
             raise ValueError(f"no {what} has the id {shorten(name)}")
 
 
-def _connection(row: ElementTree.Element) -> Connection:
-    return Connection(
+def _connection(row: ElementTree.Element) -> LaneConnection:
+    return LaneConnection(
         f"{row.attrib['from']}_{row.attrib['fromLane']}",
         f"{row.attrib['to']}_{row.attrib['toLane']}",
         row.get("via", ""),
@@ -234,7 +234,7 @@ def draw_route(net: RoadNet, random: np.random.Generator, length_m: float) -> Ro
     Raises `InputError` where the net has no driving lane of `SHORTEST_M`.
     """
     lanes = {lane.id: (edge, lane) for edge in net.edges.values() for lane in edge.lanes_of("driving")}
-    onward: dict[str, list[Connection]] = {}
+    onward: dict[str, list[LaneConnection]] = {}
     for way in net.connections:
         if way.end in lanes and (not way.via or way.via in lanes):
             onward.setdefault(way.start, []).append(way)
@@ -257,7 +257,7 @@ def draw_route(net: RoadNet, random: np.random.Generator, length_m: float) -> Ro
 
 
 def _through(
-    way: Connection, lanes: dict[str, tuple[Edge, Lane]], onward: dict[str, list[Connection]]
+    way: LaneConnection, lanes: dict[str, tuple[Edge, Lane]], onward: dict[str, list[LaneConnection]]
 ) -> Iterator[tuple[Edge, Lane]]:
     """Yield the lanes inside a junction that lead to the end of a connection, and that end."""
     via = way.via

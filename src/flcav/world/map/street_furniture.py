@@ -120,14 +120,17 @@ def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) 
         street = verge.street
         along = -CORNER_M
         while along < verge.line.length + CORNER_M:
-            length, width = draw(random, street.building_length_m), draw(random, street.building_depth_m)
-            height = draw(random, street.building_height_m)
-            right = verge.half_width + street.frontage_m + draw(random, street.setback_m) + width / 2
+            length, width = (
+                draw_uniform(random, street.building_length_m),
+                draw_uniform(random, street.building_depth_m),
+            )
+            height = draw_uniform(random, street.building_height_m)
+            right = verge.half_width + street.frontage_m + draw_uniform(random, street.setback_m) + width / 2
             for candidate in (length, street.building_length_m[0]):
                 x, y, yaw = verge.at(along + candidate / 2, right)
                 if plot.build(make_footprint(x, y, yaw, candidate, width)):
                     out.append((x, y, yaw, candidate, width, height))
-                    along += candidate + max(CLEARANCE_M, draw(random, street.building_gap_m))
+                    along += candidate + max(CLEARANCE_M, draw_uniform(random, street.building_gap_m))
                     break
             else:
                 along += STEP_M
@@ -136,16 +139,15 @@ def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) 
 
 def place_clutter(rows: list[Verge], plot: Plot, random: np.random.Generator) -> tuple[tuple[str, Array], ...]:
     """Return the clutter just behind the sidewalks by kind: rows (K, 6) x, y, yaw, length, width, height [m, rad]."""
-    out: dict[str, list[tuple[float, ...]]] = {}
+    pieces: list[Piece] = []
     for verge in rows:
-        kinds, weights = list(verge.street.clutter), np.array(list(verge.street.clutter.values()))
         for along in list_stations(verge, verge.street.clutter_spacing_m, random):
-            kind = kinds[int(random.choice(len(kinds), p=weights / weights.sum()))]
+            kind = _choose(verge.street.clutter, random)
             length, width, height = np.array(CLUTTER[kind]) * random.uniform(*verge.street.clutter_size, size=3)
             x, y, yaw = verge.at(along, verge.half_width + 0.15 + width / 2)
             if plot.build(make_footprint(x, y, yaw, length, width)):
-                out.setdefault(kind, []).append((x, y, yaw, float(length), float(width), float(height)))
-    return tuple((kind, _rows(out[kind], 6)) for kind in sorted(out))
+                pieces.append((kind, (x, y, yaw, length, width, height)))
+    return _by_kind(pieces)
 
 
 def place_trees(rows: list[Verge], ground: GroundSurfaces, plot: Plot, random: np.random.Generator) -> Array:
@@ -255,7 +257,7 @@ def list_stations(verge: Verge, spacing_m: float, random: np.random.Generator) -
         along += spacing_m * random.uniform(0.7, 1.3)
 
 
-def draw(random: np.random.Generator, interval: Interval) -> float:
+def draw_uniform(random: np.random.Generator, interval: Interval) -> float:
     """Return a number drawn uniformly from an interval."""
     return float(random.uniform(*interval))
 
@@ -279,11 +281,11 @@ def place_boundaries(rows: list[Verge], plot: Plot, random: np.random.Generator)
     pieces: list[Piece] = []
     for verge in rows:
         street = verge.street
-        along = draw(random, street.boundary_gap_m) if street.boundary else np.inf
+        along = draw_uniform(random, street.boundary_gap_m) if street.boundary else np.inf
         while along < verge.line.length:
-            end = min(along + draw(random, street.boundary_length_m), verge.line.length)
+            end = min(along + draw_uniform(random, street.boundary_length_m), verge.line.length)
             pieces += _stretch(verge, along, end, plot, random)
-            along = end + max(draw(random, street.boundary_gap_m), 0.1)
+            along = end + max(draw_uniform(random, street.boundary_gap_m), 0.1)
     return _by_kind(pieces)
 
 
@@ -291,7 +293,7 @@ def _stretch(verge: Verge, start: float, end: float, plot: Plot, random: np.rand
     """Yield the pieces of one stretch of a boundary from `start` to `end` along the verge [m]."""
     kind = _choose(verge.street.boundary, random)
     _, width, height = np.array(CLUTTER[kind]) * random.uniform(*verge.street.clutter_size, size=3)
-    setback = draw(random, verge.street.boundary_setback_m)
+    setback = draw_uniform(random, verge.street.boundary_setback_m)
     edges = np.linspace(start, end, max(1, int(np.ceil((end - start) / PIECE_M))) + 1)
     for first, last in pairwise(edges.tolist()):
         x, y, yaw = verge.at((first + last) / 2, verge.half_width + setback + width / 2)

@@ -3,9 +3,11 @@
 import hashlib
 import os
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
+from itertools import compress
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import shapely
@@ -19,7 +21,7 @@ from flcav.world.map.parameters import GeoReference, TownParameters
 from flcav.world.map.relief import Relief
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.signals import Signals, place_signals
-from flcav.world.map.surfaces import add, build_ground_surfaces, find_kerbs, split_into_polygons, unite
+from flcav.world.map.surfaces import build_ground_surfaces, find_kerbs, join_areas, split_into_polygons, unite
 
 TOWNS: tuple[str, ...] = ("suburb", "grid", "ring", "arterial")
 HILLY: dict[str, str] = {f"hilly_{name}": name for name in TOWNS}  # the same towns with slopes and camber
@@ -49,6 +51,9 @@ class Signs:
     position: Array  # (S, 3) plate centre, world [m]
     yaw: Array  # (S,) direction of the plate's front normal, world [rad]
     kind: tuple[str, ...]  # (S,) stop | yield | speed_30 | speed_60 | speed_90
+
+
+Placed = TypeVar("Placed", Poles, Signs, Signals)
 
 
 @dataclass(frozen=True)
@@ -221,25 +226,18 @@ def _clear_bridges(town: Town, relief: Relief) -> Town:
         clutter=tuple((kind, rows[is_clear(rows)]) for kind, rows in town.clutter),
         lamps=town.lamps[is_free(town.lamps)],
         posts=town.posts[is_free(town.posts)],
-        poles=Poles(
-            town.poles.id[poles],
-            town.poles.position[poles],
-            town.poles.yaw[poles],
-            tuple(kind for kind, kept in zip(town.poles.kind, poles) if kept),
-        ),
-        signs=Signs(
-            town.signs.position[signs],
-            town.signs.yaw[signs],
-            tuple(kind for kind, kept in zip(town.signs.kind, signs) if kept),
-        ),
-        signals=Signals(
-            signals.position[heads],
-            signals.yaw[heads],
-            signals.foot[heads],
-            tuple(link for link, kept in zip(signals.link, heads) if kept),
-            int(heads[len(heads) - signals.walkers :].sum()),
-        ),
+        poles=_pick(town.poles, poles),
+        signs=_pick(town.signs, signs),
+        signals=replace(_pick(signals, heads), walkers=int(heads[len(heads) - signals.walkers :].sum())),
     )
+
+
+def _pick(record: Placed, kept: Mask) -> Placed:
+    """Return the rows of a record's arrays and tuples for which `kept` (N,) is true."""
+    columns = {field.name: getattr(record, field.name) for field in fields(record)}
+    arrays = {name: column[kept] for name, column in columns.items() if isinstance(column, np.ndarray)}
+    words = {name: tuple(compress(column, kept)) for name, column in columns.items() if isinstance(column, tuple)}
+    return replace(record, **arrays, **words)
 
 
 def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters) -> Town:
@@ -252,7 +250,7 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
         net, frontage, [street_furniture.outline_space(space) for space in parameters.parking]
     )
     rows = list(street_furniture.list_verges(net, parameters))
-    paved = add(ground.roads, ground.sidewalks)
+    paved = join_areas(ground.roads, ground.sidewalks)
     land = street_furniture.Plot(paved)
     for shape in (given := street_furniture.outline_objects(parameters.objects)):
         land.build(shape, 0.0)

@@ -169,8 +169,7 @@ def _cabin_side(profile: Profile, lower: _Lower, length: float, height: float) -
 
     share = np.array((0.0, 0.10, 0.86, 1.0))
     side = np.stack(
-        [np.stack((x, waist + (shoulder - waist) * part, belt + (top - belt) * part), axis=1) for part in share],
-        axis=1,
+        [np.stack((x, waist + (shoulder - waist) * part, belt + (top - belt) * part), axis=1) for part in share], axis=1
     )
     side_material = np.full((len(x) - 1, 3), Material.PAINT, np.uint8)
     side_material[glazed, 1] = Material.GLASS

@@ -1,7 +1,6 @@
 """Parameters of an imported town: defaults by street type, traffic by lane length, and candidate sites of sensors."""
 
 import xml.etree.ElementTree as ElementTree
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -25,8 +24,8 @@ from flcav.world.map.parameters import (
 )
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.opendrive.objects.signal_heads import count_controllers, find_heads
-from flcav.world.opendrive.objects.signs import find_posts, find_signs
-from flcav.world.opendrive.objects.standing import find_objects, find_parking
+from flcav.world.opendrive.objects.signs import find_map_poles, find_signs
+from flcav.world.opendrive.objects.standing import find_parking, find_standing_objects
 from flcav.world.opendrive.objects.stop_lines import add_crossing_lines, find_stop_lines, stop_at_lines
 
 
@@ -53,8 +52,8 @@ def take_objects(
     """
     heads = find_heads(root, offset_m, net)
     parking = find_parking(root, offset_m, net)
-    objects = find_objects(root, offset_m, net)
-    signs, posts = find_signs(root, offset_m), find_posts(root, offset_m)
+    objects = find_standing_objects(root, offset_m, net)
+    signs, posts = find_signs(root, offset_m), find_map_poles(root, offset_m)
     found = find_stop_lines(root, offset_m, net)
     lines = add_crossing_lines(net, found.found) if crosswalks else found.found
     stop_at_lines(path, lines)
@@ -69,23 +68,15 @@ def take_objects(
         stop_lines=lines,
         parking=parking.found,
         notes=(
-            *tell("Signs", len(signs.found), signs.left),
-            *tell("Poles", len(posts.found), posts.left),
-            *tell("Signal heads", len(heads.found), heads.left),
-            *tell("Stop lines", found.taken, found.left),
-            *tell("Parking spaces", len(parking.found), parking.left),
-            *tell("Buildings, plants, barriers and obstacles", objects.taken, objects.left),
+            *signs.notes("Signs"),
+            *posts.notes("Poles"),
+            *heads.notes("Signal heads"),
+            *found.notes("Stop lines"),
+            *parking.notes("Parking spaces"),
+            *objects.notes("Buildings, plants, barriers and obstacles"),
             *([told] if several else []),
         ),
     )
-
-
-def tell(what: str, taken: int, left: Counter[str]) -> list[str]:
-    """Return a sentence on how many of a map's things were taken over, and why others were not; none without any."""
-    if not taken and not left:
-        return []
-    told = "".join(f"; left out: {count} ({reason})" for reason, count in sorted(left.items()))
-    return [f"{what} of the map taken over: {taken}{told}."]
 
 
 VEHICLES_PER_KM = 9.0  # of driving lane
@@ -126,13 +117,7 @@ MIX = {"car": 0.66, "van": 0.12, "truck": 0.05, "bus": 0.03, "motorcycle": 0.05,
 
 
 def furnish(
-    net: RoadNet,
-    *,
-    description: str,
-    seed: int,
-    geo: GeoReference,
-    source: MapSource,
-    found: MapObjects,
+    net: RoadNet, *, description: str, seed: int, geo: GeoReference, source: MapSource, found: MapObjects
 ) -> TownParameters:
     """Return the parameters of a town on `net` with the objects `found` in its map.
 

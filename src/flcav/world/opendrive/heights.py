@@ -143,7 +143,7 @@ def _sample_terrain(strips: list[list[Strip]], spans: list[Spans]) -> Array:
     room = np.minimum(np.array(ASIDE_M) - 0.1, CLEAR_M)
     aside = aside[distance > np.tile(room, len(aside) // len(room))]
     merged = _merge(np.concatenate((surface, aside)))
-    return np.concatenate((merged, surround(merged))).round(4)
+    return np.concatenate((merged, surround_terrain(merged))).round(4)
 
 
 def _sample_ground(strips: list[Strip], spans: Spans) -> tuple[Array, Array]:
@@ -214,7 +214,7 @@ def _merge(points: Array) -> Array:
     return np.stack([np.bincount(cells, column) / count for column in points.T], axis=1)
 
 
-def surround(points: Array, far_m: float = FAR_M) -> Array:
+def surround_terrain(points: Array, far_m: float = FAR_M) -> Array:
     """Return points (K, 3) on a frame `far_m` around, at the height of the nearest point."""
     low, high = points[:, :2].min(axis=0) - far_m, points[:, :2].max(axis=0) + far_m
     share = np.linspace(0.0, 1.0, 9)

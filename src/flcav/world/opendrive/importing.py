@@ -25,13 +25,14 @@ from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet
 from flcav.world.map.town import HEIGHTS, Town, check_town_name, load_town
 from flcav.world.opendrive.document import describe_map, read_map
-from flcav.world.opendrive.furnishing import furnish, take_objects, tell
+from flcav.world.opendrive.furnishing import furnish, take_objects
 from flcav.world.opendrive.georeference import locate_origin
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.mending.maps import mend_map, name_safely
 from flcav.world.opendrive.mending.roads import mend_roads
 from flcav.world.opendrive.netconvert import mirror_map, mirror_parts, run_netconvert
 from flcav.world.opendrive.objects.crossings import Crosswalk, find_crosswalks, take_crosswalks
+from flcav.world.opendrive.objects.places import note_taken
 from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 
 WIDEST_M = 5e5  # farthest that a street is from the middle of the town
@@ -190,7 +191,7 @@ def _import(xodr: Path, out: Path) -> ImportedTown:
         roads_m = sum(float(road.attrib["length"]) for road in root.iterfind("road"))
         net = _read_joined(folder / "town.net.xml", xodr, roads_m)
         nowhere = Counter({"no street between two sidewalks there": len(crosswalks.found) - crossed})
-        notes += tell("Crosswalks", crossed, crosswalks.left + nowhere)
+        notes += note_taken("Crosswalks", crossed, crosswalks.left + nowhere)
         found = take_objects(root, streets.offset_m, net, folder / "town.net.xml", crosswalks=crossed > 0)
         notes += found.notes
         dx, dy = streets.offset_m

@@ -20,7 +20,7 @@ LENGTH_SHARE, LENGTH_M = 0.01, 0.5  # by which the length of a curve or road may
 
 
 @dataclass(frozen=True)
-class Piece:
+class GeometryPiece:
     """One <geometry>: a curve from a place in the map."""
 
     s: float  # where it begins along the road [m]
@@ -60,7 +60,7 @@ class ReferenceLine:
         return out
 
 
-def list_pieces(rows: Iterable[ElementTree.Element]) -> list[Piece]:
+def list_pieces(rows: Iterable[ElementTree.Element]) -> list[GeometryPiece]:
     """Return the curves of <geometry> elements that keep to `standard`."""
     return [_piece(row) for row in rows]
 
@@ -82,10 +82,10 @@ def is_by_length(shape: ElementTree.Element, length: float) -> bool:
     return said if by_length == by_share else by_length
 
 
-def _piece(row: ElementTree.Element) -> Piece:
+def _piece(row: ElementTree.Element) -> GeometryPiece:
     s, x, y, heading, length = (float(row.attrib[name]) for name in ("s", "x", "y", "hdg", "length"))
     shape = next(child for child in row if child.tag in CURVES)
-    return Piece(s, length, x, y, heading, CURVES[shape.tag](shape, length))
+    return GeometryPiece(s, length, x, y, heading, CURVES[shape.tag](shape, length))
 
 
 def _line(_shape: ElementTree.Element, _length: float) -> Curve:
@@ -209,7 +209,7 @@ def close_gaps(road: ElementTree.Element) -> list[Joint]:
         before = out[-1]
         start, room = float(row.attrib["s"]), float(row.attrib["s"]) - float(before.attrib["s"])
         if any(joint.s == start and joint.gap_m >= NOTED_M for joint in joints):
-            shorten(before, min(float(before.attrib["length"]), room))
+            shorten_geometry(before, min(float(before.attrib["length"]), room))
             out[-1:] = _ease(before, row, room)
         out.append(row)
     view = road.find("planView")
@@ -218,7 +218,7 @@ def close_gaps(road: ElementTree.Element) -> list[Joint]:
     return joints
 
 
-def shorten(row: ElementTree.Element, length: float) -> None:
+def shorten_geometry(row: ElementTree.Element, length: float) -> None:
     """Let a geometry element end at `length` [m], up to which it stays as it is."""
     whole = float(row.attrib["length"])
     spiral, cubic = row.find("spiral"), row.find("paramPoly3")
@@ -245,7 +245,7 @@ def _ease(before: ElementTree.Element, row: ElementTree.Element, room: float) ->
     points = one.at(first + share * (min(one.length, room) - first))[:, :2] + share[:, None] * gap
     out = [before] if first > SHORTEST_M else []
     if out:
-        shorten(before, first)
+        shorten_geometry(before, first)
     for i, (dx, dy) in enumerate(np.diff(points, axis=0).tolist()):
         place = {"s": start + first + share[i] * over, "x": points[i, 0], "y": points[i, 1], "hdg": math.atan2(dy, dx)}
         values = place | {"length": over * share[1]}

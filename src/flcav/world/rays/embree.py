@@ -46,10 +46,7 @@ SIGNATURES: dict[str, tuple[object, list[object]]] = {
     "rtcAttachGeometry": (c_uint, [c_void_p, c_void_p]),
     "rtcEnableGeometry": (None, [c_void_p]),
     "rtcDisableGeometry": (None, [c_void_p]),
-    "rtcSetSharedGeometryBuffer": (
-        None,
-        [c_void_p, c_int, c_uint, c_int, c_void_p, c_size_t, c_size_t, c_size_t],
-    ),
+    "rtcSetSharedGeometryBuffer": (None, [c_void_p, c_int, c_uint, c_int, c_void_p, c_size_t, c_size_t, c_size_t]),
     "rtcSetGeometryInstancedScene": (None, [c_void_p, c_void_p]),
     "rtcSetGeometryTransform": (None, [c_void_p, c_uint, c_int, POINTER(c_float)]),
     "rtcIntersect16": (None, [c_void_p, c_void_p, c_void_p, c_void_p]),
@@ -57,28 +54,15 @@ SIGNATURES: dict[str, tuple[object, list[object]]] = {
 }
 
 
-class IntersectArguments(ctypes.Structure):
-    """`RTCIntersectArguments`."""
+class QueryArguments(ctypes.Structure):
+    """`RTCIntersectArguments`, and `RTCOccludedArguments`, which has the same layout."""
 
     _fields_ = (
         ("flags", c_uint),
         ("feature_mask", c_uint),
         ("context", c_void_p),
         ("filter", c_void_p),
-        ("intersect", c_void_p),
-        ("min_width_distance_factor", c_float),
-    )
-
-
-class OccludedArguments(ctypes.Structure):
-    """`RTCOccludedArguments`."""
-
-    _fields_ = (
-        ("flags", c_uint),
-        ("feature_mask", c_uint),
-        ("context", c_void_p),
-        ("filter", c_void_p),
-        ("occluded", c_void_p),
+        ("callback", c_void_p),
         ("min_width_distance_factor", c_float),
     )
 
@@ -111,11 +95,42 @@ def _matching(folders: tuple[Path, ...], stem: str) -> list[Path]:
     return sorted(path for folder in folders for prefix in ("lib", "") for path in folder.glob(f"{prefix}{stem}*.*"))
 
 
-_ARGUMENTS = IntersectArguments(flags=QUERY_COHERENT, feature_mask=0xFFFFFFFF)
-_BLOCK_ARGUMENTS = OccludedArguments(flags=QUERY_COHERENT, feature_mask=0xFFFFFFFF)
+_ARGUMENTS = QueryArguments(flags=QUERY_COHERENT, feature_mask=0xFFFFFFFF)
 
 
-class Solid:
+class Hierarchy:
+    """A bounding volume hierarchy of Embree that rays are traced through: a scene in Embree's terms."""
+
+    handle: int
+
+    def trace(
+        self,
+        target_from_rays: Array,
+        directions: Array32,
+        *,
+        near_m: Array32 | None = None,
+        far_m: float = np.inf,
+        threads: int = 1,
+    ) -> Hits:
+        """Return the first hit of each ray beyond `near_m` (N,) [m], by default 0, and before `far_m` [m].
+
+        All rays start at the origin of one frame: `target_from_rays` (4, 4) is its pose in the hierarchy's frame,
+        `directions` (N, 3) are unit vectors in it. Each of `threads` threads traces whole packets. Raises `ValueError`
+        where `near_m` is not of the rays' number.
+        """
+        rays, near, hits = _buffers(directions, near_m)
+        origin = target_from_rays[:3, 3].astype(np.float32)
+        rotation = np.ascontiguousarray(target_from_rays[:3, :3], np.float32)
+        frame = (_address("rtcIntersect16"), self.handle, ctypes.addressof(_ARGUMENTS), origin, rotation)
+
+        def part(first: int, last: int) -> None:
+            trace_packets(*frame, rays, near, np.float32(far_m), first, last, *hits)
+
+        share_among_threads(part, len(rays), threads, whole=LANES)
+        return hits
+
+
+class Solid(Hierarchy):
     """A triangle mesh with its bounding volume hierarchy, in the mesh's own frame."""
 
     def __init__(self, vertices: Array32, faces: Ints32) -> None:
@@ -129,7 +144,7 @@ class Solid:
         # Embree reads 16 bytes at the last 12-byte vertex: one more vertex keeps that inside the buffer.
         self._vertices = np.concatenate((vertices, vertices[-1:])).astype(np.float32)
         self._faces = np.ascontiguousarray(faces, np.uint32)
-        self.handle: int = api.rtcNewScene(device)
+        self.handle = api.rtcNewScene(device)
         api.rtcSetSceneBuildQuality(self.handle, BUILD_QUALITY_HIGH)
         geometry = api.rtcNewGeometry(device, GEOMETRY_TRIANGLE)
         for kind, form, array, count in (
@@ -144,27 +159,15 @@ class Solid:
         _check("building a mesh")
         weakref.finalize(self, api.rtcReleaseScene, self.handle)
 
-    def trace(
-        self,
-        target_from_rays: Array,
-        directions: Array32,
-        *,
-        near_m: Array32 | None = None,
-        far_m: float = np.inf,
-        threads: int = 1,
-    ) -> Hits:
-        """Return the first hit of each ray with the mesh alone: see `Assembly.trace`."""
-        return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
 
-
-class Assembly:
+class Assembly(Hierarchy):
     """Instances of solids, placed by rigid transforms: the upper level of the hierarchy."""
 
     def __init__(self, solids: Sequence[Solid]) -> None:
         """Make one instance of each of `solids`, none placed yet; instance i is of solid i."""
         api, device = embree_library(), _device()
         self._solids = tuple(solids)  # kept alive as long as their instances
-        self.handle: int = api.rtcNewScene(device)
+        self.handle = api.rtcNewScene(device)
         api.rtcSetSceneFlags(self.handle, SCENE_DYNAMIC)
         self._instances: list[int] = []
         for solid in solids:
@@ -197,30 +200,7 @@ class Assembly:
         embree_library().rtcCommitScene(self.handle)
         _check("placing meshes")
 
-    def trace(
-        self,
-        target_from_rays: Array,
-        directions: Array32,
-        *,
-        near_m: Array32 | None = None,
-        far_m: float = np.inf,
-        threads: int = 1,
-    ) -> Hits:
-        """Return the first hit of each ray beyond `near_m` (N,) [m], by default 0, and before `far_m` [m].
-
-        All rays start at the origin of one frame: `target_from_rays` (4, 4) is its pose in the assembly's frame,
-        `directions` (N, 3) are unit vectors in it. Raises `ValueError` where `near_m` is not of the rays' number.
-        """
-        return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
-
-    def find_occluded(
-        self,
-        origins: Array32,
-        directions: Array32,
-        far_m: Array32,
-        *,
-        threads: int = 1,
-    ) -> Mask:
+    def find_occluded(self, origins: Array32, directions: Array32, far_m: Array32, *, threads: int = 1) -> Mask:
         """Return (N,) whether each ray is occluded before its end `far_m` (N,) [m]; never where that is not positive.
 
         `origins` (N, 3) [m] and unit `directions` (N, 3), or (1, 3) for all, are in the assembly's frame.
@@ -228,7 +208,7 @@ class Assembly:
         start, towards, far = (np.ascontiguousarray(each, np.float32) for each in (origins, directions, far_m))
         out = np.empty(len(far), np.bool_)
         cast = np.flatnonzero(far > 0)
-        arguments = ctypes.addressof(_BLOCK_ARGUMENTS)
+        arguments = ctypes.addressof(_ARGUMENTS)
 
         def part(first: int, last: int) -> None:
             at = slice(cast[first] if first else 0, cast[last] if last < len(cast) else len(far))
@@ -297,39 +277,6 @@ def _buffers(directions: Array32, near_m: Array32 | None) -> tuple[Array32, Arra
         raise ValueError(f"near_m has {len(near)} values for {len(rays)} rays")
     count = len(rays)
     return rays, near, Hits(np.empty(count, np.float32), np.empty(count, np.int32), np.empty(count, np.int32))
-
-
-def _trace(
-    handle: int,
-    target_from_rays: Array,
-    directions: Array32,
-    near_m: Array32 | None,
-    far_m: float,
-    threads: int,
-) -> Hits:
-    """Return the first hit of each ray with the Embree scene `handle`, in whole packets by each thread."""
-    rays, near, hits = _buffers(directions, near_m)
-    origin = target_from_rays[:3, 3].astype(np.float32)
-    rotation = np.ascontiguousarray(target_from_rays[:3, :3], np.float32)
-    arguments = ctypes.addressof(_ARGUMENTS)
-
-    def part(first: int, last: int) -> None:
-        trace_packets(
-            _address("rtcIntersect16"),
-            handle,
-            arguments,
-            origin,
-            rotation,
-            rays,
-            near,
-            np.float32(far_m),
-            first,
-            last,
-            *hits,
-        )
-
-    share_among_threads(part, len(rays), threads, whole=LANES)
-    return hits
 
 
 @lru_cache(maxsize=1)

@@ -34,6 +34,25 @@ def call_c(typing_context, address, first, second, third, fourth):
 
 
 @compiled
+def _allocate_packet():
+    """Return a ray packet (ROWS, LANES) as float32 and as int32, and its mask of valid rays (LANES,).
+
+    Embree requires them to be aligned to 64 bytes. Time, mask, id and flags of the rays are set.
+    """
+    spare_floats = np.empty(ROWS * LANES + LANES, np.float32)
+    skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4
+    packet = spare_floats[skipped : skipped + ROWS * LANES].reshape(ROWS, LANES)
+    words = packet.view(np.int32)
+    spare_words = np.empty(2 * LANES, np.int32)
+    skipped = ((64 - spare_words.ctypes.data % 64) % 64) // 4
+    packet[TIME, :] = 0
+    words[MASK, :] = -1
+    words[RAY_ID, :] = 0
+    words[FLAGS, :] = 0
+    return packet, words, spare_words[skipped : skipped + LANES]
+
+
+@compiled
 def trace_packets(
     intersect, scene, arguments, origin, rotation, directions, near, far, first_ray, last_ray, distance, instance, face
 ):
@@ -44,23 +63,13 @@ def trace_packets(
     frame in the scene, `directions` (N, 3) unit vectors in it. `near` is (N,), or (1,) for all; `far` is a scalar [m].
     Distance is inf, and instance and face are -1, where nothing is hit.
     """
-    spare_floats = np.empty(ROWS * LANES + LANES, np.float32)
-    skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4  # Embree requires 64-byte alignment
-    packet = spare_floats[skipped : skipped + ROWS * LANES].reshape(ROWS, LANES)
-    packet_words = packet.view(np.int32)
-    spare_words = np.empty(2 * LANES, np.int32)
-    skipped = ((64 - spare_words.ctypes.data % 64) % 64) // 4
-    valid = spare_words[skipped : skipped + LANES]
+    packet, packet_words, valid = _allocate_packet()
     near_step = 1 if len(near) > 1 else 0
     r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
     for axis in range(3):
         packet[ORIGIN + axis, :] = origin[axis]
-    packet[TIME, :] = 0
-    packet_words[MASK, :] = -1
-    packet_words[RAY_ID, :] = 0
-    packet_words[FLAGS, :] = 0
     for start in range(first_ray, last_ray, LANES):
         lanes = min(LANES, last_ray - start)
         for lane in range(LANES):
@@ -117,20 +126,10 @@ def occlude_packets(occluded, scene, arguments, origins, directions, far, blocke
     `occluded`, `scene` and `arguments` are addresses. `origins` (N, 3) and unit `directions` (N, 3), or (1, 3) for all,
     are in the scene's frame.
     """
-    spare_floats = np.empty(ROWS * LANES + LANES, np.float32)
-    skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4
-    packet = spare_floats[skipped : skipped + ROWS * LANES].reshape(ROWS, LANES)
-    packet_words = packet.view(np.int32)
-    spare_words = np.empty(2 * LANES, np.int32)
-    skipped = ((64 - spare_words.ctypes.data % 64) % 64) // 4
-    valid = spare_words[skipped : skipped + LANES]
+    packet, _, valid = _allocate_packet()
     rays = np.empty(LANES, np.int64)
     direction_step = 1 if len(directions) > 1 else 0
     packet[NEAR, :] = 0
-    packet[TIME, :] = 0
-    packet_words[MASK, :] = -1
-    packet_words[RAY_ID, :] = 0
-    packet_words[FLAGS, :] = 0
     lanes = 0
     for ray in range(len(far)):
         blocked[ray] = False

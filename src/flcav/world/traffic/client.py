@@ -11,31 +11,31 @@ from pathlib import Path
 from typing import Any
 
 from flcav.world.traffic.demand import Demand
-from flcav.world.traffic.simulation import NET, ROUTES, Job, Request, States
+from flcav.world.traffic.simulation import NET, ROUTES, States, StepRequest, TrafficJob
 
-SERVE = "flcav.world.traffic.process:serve"  # what that process runs
+SERVE = "flcav.world.traffic.process:serve_traffic"  # what that process runs
 ROOT = str(Path(__file__).parents[3])  # where flcav is, installed or not
 
 _idle: list[tuple[int, subprocess.Popen[str]]] = []  # processes without a run, with the id of their parent
 
 
-def write_job(folder: Path, net: Path, demand: Demand, seed: int) -> Job:
+def write_job(folder: Path, net: Path, demand: Demand, seed: int) -> TrafficJob:
     """Return the job of a run, whose files are in `folder` until it has begun."""
     (folder / NET).symlink_to(net.absolute())
     (folder / ROUTES).write_text(demand.routes, encoding="utf-8")
-    return Job(str(folder.absolute()), seed, demand.followers)
+    return TrafficJob(str(folder.absolute()), seed, demand.followers)
 
 
 class Sumo:
     """A SUMO run in a process beside this one, which it has until it is closed."""
 
-    def __init__(self, job: Job, failure: str = "SUMO failed") -> None:
+    def __init__(self, job: TrafficJob, failure: str = "SUMO failed") -> None:
         """Start a run; where SUMO fails, now or later, that is a `RuntimeError` that begins with `failure`."""
         self._failure = failure
         self._process: subprocess.Popen[str] | None = _take_process()
         self.begun: States = self._ask(job._asdict())
 
-    def step(self, request: Request) -> States:
+    def step(self, request: StepRequest) -> States:
         """Make a step, and return the states after it."""
         return self._ask({"step": request._asdict()})
 

@@ -10,7 +10,7 @@ import numpy as np
 from flcav.config import InputError, read_xml, shorten
 from flcav.geometry import heading_vectors, left_vectors, wrap_angle
 from flcav.statistics.streams import derive_seed, stream
-from flcav.world.dynamics.obstacles import Ground
+from flcav.world.dynamics.obstacles import TownGround
 from flcav.world.dynamics.vehicle import VEHICLES
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import Town
@@ -20,7 +20,7 @@ from flcav.world.snapshot import NOBODY, Actors
 from flcav.world.traffic.bridges import find_footing
 from flcav.world.traffic.client import Sumo, write_job
 from flcav.world.traffic.demand import list_vehicle_types, park, write_demand
-from flcav.world.traffic.simulation import Body, Job, Request
+from flcav.world.traffic.simulation import Body, StepRequest, TrafficJob
 from flcav.world.traffic.traffic import number_of
 
 FILL_S = 20.0  # all actors have departed by then
@@ -32,7 +32,7 @@ SOON_S = 0.7  # so far ahead traffic looks at who crosses its way
 BERTH_M = 1.0  # half the width of a vehicle that passes
 
 
-def write_live_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians: int) -> Job:
+def write_live_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians: int) -> TrafficJob:
     """Return the job of a live world's run, whose files are in `folder`.
 
     Raises `InputError` as `write_demand`.
@@ -53,7 +53,7 @@ def write_live_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedest
 class SumoTraffic:
     """SUMO's traffic in a town, with a SUMO process of its own until it is closed."""
 
-    def __init__(self, town: Town, ground: Ground, *, seed: int, vehicles: int, pedestrians: int) -> None:
+    def __init__(self, town: Town, ground: TownGround, *, seed: int, vehicles: int, pedestrians: int) -> None:
         """Start with the traffic under way; raises `InputError` as `write_demand`, `RuntimeError` where SUMO fails."""
         self.ticks = 0  # steps of SUMO since the start
         self._actors = NOBODY  # those present before and after the step of SUMO under way, at their last places
@@ -75,7 +75,7 @@ class SumoTraffic:
         """
         changed = {name: state for name, state in lights.items() if self._lights.get(name) != state}
         self._lights |= changed
-        request = Request(_list_vehicles(bodies), _list_dangers(bodies), changed, halted, self._gone)
+        request = StepRequest(_list_vehicles(bodies), _list_dangers(bodies), changed, halted, self._gone)
         self._before, self._after = self._after, self._sumo.step(request)
         self._gone = []
         self.ticks += 1
@@ -191,7 +191,7 @@ def _list_dangers(bodies: Actors) -> list[list[float]]:
     return np.column_stack((np.concatenate(places), np.tile(row, (len(places), 1)))).tolist()
 
 
-def stand_parked(town: Town, ground: Ground, seed: int) -> Actors:
+def stand_parked(town: Town, ground: TownGround, seed: int) -> Actors:
     """Return the vehicles parked along a town's streets, the same as in a recording with this seed."""
     cars = park(read_net(town.net), town.parameters, stream(seed, "parked")) if town.net.exists() else []
     if not cars:
@@ -230,7 +230,7 @@ class LightProgram:
         return self.states[0]
 
 
-class Lights:
+class TrafficLights:
     """The lights of a town, which follow their programs unless they are set or frozen."""
 
     def __init__(self, programs: tuple[LightProgram, ...], time_s: float) -> None:

@@ -1,9 +1,10 @@
 """The SUMO process, which makes the steps of recordings and of live worlds.
 
-`serve` reads requests and writes an answer to each, JSON on a line. The first request of a run is its `Job`; the run is
-a fork of this process, since libsumo holds one simulation per process and takes longer to load than a minute of
-traffic. `{"step": Request}` makes a step, `{"record": {"steps": [...], "out": FILE}}` records the run into a file; the
-answer is `States`, as at the start. `null` ends the run, and so does the answer `{"error": TEXT}`.
+`serve_traffic` reads requests and writes an answer to each, JSON on a line. The first request of a run is its
+`TrafficJob`; the run is a fork of this process, since libsumo holds one simulation per process and takes longer to load
+than a minute of traffic. `{"step": StepRequest}` makes a step,
+`{"record": {"steps": [...], "out": FILE}}` records the run into a file; the answer is `States`, as at the start. `null`
+ends the run, and so does the answer `{"error": TEXT}`.
 """
 
 import json
@@ -18,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from flcav.arrays import Array, Words
-from flcav.world.traffic.simulation import Job, Request, Simulation, States
+from flcav.world.traffic.simulation import Simulation, States, StepRequest, TrafficJob
 
 
-def serve() -> None:
+def serve_traffic() -> None:
     """Make the run of each job that is read from stdin, in a fork."""
     import libsumo  # noqa: F401 - for the forks
 
@@ -52,16 +53,16 @@ def _run(first: bytes) -> None:
         try:
             import libsumo
 
-            job = Job(**json.loads(first))
+            job = TrafficJob(**json.loads(first))
             os.chdir(job.folder)  # in a path SUMO would take a comma for a separator, and ${...} for a variable
             simulation = Simulation(libsumo, job)
             answer(simulation.states())
             while request := json.loads(sys.stdin.buffer.readline() or "null"):
                 said.truncate(0)
                 if asked := request.get("record"):
-                    record(simulation, asked["steps"], Path(asked["out"]))
+                    record_traffic(simulation, asked["steps"], Path(asked["out"]))
                 else:
-                    simulation.step(Request(**request["step"]))
+                    simulation.step(StepRequest(**request["step"]))
                 answer(simulation.states())
             answer({})
         except BaseException as error:
@@ -70,7 +71,7 @@ def _run(first: bytes) -> None:
             answer({"error": f"{words}{type(error).__name__}: {error}"})
 
 
-class Recorded(NamedTuple):
+class RecordedTraffic(NamedTuple):
     """The states of A actors and the letters of J lights' links at T instants."""
 
     id: Words  # (A,)
@@ -81,8 +82,8 @@ class Recorded(NamedTuple):
     events: Words  # () scenarios that took place, as JSON
 
 
-def record(simulation: Simulation, steps: Sequence[int], out: Path) -> None:
-    """Make the steps up to the last of `steps` (T,), ascending, and write what is `Recorded` at these into `out`."""
+def record_traffic(simulation: Simulation, steps: Sequence[int], out: Path) -> None:
+    """Make the steps up to the last of `steps` (T,), ascending, and write the `RecordedTraffic` at these into `out`."""
     lights, director = simulation.sumo.trafficlight, simulation.director
     junctions, now = lights.getIDList(), 0
     seen: list[States] = []
@@ -101,7 +102,7 @@ def record(simulation: Simulation, steps: Sequence[int], out: Path) -> None:
     state = np.full((len(steps), len(kinds), 4), np.nan)
     for row, states in zip(state, seen):
         row[[column[name] for name in states]] = np.array([each[1:] for each in states.values()]).reshape(-1, 4)
-    recorded = Recorded(
+    recorded = RecordedTraffic(
         id=np.array(list(kinds), dtype=np.str_),
         type=np.array(list(kinds.values()), dtype=np.str_),
         state=state,

@@ -1,7 +1,7 @@
 """Stepped traffic: a SUMO run that is the same for recordings and for live worlds, and reacts to what is driven there.
 
-A step of `STEP_S` obeys a `Request`: the vehicles under control are placed, SUMO's brake for what is in their way, and
-then all move. Nobody is under control in a recording.
+A step of `STEP_S` obeys a `StepRequest`: the vehicles under control are placed, SUMO's brake for what is in their way,
+and then all move. Nobody is under control in a recording.
 """
 
 import math
@@ -26,7 +26,7 @@ Body = tuple[str, str, Sequence[float]]
 """A vehicle under control: name, SUMO's type; length, width, front x, y [m], angle [deg], speed [m/s]."""
 
 
-class Job(NamedTuple):
+class TrafficJob(NamedTuple):
     """What a run is started with; the files `NET` and `ROUTES` of its folder are SUMO's."""
 
     folder: str
@@ -38,7 +38,7 @@ class Job(NamedTuple):
     steps: int = 0  # that are made at the start
 
 
-class Request(NamedTuple):
+class StepRequest(NamedTuple):
     """What a step obeys."""
 
     bodies: Sequence[Body] = ()  # under control
@@ -51,7 +51,7 @@ class Request(NamedTuple):
 class Simulation:
     """A SUMO run, step by step."""
 
-    def __init__(self, sumo: Any, job: Job) -> None:
+    def __init__(self, sumo: Any, job: TrafficJob) -> None:
         """Start libsumo, the module `sumo`, in the job's folder, which is the working directory."""
         options = {
             "net-file": NET,
@@ -81,7 +81,7 @@ class Simulation:
         for _ in range(job.steps):
             self.advance()
 
-    def step(self, request: Request) -> None:
+    def step(self, request: StepRequest) -> None:
         """Make a step that obeys the request."""
         for light, state in request.lights.items():
             self.sumo.trafficlight.setRedYellowGreenState(light, state)

@@ -21,6 +21,7 @@ from flcav.world.map.relief import find_tilts
 from flcav.world.map.roads import read_net
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import KERB_M, Town
+from flcav.world.scenarios.manoeuvres import shape_of
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S
 from flcav.world.shapes import SHAPES
@@ -28,7 +29,7 @@ from flcav.world.trace import Event, Trace
 from flcav.world.traffic.bridges import find_footing
 from flcav.world.traffic.client import Sumo, write_job
 from flcav.world.traffic.demand import Demand, Parked, list_vehicle_types, park, write_demand
-from flcav.world.traffic.process import Recorded
+from flcav.world.traffic.process import RecordedTraffic
 
 FILL_S = 30.0  # all actors have departed by then
 SMOOTHING_STEPS = 4  # half width of the moving average of poses, since SUMO turns and changes lanes abruptly
@@ -85,7 +86,7 @@ def simulate_drives(
     return trace, _build_trace(town, (driven * np.float64(STEP_S)).round(1), _of_cavs(raw), drive_rows, [])
 
 
-def _of_cavs(raw: Recorded) -> Recorded:
+def _of_cavs(raw: RecordedTraffic) -> RecordedTraffic:
     """Return the states of CAVs alone."""
     own = np.char.startswith(raw.id, "cav")
     return raw._replace(id=raw.id[own], type=raw.type[own], state=raw.state[:, own])
@@ -96,22 +97,18 @@ def _windows(steps: Ints) -> Ints:
     return np.maximum(steps[:, None] + np.arange(-SMOOTHING_STEPS, SMOOTHING_STEPS + 1), 1)
 
 
-def _run(net: Path, demand: Demand, seed: int, steps: Ints, scenarios: Sequence[Scenario]) -> Recorded:
+def _run(net: Path, demand: Demand, seed: int, steps: Ints, scenarios: Sequence[Scenario]) -> RecordedTraffic:
     """Return the states at these steps of a run with nobody under control; raises `RuntimeError` where SUMO fails."""
     with tempfile.TemporaryDirectory(prefix="flcav_traffic_") as name:
         job = write_job(Path(name), net, demand, seed)._replace(scenarios=[each.model_dump() for each in scenarios])
         with contextlib.closing(Sumo(job, f"SUMO failed on {net}")) as sumo:
             sumo.record(steps.tolist(), out := Path(name) / "out.npz")
         with np.load(out) as arrays:
-            return Recorded(**arrays)
+            return RecordedTraffic(**arrays)
 
 
 def _build_trace(
-    town: Town,
-    time_s: Array,
-    raw: Recorded,
-    windows: tuple[Ints, ...],
-    parked: list[Parked],
+    town: Town, time_s: Array, raw: RecordedTraffic, windows: tuple[Ints, ...], parked: list[Parked]
 ) -> Trace:
     """Return the trace of SUMO's states, averaged over `windows` (rows of the steps before, at and after the times)."""
     before, now, after = windows
@@ -164,7 +161,7 @@ def _build_trace(
     )
 
 
-def _smooth(raw: Recorded, windows: Ints) -> Array:
+def _smooth(raw: RecordedTraffic, windows: Ints) -> Array:
     """Return front x, y, yaw, speed (T, A, 4), averaged over each window (T, W); NaN where absent at its middle."""
     rows = np.unique(windows)
     dense, windows = _dense(raw, rows), np.searchsorted(rows, windows)
@@ -179,7 +176,7 @@ def _smooth(raw: Recorded, windows: Ints) -> Array:
     return out
 
 
-def _dense(raw: Recorded, rows: Ints) -> Array:
+def _dense(raw: RecordedTraffic, rows: Ints) -> Array:
     """Return front x, y, unwrapped yaw, speed (R, A, 4) at `rows` (R,) of the steps read; NaN where absent."""
     out = raw.state[rows]
     yaw = np.pi / 2 - np.radians(out[..., 2])
@@ -225,14 +222,13 @@ def _walk(before: Array, now: Array, after: Array) -> tuple[Array, Array]:
     return next(motions), next(motions)
 
 
-def _drop_obstructing(raw: Recorded, parked: list[Parked]) -> list[Parked]:
+def _drop_obstructing(raw: RecordedTraffic, parked: list[Parked]) -> list[Parked]:
     """Return the parked vehicles that do not overlap the paths of actors created for scenarios."""
     scripted = np.flatnonzero(np.char.startswith(raw.id, "scripted"))
     ways = []
     for actor in scripted:
         at = raw.state[~np.isnan(raw.state[:, actor, 0]), actor]
-        category, _, shape = str(raw.type[actor]).partition(".")
-        length, width = next(row[1:3] for row in SHAPES[category] if row.name == shape)
+        length, width = shape_of(str(raw.type[actor]))[1:3]
         yaw = np.pi / 2 - np.radians(at[:, 2])
         middle = at[:, :2] - length / 2 * heading_vectors(yaw)
         ways += [make_footprint(x, y, turn, length, width).buffer(0.3) for (x, y), turn in zip(middle, yaw)]

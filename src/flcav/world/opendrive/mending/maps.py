@@ -58,18 +58,14 @@ def mend_map(root: ElementTree.Element) -> tuple[str, ...]:
                 for lane in row.findall("laneLink"):
                     if lane not in ways:
                         row.remove(lane)
-    notes = []
-    if untyped:
-        notes.append(f"Signals without a type: {untyped}; they have no meaning here.")
-    if dangling:
-        notes.append(f"Links that lead to no road, junction or lane of the map, left out: {dangling}.")
-    if endless:
-        notes.append(f"Speed limits that are not finite, left out: {endless}.")
-    if direct:
-        notes.append(f"Connections of direct junctions: {direct}; their lanes are joined by where they lie.")
-    if unknown:
-        notes.append(f"Lanes without a type, closed to traffic: {unknown}.")
-    return tuple(notes)
+    notes = (
+        (untyped, f"Signals without a type: {untyped}; they have no meaning here."),
+        (dangling, f"Links that lead to no road, junction or lane of the map, left out: {dangling}."),
+        (endless, f"Speed limits that are not finite, left out: {endless}."),
+        (direct, f"Connections of direct junctions: {direct}; their lanes are joined by where they lie."),
+        (unknown, f"Lanes without a type, closed to traffic: {unknown}."),
+    )
+    return tuple(note for count, note in notes if count)
 
 
 def name_safely(root: ElementTree.Element) -> None:

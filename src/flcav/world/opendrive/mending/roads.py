@@ -163,15 +163,15 @@ NARROW_M = 1.8  # width from which on netconvert opens a lane to traffic
 ZERO = Polynomial([0.0])
 
 
-class Piece(NamedTuple):
+class WidthPiece(NamedTuple):
     """A piece of a piecewise polynomial: its value [m] by the length [m] from `s` on."""
 
     s: float  # [m] from the beginning of the lane section
     value: Polynomial
 
-    def at(self, s: float) -> "Piece":
+    def at(self, s: float) -> "WidthPiece":
         """Return the same polynomial from another place on."""
-        return self if s == self.s else Piece(s, self.value(Polynomial([s - self.s, 1.0])))
+        return self if s == self.s else WidthPiece(s, self.value(Polynomial([s - self.s, 1.0])))
 
 
 class Change(NamedTuple):
@@ -190,14 +190,14 @@ def rewrite_widths(section: ElementTree.Element, length: float) -> list[Change]:
     for side, sign in (("left", 1.0), ("right", -1.0)):
         lanes = sorted(section.iterfind(f"{side}/lane"), key=lambda lane: abs(int(lane.attrib["id"])))
         bordered = any(lane.find("border") is not None for lane in lanes)
-        edge = [Piece(0.0, ZERO)]  # from the centre line to the outer border of the lane before
+        edge = [WidthPiece(0.0, ZERO)]  # from the centre line to the outer border of the lane before
         for lane in lanes:
             widths, borders = lane.findall("width"), lane.findall("border")
             if not bordered and _is_plain(widths):
                 continue
             pieces = _read(widths)
             if borders and not widths:
-                pieces = _add(_add([Piece(0.0, ZERO)], _read(borders), sign), edge, -1.0)
+                pieces = _add(_add([WidthPiece(0.0, ZERO)], _read(borders), sign), edge, -1.0)
             kept, least, most = _cut(pieces, length)
             if most <= LEAST_M or least < -LEAST_M:
                 changes.append(Change(int(lane.attrib["id"]), least if most > LEAST_M else 0.0))
@@ -216,7 +216,7 @@ def _is_plain(widths: list[ElementTree.Element]) -> bool:
     return len(own) == 1 and own[0][0] == 0.0 and own[0][1] > LEAST_M and not any(own[0][2:])
 
 
-def _cut(pieces: list[Piece], length: float) -> tuple[list[Piece], float, float]:
+def _cut(pieces: list[WidthPiece], length: float) -> tuple[list[WidthPiece], float, float]:
     """Return the pieces up to `length` [m], zero where they are below it, and the least and the largest value [m].
 
     A piece also ends where it is narrowest, if no vehicle fits there.
@@ -231,9 +231,9 @@ def _cut(pieces: list[Piece], length: float) -> tuple[list[Piece], float, float]
     values = np.array([piece.value(np.linspace(0.0, span, 3)) for piece, span in parts])
     least, most = float(values.min()), float(values.max())
     if most <= LEAST_M:
-        return [Piece(0.0, ZERO)], least, most
+        return [WidthPiece(0.0, ZERO)], least, most
     below = values[:, 1] < (0.0 if least < -LEAST_M else -np.inf)
-    return [Piece(piece.s, ZERO) if negative else piece for (piece, _), negative in zip(parts, below)], least, most
+    return [WidthPiece(piece.s, ZERO) if negative else piece for (piece, _), negative in zip(parts, below)], least, most
 
 
 def _find_roots(value: Polynomial, span: float) -> list[float]:
@@ -244,29 +244,31 @@ def _find_roots(value: Polynomial, span: float) -> list[float]:
     return [float(root.real) for root in roots if abs(root.imag) < 1e-9 and 1e-6 < root.real < span - 1e-6]
 
 
-def _read(rows: list[ElementTree.Element]) -> list[Piece]:
+def _read(rows: list[ElementTree.Element]) -> list[WidthPiece]:
     """Return the pieces of rows in the order of s, from the beginning of the section on."""
-    pieces = [Piece(float(row.attrib["sOffset"]), Polynomial([float(row.attrib[i]) for i in "abcd"])) for row in rows]
+    pieces = [
+        WidthPiece(float(row.attrib["sOffset"]), Polynomial([float(row.attrib[i]) for i in "abcd"])) for row in rows
+    ]
     early = [piece for piece in pieces if piece.s <= 0.0]
     late = [piece for piece in pieces if piece.s > 0.0]
     if early:
         return [early[-1].at(0.0), *late]
     if late and late[0].s <= LATE_M:
         return [late[0]._replace(s=0.0), *late[1:]]
-    return [Piece(0.0, ZERO), *late]
+    return [WidthPiece(0.0, ZERO), *late]
 
 
-def _add(one: list[Piece], other: list[Piece], factor: float) -> list[Piece]:
+def _add(one: list[WidthPiece], other: list[WidthPiece], factor: float) -> list[WidthPiece]:
     """Return the pieces of one piecewise polynomial plus `factor` times another."""
     starts = sorted({piece.s for piece in (*one, *other)})
-    return [Piece(s, _at(one, s).value + factor * _at(other, s).value) for s in starts]
+    return [WidthPiece(s, _at(one, s).value + factor * _at(other, s).value) for s in starts]
 
 
-def _at(pieces: list[Piece], s: float) -> Piece:
+def _at(pieces: list[WidthPiece], s: float) -> WidthPiece:
     return [piece for piece in pieces if piece.s <= s][-1].at(s)
 
 
-def _write(piece: Piece) -> dict[str, str]:
+def _write(piece: WidthPiece) -> dict[str, str]:
     """Return the attributes of a <width>."""
     coefficients = [*piece.value.coef.tolist(), 0.0, 0.0, 0.0][:4]
     return {"sOffset": repr(piece.s), **{name: repr(value) for name, value in zip("abcd", coefficients)}}

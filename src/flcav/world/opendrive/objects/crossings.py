@@ -12,7 +12,7 @@ from shapely.ops import substring
 
 from flcav.arrays import Array
 from flcav.world.map.roads import CARRIAGEWAY, Edge, Lane, RoadNet, read_net
-from flcav.world.opendrive.objects.places import enclose_outline, locate, outline_object, read_number
+from flcav.world.opendrive.objects.places import TakenOver, enclose_outline, locate_thing, outline_object, read_number
 from flcav.world.opendrive.road_surface import Road
 
 PAINTED_CROSSWALK = "1000003"  # type of a signal that is a painted crosswalk: its width is that across the road,
@@ -38,15 +38,7 @@ class Crosswalk:
         return self.axes[first] * np.sign(share[first]), float(self.sides[first]), float(self.sides[1 - first])
 
 
-@dataclass(frozen=True)
-class Crosswalks:
-    """The crosswalks that a map describes, and how many it only names, by the reason."""
-
-    found: tuple[Crosswalk, ...]
-    left: Counter[str]
-
-
-def find_crosswalks(root: ElementTree.Element, offset_m: tuple[float, float]) -> Crosswalks:
+def find_crosswalks(root: ElementTree.Element, offset_m: tuple[float, float]) -> TakenOver[Crosswalk]:
     """Return the crosswalks of a map in town coordinates: map + `offset_m` [m]."""
     found, left = [], Counter[str]()
     for row in root.iterfind("road"):
@@ -64,12 +56,12 @@ def find_crosswalks(root: ElementTree.Element, offset_m: tuple[float, float]) ->
                 left["no size of a crosswalk"] += 1
             else:
                 found.append(crosswalk)
-    return Crosswalks(tuple(found), left)
+    return TakenOver(tuple(found), left)
 
 
 def _outline(road: Road, marking: ElementTree.Element) -> Array | None:
     """Return the corners (4, 2) of a crosswalk that is a signal; None where it lacks its place or extents."""
-    place = locate(road, marking)
+    place = locate_thing(road, marking)
     across, along = read_number(marking, "width"), read_number(marking, "value")
     if place is None or not (LONG_M[0] <= across <= LONG_M[1] and WIDE_M[0] <= along <= WIDE_M[1]):
         return None
