@@ -16,8 +16,7 @@ from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.importing import import_town
-from flcav.world.opendrive.mending.maps import mend_map
-from flcav.world.opendrive.mending.roads import mend_roads
+from flcav.world.opendrive.mending import mend_map, mend_roads
 from flcav.world.opendrive.netconvert import mirror_map
 from flcav.world.opendrive.objects.crossings import find_crosswalks
 from flcav.world.opendrive.objects.signal_heads import find_heads

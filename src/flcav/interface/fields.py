@@ -1,4 +1,7 @@
-"""The fields of a record or of a model as its source writes them, with the comment beside each."""
+"""The fields of a record or of a model as its source writes them, with the comment beside each.
+
+Lazy imports: module attributes that are imported on first access (PEP 562).
+"""
 
 import ast
 import inspect

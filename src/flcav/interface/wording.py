@@ -1,4 +1,7 @@
-"""Wording of messages: names that were probably meant, numbers without their units, plurals of counts."""
+"""Wording of messages: names that were probably meant, numbers without their units, plurals of counts.
+
+Optional dependencies: the packages of flcav's extras and the command that installs them.
+"""
 
 import re
 import shlex

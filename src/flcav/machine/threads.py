@@ -1,4 +1,4 @@
-"""Thread count of the numerical libraries, and work shared among threads.
+"""Thread count of the numerical libraries, work shared among threads, and the memory that a process keeps.
 
 The thread count of the libraries decides the order of sums, and so the last bits of results.
 """

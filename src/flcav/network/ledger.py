@@ -1,4 +1,9 @@
-"""Communication ledger: the bytes of every message on every link, under uplink budgets that it enforces."""
+"""Communication ledger: the bytes of every message on every link, under uplink budgets that it enforces.
+
+Messages on a link: arrays as bytes and back, and sending them through a ledger.
+
+A message is a safetensors file: names, types and shapes of its arrays in JSON, then their values; nothing is unpickled.
+"""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,4 +1,7 @@
-"""Simulation of a colour camera: rendering, tone mapping, sensor noise; depth, semantic and instance images."""
+"""Simulation of a colour camera: rendering, tone mapping, sensor noise; depth, semantic and instance images.
+
+Tone mapping: exposure, a filmic curve and the sRGB transfer function, by one look-up table; sensor noise.
+"""
 
 from functools import lru_cache
 from typing import NamedTuple

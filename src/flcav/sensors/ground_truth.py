@@ -1,4 +1,9 @@
-"""Ground truth of one frame, from the rays of its sensors."""
+"""Ground truth of one frame from the rays of its sensors: boxes, occlusion, and what images show of actors and signs.
+
+Occlusion of actors for a LiDAR: occluded rays, counted by casting stopped rays again in an empty world.
+
+Only rays that end before an actor's bounding box and pass through it are cast again, against that actor alone.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple

@@ -1,6 +1,19 @@
 """Simulation of a 77 GHz radar: ray casting, cross-sections, resolution cells, detection and false alarms.
 
 Only direct echoes of the first surface are modelled: no multipath over the road, nothing behind glass.
+
+Radar cross-sections at 77 GHz, and a Swerling 1 detector over resolution cells.
+
+Mean cross-sections of actors are those commonly measured at 76 to 81 GHz (pedestrian -8 dBsm: Yamada et al., 2005; cars
+10 dBsm with flashes off flat front, rear and sides: Schipper et al., 2011). An actor's cross-section is spread evenly
+over its silhouette, so that a car of which half is hidden has half of it. Ground follows the constant-gamma model of
+land clutter.
+
+The radar equation gives each cell's signal-to-noise ratio, S = K g(direction) sigma L(rain) / r^4, with g the two-way
+antenna gain and sigma the cross-section. A cell fluctuates as Swerling's case 1: its measured power, in units of the
+noise, is exponential with mean 1 + S and is reported above T = -ln(P_fa); so the probability of detection is
+P_fa^(1 / (1 + S)) (Richards, "Fundamentals of Radar Signal Processing", section 6.3). Errors of a reported value shrink
+with the square root of the power.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,10 @@
-"""Rigs: the sensors of an agent with their mounts and settings, and presets of them."""
+"""Rigs: the sensors of an agent with their mounts and settings, presets of them, and their calibration.
+
+Calibration of a rig (extrinsics, intrinsics, distortion, trigger times), and random errors of calibration.
+
+The true calibration follows from the rig. The agent works with an assumed one, which differs by one Gaussian error per
+sensor and dataset.
+"""
 
 import re
 from collections import Counter

@@ -1,4 +1,7 @@
-"""Image annotations of actors: visible pixels, visible and amodal boxes, truncation, occlusion."""
+"""Image annotations of actors: visible pixels, visible and amodal boxes, truncation, occlusion.
+
+Amodal 2-D boxes: bounding rectangles of actors' projected convex hulls, exact for lenses without distortion.
+"""
 
 from functools import lru_cache
 from typing import NamedTuple

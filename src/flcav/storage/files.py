@@ -1,4 +1,7 @@
-"""Atomic and durable file writing, JSON files and SHA-256 checksums."""
+"""Atomic and durable file writing, JSON files and SHA-256 checksums.
+
+Strict reading of Parquet files, and their writing as a whole.
+"""
 
 import contextlib
 import errno

@@ -1,4 +1,7 @@
-"""Conversion of frozen dataclasses to JSON values and back, by pydantic, and to rows of a table."""
+"""Conversion of frozen dataclasses to JSON values and back, by pydantic, and to rows of a table.
+
+Tables of users: CSV read, and tables written as CSV or Parquet by the suffix of the file's name.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache

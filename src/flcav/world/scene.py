@@ -12,7 +12,7 @@ from flcav.geometry import pose, rotations, rotations_about_z
 from flcav.world.map.town import Town
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
 from flcav.world.meshes import Mesh, actor_mesh
-from flcav.world.rays.embree import Embree, Solid
+from flcav.world.rays.embree import Assembly, Solid, check_embree, trace_each
 from flcav.world.rays.packets import Hits
 from flcav.world.static import SignsAndSignals, TownCache, build_town_mesh, list_signs_and_signals
 from flcav.world.trace import Trace
@@ -43,7 +43,7 @@ class Scene:
         """
         self.town = town
         self.paints: Mapping[str, tuple[float, float, float]] = {}  # linear RGB by actor; others are painted by name
-        self._engine = Embree()
+        check_embree()
         self._town_model = _TOWNS.get(town, lambda: _model(build_town_mesh(town)))
         self._cast(trace)
 
@@ -68,7 +68,7 @@ class Scene:
         models = [self._town_model, *(_actor_model(*trace.model(actor)) for actor in range(len(trace.actor)))]
         self.surfaces = _surfaces(models, [str(name) for name in trace.actor])
         self._solids = [model.solid for model in models]
-        self._assembly = self._engine.assembly(self._solids)
+        self._assembly = Assembly(self._solids)
         self._assembly.place(0, np.eye(4))
         # x, y, z, yaw, pitch, roll; NaN where an actor is not placed
         self._placed = np.full((len(trace.actor), 6), np.nan)
@@ -162,7 +162,7 @@ class Scene:
         pose in the actor's body frame is `body_from_rays[k]` (4, 4).
         """
         solids = [self._solids[actor + 1] for actor in actors.tolist()]
-        return self._engine.trace_each(solids, body_from_rays, ends, directions, near_m=near_m, far_m=far_m)
+        return trace_each(solids, body_from_rays, ends, directions, near_m=near_m, far_m=far_m)
 
     def _hide(self, hidden: int | None) -> None:
         if hidden != self._hidden:
@@ -196,7 +196,7 @@ class _Model(NamedTuple):
 
 
 def _model(mesh: Mesh) -> _Model:
-    return _Model(mesh, mesh.normals(), Embree().solid(mesh.vertices, mesh.faces))
+    return _Model(mesh, mesh.normals(), Solid(mesh.vertices, mesh.faces))
 
 
 def _surfaces(models: list[_Model], names: list[str]) -> Surfaces:

@@ -1,4 +1,4 @@
-"""The static mesh of a town, with the object that each face belongs to."""
+"""The static mesh of a town, its buildings included, with the object that each face belongs to."""
 
 import pickle
 from collections.abc import Callable, Iterator

@@ -6,13 +6,12 @@ import pytest
 from flcav.world.materials import Material
 from flcav.world.meshes import furniture
 from flcav.world.meshes.mesh import Mesh
-from flcav.world.rays.embree import Embree
+from flcav.world.rays.embree import Assembly, Solid
 
 
 def stopped(mesh: Mesh, low: float, high: float) -> float:
     """Return the share of level rays towards a barrier of 4 m that it stops, between two heights [m]."""
-    engine = Embree()
-    assembly = engine.assembly([engine.solid(mesh.vertices, mesh.faces)])
+    assembly = Assembly([Solid(mesh.vertices, mesh.faces)])
     assembly.place(0, np.eye(4))
     assembly.commit()
     x, z = np.meshgrid(np.linspace(-1.95, 1.95, 301), np.linspace(low, high, 7))

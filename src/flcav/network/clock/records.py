@@ -1,4 +1,4 @@
-"""Records of rounds on the clock: when each client downloaded, trained and uploaded, and why one was dropped."""
+"""Records of the clock of rounds: the work of each client, when it did what, and why its update did not arrive."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,12 @@
-"""Link budget of V2X transmissions: received power, noise, SINR, and the rate by a truncated Shannon bound.
+"""Link budget of V2X transmissions: path loss, blockage, shadowing, SINR, and the rate by a truncated Shannon bound.
 
 Powers are in dBm, gains and losses in dB. The constants of `Radio` are those of 3GPP's studies of V2X at 5.9 GHz, and
 of 3GPP TR 36.942 for the rate of an uplink.
+
+Large-scale propagation of V2X links by 3GPP TR 37.885 V15.3.0, clause 6.2: path loss, blockage, shadowing.
+
+A vehicle and a roadside unit of UE type are linked like two vehicles (Table 6.2.1-2). Distances are between the two
+antennas, in three dimensions. Losses are in dB.
 """
 
 from collections.abc import Mapping

@@ -1,4 +1,10 @@
-"""Radio links of the connected vehicles of a trace to roadside units, instant by instant."""
+"""Radio links of the connected vehicles of a trace to roadside units, instant by instant.
+
+State of the direct paths between vehicles and roadside units: free, blocked by vehicles, blocked by buildings.
+
+TR 37.885 draws the state of urban links along a street by distance; here it follows from the town and its traffic,
+whose buildings are its meshes, and whose vehicles are boxes as in the report.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +22,7 @@ from flcav.network.radio import budget as laws
 from flcav.network.radio.budget import PathState, Radio, lone_rate_bps, received_dbm
 from flcav.statistics.streams import stream
 from flcav.world.map.town import Town
-from flcav.world.rays.embree import Assembly, Embree
+from flcav.world.rays.embree import Assembly, Solid, check_embree
 from flcav.world.static import build_buildings_mesh
 from flcav.world.trace import Trace
 
@@ -167,8 +173,9 @@ class PathStates:
 
 def raise_walls(town: Town) -> Assembly:
     """Return the buildings of a town for ray casting, world frame; raises `OSError` where the engine is missing."""
-    mesh, engine = build_buildings_mesh(town), Embree()
-    walls = engine.assembly([engine.solid(mesh.vertices, mesh.faces)])
+    check_embree()
+    mesh = build_buildings_mesh(town)
+    walls = Assembly([Solid(mesh.vertices, mesh.faces)])
     walls.place(0, np.eye(4))
     walls.commit()
     return walls

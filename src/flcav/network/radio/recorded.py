@@ -1,4 +1,4 @@
-"""Radio links of a recorded scene: its connected vehicles, its town, and roadside units on the town's poles."""
+"""Radio links of a recorded scene to roadside units on its town's poles, and the coverage of a town by units."""
 
 import re
 from collections.abc import Mapping, Sequence

@@ -3,6 +3,17 @@
 The power received from a surface, relative to that of a white one at normal incidence at 1 m, is
 P = reflectivity * cos(incidence) / R^2; it is detected above P_min = 0.9 / R_max^2 (LISA, arXiv 2107.07004, section 3).
 Rain, fog and wet roads change P; in clear weather they cost nothing and draw no random numbers.
+
+Beam patterns of LiDAR models, from their makers' data sheets, and the LiDAR returns of CARLA.
+
+Patterns are for `beams: <name>` in a rig: Velodyne VLP-16 (63-9229), HDL-32E (97-0038), VLP-32C (63-9378),
+HDL-64E (63-HDL64E), VLS-128 "Alpha Prime" (63-9679) at 10 spins a second, and Ouster OS1-128 in its mode 1024x10.
+Elevations are nominal: those of a unit differ by some hundredths of a degree.
+
+CARLA's `sensor.lidar.ray_cast` (its documentation, core sensors, "Lidar sensor") gives a return at range d the
+intensity exp(-a d), whatever the surface. A share of all rays is lost; of the rest, returns with an intensity below a
+limit are lost with a probability that rises linearly from 0 at the limit to its value at intensity 0. Weather plays no
+part.
 """
 
 from functools import lru_cache

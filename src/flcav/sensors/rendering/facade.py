@@ -1,4 +1,9 @@
-"""Procedural textures of facades: plaster, brick or panels, with windows aligned to the mesh's sills and balconies."""
+"""Textures of facades and of traffic signs.
+
+Procedural textures of facades: plaster, brick or panels, with windows aligned to the mesh's sills and balconies.
+
+Textures of traffic signs: mip-maps, drawn once, with trilinear filtering.
+"""
 
 from functools import lru_cache
 from typing import NamedTuple

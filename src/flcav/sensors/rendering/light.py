@@ -1,7 +1,11 @@
-"""Illumination: sun, sky and air by weather, and shadows of the sun and of lamps by shadow rays.
+"""Illumination: sun, sky and air by weather, shadows of the sun and of lamps by shadow rays, and ambient occlusion.
 
 One unit of radiance is the brightness that a camera exposed for full daylight shows as white. Shadows take one ray from
 every hit to the sun, and one to the lamp that is strongest there.
+
+Ambient occlusion: one short ray for every block of 2 x 2 pixels, averaged over 4 x 4 neighbouring blocks.
+
+Ray directions are cosine-weighted; each of the 16 blocks has another one.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Rain in camera images: reflections of wet roads, streaks of falling drops, and drops on the lens."""
+"""Rain and glare in camera images: wet roads, streaks, drops on the lens, halos of lamps, veiling glare of the sun."""
 
 import numpy as np
 

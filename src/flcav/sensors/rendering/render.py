@@ -1,6 +1,12 @@
 """Deferred renderer: primary rays, G-buffer, shading, wet reflections, supersampling, rain and glare, in this order.
 
 The result is the radiance of every pixel; exposure and tone mapping follow in `flcav.sensors.camera`.
+
+Adaptive supersampling: further rays for pixels at visible edges and where thin distant objects may cross them.
+
+Pixels at edges get two more rays, which with the first form a pattern of three rooks; pixels that a thin distant object
+may cross get eight more, in a pattern of nine rooks. So a pole covers the share of its pixels that its width is,
+whether or not a pixel's centre hits it.
 """
 
 from typing import NamedTuple

@@ -2,6 +2,8 @@
 
 Diffuse light is Lambertian, on procedural textures. Mirror reflection grows towards grazing incidence after Schlick's
 approximation of the Fresnel term. The air blends radiance into its own by exp(-extinction * distance).
+
+Radiance of the sky with sun and clouds, and an environment map of a street for mirror reflections.
 """
 
 import numpy as np

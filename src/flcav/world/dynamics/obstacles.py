@@ -1,4 +1,4 @@
-"""Obstacles: what stands in a town and stops vehicles and walkers, as upright boxes."""
+"""What bodies stand on and run into in a town: its ground with bridges and kerbs, and obstacles as upright boxes."""
 
 from collections.abc import Iterator
 from typing import NamedTuple

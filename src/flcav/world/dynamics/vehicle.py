@@ -1,4 +1,4 @@
-"""The kinematic bicycle model with tyres of limited grip.
+"""Vehicles: their mechanical parameters, and the kinematic bicycle model with tyres of limited grip.
 
 The bicycle model turns a vehicle about a point on the line of its rear axle: at the speed u its yaw rate is
 u tan(steer) / wheelbase, and its middle moves sideways by the yaw rate times the distance to the rear axle (Rajamani,

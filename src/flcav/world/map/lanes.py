@@ -1,4 +1,11 @@
-"""The lane-level map of a town: vector layers (`map_layers`) and their bird's-eye raster (`rasterise`)."""
+"""The lane-level map of a town: vector layers (`map_layers`), road markings, and a bird's-eye raster (`rasterise`).
+
+Road markings of a SUMO net, after the practice of European towns.
+
+Lane lines are dashed, and solid before a controlled junction. The directions of a street are separated by a dashed
+line, and by a double solid line where they have more than two driving lanes together. Solid lines separate bicycle and
+parking lanes; edge lines mark streets without a kerb and fast ones. Approaches end in a stop line or a give-way line.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Records of a lane-level map: lanes, road markings, crossings and lane arrows as vectors.
+"""Records of a lane-level map: lanes, markings, crossings and lane arrows as vectors, and the outlines of their paint.
 
 Lines and outlines are two-dimensional, in the world frame [m]; angles are in radians. The road surface is at z = 0.
 """

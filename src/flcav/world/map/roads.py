@@ -1,4 +1,4 @@
-"""SUMO road networks: edges with their lanes, junctions, connections and right of way.
+"""SUMO road networks: edges with their lanes, junctions, connections, right of way, and routes along the lanes.
 
 Format: https://sumo.dlr.de/docs/Networks/SUMO_Road_Networks.html
 """

@@ -1,6 +1,12 @@
-"""Procedural placement along the streets of a town: buildings, trees, clutter, lamps, signs and candidate poles.
+"""Procedural placement along the streets of a town: buildings, trees, clutter, fences, lamps, signs, candidate poles.
 
 Positions and yaws are in the world frame [m, rad]. The same random generator gives the same placement.
+
+Procedural placement of what encloses plots (hedges, walls, fences) and of small objects at the kerb.
+
+Both are clutter: rows (K, 6) x, y, yaw, length, width, height by kind, in the world frame [m, rad].
+
+Parking spaces, and objects beside the roads, of the map that a town was imported from.
 """
 
 from collections.abc import Callable, Iterator, Sequence

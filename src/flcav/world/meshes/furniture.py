@@ -1,6 +1,10 @@
-"""Meshes of trees and street furniture: signal heads, masts, lamps, signs and clutter, each about its foot.
+"""Meshes of trees, street furniture and barriers about their feet: signal heads, masts, signs, clutter, hedges, fences.
 
 Crowns of trees are loose leaves, so that some rays pass between them.
+
+Meshes of what stands along real streets: hedges, shrubs, walls, fences, bins, posts, parked bicycles and trailers.
+
+Each is `length` along x, `width` along y and `height` [m], about its foot.
 """
 
 from collections.abc import Callable, Mapping

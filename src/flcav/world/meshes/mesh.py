@@ -1,4 +1,7 @@
-"""Triangle meshes, their primitives and operations. Body frame: x forward, y left, z up, metres."""
+"""Triangle meshes, their primitives, and draping over a relief. Body frame: x forward, y left, z up, metres.
+
+Draping over a relief: polygons and lines are cut along the relief's triangles, and then lifted.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Parameters of an imported town: defaults by street type, traffic by lane length, and candidate sites of sensors."""
+"""Parameters of an imported town: what its map has along the roads, defaults by street type, traffic, sensor sites."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass

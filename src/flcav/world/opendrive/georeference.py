@@ -1,7 +1,12 @@
-"""Place of a map on the WGS 84 ellipsoid: inverse Mercator projections of an OpenDRIVE header, with its offset.
+"""Place of a map on the WGS 84 ellipsoid: the map projection of an OpenDRIVE header, its offset, and their inverse.
 
 Transverse Mercator is Krüger's series in the third flattening n, to n^4 (C. F. F. Karney, "Transverse Mercator with an
 accuracy of a few nanometers", J. Geodesy 85, 2011, eqs. 11, 15, 36).
+
+Map projection of an OpenDRIVE header, from its PROJ string or EPSG code (ASAM OpenDRIVE 1.8, 8.5).
+
+Understood are transverse Mercator, UTM and Mercator on the ellipsoids of WGS 84 and GRS 80, which differ by 0.1 mm, and
+the spherical Mercator projection of web maps. Of parameters given twice PROJ takes the first, and `k_0` before `k`.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Reference lines of OpenDRIVE roads in the plane (OpenDRIVE 1.8, 9): line, arc, spiral, poly3 and paramPoly3."""
+"""Reference lines of OpenDRIVE roads in plan (OpenDRIVE 1.8, 9): their geometry elements, and the joints of these."""
 
 import math
 import xml.etree.ElementTree as ElementTree

@@ -2,6 +2,10 @@
 
 There is one Embree device per process. It builds the bounding volume hierarchies on one thread, so that they are the
 same from run to run.
+
+Loader of the Embree 4 C library in the embreex wheel, with typed entry points through ctypes.
+
+API: https://github.com/RenderKit/embree/blob/v4.4.0/README.md (chapter "Embree API").
 """
 
 import ctypes
@@ -219,50 +223,34 @@ class Assembly(Hierarchy):
         return out
 
 
-class Embree:
-    """The Embree engine."""
+def trace_each(
+    solids: Sequence[Solid],
+    solid_from_rays: Array,
+    ends: Ints,
+    directions: Array32,
+    *,
+    near_m: Array32 | None = None,
+    far_m: float = np.inf,
+) -> Hits:
+    """Return the first hits of K groups of rays, group k with `solids[k]` alone; `instance` is the group's number.
 
-    def __init__(self) -> None:
-        """Test the library, once per process; raises `OSError` where it is missing or traces a known scene wrongly."""
-        _self_test()
-
-    def solid(self, vertices: Array32, faces: Ints32) -> Solid:
-        """Return a mesh with its bounding volume hierarchy: see `Solid`."""
-        return Solid(vertices, faces)
-
-    def assembly(self, solids: Sequence[Solid]) -> Assembly:
-        """Return an assembly of `solids`, none placed yet: see `Assembly`."""
-        return Assembly(solids)
-
-    def trace_each(
-        self,
-        solids: Sequence[Solid],
-        solid_from_rays: Array,
-        ends: Ints,
-        directions: Array32,
-        *,
-        near_m: Array32 | None = None,
-        far_m: float = np.inf,
-    ) -> Hits:
-        """Return the first hits of K groups of rays, group k with `solids[k]` alone; `instance` is the group's number.
-
-        Group k is `directions[ends[k - 1] : ends[k]]`: unit vectors in a frame whose pose in its solid's frame is
-        `solid_from_rays[k]` (4, 4). `near_m` and `far_m` are as in `Assembly.trace`.
-        """
-        rays, near, hits = _buffers(directions, near_m)
-        trace_groups(
-            _address("rtcIntersect16"),
-            np.array([solid.handle for solid in solids], np.int64),
-            ctypes.addressof(_ARGUMENTS),
-            np.ascontiguousarray(solid_from_rays[:, :3, 3], np.float32),
-            np.ascontiguousarray(solid_from_rays[:, :3, :3], np.float32),
-            rays,
-            near,
-            np.float32(far_m),
-            ends,
-            *hits,
-        )
-        return hits
+    Group k is `directions[ends[k - 1] : ends[k]]`: unit vectors in a frame whose pose in its solid's frame is
+    `solid_from_rays[k]` (4, 4). `near_m` and `far_m` are as in `Assembly.trace`.
+    """
+    rays, near, hits = _buffers(directions, near_m)
+    trace_groups(
+        _address("rtcIntersect16"),
+        np.array([solid.handle for solid in solids], np.int64),
+        ctypes.addressof(_ARGUMENTS),
+        np.ascontiguousarray(solid_from_rays[:, :3, 3], np.float32),
+        np.ascontiguousarray(solid_from_rays[:, :3, :3], np.float32),
+        rays,
+        near,
+        np.float32(far_m),
+        ends,
+        *hits,
+    )
+    return hits
 
 
 def _buffers(directions: Array32, near_m: Array32 | None) -> tuple[Array32, Array32, Hits]:
@@ -302,8 +290,11 @@ def _check(doing: str) -> None:
 
 
 @lru_cache(maxsize=1)
-def _self_test() -> None:
-    """Raise `OSError` unless known rays hit a known mesh, alone and as a rotated and translated instance."""
+def check_embree() -> None:
+    """Raise `OSError` where Embree is missing, or known rays miss a known mesh, alone or as a moved instance.
+
+    It is done once per process.
+    """
     vertices = np.array([[2, -1, -1], [2, 1, -1], [2, 0, 1]], np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
     forward = np.array([[1, 0, 0]], np.float32)

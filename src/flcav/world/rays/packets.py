@@ -1,4 +1,4 @@
-"""Compiled loops over ray packets of 16 for Embree's `rtcIntersect16` and `rtcOccluded16`.
+"""First hits of rays, and compiled loops over ray packets of 16 for Embree's `rtcIntersect16` and `rtcOccluded16`.
 
 Embree's function is called by its address, an integer argument, so that Numba can cache the compiled code on disk; a
 kernel that closes over a ctypes function cannot be cached.

@@ -1,4 +1,9 @@
-"""The traffic of a live world: SUMO's, between the steps of SUMO."""
+"""The traffic of a live world: SUMO's actors between the steps of SUMO, and the traffic lights.
+
+Traffic lights: the programs of a SUMO net, phases of fixed durations that repeat, and what overrides them.
+
+Format: https://sumo.dlr.de/docs/Simulation/Traffic_Lights.html
+"""
 
 import tempfile
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Passages: routes through a road net with open ends, from where vehicles enter it to where they leave it."""
+"""Reachability in a road net, and passages: routes from where vehicles enter an open net to where they leave it."""
 
 from dataclasses import dataclass, replace
 

@@ -1,4 +1,4 @@
-"""The SUMO process, which makes the steps of recordings and of live worlds.
+"""The SUMO process, which makes the steps of recordings and of live worlds, and the states that a recording keeps.
 
 `serve_traffic` reads requests and writes an answer to each, JSON on a line. The first request of a run is its
 `TrafficJob`; the run is a fork of this process, since libsumo holds one simulation per process and takes longer to load

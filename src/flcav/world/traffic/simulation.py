@@ -2,6 +2,12 @@
 
 A step of `STEP_S` obeys a `StepRequest`: the vehicles under control are placed, SUMO's brake for what is in their way,
 and then all move. Nobody is under control in a recording.
+
+Pedestrians of limited speed.
+
+In SUMO's "striping" model they jump: up to three stripes aside in one step, and from one end of a junction's corner to
+the other where they wait for one crossing and another turns green. Here a pedestrian who falls behind follows the path
+of SUMO's pedestrian at no more than `HURRY_MPS` until caught up. Nothing of later steps is used.
 """
 
 import math

@@ -1,4 +1,9 @@
-"""Traffic simulation of a town by SUMO: the smoothed motion of all actors and the parked vehicles, as a `Trace`."""
+"""Traffic simulation of a town by SUMO: the smoothed motion of all actors and the parked vehicles, as a `Trace`.
+
+Actors on a relief: their heights, pitch and roll, and how fast they climb.
+
+SUMO moves them in plan. Their horizontal velocity stays as it is; the vertical one follows from the ground they pass.
+"""
 
 import contextlib
 import json

@@ -18,7 +18,7 @@ from flcav.world.map.surfaces import cut_area, unite
 from flcav.world.map.town import Town
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.importing import ImportedTown, import_town
-from flcav.world.opendrive.mending.maps import mend_map
+from flcav.world.opendrive.mending import mend_map
 from flcav.world.opendrive.netconvert import mirror_map
 from flcav.world.opendrive.objects.signs import find_signs
 from flcav.world.static import TownPart, build_static_world

@@ -14,7 +14,7 @@ from flcav.config import InputError
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.importing import ImportedTown, import_town
-from flcav.world.opendrive.mending.roads import MOST_TOLD, mend_roads
+from flcav.world.opendrive.mending import MOST_TOLD, mend_roads
 from flcav.world.opendrive.reference_line import ReferenceLine, list_pieces, shorten_geometry
 from flcav.world.opendrive.road_surface import Road
 

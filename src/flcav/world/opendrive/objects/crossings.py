@@ -1,4 +1,7 @@
-"""Crossings of a town's net where the map has its crosswalks, in netconvert's plain files."""
+"""Crosswalks of an OpenDRIVE map, and the crossings that they become in a town's net, in netconvert's plain files.
+
+Crosswalks of an OpenDRIVE map: objects with an outline, and markings that are signals (OpenDRIVE 1.8, 13 and 14).
+"""
 
 import copy
 import xml.etree.ElementTree as ElementTree

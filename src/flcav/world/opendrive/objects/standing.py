@@ -1,4 +1,4 @@
-"""Buildings, trees, hedges, walls and railings of an OpenDRIVE map (OpenDRIVE 1.8, 13)."""
+"""Buildings, trees, hedges, walls, railings and parking spaces of an OpenDRIVE map (OpenDRIVE 1.8, 13)."""
 
 import math
 import xml.etree.ElementTree as ElementTree
