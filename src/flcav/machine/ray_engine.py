@@ -22,7 +22,7 @@ Given = ParamSpec("Given")
 Arguments = TypeVarTuple("Arguments")
 
 STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and pieces of files pass through it
-CALLS = 3  # that an actor answers at the same time: it works, tells how far it is, and leaves
+CALLS = 3  # concurrent calls of an actor: its work, its progress, and its end
 LEAVING_S = 5.0  # for actors to leave before they are killed
 
 

@@ -55,7 +55,7 @@ class LedgerEntry:
     link: Link
     direction: Direction  # up: towards the cloud; only this counts against a budget
     round: int  # within its stage, from 1; 0 where a stage has no rounds
-    client: str  # who sent it (up) or received it (down), e.g. "grid/cav0"
+    client: str  # sender (up) or receiver (down), e.g. "grid/cav0"
     bytes: int  # serialised size
 
     def __post_init__(self) -> None:

@@ -7,7 +7,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from flcav.arrays import Array, Array32, Bytes, Ints32, Mask
@@ -37,9 +36,7 @@ class Exposure(NamedTuple):
     rgb: Bytes  # (H, W, 3) sRGB
     depth_m: Array32  # (H, W) z in the optical frame; inf for the sky
     semantic: Bytes  # (H, W) one of SEMANTICS
-    instance: NDArray[
-        np.int32
-    ]  # (H, W) 0 none, a + 1: the trace's actor a, -(t + 1): thing t of `list_signs_and_signals`
+    instance: Ints32  # (H, W) 0 none, a + 1: the trace's actor a, -(t + 1): thing t of `list_signs_and_signals`
 
 
 def photograph(

@@ -48,7 +48,7 @@ def find_visible_pairs(
 def find_viewshed(town: Town, traces: Sequence[Trace], site: Array, range_m: float) -> Viewshed:
     """Return the viewshed of a site (3,): points EYE_M above the ground that it sees within `range_m`.
 
-    Seen is what `find_visible_pairs` calls so.
+    `site` (3,) is in the world frame [m]; a point counts as seen as in `find_visible_pairs`.
     """
     x, y = site[:2, None] + np.linspace(-range_m, range_m, 2 * FINE + 1)
     across, along = (each.ravel() for each in np.meshgrid(x, y))

@@ -128,9 +128,9 @@ class LiveWorld:
         """
         dt_s = self.settings.dt_s if dt_s is None else dt_s
         _check_step(dt_s)
-        for name, told in controls.items():
-            if self.bodies.find(name).controls != told:
-                self.apply(commands.Drive(name, told))
+        for name, wanted in controls.items():
+            if self.bodies.find(name).controls != wanted:
+                self.apply(commands.Drive(name, wanted))
         self._note(LiveStep(dt_s))
         begins, velocity = self._time_s, self.bodies.velocity.copy()
         found: dict[tuple[str, str], Collision] = {}

@@ -86,7 +86,7 @@ class Scene:
         return list_signs_and_signals(self.town)
 
     def move_to(self, index: int, offset_s: float = 0.0) -> None:
-        """Move every actor to its pose at instant `index` of the trace, or `offset_s` later.
+        """Move every actor to its pose at instant `index` of the trace, or `offset_s` [s] later.
 
         Poses off an instant are extrapolated with constant acceleration and yaw rate. Raises `ValueError` where
         `offset_s` is not within -`OFFSET_S` and `OFFSET_S`.
@@ -107,7 +107,7 @@ class Scene:
         return np.concatenate((position, yaw[:, None]), axis=1)
 
     def world_from_actor(self, actor: int) -> Array:
-        """Return the pose (4, 4) of an actor that is present; the origin of its body frame is its ground centre."""
+        """Return the pose (4, 4) [m] of an actor that is present; the origin of its body frame is its ground centre."""
         return pose(*self.poses()[actor], *self.trace.tilts(self.index)[actor])
 
     def world_from_instance(self) -> Array:

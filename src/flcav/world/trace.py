@@ -61,9 +61,7 @@ class Trace:
     light: Words  # (L,) ids of signals, "junction:link index"
     light_state: Words  # (T, L) one SUMO state letter: G g y r ...
     events: tuple[Event, ...] = ()
-    tilt: Array | None = (
-        None  # (T, A, 2) pitch and roll [rad], as in `geometry.pose`; NaN where absent; None: all level
-    )
+    tilt: Array | None = None  # (T, A, 2) pitch and roll [rad], as in `geometry.pose`; NaN if absent; None: all level
     bow: Array | None = None  # (A,) of the ends of its body [m], see `meshes.mesh.bow_ends`; None: all are flat
 
     def model(self, actor: int) -> tuple[str, int, tuple[float, ...]]:

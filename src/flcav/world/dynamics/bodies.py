@@ -23,11 +23,11 @@ from flcav.world.snapshot import Actors
 
 AT_REST = Controls()
 ON_SPRINGS = ("car", "van", "truck", "bus")
-ALOFT_M = 3.0  # who is placed so far above the ground falls, and who is so far below it stays there
-LAUNCH_MPS = 1.0  # who is pushed up by more than it climbs, and by so much, leaves the ground
+ALOFT_M = 3.0  # a body placed farther above the ground than this falls; one farther below it stays there
+LAUNCH_MPS = 1.0  # a body leaves the ground where its vertical velocity exceeds that of the slope by more than this
 PITCH_S2PM, ROLL_S2PM = 0.004, 0.007  # rad by which cars lean on their springs, for each m/s^2 ahead and aside
 FALL_MPS = 3.0  # change of velocity by a hit that nobody stands
-SLIDE_MPS2 = 0.7 * GRAVITY_MPS2  # deceleration of who lies on the road
+SLIDE_MPS2 = 0.7 * GRAVITY_MPS2  # deceleration of a fallen walker on the road
 MOST_LEAN_MPS2 = 10.0  # accelerations beyond are those of collisions
 WALK_MPS2 = 10.0  # by which walkers change their velocity, also after they were hit
 
@@ -45,7 +45,7 @@ class ControlledBody:
     walk: tuple[float, float] = (0.0, 0.0)  # wanted velocity [m/s]
     physics: bool = True
     gravity: bool = True
-    fallen: bool = False  # of a walker who was hit
+    fallen: bool = False  # of a walker: was hit, and lies on the road
     grip: float = 1.0  # share of the friction of a dry road
 
     @property
@@ -65,7 +65,7 @@ class Bodies:
         self.yaw, self.yaw_rate, self.steer = (np.zeros(0) for _ in range(3))
         self.tilt = np.zeros((0, 2))
         self.size = np.zeros((0, 3))
-        self.aloft = np.zeros(0, np.bool_)  # who has physics and gravity, and yet does not stand on the ground
+        self.aloft = np.zeros(0, np.bool_)  # (N,) bodies with physics and gravity that are not on the ground
         self._vehicles: Vehicles = stack_blueprints([])
         self._ground = ground
 
@@ -81,7 +81,7 @@ class Bodies:
         return self.members[self.row(name)]
 
     def add(self, body: ControlledBody, x: float, y: float, yaw: float, z: float | None) -> None:
-        """Add a body at rest."""
+        """Add a body at rest at x, y [m] with this yaw [rad], its underside at `z` [m]; None: on the ground."""
         self.members.append(body)
         for name in STATE:
             array = getattr(self, name)
@@ -99,7 +99,10 @@ class Bodies:
     def place(
         self, row: int, x: float, y: float, yaw: float, z: float | None, pitch: float = 0.0, roll: float = 0.0
     ) -> None:
-        """Move a body to another pose; with physics and gravity it stands on the ground there, if that is near."""
+        """Move a body to x, y [m], yaw, pitch, roll [rad], its underside at `z` [m]; None: onto the ground.
+
+        With physics and gravity it stands on the ground there, where that is within `ALOFT_M`.
+        """
         self.position[row] = x, y, np.nan if z is None else z
         self.yaw[row] = wrap_angle(yaw)
         self.tilt[row] = pitch, roll
@@ -146,7 +149,10 @@ class Bodies:
             self._walk(rows, dt_s)
 
     def fall(self, change: Array) -> None:
-        """Let walkers fall whose velocity contacts `change` (N, 2) [m/s] much, in the direction of the hit."""
+        """Let walkers fall whose velocity changed by more than `FALL_MPS` in contacts, in the direction of the hit.
+
+        `change` (N, 2) [m/s] are the changes of velocity.
+        """
         for row in np.flatnonzero(np.linalg.norm(change, axis=1) > FALL_MPS).tolist():
             body = self.members[row]
             if body.category == "pedestrian" and body.physics and not body.fallen:
@@ -174,7 +180,7 @@ class Bodies:
         return mass, np.where(held | upright, np.inf, inertia)
 
     def find_grounded(self) -> Mask:
-        """Return who is near the ground (N,): others are in nobody's way there."""
+        """Return (N,) which bodies are within `ALOFT_M` of the ground; the others obstruct no traffic."""
         return np.abs(self._clearance(np.arange(len(self.members)))) <= ALOFT_M
 
     def _clearance(self, rows: Ints) -> Array:
@@ -198,9 +204,10 @@ class Bodies:
         )
 
     def _find_lean(self) -> Array:
-        """Return further pitch and roll (N, 2) [rad]: of who lies, the head ahead, and of cars on their springs.
+        """Return pitch and roll (N, 2) [rad] on top of the ground's: of fallen walkers, and of cars on their springs.
 
-        These go down ahead when they brake, and outwards in a curve.
+        A fallen walker lies with the head ahead. Cars dive when they brake, and roll outwards in a curve, both in
+        proportion to the acceleration.
         """
         lie: Array = np.column_stack((np.pi / 2 * self._lie(), np.zeros(len(self.members)))).astype(np.float64)
         if not self._leans:
@@ -219,13 +226,9 @@ class Bodies:
         self.size = np.array([body.blueprint.size for body in self.members], np.float64).reshape(-1, 3)
 
     def _drive(self, rows: Ints, dt_s: float) -> None:
-        told = [self.members[row].controls for row in rows]
+        controls = [self.members[row].controls for row in rows]
         pedals = Pedals(
-            np.array([each.throttle for each in told]),
-            np.array([each.steer for each in told]),
-            np.array([each.brake for each in told]),
-            np.array([each.hand_brake for each in told]),
-            np.array([each.reverse for each in told]),
+            *(np.array([getattr(each, name) for each in controls]) for name in Pedals._fields),
         )
         motion = PlanarMotion(
             self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2], self.yaw_rate[rows], self.steer[rows]

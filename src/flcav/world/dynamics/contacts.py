@@ -43,8 +43,8 @@ def resolve_contacts(
     """Return places (N, 3), velocities (N, 2), yaw rates (N,) after all contacts of N boxes, and these.
 
     `mass` (N,) [kg] and `inertia` (N,) [kg m^2] are infinite for what nothing moves. `before` (N, 3) are the places
-    before the last motion: who still overlaps in the end goes back there, and stands still, so that boxes that did not
-    overlap there never do unless something immovable was moved into them.
+    before the last motion: a box that still overlaps in the end goes back there and stands still, so that boxes that
+    did not overlap there never do unless something immovable was moved into them.
     """
     place, velocity, yaw_rate = boxes.place.copy(), velocity.copy(), yaw_rate.copy()
     pairs = _find_neighbours(place, before, boxes.half, boxes.level, 1 / mass)

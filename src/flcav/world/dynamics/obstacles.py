@@ -51,7 +51,7 @@ def list_obstacles(town: Town, parked: Actors = NOBODY) -> Obstacles:
 
 
 def outline_actors(actors: Actors) -> Footprints:
-    """Return the boxes of actors, upright; those who move begin above what they drive or step over."""
+    """Return the upright boxes of actors, world frame [m]; those of vehicles and people from `CLEARANCE_M` up."""
     z = actors.position[:, 2]
     clear = np.where(np.array(actors.category, np.str_) == "prop", 0.0, CLEARANCE_M)
     return Footprints(actors.places, actors.size[:, :2] / 2, np.column_stack((z + clear, z + actors.size[:, 2])))
@@ -118,8 +118,8 @@ class TownGround:
     def stand(self, position: Array, yaw: Array, size: Array, upright: Mask) -> tuple[Array, Array]:
         """Return height (N,) [m], pitch and roll (N, 2) [rad] of bodies of this `size` (N, 3) at `position` (N, 3) [m].
 
-        On a bridge or below it is told by their height, NaN: below. Those who are `upright` (N,) do not tilt, and step
-        onto kerbs.
+        Whether a body is on a bridge or below it follows from its height; NaN: below. Bodies that are `upright` (N,)
+        do not tilt, and step onto kerbs.
         """
         x, y, z = position.T
         height, tilt = np.zeros(len(x)), np.zeros((len(x), 2))

@@ -62,7 +62,7 @@ class BodyBlueprint:
 
     @property
     def inertia_kgm2(self) -> float:
-        """The moment of inertia about the vertical axis, of a homogeneous box."""
+        """The moment of inertia about the vertical axis [kg m^2], of a homogeneous box."""
         length, width, _ = self.size
         return self.mass_kg * (length**2 + width**2) / 12
 

@@ -120,7 +120,7 @@ def list_verges(net: RoadNet, parameters: TownParameters) -> Iterator[Verge]:
 
 
 def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) -> Array:
-    """Return the buildings (B, 6) x, y, yaw, length, width, height: rows along every verge, with drawn gaps."""
+    """Return the buildings (B, 6) x, y, yaw, length, width, height [m, rad]: rows along every verge with drawn gaps."""
     out = []
     for verge in rows:
         street = verge.street
@@ -201,7 +201,9 @@ def place_lamps(rows: list[Verge], sensors: Array, random: np.random.Generator) 
 def place_poles(
     net: RoadNet, parameters: tuple[PoleParameters, ...]
 ) -> list[tuple[int, tuple[float, float, float], float, str]]:
-    """Return id, position, yaw and kind of each candidate site, by id; raises `KeyError` for an edge the net lacks.
+    """Return id, position [m], yaw [rad] and kind of each candidate site, by id.
+
+    Raises `KeyError` for an edge that the net lacks.
 
     A straight site faces across the road, another one its junction or the middle of its roundabout.
     """
@@ -222,7 +224,7 @@ def place_poles(
 def place_signs(
     net: RoadNet, known: tuple[SignParameters, ...] = (), *, limits_known: bool = False
 ) -> list[tuple[tuple[float, float, float], float, str]]:
-    """Return position, yaw and kind of each traffic sign: give way and stop before junctions, the limit after them.
+    """Return position [m], yaw [rad] and kind of each sign: give way and stop before junctions, the limit after them.
 
     Where some are `known`, these stand instead: signs of right of way, or speed limits. With `limits_known` there is no
     speed limit but these, even where there are none.

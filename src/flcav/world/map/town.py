@@ -147,8 +147,8 @@ def _build_town(folder: Path, files: str) -> Town:
 def _raise_hills(name: str, folder: Path) -> Town:
     """Return the level town of a folder of flcav with its slopes and camber, under another name."""
     level = load_town(folder)
-    told = f"{level.parameters.description.rstrip('.')}; with slopes and camber."
-    named = replace(level, name=name, parameters=level.parameters.model_copy(update={"description": told}))
+    description = f"{level.parameters.description.rstrip('.')}; with slopes and camber."
+    named = replace(level, name=name, parameters=level.parameters.model_copy(update={"description": description}))
     return lift_town(named, Relief.load(folder / HILLS))
 
 

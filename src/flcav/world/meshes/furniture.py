@@ -38,7 +38,7 @@ BICYCLE_M, POST_M = 0.55, 2.0  # from one bicycle of a rack to the next, and fro
 
 
 def make_hedgerow(length: float, width: float, height: float) -> Mesh:
-    """Return a hedge with an uneven surface and loose leaves around it."""
+    """Return a hedge of these dimensions [m], with an uneven surface and loose leaves around it."""
     rng = stream(0, "hedgerow", *(round(1000 * size) for size in (length, width, height)))
     along = np.linspace(-0.5, 0.5, max(2, round(length / 0.5)) + 1)
     around = np.array(((-0.5, 0.0), (-0.5, 0.5), (-0.42, 0.9), (0.0, 1.0), (0.42, 0.9), (0.5, 0.5), (0.5, 0.0)))
@@ -49,7 +49,7 @@ def make_hedgerow(length: float, width: float, height: float) -> Mesh:
 
 
 def make_shrub(length: float, width: float, height: float) -> Mesh:
-    """Return a shrub: an uneven dome with loose leaves around it."""
+    """Return a shrub of these dimensions [m]: an uneven dome with loose leaves around it."""
     rng = stream(0, "shrub", *(round(1000 * size) for size in (length, width, height)))
     polar, azimuth = np.linspace(0, 0.55 * np.pi, 5)[:, None], np.linspace(0, 2 * np.pi, 10)[None]
     dome = (np.sin(polar) * np.cos(azimuth) / 2, np.sin(polar) * np.sin(azimuth) / 2, np.cos(polar) + 0 * azimuth)
@@ -59,36 +59,36 @@ def make_shrub(length: float, width: float, height: float) -> Mesh:
 
 
 def make_wall(length: float, width: float, height: float) -> Mesh:
-    """Return a garden wall with its coping."""
+    """Return a garden wall of these dimensions [m], with its coping."""
     body = box((0, 0, 0.46 * height), (length, 0.8 * width, 0.92 * height), Material.WALL)
     return join_meshes((body, box((0, 0, 0.96 * height), (length, width, 0.08 * height), Material.SIDEWALK)))
 
 
 def make_fence(length: float, width: float, height: float) -> Mesh:
-    """Return a wooden picket fence: gaps between the pickets, two rails behind them."""
+    """Return a wooden picket fence of these dimensions [m]: gaps between the pickets, two rails behind them."""
     return _barrier(length, width, height, PICKET_M, 0.6, Material.BARK)
 
 
 def make_railing(length: float, width: float, height: float) -> Mesh:
-    """Return a metal railing of thin bars between two rails."""
+    """Return a metal railing of these dimensions [m]: thin bars between two rails."""
     return _barrier(length, width, height, BAR_M, 0.18, Material.METAL)
 
 
 def make_bin(length: float, width: float, height: float) -> Mesh:
-    """Return a wheeled bin with its lid."""
+    """Return a wheeled bin of these dimensions [m], with its lid."""
     body = box((0, 0, 0.47 * height), (0.85 * length, 0.85 * width, 0.9 * height), Material.TRIM)
     return join_meshes((body, box((0, 0, 0.96 * height), (length, width, 0.08 * height), Material.RIM)))
 
 
 def make_post(length: float, width: float, height: float) -> Mesh:
-    """Return a round post or bollard."""
+    """Return a round post or bollard of these dimensions [m]."""
     return fit_to_size(tube((0, 0, 0), (0, 0, 1), 0.5, Material.METAL, sides=8), length, width, height)
 
 
 def make_rack(length: float, width: float, height: float) -> Mesh:
-    """Return bicycles in a rack across its `length`, without riders, every fifth place empty; for one place a bicycle.
+    """Return bicycles without riders in a rack of these dimensions [m], across its `length`, every fifth place empty.
 
-    A single bicycle stands along x.
+    A rack with room for one is a single bicycle, along x.
     """
     shape = SHAPES["bicycle"][0]
     one = bicycle(shape, ridden=False)
@@ -103,12 +103,12 @@ def make_rack(length: float, width: float, height: float) -> Mesh:
 
 
 def make_motorbike(length: float, width: float, height: float) -> Mesh:
-    """Return a parked motorcycle."""
+    """Return a parked motorcycle of these dimensions [m]."""
     return fit_to_size(motorcycle(SHAPES["motorcycle"][0], ridden=False), length, width, height)
 
 
 def make_trailer(length: float, width: float, height: float) -> Mesh:
-    """Return a parked car trailer: a tarpaulin on boards, one axle, and a drawbar ahead."""
+    """Return a parked car trailer of these dimensions [m]: a tarpaulin on boards, one axle, and a drawbar ahead."""
     bed, rear = 0.72 * length, -length / 2
     middle, floor = rear + bed / 2, min(0.5, 0.4 * height)
     parts = [
@@ -122,7 +122,7 @@ def make_trailer(length: float, width: float, height: float) -> Mesh:
 
 
 def make_guard_rail(length: float, width: float, height: float) -> Mesh:
-    """Return a guard rail: a corrugated beam before posts."""
+    """Return a guard rail of these dimensions [m]: a corrugated beam before posts."""
     waves = ((0.0, 1.0), (0.5, 0.86), (0.0, 0.72), (0.5, 0.58), (0.0, 0.44))
     rows = [[(x, width * (0.5 - depth), height * top) for depth, top in waves] for x in (-length / 2, length / 2)]
     count = max(2, round(length / POST_M))

@@ -97,7 +97,7 @@ def fit_to_size(mesh: Mesh, length: float, width: float, height: float) -> Mesh:
 
 
 def bow_ends(mesh: Mesh, bow_m: float) -> Mesh:
-    """Return a vehicle's mesh whose front and rear curve in plan: their corners lie `bow_m` behind their middles.
+    """Return a vehicle's mesh whose front and rear curve in plan: their corners lie `bow_m` [m] behind their middles.
 
     The last `BOWED_M` of either end are drawn in by the cube of the distance from the middle, as bumpers are.
     """

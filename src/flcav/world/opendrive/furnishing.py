@@ -58,7 +58,7 @@ def take_objects(
     lines = add_crossing_lines(net, found.found) if crosswalks else found.found
     stop_at_lines(path, lines)
     several, alike = count_controllers(heads.found, path)
-    told = f"Controllers with several of these heads: {several}; switched alike here: {alike}."
+    switched = f"Controllers with several of these heads: {several}; switched alike here: {alike}."
     return MapObjects(
         signs=signs.found,
         limits=signs.limits,
@@ -74,7 +74,7 @@ def take_objects(
             *found.notes("Stop lines"),
             *parking.notes("Parking spaces"),
             *objects.notes("Buildings, plants, barriers and obstacles"),
-            *([told] if several else []),
+            *([switched] if several else []),
         ),
     )
 

@@ -33,7 +33,7 @@ from flcav.world.opendrive.reference_line import (
 )
 
 STRAIGHT = 1e-9  # least curvature, and difference between two [1/m]
-MOST_TOLD = 10  # changes of a kind that are told one by one
+MOST_TOLD = 10  # changes of a kind that are listed one by one
 PROFILES = ("planView", "elevationProfile", "lateralProfile", "lanes")  # children of a <road> with elements along s
 
 
@@ -42,7 +42,7 @@ def mend_roads(root: ElementTree.Element) -> tuple[str, ...]:
 
     Elements along a road are sorted by s, those without a length are left out, gaps between geometry elements are
     closed, widths are rewritten for netconvert, and speed limits that are none are removed. Of many changes of a kind
-    `MOST_TOLD` are told.
+    the first `MOST_TOLD` are listed.
     """
     notes: list[list[str]] = [[] for _ in range(6)]
     order, empty, gaps, kinks, widths, limits = notes

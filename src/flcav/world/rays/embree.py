@@ -186,7 +186,7 @@ class Assembly(Hierarchy):
         weakref.finalize(self, api.rtcReleaseScene, self.handle)
 
     def place(self, instance: int, target_from_body: Array | None) -> None:
-        """Place an instance by a (4, 4) rigid transform, or remove it (None); takes effect with `commit`."""
+        """Place an instance by its pose (4, 4), with a translation in metres, or remove it (None), as of `commit`."""
         api, geometry = embree_library(), self._instances[instance]
         if target_from_body is None:
             api.rtcDisableGeometry(geometry)

@@ -18,7 +18,7 @@ from flcav.geometry import heading_vectors
 from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet, read_net
 
-REACH_M = 15.0  # half a long vehicle, and the way of .3 s: so far beside a deck actors are told to be on it
+REACH_M = 15.0  # half a long vehicle, and the way of .3 s: nearer to a deck, actors are on it or below it
 ALONG = np.cos(np.pi / 4)  # lanes that lead over a deck keep to its direction
 TURNED_M = 6.0  # distance that counts as much as a right angle between an actor and a lane
 BATCH = 1000  # actors that are compared with all lanes at a time

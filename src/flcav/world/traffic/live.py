@@ -33,7 +33,7 @@ WARM_UP_S = 30.0  # time of SUMO at the start of a live world
 TOUR_S = 900.0  # length of a vehicle's tour, at least; it then sets out again
 SLOW_MPS = 1.0  # traffic brakes for a slower vehicle wherever it stands, and for a faster one in its lane
 DANGERS = (-0.4, 0.0, 0.4)  # places to brake for, over a body's length from its middle
-SOON_S = 0.7  # so far ahead traffic looks at who crosses its way
+SOON_S = 0.7  # for so long ahead traffic considers crossing vehicles
 BERTH_M = 1.0  # half the width of a vehicle that passes
 
 
@@ -65,7 +65,7 @@ class SumoTraffic:
         self._ground, self._town = ground, town
         self._kinds = {name: (category, shape) for name, category, shape in list_vehicle_types()}
         self._lights: dict[str, str] = {}
-        self._gone: list[str] = []  # who left since the last step of SUMO
+        self._gone: list[str] = []  # actors removed since the last step of SUMO
         with tempfile.TemporaryDirectory(prefix="flcav_live_") as folder:
             job = write_live_job(town, Path(folder), seed=seed, vehicles=vehicles, pedestrians=pedestrians)
             self._sumo = Sumo(job)
@@ -105,7 +105,7 @@ class SumoTraffic:
     def at(self, time_s: float) -> Actors:
         """Return those present at a time since the start, within the step of SUMO under way: linear in it.
 
-        Times must ascend, since who is on a bridge stays on it.
+        Times must ascend, since an actor stays on the bridge, or below it, where it was.
         """
         share = time_s / STEP_S - (self.ticks - 1)
         first, last = self._ends

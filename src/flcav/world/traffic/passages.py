@@ -25,9 +25,7 @@ class Passages:
     edges: list[Edge]
     onward: list[list[int]]  # per edge, the rows of those that follow it
     time_s: Array  # (N,) on each edge at the limit
-    left_s: (
-        Array  # (N,) longest from the beginning of each edge to where the net ends; infinite where there is a circle
-    )
+    left_s: Array  # (N,) longest from the beginning of each edge to where the net ends; infinite on a circle
     entries: Mask  # (N,) whether nothing leads to it
 
     def slow_down(self, least_s: float) -> tuple["Passages", float | None]:

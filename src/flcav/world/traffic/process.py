@@ -46,8 +46,8 @@ def _run(first: bytes) -> None:
         os.dup2(said.fileno(), 1)  # SUMO's own output
         os.dup2(said.fileno(), 2)
 
-        def answer(told: Mapping[str, object]) -> None:
-            answers.write(json.dumps(told).encode() + b"\n")
+        def answer(message: Mapping[str, object]) -> None:
+            answers.write(json.dumps(message).encode() + b"\n")
             answers.flush()
 
         try:

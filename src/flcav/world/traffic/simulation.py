@@ -37,9 +37,9 @@ class TrafficJob(NamedTuple):
 
     folder: str
     seed: int
-    followers: Mapping[str, tuple[str, str, list[str]]]  # name, type and edges of who enters when a vehicle has left
+    followers: Mapping[str, tuple[str, str, list[str]]]  # by a vehicle that leaves: name, type, edges of the next
     again: int | None = None  # vehicles without one set out again, numbered from this; None where they do not
-    edge: str = ""  # a route of those under control, whom SUMO does not see without one
+    edge: str = ""  # a route for the vehicles under control; without one, SUMO does not see them
     scenarios: Sequence[Mapping[str, object]] = ()  # as JSON
     steps: int = 0  # that are made at the start
 
@@ -131,7 +131,7 @@ class Simulation:
         self._walkers.follow({name: _state_of(sumo.person, name) for name in sumo.person.getIDList()})
         if self.director:
             self.director.direct()
-        for name in sumo.simulation.getDepartedIDList():  # those whom a script has entered, too
+        for name in sumo.simulation.getDepartedIDList():  # including those that a script has inserted
             if name not in self._own:
                 self._tours[name] = _type_of(sumo.vehicle, name), list(sumo.vehicle.getRoute(name))
 

@@ -85,9 +85,9 @@ def simulate_drives(
     trace = _build_trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
     under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
     if under_way.sum() < cavs * len(times_s):
-        told = "the CAV is not" if cavs == 1 else f"not all of {cavs} CAVs are"
+        missing = "the CAV is not" if cavs == 1 else f"not all of {cavs} CAVs are"
         fewer = ", or take fewer" if cavs > 1 else ""
-        raise InputError(f"{told} under way at {times_s[0]} s: begin later{fewer}")
+        raise InputError(f"{missing} under way at {times_s[0]} s: begin later{fewer}")
     return trace, _build_trace(town, (driven * np.float64(STEP_S)).round(1), _of_cavs(raw), drive_rows, [])
 
 
@@ -171,7 +171,7 @@ def _smooth(raw: RecordedTraffic, windows: Ints) -> Array:
     rows = np.unique(windows)
     dense, windows = _dense(raw, rows), np.searchsorted(rows, windows)
     total, count = np.zeros((len(windows), *dense.shape[1:])), np.zeros((len(windows), dense.shape[1], 1))
-    for column, opposite in zip(windows.T, windows.T[::-1]):  # both or neither: else who just came would be ahead
+    for column, opposite in zip(windows.T, windows.T[::-1]):  # both or neither: no shift of new actors
         there = ~np.isnan(dense[column, :, :1] + dense[opposite, :, :1])
         total += np.where(there, dense[column], 0.0)
         count += there
@@ -283,7 +283,7 @@ def stand_on_relief(
     """Return the motion of actors on a relief, given that in plan.
 
     `heights` are those of what each actor stands on, at x, y (T, A) [m]. `centre` (T, A, 2) [m], `yaw` (T, A) [rad],
-    `velocity` and `acceleration` (T, A, 3); `size` (A, 3) [m]. Those who are `upright` (A,) do not tilt.
+    `velocity` and `acceleration` (T, A, 3); `size` (A, 3) [m]. Actors that are `upright` (A,) do not tilt.
     """
 
     def height_at(time_s: float) -> Array:
