@@ -1,9 +1,8 @@
-"""Radio links of the connected vehicles of a trace to roadside units, instant by instant.
+"""Radio links of the connected vehicles of a trace to roadside units, instant by instant; wireline links to the cloud.
 
-State of the direct paths between vehicles and roadside units: free, blocked by vehicles, blocked by buildings.
-
-TR 37.885 draws the state of urban links along a street by distance; here it follows from the town and its traffic,
-whose buildings are its meshes, and whose vehicles are boxes as in the report.
+The direct path between a vehicle and a unit is free, blocked by vehicles, or blocked by buildings. TR 37.885 draws the
+state of urban links along a street by distance; here it follows from the town and its traffic: buildings are the town's
+meshes, and vehicles are boxes as in the report.
 """
 
 from collections.abc import Mapping, Sequence

@@ -16,7 +16,6 @@ from flcav.sensors.rendering.ground import Markings, build_markings
 from flcav.sensors.rendering.noise import make_noise
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.layers import MapLayers
-from flcav.world.map.town import Town
 from flcav.world.materials import (
     CLOTH_COLOURS,
     COLOUR,
@@ -81,19 +80,7 @@ class Appearance(NamedTuple):
 
 _AS = {"van": "car", "prop": "static"}  # categories without a class of their own
 _KNOWN: WeakKeyDictionary[Scene, tuple[Surfaces, Appearance]] = WeakKeyDictionary()
-_TOWNS: WeakKeyDictionary[Solid, "_OfTown"] = WeakKeyDictionary()
-
-
-class _OfTown(NamedTuple):
-    """The tables of a town's F faces, and what else does not depend on the actors: see `Appearance`."""
-
-    semantic: Bytes  # (F,)
-    thing: Ints32  # (F,)
-    part: Bytes  # (F,)
-    part_row: Ints32  # (F,)
-    markings: Markings
-    facades: Facades
-    plates: Plates
+_TOWNS: WeakKeyDictionary[Solid, Appearance] = WeakKeyDictionary()  # of towns without actors
 
 
 def build_appearance(scene: Scene) -> Appearance:
@@ -101,29 +88,40 @@ def build_appearance(scene: Scene) -> Appearance:
     if scene not in _KNOWN or _KNOWN[scene][0] is not scene.surfaces:
         if scene.town_solid not in _TOWNS:
             _TOWNS[scene.town_solid] = _of_town(scene)
-        _KNOWN[scene] = scene.surfaces, _appearance(scene, _TOWNS[scene.town_solid])
+        _KNOWN[scene] = scene.surfaces, _add_actors(scene, _TOWNS[scene.town_solid])
     return _KNOWN[scene][1]
 
 
-def _of_town(scene: Scene) -> _OfTown:
+def _of_town(scene: Scene) -> Appearance:
+    """Return the appearance of a scene's town alone, whose faces come first in the scene."""
     town = scene.town
     world, signs = build_static_world(town), town.signs
     numbers = np.array([SEMANTICS[_OF_PART[TownPart(value)]] for value in range(len(TownPart))], np.uint8)
     leafy = (world.part == TownPart.CLUTTER) & (world.mesh.material == Material.LEAF)
     place = np.c_[signs.position, left_vectors(signs.yaw)].astype(np.float32)
     kinds = np.array([SIGN_KINDS.index(kind) for kind in signs.kind], np.uint8)
-    return _OfTown(
+    no_corners = np.zeros((0, 3, 3), np.float32)
+    return Appearance(
+        material=world.mesh.material,
         semantic=np.where(leafy, SEMANTICS["vegetation"], numbers[world.part]).astype(np.uint8),
         thing=-(scene.things.face + 1),
         part=world.part,
         part_row=world.row,
-        markings=_markings(town),
+        first_actor=len(world.part),
+        corner=no_corners,
+        corner_normal=no_corners,
+        colour=COLOUR[None],
+        mirror=MIRROR,
+        gloss=GLOSS,
+        markings=build_markings(map_layers(town) if town.net.exists() else MapLayers((), (), (), (), (), ())),
         facades=facades_of(town.name, town.buildings),
         plates=Plates(place, kinds, draw_signs()),
+        noise=make_noise(),
     )
 
 
-def _appearance(scene: Scene, of_town: _OfTown) -> Appearance:
+def _add_actors(scene: Scene, of_town: Appearance) -> Appearance:
+    """Return the appearance of a scene from that of its town alone."""
     surfaces, trace = scene.surfaces, scene.trace
     actors = len(of_town.part)
     beyond = (0, len(surfaces.material) - actors)  # the faces of the actors follow the town's
@@ -134,35 +132,20 @@ def _appearance(scene: Scene, of_town: _OfTown) -> Appearance:
         corners, normals = _corners(*trace.model(instance - 1))
         first = int(surfaces.first[instance])
         faces = slice(first, first + len(corners))
-        corner[first - actors : first - actors + len(corners)] = corners
-        corner_normal[first - actors : first - actors + len(corners)] = normals
+        corner[first - actors :][: len(corners)], corner_normal[first - actors :][: len(corners)] = corners, normals
         semantic[faces] = SEMANTICS[_AS.get(str(category), str(category))]
         if category in ("bicycle", "motorcycle"):
             semantic[faces][np.isin(surfaces.material[faces], _RIDER)] = SEMANTICS["rider"]
-    return Appearance(
+    return of_town._replace(
         material=surfaces.material,
         semantic=semantic,
         thing=np.pad(of_town.thing, beyond),
         part=np.pad(of_town.part, beyond),
         part_row=np.pad(of_town.part_row, beyond),
-        first_actor=actors,
         corner=corner,
         corner_normal=corner_normal,
         colour=_colours([str(name) for name in trace.actor], scene.paints),
-        mirror=MIRROR,
-        gloss=GLOSS,
-        markings=of_town.markings,
-        facades=of_town.facades,
-        plates=of_town.plates,
-        noise=make_noise(),
     )
-
-
-def _markings(town: Town) -> Markings:
-    """Return the road markings of a town; none where its net file does not exist."""
-    if not town.net.exists():
-        return build_markings(MapLayers((), (), (), (), (), ()))
-    return build_markings(map_layers(town))
 
 
 @lru_cache(maxsize=256)

@@ -81,9 +81,7 @@ class Town:
     lamps: Array  # (L, 3) street lamps: x, y of the foot, height above it [m]
     geo: GeoReference = field(default_factory=GeoReference)  # geodetic position of the world frame's origin
     signals: Signals = field(default_factory=Signals.none)
-    posts: Array = field(
-        default_factory=lambda: np.zeros((0, 3))
-    )  # (K, 3) poles of a map: x, y of the foot, height [m]
+    posts: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (K, 3) poles of a map: x, y of foot, height [m]
     relief: Relief | None = None  # heights of the ground; None: it is level, at z = 0
 
     def grounds(self, x: Array, y: Array) -> Array:
