@@ -62,7 +62,7 @@ def only_writer(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def wait_for_turn(what: str) -> Iterator[None]:
-    """Hold what is called `what` (letters, digits, dashes) within the context; others on this machine wait for it."""
+    """Hold the machine-wide lock named `what` (letters, digits, dashes) within the context; other processes wait."""
     with (Path(tempfile.gettempdir()) / f"flcav-{what}{LOCK}").open("a") as file:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX)

@@ -49,7 +49,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def _flush(path: Path) -> None:
-    """Write what the system holds back of a file, or of the names in a folder, to the disk: fsync(2)."""
+    """Flush a file, or the names in a folder, from the system's cache to the disk: fsync(2)."""
     file = os.open(path, os.O_RDONLY)
     try:
         os.fsync(file)
@@ -58,14 +58,14 @@ def _flush(path: Path) -> None:
 
 
 def flush_all(paths: Iterable[Path]) -> None:
-    """Write what the system holds back of files, and of the names in folders, to the disk, except of symbolic links."""
+    """Flush files, and the names in folders, to the disk, except symbolic links."""
     with ThreadPoolExecutor(SYNCING) as threads:
         for _ in threads.map(_flush, (path for path in paths if not path.is_symlink())):
             pass  # raises the OSError of a file
 
 
 def flush_tree(folder: Path) -> None:
-    """Write what the system holds back of a folder, of all below it and of its own name to the disk."""
+    """Flush a folder, everything below it and its name in its parent to the disk."""
     flush_all([folder.parent, folder, *folder.rglob("*")])
 
 
@@ -139,7 +139,7 @@ def read_parquet(path: Path) -> pa.Table:
 
 
 def _measure_table(metadata: Any) -> int:
-    """Return the bytes that a file's values take, by what its metadata says: at least eight each, or their pages'."""
+    """Return the size of a file's values in memory by its metadata [bytes]: at least eight a value, or their pages."""
     groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
     columns = (group.column(j) for group in groups for j in range(group.num_columns))
     return sum(max(8 * column.num_values, column.total_uncompressed_size) for column in columns)

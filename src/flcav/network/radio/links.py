@@ -75,7 +75,7 @@ def check_units(town: Town, units: Mapping[str, Array], radio: Radio) -> None:
 
 
 def walls_of(town: Town, radio: Radio) -> Assembly | None:
-    """Return the buildings that the radio's environment knows: none on a highway."""
+    """Return the buildings that block links in the radio's environment; None on a highway, which has none."""
     return raise_walls(town) if radio.environment == "urban" else None
 
 
@@ -122,7 +122,7 @@ def link_vehicles(
 
 
 class _Paths(NamedTuple):
-    """Geometry of the direct paths, the first two as in `RadioLinks`."""
+    """Geometry of the direct paths; `distance_m` and `state` as in `RadioLinks`."""
 
     distance_m: Array  # (T, V, U)
     state: NDArray[np.int8]  # (T, V, U)

@@ -20,7 +20,7 @@ POLE = re.compile(r"pole([0-9]{1,9})")  # what agents on poles are called
 
 @dataclass(frozen=True)
 class RecordedScene:
-    """The links of the connected vehicles of a scene, with what they were made of."""
+    """The links of the connected vehicles of a scene, with the town, units and paths that they follow from."""
 
     scene: str
     town: Town

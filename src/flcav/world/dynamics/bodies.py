@@ -37,7 +37,7 @@ STATE = ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "ti
 
 @dataclass
 class ControlledBody:
-    """A body under control, but for its motion."""
+    """A vehicle, walker or prop under control: what does not change with its motion."""
 
     name: str
     blueprint: BodyBlueprint
@@ -50,15 +50,15 @@ class ControlledBody:
 
     @property
     def category(self) -> str:
-        """Return that of the blueprint."""
+        """Return the category of the blueprint."""
         return self.blueprint.category
 
 
 class Bodies:
-    """N bodies and their motion."""
+    """The N bodies under control and their motion, world frame."""
 
     def __init__(self, ground: TownGround, *, leans: bool = False) -> None:
-        """Start without any, on this ground; `leans`: cars are seen to lean on their springs."""
+        """Start without bodies on this ground; with `leans`, cars pitch and roll on their springs."""
         self._leans = leans
         self.members: list[ControlledBody] = []
         self.position, self.velocity, self.acceleration = (np.zeros((0, 3)) for _ in range(3))
@@ -113,7 +113,7 @@ class Bodies:
             self.land(row)
 
     def land(self, row: int) -> None:
-        """Let a body with physics and gravity stand on the ground, unless that is too far from it."""
+        """Put a body with physics and gravity onto the ground, unless that is more than `ALOFT_M` away."""
         body = self.members[row]
         if body.physics and body.gravity:
             self.aloft[row] = abs(self._clearance(np.array([row]))[0]) > ALOFT_M
@@ -121,7 +121,7 @@ class Bodies:
                 self._stand(np.array([row]))
 
     def push(self, row: int, velocity: tuple[float, float, float]) -> None:
-        """Give a body another velocity [m/s]: one that is pushed up leaves the ground, and none goes into it."""
+        """Set the velocity [m/s] of a body: pushed up, it leaves the ground; pushed down, it stays on it."""
         self.velocity[row] = velocity
         body = self.members[row]
         if body.physics and body.gravity and not self.aloft[row]:
@@ -131,12 +131,12 @@ class Bodies:
                 self.velocity[row, 2] = climb
 
     def _climb(self, rows: Ints) -> Array:
-        """Return the vertical velocities [m/s] by which bodies stay on the slopes that they move on."""
+        """Return the vertical velocities [m/s] with which bodies follow the slopes that they move on."""
         ahead = (self.velocity[rows, :2] * heading_vectors(self.yaw[rows])).sum(axis=1)
         return -ahead * np.tan(self.tilt[rows, 0])
 
     def move(self, dt_s: float) -> None:
-        """Move all with physics by `dt_s` [s], as if nothing were in their way."""
+        """Move all bodies with physics by a step of `dt_s` [s], before contacts are resolved."""
         on = np.array([body.physics for body in self.members], np.bool_)
         flies = on & self.aloft
         self.position[flies] += self.velocity[flies] * dt_s
@@ -160,7 +160,7 @@ class Bodies:
                 self.yaw[row] = np.arctan2(change[row, 1], change[row, 0])
 
     def settle(self, dt_s: float) -> None:
-        """Let all with physics stand on the ground where they are, climbing with its slope, or fall for `dt_s` [s]."""
+        """Put bodies with physics onto the ground and its slope after contacts; let those aloft fall for `dt_s` [s]."""
         heavy = np.array([body.physics and body.gravity for body in self.members], np.bool_)
         if len(rows := np.flatnonzero(heavy & self.aloft)):
             clearance = self._clearance(rows)
@@ -172,7 +172,7 @@ class Bodies:
             self.velocity[rows, 2] = self._climb(rows)
 
     def weights(self) -> tuple[Array, Array]:
-        """Return the masses (N,) [kg] and moments of inertia (N,) [kg m^2], infinite for what nothing moves."""
+        """Return masses (N,) [kg] and moments of inertia (N,) [kg m^2]; infinite where contacts do not move a body."""
         held = np.array([not body.physics or body.category == "prop" for body in self.members], np.bool_)
         upright = np.array([body.category == "pedestrian" for body in self.members], np.bool_)
         mass = np.where(held, np.inf, self._vehicles.mass_kg)
@@ -189,7 +189,7 @@ class Bodies:
         return z - self._ground.heights(x, y, z)
 
     def actors(self) -> Actors:
-        """Return the bodies as they are now."""
+        """Return the present states of the bodies."""
         return Actors(
             name=tuple(body.name for body in self.members),
             category=tuple(body.category for body in self.members),

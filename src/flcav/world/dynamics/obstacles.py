@@ -28,12 +28,12 @@ class Obstacles(NamedTuple):
     tree: shapely.STRtree
 
     def near(self, low: Array, high: Array) -> Ints:
-        """Return the rows (K,), ascending, of obstacles about boxes with these corners, (N, 2) [m] each."""
+        """Return the rows (K,), ascending, of obstacles that touch any of the boxes from `low` to `high` (N, 2) [m]."""
         return np.unique(self.tree.query(shapely.box(*low.T, *high.T))[1])
 
 
 def list_obstacles(town: Town, parked: Actors = NOBODY) -> Obstacles:
-    """Return a town's buildings, trunks, clutter and posts, and the `parked` vehicles by their own names."""
+    """Return a town's buildings, trunks, clutter and posts as obstacles, and its `parked` vehicles."""
     rows, name = [np.zeros((0, 6))], []
     for kind, part in _parts(town):
         rows.append(part)
@@ -85,7 +85,7 @@ def _parts(town: Town) -> Iterator[tuple[str, Array]]:
 
 
 def _posts(foot: Array, radius: Array | float, height: Array | float) -> Array:
-    """Return posts at `foot` (K, 2) of this radius and height [m] as rows x, y, yaw, length, width, height."""
+    """Return posts at `foot` (K, 2) [m] with this radius and height [m] as rows x, y, yaw, length, width, height."""
     level = np.zeros(len(foot))
     return np.column_stack((foot, level, 2 * radius + level, 2 * radius + level, height + level))
 

@@ -23,7 +23,7 @@ STEER_LIMIT_RAD = float(np.radians(70.0))  # of the inner front wheel
 
 
 class _Make(NamedTuple):
-    """What vehicles of a category have in common."""
+    """Mechanical parameters that the vehicles of a category share."""
 
     density: float  # mass over the volume of the box [kg/m^3]
     pull: float  # greatest acceleration by the engine [m/s^2]
@@ -68,7 +68,7 @@ class BodyBlueprint:
 
 
 def make_blueprint(category: str, shape: int = 0, size: tuple[float, float, float] | None = None) -> BodyBlueprint:
-    """Return the blueprint of a shape, with its own or another `size` (length, width, height [m]).
+    """Return the blueprint of a shape; `size` is length, width, height [m], None: those of the shape.
 
     Raises `InputError` for an unknown category or shape, and for a size that is not positive.
     """
@@ -130,7 +130,7 @@ class Vehicles(NamedTuple):
 
 
 class Pedals(NamedTuple):
-    """What the drivers of N vehicles do."""
+    """Controls of N vehicles."""
 
     throttle: Array  # (N,) 0 to 1
     steer: Array  # (N,) -1 to 1, share of the limit, positive to the left
@@ -154,7 +154,7 @@ def stack_blueprints(blueprints: list[BodyBlueprint]) -> Vehicles:
 
 
 def drive_vehicles(motion: PlanarMotion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s: float) -> PlanarMotion:
-    """Return the motion of N vehicles `dt_s` later, on slopes of this `pitch` (N,) [rad], positive downhill."""
+    """Return the motion of N vehicles `dt_s` [s] later, on slopes of this `pitch` (N,) [rad], positive downhill."""
     ahead = heading_vectors(motion.yaw)
     speed = (motion.velocity * ahead).sum(axis=1)
     wanted = np.clip(pedals.steer, -1, 1) * vehicles.steer_limit_rad
@@ -176,7 +176,7 @@ def drive_vehicles(motion: PlanarMotion, vehicles: Vehicles, pedals: Pedals, pit
 
 
 def _accelerate(speed: Array, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s: float) -> Array:
-    """Return the speed ahead (N,) [m/s] after `dt_s`: engine, drag and slope; then the brakes, at most to rest."""
+    """Return the longitudinal speed (N,) [m/s] after `dt_s` [s]: engine, drag, slope, then brakes, at most to rest."""
     force = np.minimum(vehicles.engine_n, vehicles.power_w / np.maximum(np.abs(speed), 1e-3))
     force = np.clip(pedals.throttle, 0, 1) * np.where(pedals.reverse, -1 * (speed > -REVERSE_MPS), 1) * force
     drag = AIR_KGPM3 / 2 * vehicles.drag_area_m2 * speed * np.abs(speed)

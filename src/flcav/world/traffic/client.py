@@ -27,7 +27,7 @@ def write_job(folder: Path, net: Path, demand: Demand, seed: int) -> TrafficJob:
 
 
 class Sumo:
-    """A SUMO run in a process beside this one, which it has until it is closed."""
+    """A SUMO run in a child process, which it keeps until it is closed."""
 
     def __init__(self, job: TrafficJob, failure: str = "SUMO failed") -> None:
         """Start a run; where SUMO fails, now or later, that is a `RuntimeError` that begins with `failure`."""
@@ -36,11 +36,11 @@ class Sumo:
         self.begun: States = self._ask(job._asdict())
 
     def step(self, request: StepRequest) -> States:
-        """Make a step, and return the states after it."""
+        """Advance by a step that obeys the request, and return the states after it."""
         return self._ask({"step": request._asdict()})
 
     def record(self, steps: Sequence[int], out: Path) -> None:
-        """Record a run that has made no step yet, see `recording.record`."""
+        """Record a run that has made no step yet, see `process.record_traffic`."""
         self._ask({"record": {"steps": steps, "out": str(out.absolute())}})
 
     def close(self) -> None:
@@ -101,6 +101,6 @@ def _stop() -> None:
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Kill a process, without waiting for its run, which ends when it would answer."""
+    """Kill a process; its run ends by itself at its next answer."""
     with contextlib.suppress(BrokenPipeError), process:
         process.kill()

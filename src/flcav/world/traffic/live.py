@@ -56,7 +56,7 @@ def write_live_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedest
 
 
 class SumoTraffic:
-    """SUMO's traffic in a town, with a SUMO process of its own until it is closed."""
+    """SUMO's traffic in a town, in a SUMO process that it keeps until it is closed."""
 
     def __init__(self, town: Town, ground: TownGround, *, seed: int, vehicles: int, pedestrians: int) -> None:
         """Start with the traffic under way; raises `InputError` as `write_demand`, `RuntimeError` where SUMO fails."""
@@ -73,7 +73,7 @@ class SumoTraffic:
         self.advance(NOBODY, {}, [])
 
     def advance(self, bodies: Actors, lights: Mapping[str, str], halted: Sequence[str]) -> None:
-        """Let SUMO make its next step, in which its traffic sees the `bodies` under control.
+        """Advance SUMO by a step, in which its traffic reacts to the `bodies` under control.
 
         `lights` are the letters of each junction's links. Vehicles that are `halted` stand for a while. Raises
         `RuntimeError` where SUMO fails.
@@ -93,7 +93,7 @@ class SumoTraffic:
         self._line_up()
 
     def _line_up(self) -> None:
-        """Take those who are there both before and after the step of SUMO under way."""
+        """Keep the actors that are present both before and after SUMO's present step."""
         names = sorted((name for name in self._before if name in self._after), key=number_of)
         self._ends = tuple(
             np.array([state[name][1:] for name in names], np.float64).reshape(-1, 4)
@@ -103,7 +103,7 @@ class SumoTraffic:
             self._recast(names)
 
     def at(self, time_s: float) -> Actors:
-        """Return those present at a time since the start, within the step of SUMO under way: linear in it.
+        """Return the actors at a time [s] since the start within SUMO's present step, interpolated linearly.
 
         Times must ascend, since an actor stays on the bridge, or below it, where it was.
         """
@@ -132,7 +132,7 @@ class SumoTraffic:
         return self._actors
 
     def _recast(self, names: Sequence[str]) -> None:
-        """Take over these actors; those who come are on the ground, or on the bridge that their lane leads over."""
+        """Set up these actors; new ones stand on the ground, or on the bridge that their lane leads over."""
         kinds = [self._kinds[self._after[name][0]] for name in names]
         size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], np.float64).reshape(-1, 3)
         count = len(names)
@@ -226,7 +226,7 @@ class LightProgram:
     offset_s: float  # the first phase begins at this time
 
     def at(self, time_s: float) -> str:
-        """Return the letters of the links at a time."""
+        """Return the letters of the links at a time [s]."""
         left = (time_s - self.offset_s) % sum(self.durations_s)
         for duration, state in zip(self.durations_s, self.states):
             if left < duration - 1e-6:

@@ -23,7 +23,7 @@ from flcav.world.traffic.simulation import Simulation, States, StepRequest, Traf
 
 
 def serve_traffic() -> None:
-    """Make the run of each job that is read from stdin, in a fork."""
+    """Run each job that is read from stdin, in a fork."""
     import libsumo  # noqa: F401 - for the forks
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # left to the process that asks, which ends this one
@@ -41,7 +41,7 @@ def serve_traffic() -> None:
 
 
 def _run(first: bytes) -> None:
-    """Make the run of a job, from its first request to the last."""
+    """Run a job, from its first request to the last."""
     with os.fdopen(os.dup(1), "wb") as answers, tempfile.TemporaryFile("a+b", buffering=0) as said:
         os.dup2(said.fileno(), 1)  # SUMO's own output
         os.dup2(said.fileno(), 2)

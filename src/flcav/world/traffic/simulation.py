@@ -33,7 +33,7 @@ Body = tuple[str, str, Sequence[float]]
 
 
 class TrafficJob(NamedTuple):
-    """What a run is started with; the files `NET` and `ROUTES` of its folder are SUMO's."""
+    """Inputs of a run; its folder holds SUMO's files `NET` and `ROUTES`."""
 
     folder: str
     seed: int
@@ -45,7 +45,7 @@ class TrafficJob(NamedTuple):
 
 
 class StepRequest(NamedTuple):
-    """What a step obeys."""
+    """External inputs of a step."""
 
     bodies: Sequence[Body] = ()  # under control
     dangers: Sequence[Danger] = ()  # to brake for
@@ -102,7 +102,7 @@ class Simulation:
         self.advance()
 
     def states(self) -> States:
-        """Return the states of SUMO's own vehicles and pedestrians, as scenarios have them seen."""
+        """Return the states of SUMO's vehicles and pedestrians, with the shifts and turns of scenarios."""
         seen = self.director.stage.seen if self.director else None
         out: States = {}
         for name in self.sumo.vehicle.getIDList():
@@ -114,7 +114,7 @@ class Simulation:
         return out
 
     def advance(self) -> None:
-        """Make a step with nobody under control; vehicles that have arrived are followed, or set out again."""
+        """Advance by a step; vehicles that have arrived are replaced by the next ones, or set out again."""
         sumo = self.sumo
         sumo.simulationStep()
         for name in sumo.simulation.getArrivedIDList():
@@ -136,7 +136,7 @@ class Simulation:
                 self._tours[name] = _type_of(sumo.vehicle, name), list(sumo.vehicle.getRoute(name))
 
     def _remove(self, name: str) -> None:
-        """Let one of SUMO's own leave, if it is still there."""
+        """Remove a vehicle or pedestrian of SUMO, if it is still present."""
         self._halted.pop(name, None)
         if self._tours.pop(name, None) is not None:
             self.sumo.vehicle.remove(name)
@@ -156,7 +156,7 @@ class Simulation:
         self.sumo.vehicle.add(follower, follower, kind, departPos="base", departSpeed="max", departLane="best")
 
     def _mirror(self, bodies: Sequence[Body]) -> None:
-        """Place the vehicles under control; those that are not among `bodies` any more leave."""
+        """Mirror the vehicles under control in SUMO: place `bodies`, and remove those that are no longer among them."""
         vehicle = self.sumo.vehicle
         names = {OWN + row[0] for row in bodies}
         for name in sorted(self._own - names):
