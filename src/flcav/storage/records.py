@@ -8,9 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Self, TypeVar
 
-import pyarrow
 import pyarrow as pa
-import pyarrow.csv
+import pyarrow.csv as csv
 from pydantic import Field, TypeAdapter, ValidationError
 
 from flcav.config import InputError, Json, check_is_file
@@ -99,11 +98,11 @@ def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str
     table, or a column is there twice.
     """
     named = origin or str(path)
-    written = pyarrow.csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()), null_values=[""])
+    written = csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()), null_values=[""])
     if isinstance(path, Path | str):
         check_is_file(Path(path))
     try:
-        table = pyarrow.csv.read_csv(path, convert_options=written)
+        table = csv.read_csv(path, convert_options=written)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         said = str(error) if str(error).isprintable() else "its bytes are no text"
         raise InputError(f"{named}: not a table ({said})") from None
@@ -120,4 +119,4 @@ def write_any_table(table: pa.Table, path: Path) -> None:
         write_parquet(table, path)
         return
     with atomic_path(path) as temporary:
-        pyarrow.csv.write_csv(table, temporary)
+        csv.write_csv(table, temporary)

@@ -57,8 +57,8 @@ def join_snapshots(snapshots: Sequence[Snapshot]) -> Trace:
     count, actors = len(snapshots), len(names)
     known: dict[str, tuple[str, int, tuple[float, ...]]] = {}
     present = np.zeros((count, actors), np.bool_)
-    motion = {name: np.full((count, actors, 3), np.nan) for name in ("position", "velocity", "acceleration")}
-    turning = {name: np.full((count, actors), np.nan) for name in ("yaw", "yaw_rate")}
+    axes = {"position": (3,), "velocity": (3,), "acceleration": (3,), "yaw": (), "yaw_rate": ()}
+    motion = {name: np.full((count, actors, *shape), np.nan) for name, shape in axes.items()}
     tilt = np.full((count, actors, 2), np.nan)
     for i, each in enumerate(snapshots):
         trace = each.trace
@@ -67,7 +67,7 @@ def join_snapshots(snapshots: Sequence[Snapshot]) -> Trace:
             if known.setdefault(name, trace.model(actor)) != trace.model(actor):
                 raise ValueError(f"actor '{name}' is not the same in all snapshots")
         present[i, at] = True
-        for name, array in (motion | turning).items():
+        for name, array in motion.items():
             array[i, at] = getattr(trace, name)[0]
         tilt[i, at] = trace.tilts(0)
     category, shape, size = zip(*(known[name] for name in names)) if names else ((), (), ())
@@ -83,7 +83,6 @@ def join_snapshots(snapshots: Sequence[Snapshot]) -> Trace:
         light_state=np.concatenate([each.trace.light_state for each in snapshots]),
         tilt=None if all(each.trace.tilt is None for each in snapshots) else tilt,
         **motion,
-        **turning,
     )
 
 

@@ -256,10 +256,7 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
     if not len(buildings):
         buildings = street_furniture.place_buildings(rows, land, stream(parameters.seed, "buildings"))
     walked = unite([verge.line.buffer(verge.half_width, cap_style="flat") for verge in rows])
-    facades = [
-        street_furniture.make_footprint(x, y, yaw, length, width).buffer(0.1)
-        for x, y, yaw, length, width, _ in buildings
-    ]
+    facades = [street_furniture.make_footprint(*row[:5]).buffer(0.1) for row in buildings]
     open_land = street_furniture.Plot(unite([ground.roads, walked, *facades]))
     for shape in given:
         open_land.build(shape, 0.0)
