@@ -197,7 +197,7 @@ def to_names(array: Bytes) -> Words:
 
 
 def carry(message: bytes) -> bytes:
-    """Return a message as the other end of its link has it; in a simulation, the same bytes."""
+    """Return a message as it is received at the other end of its link: in a simulation, the same bytes."""
     return message
 
 

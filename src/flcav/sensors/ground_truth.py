@@ -118,7 +118,7 @@ def count_occluded_rays(
     instance: Ints32,
     actors: Ints,
 ) -> Ints:
-    """Return for each of `actors` (K,) the number of rays that would return from it in an empty world, but do not.
+    """Return the number (K,) of rays that return from each of `actors` (K,) in an empty world, but not in this one.
 
     `distance` (N,) [m] and `instance` (N,) are where the sweep's rays ended and at what: a + 1 at actor a. `passes`
     (N,) marks the rays that go through glass.

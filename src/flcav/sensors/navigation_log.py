@@ -39,12 +39,12 @@ class NavigationLog:
 
     @property
     def begin_s(self) -> float:
-        """Return from when on both sensors measure [s]."""
+        """Return the time from which both sensors measure [s]."""
         return float(max(self.fix_time_s[0], self.imu_time_s[0]))
 
     @property
     def end_s(self) -> float:
-        """Return until when the IMU measures [s]."""
+        """Return the time of the last sample of the IMU [s]."""
         return float(self.imu_time_s[-1])
 
     def covers(self, times_s: Array) -> Mask:
@@ -53,7 +53,7 @@ class NavigationLog:
 
 
 def log_drive(drives: Trace, agent: str, rig: Rig, geo: GeoReference, *, scene: str, seed: int) -> NavigationLog | None:
-    """Return the navigation log of the vehicle `agent` over its drive, from when it is under way for good.
+    """Return the navigation log of the vehicle `agent` over its drive, from the time after which it is always present.
 
     drives: its poses at every step of the traffic. geo: position of the town's origin. None where the rig lacks a GNSS
     receiver or an IMU, or the drive takes less than `LEAST_STEPS` steps.

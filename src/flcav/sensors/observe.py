@@ -39,7 +39,7 @@ def observe(
 ) -> Frame:
     """Return the frame of `agent` ("cav0", "pole3") with `rig` at instant `index` of the scene's traffic run.
 
-    Its own index is `number`, by default `index`: of a live world, whose traces have one instant, that of the step.
+    The frame's index is `number`, by default `index`; in a live world, whose traces have one instant, the step.
     Moves `scene` there. The same arguments give the same bytes, whatever was observed before: each sensor has a random
     stream of its own, named by `seed`, scene, number, agent and sensor, so that it does not depend on the rig's other
     sensors. `error` changes the frame's assumed calibration alone.

@@ -186,7 +186,7 @@ def detect_cells(cells: Cells, radar: Radar, rain_mm_h: float, rng: np.random.Ge
 
 
 def false_alarms(radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> Array:
-    """Return M false alarms (M, 5), columns as in `detect_cells`: a Poisson number of cells of loud noise."""
+    """Return M false alarms (M, 5), as `detect_cells`: a Poisson number of cells, at random places."""
     low, high = radar.extent().T
     cells = np.prod(np.ceil((high - low) / radar.resolution()))
     count = rng.poisson(cells * radar.false_alarm_rate)

@@ -35,12 +35,12 @@ NOTHING: Mapping[str, Controls] = MappingProxyType({})
 
 
 class Obstructed(InputError):
-    """A place where an actor cannot appear, since something else is there."""
+    """Raised where an actor cannot appear, since its place is occupied."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a live world is started with, besides its town."""
+    """Initial conditions and settings of a live world, besides its town."""
 
     seed: int = 0
     traffic: int = 0  # vehicles of SUMO; without these and without pedestrians there is no SUMO
@@ -110,7 +110,7 @@ class LiveWorld:
         self.close()
 
     def close(self) -> None:
-        """End the traffic; a world that had some makes no further steps then."""
+        """End the traffic; a world with traffic cannot be stepped any more."""
         if self._traffic is not None:
             self._traffic.close()
 

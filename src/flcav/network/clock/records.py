@@ -64,7 +64,7 @@ SCHEMA = pa.schema(
 
 
 def tabulate_rounds(records: Sequence[RoundTiming]) -> pa.Table:
-    """Return a table with a row per client and round; what is said of the round is in the columns `round_...`."""
+    """Return a table with a row per client and round; attributes of the round are in the columns `round_...`."""
     rows = [
         {**asdict(client), **{f"round_{field.name}": getattr(record, field.name) for field in _ROUND}}
         for record in records

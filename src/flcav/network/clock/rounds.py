@@ -85,7 +85,7 @@ class ClientPhases:
         return self.instant == len(self.links.time_s) - 1
 
     def run(self) -> tuple[ClientTiming, ...]:
-        """Go from event to event until every client's update has arrived or is given up."""
+        """Advance from event to event until every client's update has arrived or is dropped."""
         while True:
             self._drop()
             active = self.phase < Phase.OVER
@@ -94,7 +94,7 @@ class ClientPhases:
             self._advance(active)
 
     def _advance(self, active: Mask) -> None:
-        """Let the active clients, one or more, go on until the next event, and end the phases that are done."""
+        """Advance the active clients, one or more, to the next event, and end the phases that are complete."""
         transfers = active & (self.phase != Phase.COMPUTE)
         rates = shared_rates_bps(self.received[self.instant], self.server, transfers, self.links.radio)
         speed = np.where(self.phase == Phase.COMPUTE, 1.0, rates)  # (K,) bit/s, or seconds a second
@@ -120,7 +120,7 @@ class ClientPhases:
         self.end_s[rows[self.phase[rows] == Phase.OVER]] = self.time_s
 
     def _drop(self) -> None:
-        """Drop the clients that cannot go on at this time, each for the first reason that holds."""
+        """Drop the clients that cannot continue at this time, each for the first reason that applies."""
         n, rules = self.instant, self.rules
         distance = np.nan_to_num(self.links.distance_m[n, self.column], nan=np.inf)  # (K, U)
         nearest = distance.argmin(axis=1)

@@ -32,7 +32,7 @@ QUANTILES = ndtri((np.arange(LEVELS) + 0.5) / LEVELS).astype(np.float32)  # of t
 
 
 class CastRays(Protocol):
-    """A ray caster over a fixed set of rays, given the indices of those to cast: see `Target.trace`."""
+    """A ray caster over a fixed set of rays, given the indices of those to cast: see `embree.Hierarchy.trace`."""
 
     def __call__(self, rays: Ints | slice, *, near_m: Array32 | None = None) -> Hits:
         """Return the first hits of `rays`, beyond `near_m` (one for each of them) where given."""

@@ -267,7 +267,7 @@ def _hemisphere(seen, width, columns, rows, ways, origin, towards, far):
 
 @compiled
 def _spread(seen, blocked, width, height, columns, first, last, out):
-    """Write the shares of the blocks in rows `first` to `last`: 1 where no ray is blocked nearby, as mostly."""
+    """Write the shares of the blocks in rows `first` to `last`: 1 where no ray nearby is blocked."""
     half = SPAN // 2
     along = np.zeros(columns, np.int64)  # blocked rays in the neighbourhood's rows, by column
     for row in range(max(first - half, 0), min(first + half - 1, len(blocked))):

@@ -40,7 +40,7 @@ def wet_pixels(seen, appearance, width, height):
 
 @compiled
 def smear(image, weight, width, height, out):
-    """Blur `image` (H, W, 3) vertically, as ripples do: write weighted means `out` (H, W, 3), 0 where no weight is."""
+    """Blur `image` (H, W, 3) vertically, as ripples do: write weighted means to `out` (H, W, 3); no weight: 0."""
     for i in range(width):
         for j in range(height):
             total = np.float32(0)

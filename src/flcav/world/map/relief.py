@@ -75,7 +75,7 @@ class Relief:
         return out
 
     def above(self, points: Array) -> Array:
-        """Return how high (N,) [m] points (N, 3), world frame [m], are above the ground, or the deck below them."""
+        """Return the height (N,) [m] of points (N, 3), world frame [m], above the ground, or a deck below them."""
         x, y, z = points.T
         foot = self.heights(x, y)
         for deck in self.decks:

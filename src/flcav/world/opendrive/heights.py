@@ -30,7 +30,7 @@ BATCH = 20_000  # pieces of roads that are compared with all others at a time
 
 
 class Borders(NamedTuple):
-    """The K cross-sections of a road by their ends."""
+    """Both ends of the K cross-sections of a road."""
 
     right: Array  # (K, 3) [m]
     left: Array  # (K, 3) [m]
@@ -85,7 +85,7 @@ def _batches(tree: shapely.STRtree, areas: NDArray, rows: Ints, within_m: float)
 
 
 def _find_joined(areas: NDArray, low: Array, high: Array, crossing: Mask) -> Mask:
-    """Return which of N pieces of roads are `crossing`, or joined with such a piece, at once or by others of them.
+    """Return which of N pieces of roads are `crossing`, or connected with such a piece, directly or through others.
 
     `low` and `high` (N,) are their heights [m].
     """
@@ -204,7 +204,7 @@ def _list_decks(strips: list[Strip], spans: Spans, *, widened: bool) -> list[tup
 
 
 def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> Mask:
-    """Return which of a road's K cross-sections a terrain leaves by more than `STRAY_M`.
+    """Return at which of a road's K cross-sections the terrain differs from the road by more than `STRAY_M`.
 
     Those on decks, and those that the ground keeps already, are left out.
     """
@@ -298,14 +298,14 @@ def _find_needed(points: Array, fixed: Mask) -> Ints:
 
 
 def _merge(points: Array) -> Array:
-    """Return points (M, 3) of which no two lie in one cell: the means of those that did."""
+    """Return one point for each cell that holds any of the points (N, 3): their mean, (M, 3)."""
     cells = np.unique(np.floor(points[:, :2] / CELL_M), axis=0, return_inverse=True)[1].ravel()
     count = np.bincount(cells)
     return np.stack([np.bincount(cells, column) / count for column in points.T], axis=1)
 
 
 def surround_terrain(points: Array, far_m: float = FAR_M) -> Array:
-    """Return points (K, 3) on a frame `far_m` around, at the height of the nearest point."""
+    """Return points (K, 3) [m] on a frame `far_m` around `points` (N, 3), each at the height of the nearest of them."""
     low, high = points[:, :2].min(axis=0) - far_m, points[:, :2].max(axis=0) + far_m
     share = np.linspace(0.0, 1.0, 9)
     x, y = low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])

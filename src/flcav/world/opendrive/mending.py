@@ -119,7 +119,7 @@ def _measure(road: ElementTree.Element) -> list[tuple[ElementTree.Element, float
 
 
 def _write_shapes(road: ElementTree.Element) -> None:
-    """Write at each <paramPoly3> how far its parameter goes, and spirals of one curvature, and arcs of none, as others.
+    """Write the range of each <paramPoly3>; spirals of constant curvature become arcs, arcs without curvature lines.
 
     netconvert takes the one at its word, and divides by zero at the others.
     """
@@ -152,7 +152,7 @@ def _mend_widths(road: ElementTree.Element) -> Iterator[str]:
 
 
 def _drop_limits(road: ElementTree.Element) -> Iterator[str]:
-    """Remove the speed limits of a road and its lanes that say a number but no speed; yield a note on each."""
+    """Remove speed limits of a road and its lanes with an unknown unit or an impossible value; yield a note on each."""
     owners = [("", owner) for owner in road.iterfind("type")]
     owners += [(f", lane {lane.get('id')}", lane) for lane in road.iterfind("lanes/laneSection/*/lane")]
     for where, owner in owners:
@@ -181,19 +181,19 @@ class WidthPiece(NamedTuple):
     value: Polynomial
 
     def at(self, s: float) -> "WidthPiece":
-        """Return the same polynomial from another place on."""
+        """Return the same polynomial with its origin at another `s` [m]."""
         return self if s == self.s else WidthPiece(s, self.value(Polynomial([s - self.s, 1.0])))
 
 
 class Change(NamedTuple):
-    """What was changed of the width of a lane."""
+    """A change of the width of a lane."""
 
     lane: int
     least_m: float  # below zero: the least width, before it was cut there; 0 for a lane without a positive width
 
 
 def rewrite_widths(section: ElementTree.Element, length: float) -> list[Change]:
-    """Rewrite the widths of a <laneSection> of `length` [m] in place; return the changes worth a word.
+    """Rewrite the widths of a <laneSection> of `length` [m] in place; return the changes to report.
 
     Borders become widths, a width below zero is zero, and so is a missing one: netconvert leaves such a lane out.
     """
@@ -222,7 +222,7 @@ def rewrite_widths(section: ElementTree.Element, length: float) -> list[Change]:
 
 
 def _is_plain(widths: list[ElementTree.Element]) -> bool:
-    """Return whether a lane has one positive width all along, as most have."""
+    """Return whether a lane has one constant positive width, as most have."""
     own = [[float(row.attrib[name]) for name in ("sOffset", *"abcd")] for row in widths]
     return len(own) == 1 and own[0][0] == 0.0 and own[0][1] > LEAST_M and not any(own[0][2:])
 

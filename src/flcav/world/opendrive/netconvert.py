@@ -119,7 +119,7 @@ def mirror_parts(prefix: Path) -> None:
 
 
 def _turn(text: str) -> str:
-    """Return a number as text with the other sign."""
+    """Return a number, as text, with its sign inverted."""
     stripped = text.strip()
     return stripped[1:] if stripped.startswith("-") else f"-{stripped.removeprefix('+')}"
 
@@ -184,7 +184,7 @@ def _name_parts(prefix: Path) -> dict[str, str]:
 
 
 def name_safely(root: ElementTree.Element) -> None:
-    """Replace what SUMO's ids cannot have in the ids of roads and junctions of the map below `root`, in place."""
+    """Replace characters that SUMO's ids cannot have in the ids of roads and junctions below `root`, in place."""
     for kind, references in NAMES.items():
         known = {row.get("id", "") for row in root.iterfind(kind)}
         safe: dict[str, str] = {}

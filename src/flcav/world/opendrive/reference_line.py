@@ -131,7 +131,7 @@ def _param_poly3(shape: ElementTree.Element, length: float) -> Curve:
 
 
 def _cubic(u: tuple[float, ...], v: tuple[float, ...], length: float, *, by_length: bool) -> Curve:
-    """Return the curve of two cubic polynomials in p: p is s itself, or with `by_length` where s has been gone."""
+    """Return the curve of two cubic polynomials in p; p is s, or with `by_length` the parameter at arc length s."""
     along, across = np.polynomial.Polynomial(u), np.polynomial.Polynomial(v)
     slope_u, slope_v = along.deriv(), across.deriv()
 
@@ -196,7 +196,7 @@ def measure_joints(rows: list[ElementTree.Element]) -> list[Joint]:
 
 
 def close_gaps(road: ElementTree.Element) -> list[Joint]:
-    """Rewrite the plan view of a <road> in place without gaps of `NOTED_M` or more; return the joints worth a word.
+    """Rewrite the plan view of a <road> in place without gaps of `NOTED_M` or more; return the joints to report.
 
     Each element begins where the file says, at its s. One that overlaps the next ends there, and the last metres before
     a gap are shifted towards the next element, in proportion to s.
@@ -219,7 +219,7 @@ def close_gaps(road: ElementTree.Element) -> list[Joint]:
 
 
 def shorten_geometry(row: ElementTree.Element, length: float) -> None:
-    """Let a geometry element end at `length` [m], up to which it stays as it is."""
+    """Cut a geometry element at `length` [m], in place; up to there its shape stays."""
     whole = float(row.attrib["length"])
     spiral, cubic = row.find("spiral"), row.find("paramPoly3")
     if spiral is not None:
@@ -234,7 +234,7 @@ def shorten_geometry(row: ElementTree.Element, length: float) -> None:
 
 
 def _ease(before: ElementTree.Element, row: ElementTree.Element, room: float) -> list[ElementTree.Element]:
-    """Return the elements in the place of `before`, over `room` metres of s, whose end is where `row` begins."""
+    """Return elements that replace `before` over `room` [m] of s, and end where `row` begins."""
     (one, other), start = list_pieces([before, row]), float(before.attrib["s"])
     gap = other.at(np.zeros(1))[0, :2] - one.at(np.array([room]))[0, :2]
     over = min(EASE * max(float(np.hypot(*gap)), room - one.length), room)

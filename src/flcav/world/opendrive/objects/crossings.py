@@ -126,7 +126,7 @@ def take_crosswalks(prefix: Path, net: Path, crosswalks: tuple[Crosswalk, ...]) 
 
 
 def _guesses(connections: ElementTree.Element, net: Path) -> list[_Guess]:
-    """Return the crossings of the plain connections with their middle lines, which the net alone has."""
+    """Return the crossings of the plain connections with their middle lines, which are read from the net."""
     lines: dict[tuple[str, frozenset[str]], Array] = {}
     for row in ElementTree.parse(net).getroot().iterfind("edge"):
         lane = row.find("lane")

@@ -134,7 +134,7 @@ def _stand(road: Road, thing: ElementTree.Element, kind: Kind, offset_m: Array) 
 def _describe(
     kind: Kind, centre: Array, yaw: float, sides: tuple[float, float], height: float
 ) -> Iterator[ObjectParameters]:
-    """Yield an object of these extents [m] and heading [rad]; none where they are not believed."""
+    """Yield an object of these extents [m] and heading [rad]; none where they are implausible."""
     if SIDE_M[0] <= min(sides) and max(sides) <= SIDE_M[1] and HEIGHT_M[0] <= height <= HEIGHT_M[1]:
         yield ObjectParameters(
             kind=kind,

@@ -74,7 +74,7 @@ def find_stop_lines(
 
 
 def _list_lines(row: ElementTree.Element, offset_m: Array) -> Iterator[_Line | None]:
-    """Yield the stop lines along one road of the map; None for one that does not say enough."""
+    """Yield the stop lines along one road of the map; None for one without place or length."""
     things = [thing for thing in row.iterfind("objects/object") if _is_stop_line(thing)]
     signals = [signal for signal in row.iterfind("signals/signal") if signal.get("type") == PAINTED_STOP_LINE]
     if not things and not signals:
