@@ -113,7 +113,7 @@ NOBODY = Actors((), (), np.zeros(0, np.int64), _THREES, _THREES, _ONES, _THREES,
 def pick_actors(actors: Actors, mask: Mask) -> Actors:
     """Return the actors for which `mask` (N,) is true."""
     names, categories = (tuple(compress(words, mask)) for words in actors[:2])
-    return Actors(names, categories, *(column[mask] for column in actors[2:]))
+    return Actors(names, categories, actors.shape[mask], *(column[mask] for column in actors[3:]))
 
 
 def join_actors(*parts: Actors) -> Actors:

@@ -215,8 +215,9 @@ def cast(scene: Scene, world_from_sensor: Array, lidar: Lidar, passes: Mask, hid
 
     if not lidar.rolling:
         return part(world_from_sensor, slice(None))
-    kinds = (np.float32, np.int32, np.int32, np.uint8, np.uint8)
-    steps, whole = lidar.azimuth_steps, Returns(*(np.empty(len(pattern), kind) for kind in kinds))
+    steps, count = lidar.azimuth_steps, len(pattern)
+    numbers, kinds = np.empty((2, count), np.int32), np.empty((2, count), np.uint8)
+    whole = Returns(np.empty(count, np.float32), numbers[0], numbers[1], kinds[0], kinds[1])
     for columns, pose in step_sectors(scene, world_from_sensor, steps, 1 / lidar.rate_hz, hidden):
         rays = (np.arange(lidar.channels)[:, None] * steps + columns).ravel()
         for values, found in zip(whole, part(pose, rays)):
